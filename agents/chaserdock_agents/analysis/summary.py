@@ -1,0 +1,296 @@
+"""summary.json: a flight judged, ground truth against reference. SI units and radians; keys as in docs/summary.md."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from chaserdock_protocol import rotations
+from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.scenario import Scenario
+
+from .flight import Flight, Track, load_flight
+
+
+def summarize(log: Path) -> dict[str, Any]:
+    """The summary of a log; raises LogError when the log cannot be read."""
+    return summary_of(load_flight(log))
+
+
+def true_reference(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
+    """Times (K,), reference positions (K, 3) WRF and attitudes (K, 4) that a chaser should have had.
+
+    The commanded offset on the *true* target, so that errors of estimation count as errors of tracking. Before
+    the controller names an offset it is the scenario's.
+    """
+    scenario, target = flight.scenario, flight.truth["target"]
+    c = scenario.chasers[chaser]
+    named = {m.sim_time_ns: m.offset_m for m in flight.references.get(chaser, [])}
+    offsets, last = [], c.position_m
+    for t in target.time_s:
+        last = named.get(round(t * 1e9), last)
+        offsets.append(last)
+    positions = target.position_m + rotations.rotate(target.q_wxyz, np.array(offsets))
+    return target.time_s, positions, rotations.multiply(target.q_wxyz, np.array(c.q_wxyz))
+
+
+def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
+    """Times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from its true reference."""
+    time_s, positions, attitudes = true_reference(flight, chaser)
+    own = flight.truth[f"chaser/{chaser}"]
+    n = min(len(time_s), len(own.time_s))
+    position = np.linalg.norm(own.position_m[:n] - positions[:n], axis=1)
+    return time_s[:n], position, rotations.angle_between(attitudes[:n], own.q_wxyz[:n])
+
+
+def estimate_errors(flight: Flight) -> dict[str, Array]:
+    """Errors of the fused estimate where there is one: ``time_s``, ``position_m``, ``orientation_rad``,
+    ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and attitude), each (K,)."""
+    known = np.array([s in ("tracking", "predicting") for s in flight.estimate_status], dtype=bool)
+    truth = flight.truth["target"]
+    index = {round(t * 1e9): k for k, t in enumerate(truth.time_s)}
+    rows = [(k, index[key]) for k in np.flatnonzero(known) if (key := round(flight.estimate.time_s[k] * 1e9)) in index]
+    a = np.array([r[0] for r in rows], dtype=int)
+    b = np.array([r[1] for r in rows], dtype=int)
+    e = flight.estimate
+    position = truth.position_m[b] - e.position_m[a]
+    angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
+    pose = np.concatenate([position, angle], axis=1)
+    covariance = flight.estimate_covariance[a][:, [0, 1, 2, 6, 7, 8]][:, :, [0, 1, 2, 6, 7, 8]]
+    nees = np.einsum("ki,ki->k", pose, np.linalg.solve(covariance, pose[:, :, None])[:, :, 0])
+    return {
+        "time_s": e.time_s[a],
+        "position_m": np.linalg.norm(position, axis=1),
+        "orientation_rad": np.linalg.norm(angle, axis=1),
+        "velocity_m_s": np.linalg.norm(truth.velocity_m_s[b] - e.velocity_m_s[a], axis=1),
+        "omega_rad_s": np.linalg.norm(truth.omega_rad_s[b] - e.omega_rad_s[a], axis=1),
+        "nees": nees,
+    }
+
+
+def _rms(x: Array) -> float | None:
+    return float(np.sqrt(np.mean(x * x))) if len(x) else None
+
+
+def _mean_square(x: Array) -> float | None:
+    return float(np.mean(x * x)) if len(x) else None
+
+
+def _greatest(x: Array) -> float | None:
+    return float(np.max(x)) if len(x) else None
+
+
+def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
+    out: dict[str, float | None] = {n: float(np.percentile(x, p)) if len(x) else None for n, p in names.items()}
+    return out | {"max": _greatest(x)}
+
+
+def _distance(a: Track, b: Track) -> Array:
+    n = min(len(a.time_s), len(b.time_s))
+    return np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
+
+
+def dock_time(flight: Flight, chaser: int) -> float | None:
+    """When a chaser came into the docking tolerances for good (s), on ground truth, or None if it is not docked.
+
+    Docked: its reference is at the docking distance, and at the end it has been within the scenario's position
+    and angle tolerances of it for at least ``docked_time_s``.
+    """
+    approach = flight.scenario.approach
+    time_s, position, angle = tracking_errors(flight, chaser)
+    reached = np.zeros(len(time_s), dtype=bool)
+    named = {m.sim_time_ns: math.hypot(*m.offset_m) for m in flight.references.get(chaser, [])}
+    last = math.inf
+    for k, t in enumerate(time_s):
+        last = named.get(round(t * 1e9), last)
+        reached[k] = abs(last - approach.dock_distance_m) < 1e-6
+    limit = math.radians(approach.docked_angle_deg)
+    inside = reached & (position <= approach.docked_position_m) & (angle <= limit)
+    if not len(inside) or not inside[-1]:
+        return None
+    outside = np.flatnonzero(~inside)
+    since = time_s[outside[-1] + 1] if len(outside) else time_s[0]
+    return float(since) if time_s[-1] - since >= approach.docked_time_s else None
+
+
+def _contacts(flight: Flight) -> int:
+    """How many times two bodies came to touch."""
+    number, before = 0, set()
+    for w in flight.world:
+        now = set(w.contacts)
+        number += len(now - before)
+        before = now
+    return number
+
+
+def summary_of(flight: Flight) -> dict[str, Any]:
+    """The summary of a flight as plain values for JSON."""
+    s = flight.scenario
+    chasers, names = {}, [f"chaser/{i}" for i in range(len(s.chasers))]
+    until = s.steady_until_s or s.duration_s
+    for i, name in enumerate(names):
+        if name not in flight.truth:
+            continue
+        time_s, position, angle = tracking_errors(flight, i)
+        steady = (time_s >= s.settling_s) & (time_s < until)
+        docked_s = dock_time(flight, i)
+        chasers[str(i)] = {
+            "position_mse_m2": _mean_square(position),
+            "orientation_mse_rad2": _mean_square(angle),
+            "steady": {
+                "position_mse_m2": _mean_square(position[steady]),
+                "orientation_mse_rad2": _mean_square(angle[steady]),
+            },
+            "docked": docked_s is not None,
+            "dock_time_s": docked_s,
+            "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
+            "impulse_N_s": flight.absolute_impulse_N_s[name],
+        }
+    flown = [n for n in names if n in flight.truth]
+    between = [
+        float(np.min(_distance(flight.truth[a], flight.truth[b]))) for k, a in enumerate(flown) for b in flown[:k]
+    ]
+    errors = estimate_errors(flight)
+    late = errors["time_s"] >= s.settling_s
+    solve_s = np.array([m.wall_solve_s for m in flight.solver if m.chasers])
+    end_s = float(flight.truth["target"].time_s[-1]) if "target" in flight.truth else 0.0
+    result: dict[str, Any] = {
+        "scenario": s.name,
+        "seed": s.seed,
+        "mode": flight.run.get("mode", ""),
+        "ticks": flight.counts.get("truth/world", 1) - 1,
+        "sim_time_s": end_s,
+        "wall_time_s": flight.wall_time_s,
+        "success": False,
+        "failures": [],
+        "events": _events(flight),
+        "chasers": chasers,
+        "min_distance_chasers_m": min(between) if between else None,
+        "collisions": _contacts(flight),
+        "target_estimate": {
+            "position_rms_m": _rms(errors["position_m"][late]),
+            "orientation_rms_rad": _rms(errors["orientation_rad"][late]),
+            "velocity_rms_m_s": _rms(errors["velocity_m_s"][late]),
+            "omega_rms_rad_s": _rms(errors["omega_rad_s"][late]),
+            "max_position_error_m": _greatest(errors["position_m"][late]),
+            "max_orientation_error_rad": _greatest(errors["orientation_rad"][late]),
+            "nees_mean": float(np.mean(errors["nees"][late])) if np.any(late) else None,
+        },
+        "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
+        "solver": {
+            "name": s.controller.solver,
+            "solve_s": _percentiles(solve_s, {"p50": 50, "p95": 95}),
+            "failures": sum(st == "failed" for m in flight.solver for st in m.status),
+            "relaxed": sum(st == "infeasible_relaxed" for m in flight.solver for st in m.status),
+        },
+        "messages": _messages(flight),
+        "rejected": flight.rejected,
+        "digest": flight.digest,
+    }
+    result["failures"] = failures_of(result, s)
+    result["success"] = not result["failures"]
+    return result
+
+
+def _events(flight: Flight) -> list[dict[str, Any]]:
+    told = [(e.sim_time_ns, f"{e.process}: {e.what} {e.detail}".strip()) for e in flight.events]
+    for r in flight.replies:
+        said = "accepted" if r.accepted else "refused"
+        told.append((r.sim_time_ns, f"command {r.command} chaser {r.chaser}: {said}: {r.reason}"))
+    return [{"time_s": t / 1e9, "what": what} for t, what in sorted(told)]
+
+
+def _messages(flight: Flight) -> dict[str, dict[str, int]]:
+    out: dict[str, dict[str, int]] = defaultdict(lambda: {"count": 0, "lost": 0})
+    for key, count in flight.counts.items():
+        # Presence is told before anybody listens; what was missed then is no loss.
+        lost = 0 if key.endswith("/presence") else flight.lost.get(key, 0)
+        out[key] = {"count": count, "lost": lost}
+    return dict(out)
+
+
+def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
+    """Which of the scenario's criteria a summary does not meet, in words."""
+    out = []
+    if result["sim_time_s"] < s.duration_s - 1.0 / s.time.rate_hz:
+        out.append(f"ended at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
+    if result["collisions"] > s.success.max_collisions:
+        out.append(f"{result['collisions']} collisions, at most {s.success.max_collisions} allowed")
+    nearest = result["min_distance_chasers_m"]
+    if s.success.keep_distances and nearest is not None and nearest < s.limits.min_distance_chasers_m:
+        out.append(f"two chasers came within {nearest:.3f} m; the limit is {s.limits.min_distance_chasers_m:g} m")
+    for i, c in result["chasers"].items():
+        distance = c["min_distance_target_m"]
+        if s.success.keep_distances and distance < s.limits.min_distance_target_m:
+            out.append(
+                f"chaser {i} came within {distance:.3f} m of the target; the limit is {s.limits.min_distance_target_m:g} m"
+            )
+        if int(i) in s.success.docked and not c["docked"]:
+            out.append(f"chaser {i} is not docked")
+        _limit(out, f"chaser {i}: steady position RMS", c["steady"]["position_mse_m2"], s.success.steady_position_rms_m, 1.0, "m")
+        _limit(
+            out,
+            f"chaser {i}: steady orientation RMS",
+            c["steady"]["orientation_mse_rad2"],
+            s.success.steady_orientation_rms_deg,
+            180.0 / math.pi,
+            "deg",
+        )
+    estimate = result["target_estimate"]
+    for label, value, limit, unit, factor in (
+        ("position", estimate["max_position_error_m"], s.success.max_estimate_position_m, "m", 1.0),
+        (
+            "orientation",
+            estimate["max_orientation_error_rad"],
+            s.success.max_estimate_orientation_deg,
+            "deg",
+            180.0 / math.pi,
+        ),
+    ):
+        if limit is not None and (value is None or value * factor > limit):
+            shown = "unknown" if value is None else f"{value * factor:.4g} {unit}"
+            out.append(f"largest {label} error of the estimate: {shown}, at most {limit:g} {unit} allowed")
+    return out
+
+
+def _limit(out: list[str], what: str, mean_square: float | None, limit: float | None, factor: float, unit: str) -> None:
+    if limit is None:
+        return
+    value = None if mean_square is None else math.sqrt(mean_square) * factor
+    if value is None or value > limit:
+        shown = "unknown" if value is None else f"{value:.4g} {unit}"
+        out.append(f"{what}: {shown}, at most {limit:g} {unit} allowed")
+
+
+def text_of(result: dict[str, Any]) -> str:
+    """The summary for people, a few lines."""
+    factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
+    lines = [
+        f"{result['scenario']}: {'success' if result['success'] else 'FAILED'}; {result['sim_time_s']:.1f} s flown in "
+        f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
+    ]
+    for i, c in result["chasers"].items():
+        steady = c["steady"]
+        line = f"  chaser {i}: "
+        if steady["position_mse_m2"] is not None:
+            line += (
+                f"steady RMS {math.sqrt(steady['position_mse_m2']) * 1e3:.2f} mm, "
+                f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
+            )
+        line += f"nearest to the target {c['min_distance_target_m']:.3f} m"
+        if c["docked"]:
+            line += f"; docked since {c['dock_time_s']:.1f} s"
+        lines.append(line)
+    estimate = result["target_estimate"]
+    if estimate["position_rms_m"] is not None:
+        lines.append(
+            f"  target estimate: RMS {estimate['position_rms_m'] * 1e3:.2f} mm, "
+            f"{math.degrees(estimate['orientation_rms_rad']):.3f} deg; largest error "
+            f"{estimate['max_position_error_m'] * 1e3:.2f} mm, "
+            f"{math.degrees(estimate['max_orientation_error_rad']):.3f} deg; mean NEES {estimate['nees_mean']:.2f} of 6"
+        )
+    lines += [f"  not met: {failure}" for failure in result["failures"]]
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""The chaser process: sees the target through its camera and drives its actuators."""

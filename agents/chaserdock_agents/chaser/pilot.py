@@ -1,0 +1,57 @@
+"""What a chaser does with commands: pass on what it can trust, brake when it cannot. Pure functions."""
+
+from __future__ import annotations
+
+from chaserdock_protocol.braking import brake_wrench
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
+from chaserdock_protocol.scenario import Body
+
+def refusal(
+    command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int
+) -> str | None:
+    """Why a wrench command must not be flown, or None.
+
+    ``last_tick`` is the newest tick whose command was flown, ``now_ns`` the newest simulated time known.
+    """
+    if command.chaser != chaser:
+        return f"it is for chaser {command.chaser}"
+    if command.tick <= last_tick:
+        return f"it answers tick {command.tick}, and one for tick {last_tick} was flown already"
+    if command.expires_ns <= now_ns:
+        return f"it expired at {command.expires_ns / 1e9:.3f} s, and it is {now_ns / 1e9:.3f} s"
+    # A little above the limits is rounding; more is not a command for this body.
+    strongest_N = max(map(abs, command.force_N))
+    if strongest_N > body.force_max_N * 1.01:
+        return f"its force of {strongest_N:.3g} N exceeds the body's {body.force_max_N:.3g} N"
+    strongest_N_m = max(map(abs, command.torque_N_m))
+    if strongest_N_m > body.torque_max_N_m * 1.01:
+        return f"its torque of {strongest_N_m:.3g} N m exceeds the body's {body.torque_max_N_m:.3g} N m"
+    return None
+
+
+def brake(odometry: Odometry, body: Body, effective_ns: int) -> ActuatorCommand:
+    """The command that brings a chaser to rest in WRF: see ``braking``."""
+    wrench = brake_wrench(odometry, body)
+    return ActuatorCommand(
+        tick=odometry.tick,
+        sim_time_ns=odometry.sim_time_ns,
+        chaser=odometry.chaser,
+        effective_time_ns=effective_ns,
+        source="brake",
+        force_N=vector(wrench[:3]),
+        torque_N_m=vector(wrench[3:]),
+    )
+
+
+def passed_on(command: WrenchCommand) -> ActuatorCommand:
+    """The controller's command as the chaser's own."""
+    return ActuatorCommand(
+        tick=command.tick,
+        sim_time_ns=command.sim_time_ns,
+        chaser=command.chaser,
+        effective_time_ns=command.effective_time_ns,
+        source="command",
+        force_N=command.force_N,
+        torque_N_m=command.torque_N_m,
+    )

@@ -1,0 +1,164 @@
+"""A chaser process: picture -> sighting, wrench command -> actuators. It never sees the truth."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import cv2
+import msgspec
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    Event,
+    Image,
+    MissionEnd,
+    Odometry,
+    Presence,
+    Sighting,
+    Tick,
+    WrenchCommand,
+)
+from chaserdock_protocol.presence import JoinRefused, PresenceTeller, health_of, join, new_instance
+from chaserdock_protocol.runtime import ProcessOptions, Stop, say
+from chaserdock_protocol.scenario import Scenario, ScenarioError, scenario_from_json
+from chaserdock_protocol.targets import target_model
+from chaserdock_protocol.transport import Node, TransportError
+
+from chaserdock_agents.perception import Perception
+
+from .eye import look, prediction_from
+from .pilot import brake, passed_on, refusal
+
+
+def main(options: ProcessOptions) -> int:
+    """Runs chaser ``options.chaser``; 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
+    cv2.setNumThreads(1)
+    name = f"chaser/{options.chaser}"
+    node: Node | None = None
+    try:
+        node = Node(name, "chaser", options.link)
+        stop, instance = Stop(options.watch_parent), new_instance()
+        mission = join(node, instance, stop, options.patience_s)
+        if mission is None:
+            return 1
+        scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
+        chaser = Chaser(node, scenario, int(options.chaser or 0))
+        chaser.open(instance, realtime=mission.mode == "realtime")
+        while not (chaser.ended or stop()):
+            chaser.listen()
+        chaser.farewell()
+        return 0 if chaser.ended else 1
+    except (TransportError, JoinRefused, ScenarioError) as error:
+        say(name, str(error))
+        return 2
+    finally:
+        if node is not None:
+            node.close()
+
+
+@dataclass
+class Chaser:
+    """The state of one chaser process: what it last knew, saw and flew."""
+
+    node: Node
+    scenario: Scenario
+    number: int
+    ended: bool = False
+    odometry: Odometry | None = None
+    sighting: Sighting | None = None
+    tick: Tick | None = None
+    flown_tick: int = -1
+
+    def __post_init__(self) -> None:
+        self.name = f"chaser/{self.number}"
+        self._perception = Perception(
+            self.scenario.camera_model(), target_model(self.scenario.target.model), self.scenario.perception.name
+        )
+
+    def open(self, instance: str, realtime: bool) -> None:
+        """Opens the topics, then tells its presence."""
+        node, i = self.node, self.number
+        node.advertise(topics.SIGHTING, i)
+        node.advertise(topics.ACTUATORS, i)
+        node.subscribe(topics.IMAGE, i, latest=realtime)
+        node.subscribe(topics.ODOMETRY, i, latest=realtime)
+        node.subscribe(topics.WRENCH, i)
+        node.subscribe(topics.TICK)
+        node.subscribe(topics.END)
+        self.teller = PresenceTeller(node, instance)
+
+    def listen(self) -> None:
+        """Waits for one message and does what it asks for."""
+        received = self.node.receive(0.2)
+        match received.message if received is not None else None:
+            case Image() as image:
+                self._look(image)
+            case Odometry() as odometry:
+                self.odometry = odometry
+                self._brake_if_alone()
+            case WrenchCommand() as command:
+                self._fly(command)
+            case Tick() as tick:
+                self.tick = tick
+                self.teller.settled.set()
+                self._brake_if_alone()
+                if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
+                    health = health_of(self.node, tick.tick, tick.sim_time_ns)
+                    self.node.publish(topics.HEALTH, health, self.name)
+            case Presence() as presence:
+                self.teller.take(presence)
+            case MissionEnd():
+                self.ended = True
+
+    def _look(self, image: Image) -> None:
+        begun_s = time.perf_counter()
+        sighting = look(self._perception, image, prediction_from(self.sighting))
+        took_s = time.perf_counter() - begun_s
+        if sighting.status == "bad_picture" and (self.sighting is None or self.sighting.status != "bad_picture"):
+            self._warn("bad picture", sighting.detail, image.tick, image.sim_time_ns)
+        self.sighting = sighting
+        self.node.publish(topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number)
+
+    def _fly(self, command: WrenchCommand) -> None:
+        now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0
+        why_not = refusal(command, self.number, self.scenario.chaser, self.flown_tick, now_ns)
+        if why_not is None:
+            self._send(passed_on(command))
+            return
+        self.node.counts.stale += 1
+        self._warn("command refused", why_not, command.tick, now_ns)
+        # A tick of the world must be answered, if not with this command then with a safe one.
+        if self.odometry is not None and command.tick == self.odometry.tick > self.flown_tick:
+            self._send(self._braking(self.odometry))
+
+    def _brake_if_alone(self) -> None:
+        """Without a controller the chaser answers the open tick itself, by coming to rest."""
+        tick, odometry = self.tick, self.odometry
+        if tick is None or odometry is None or tick.controller or odometry.tick != tick.tick:
+            return
+        if self.number in tick.chasers and tick.tick > self.flown_tick:
+            self._send(self._braking(odometry))
+
+    def _braking(self, odometry: Odometry) -> ActuatorCommand:
+        return brake(odometry, self.scenario.chaser, self.scenario.timing.effective_ns(odometry.tick))
+
+    def _send(self, command: ActuatorCommand) -> None:
+        self.flown_tick = command.tick
+        self.node.publish(topics.ACTUATORS, command, self.number)
+
+    def _warn(self, what: str, detail: str, tick: int, time_ns: int) -> None:
+        event = Event(
+            tick=tick,
+            sim_time_ns=time_ns,
+            process=self.name,
+            level="warning",
+            what=what,
+            detail=detail,
+        )
+        self.node.publish(topics.EVENT, event, self.name)
+
+    def farewell(self) -> None:
+        """The last messages of this process."""
+        tick = self.tick
+        self.teller.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)

@@ -1,0 +1,253 @@
+"""``chaserdock run``: starts every process of a scenario, watches over them, ends them all, has the flight judged."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+import uuid
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+
+import psutil
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import MissionEnd
+from chaserdock_protocol.runtime import SINGLE_THREADED
+from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
+from chaserdock_protocol.transport import Link, Node, TransportError
+
+from .progress import Progress
+
+_PATIENCE_S = 120
+_END_S = 30.0
+
+
+class RunError(Exception):
+    """The run could not be started; one clear line."""
+
+
+@dataclass
+class Child:
+    """One process of the mission and where its own words go."""
+
+    name: str
+    process: subprocess.Popen[bytes]
+    words: Path
+
+    def last_words(self) -> str:
+        """The last line it said."""
+        lines = self.words.read_text(errors="replace").strip().splitlines()
+        return lines[-1] if lines else f"{self.name}: ended without a word"
+
+
+@dataclass
+class Fleet:
+    """All processes of a run."""
+
+    children: list[Child] = field(default_factory=list)
+    peak_memory_bytes: int = 0
+
+    def start(self, name: str, arguments: list[str], folder: Path) -> None:
+        """Starts one; it ends by itself when this launcher dies, however that happens (its stdin closes)."""
+        words = folder / f"{name.replace('/', '-')}.txt"
+        with words.open("wb") as out:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "chaserdock_agents", *arguments, "--watch-parent"],
+                stdin=subprocess.PIPE,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                env={**os.environ, **SINGLE_THREADED},
+                start_new_session=True,
+            )
+        self.children.append(Child(name, process, words))
+
+    def running(self) -> list[Child]:
+        return [c for c in self.children if c.process.poll() is None]
+
+    def measure_memory(self) -> None:
+        """Notes the memory of all processes together (proportional set size where the system tells it)."""
+        total = 0
+        for child in self.running():
+            try:
+                info = psutil.Process(child.process.pid).memory_full_info()
+                total += getattr(info, "pss", 0) or info.rss
+            except (psutil.NoSuchProcess, psutil.AccessDenied):
+                continue
+        self.peak_memory_bytes = max(self.peak_memory_bytes, total)
+
+    def wait(self, seconds: float) -> None:
+        """Waits until all have ended, at most so long."""
+        deadline = time.monotonic() + seconds
+        while self.running() and time.monotonic() < deadline:
+            time.sleep(0.02)
+
+    def end(self) -> None:
+        """Ends whatever still runs: asked first, then made to."""
+        for child in self.running():
+            child.process.send_signal(signal.SIGTERM)
+        self.wait(5.0)
+        for child in self.running():
+            child.process.kill()
+        for child in self.children:
+            child.process.wait()
+            if child.process.stdin is not None:
+                child.process.stdin.close()
+
+
+def free_port() -> int:
+    """A TCP port that nobody listens on now."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def open_hub(namespace: str, lease_ms: int) -> tuple[Node, str]:
+    """The launcher's own node, which the processes connect to first, and its endpoint. Raises TransportError."""
+    for attempt in range(5):
+        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        try:
+            return Node("operator", "operator", Link(namespace, (), (endpoint,), lease_ms=lease_ms)), endpoint
+        except TransportError:
+            if attempt == 4:
+                raise
+    raise TransportError("no free port")
+
+
+def run_mission(
+    path: Path, folder: Path, mode: str, seed: int | None, overrides: tuple[str, ...], quiet: bool
+) -> int:
+    """Flies a scenario; log, summary and the processes' words go to ``folder``. 0 if the flight was a success.
+
+    Raises RunError when it cannot be started at all.
+    """
+    overrides = overrides if seed is None else (*overrides, f"seed={seed}")
+    try:
+        scenario = load_scenario(path, overrides)
+    except ScenarioError as error:
+        raise RunError(str(error)) from None
+    words = folder / "processes"
+    if (folder / "mission.mcap").exists():
+        raise RunError(f"{folder} holds a mission.mcap already; a log is never overwritten, choose another --out")
+    try:
+        words.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise RunError(f"{folder}: cannot be made: {error.strerror or error}") from None
+    namespace = f"run-{uuid.uuid4().hex[:12]}"
+    # A silent peer is given up after the lease; in lock-step a stopped process is waited for instead.
+    lease_ms = 2_000 if mode == "realtime" else 600_000
+    try:
+        hub, endpoint = open_hub(namespace, lease_ms)
+    except TransportError as error:
+        raise RunError(str(error)) from None
+    stop = _Stop()
+    fleet = Fleet()
+    try:
+        start_all(fleet, scenario, path, folder, mode, overrides, ["-e", endpoint, "--namespace", namespace])
+        failure = watch(fleet, hub, scenario, Progress(scenario, mode, quiet), stop)
+    finally:
+        fleet.end()
+        hub.close()
+        stop.restore()
+    return judge(fleet, folder, failure)
+
+
+def start_all(
+    fleet: Fleet,
+    scenario: Scenario,
+    path: Path,
+    folder: Path,
+    mode: str,
+    overrides: tuple[str, ...],
+    network: list[str],
+) -> None:
+    """Starts recorder, world, controller and chasers; in which order does not matter."""
+    words = folder / "processes"
+    network = [*network, "--lease-ms", "2000" if mode == "realtime" else "600000"]
+    patient = ["--patience", str(_PATIENCE_S)]
+    sets = [item for override in overrides for item in ("--set", override)]
+    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, "-l", "tcp/127.0.0.1:0"], words)
+    fleet.start("controller", ["controller", *network, *patient], words)
+    for i in range(len(scenario.chasers)):
+        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, *patient], words)
+    fleet.start("recorder", ["record", "--out", str(folder), *network, *patient], words)
+
+
+def watch(fleet: Fleet, hub: Node, scenario: Scenario, progress: Progress, stop: _Stop) -> str | None:
+    """Shows the flight until it has ended; why it failed, or None."""
+    hub.subscribe(topics.END)
+    progress.subscribe(hub)
+    ended: MissionEnd | None = None
+    measured_s = 0.0
+    while ended is None:
+        received = hub.receive(0.1)
+        if received is not None:
+            progress.take(received.message)
+            if isinstance(received.message, MissionEnd):
+                ended = received.message
+        if time.monotonic() - measured_s > 2.0:
+            measured_s = time.monotonic()
+            fleet.measure_memory()
+        if stop.asked and not stop.passed_on:
+            stop.passed_on = True
+            progress.say("stopping: the log is being closed")
+            fleet.children[0].process.send_signal(signal.SIGTERM)
+        dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
+        if dead and ended is None:
+            if dead[0].name == "world" or stop.asked or not progress.flying:
+                progress.close()
+                return "stopped by the operator" if stop.asked else dead[0].last_words()
+            for child in dead:
+                progress.warn(child.name, child.last_words())
+    progress.close()
+    fleet.wait(_END_S)
+    if stop.asked:
+        return "stopped by the operator"
+    if not ended.complete:
+        return ended.reason
+    bad = [c for c in fleet.children if c.process.poll() != 0]
+    return bad[0].last_words() if bad else None
+
+
+def judge(fleet: Fleet, folder: Path, failure: str | None) -> int:
+    """Writes summary.json from the log; the run's status."""
+    from chaserdock_protocol.log import LogError
+
+    from .analysis.summary import summarize, text_of
+
+    log = folder / "mission.mcap"
+    try:
+        summary = summarize(log)
+    except LogError as error:
+        print(f"chaserdock: {failure or error}", file=sys.stderr)
+        return 1
+    if failure is not None:
+        summary["failures"] = [failure, *summary["failures"]]
+        summary["success"] = False
+    summary["peak_memory_bytes"] = fleet.peak_memory_bytes
+    (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+    print(text_of(summary))
+    print(f"log, summary and the processes' words: {folder}")
+    if not summary["success"]:
+        print(f"chaserdock: failed: {summary['failures'][0]}", file=sys.stderr)
+    return 0 if summary["success"] else 1
+
+
+class _Stop:
+    """Ctrl-C or SIGTERM asked for the end; a second time makes no difference until all is put away."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.passed_on = False
+        self._before = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
+
+    def _ask(self, number: int, frame: FrameType | None) -> None:
+        self.asked = True
+
+    def restore(self) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)

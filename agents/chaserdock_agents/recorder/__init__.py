@@ -1,0 +1,1 @@
+"""The recorder process: everything that travels, verbatim, into an MCAP file."""

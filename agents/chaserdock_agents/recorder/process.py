@@ -1,0 +1,156 @@
+"""The recorder process: every message of the run, verbatim, into one MCAP file.
+
+In lock-step it confirms each tick that it holds completely, which bounds how far the flight runs ahead; at
+the end it waits until it has all that the others say they published.
+"""
+
+from __future__ import annotations
+
+import queue
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.log import LogError, LogWriter
+from chaserdock_protocol.messages import ActuatorCommand, Farewell, MissionEnd, Presence, RecorderAck, SolverStatus, Tick
+from chaserdock_protocol.presence import JoinRefused, PresenceTeller, join, new_instance
+from chaserdock_protocol.runtime import ProcessOptions, Stop, say
+from chaserdock_protocol.transport import Node, Raw, TransportError
+
+LOG_NAME = "mission.mcap"
+_DRAIN_S = 10.0
+
+
+def main(options: ProcessOptions) -> int:
+    """Records into ``options.out``; 0 when complete, 1 when stopped early or with messages missing, 2 if it could not."""
+    node: Node | None = None
+    try:
+        node = Node("recorder", "recorder", options.link)
+        stop, instance = Stop(options.watch_parent), new_instance()
+        mission = join(node, instance, stop, options.patience_s)
+        if mission is None:
+            return 1
+        writer = open_log(options.out)
+        try:
+            writer.describe(mission.scenario_json, {"run_id": mission.run_id, "mode": mission.mode})
+            recorder = Recorder(node, writer)
+            recorder.open(instance)
+            while not recorder.finished() and not (stop() and recorder.idle()):
+                recorder.take_one(0.1)
+        finally:
+            writer.close()
+        if recorder.ended_s is None:
+            say("recorder", f"stopped before the mission's end; {writer.path} holds what came until then")
+            return 1
+        missing = recorder.missing()
+        for key, number in missing.items():
+            say("recorder", f"{number} messages of {key} never came")
+        return 1 if missing else 0
+    except (TransportError, JoinRefused, LogError) as error:
+        say("recorder", str(error))
+        return 2
+    finally:
+        if node is not None:
+            node.close()
+
+
+def open_log(folder: Path) -> LogWriter:
+    """The run's log in ``folder``, which is made; raises LogError."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from None
+    return LogWriter(folder / LOG_NAME)
+
+
+@dataclass
+class Recorder:
+    """What has been recorded, and what the ends of the others say there should be."""
+
+    node: Node
+    writer: LogWriter
+    ended_s: float | None = None
+    _waiting: queue.SimpleQueue[Raw] = field(default_factory=queue.SimpleQueue)
+    _received: dict[str, int] = field(default_factory=dict)
+    _promised: dict[str, int] = field(default_factory=dict)
+    _said_goodbye: set[str] = field(default_factory=set)
+    _expected: set[str] = field(default_factory=set)
+    _latest: dict[str, int] = field(default_factory=dict)
+    _acked: int = -1
+
+    def open(self, instance: str) -> None:
+        """Subscribes everything, then tells its presence."""
+        self.node.advertise(topics.ACK)
+        self.node.subscribe_raw("**", self._waiting.put)
+        self.teller = PresenceTeller(self.node, instance)
+
+    def take_one(self, timeout_s: float) -> None:
+        """Writes one message, if one comes in time."""
+        while self.node.receive(0) is not None:
+            pass  # presence reaches the raw subscription, too; the typed one is only for the barrier
+        try:
+            raw = self._waiting.get(timeout=timeout_s)
+        except queue.Empty:
+            return
+        self.writer.write(raw.key, raw.encoding, raw.payload, raw.sent_ns)
+        self._received[raw.key] = self._received.get(raw.key, 0) + 1
+        found = topics.topic_of_key(raw.key)
+        if found is None or found[0] not in _READ:
+            return
+        try:
+            self._note(raw.key, codec.decode(found[0].kind, raw.payload, raw.encoding))
+        except Rejected:
+            return
+
+    def _note(self, key: str, message: object) -> None:
+        match message:
+            case Presence(process=process):
+                self.teller.take(message)
+            case Tick() as tick:
+                self.teller.settled.set()
+                self._expected = {topics.ACTUATORS.key_of(i) for i in tick.chasers}
+                if tick.controller:
+                    self._expected.add(topics.SOLVER.key_of())
+                self._latest[key] = tick.tick
+                self._confirm()
+            case ActuatorCommand() | SolverStatus():
+                self._latest[key] = message.tick
+                self._confirm()
+            case Farewell(process=process, published=published):
+                self._said_goodbye.add(process)
+                self._promised.update(published)
+            case MissionEnd():
+                self.ended_s = time.monotonic()
+
+    def _confirm(self) -> None:
+        keys = self._expected | {topics.TICK.key_of()}
+        held = min(self._latest.get(key, -1) for key in keys)
+        if held > self._acked:
+            self._acked = held
+            self.node.publish(topics.ACK, RecorderAck(tick=held))
+
+    def missing(self) -> dict[str, int]:
+        """Messages that were published, by their publishers' own account, and never came."""
+        return {
+            key: number - self._received.get(key, 0)
+            for key, number in self._promised.items()
+            # Presence is told from before the recorder can hear it.
+            if number > self._received.get(key, 0) and not key.endswith("/presence")
+        }
+
+    def idle(self) -> bool:
+        """Whether nothing waits to be written."""
+        return self._waiting.empty()
+
+    def finished(self) -> bool:
+        """Whether the mission is over and all that was published is here, or has had its time to come."""
+        if self.ended_s is None:
+            return False
+        everyone = {"world", "controller", *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser"))}
+        complete = everyone <= self._said_goodbye and not self.missing() and self.idle()
+        return complete or time.monotonic() - self.ended_s > _DRAIN_S
+
+
+_READ = (topics.TICK, topics.ACTUATORS, topics.SOLVER, topics.PRESENCE, topics.FAREWELL, topics.END)

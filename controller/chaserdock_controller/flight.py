@@ -1,0 +1,283 @@
+"""One tick of the controller, without I/O: odometry and sightings in, commands and all that explains them out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from chaserdock_protocol import rotations
+from chaserdock_protocol.braking import brake_wrench
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import (
+    CommandReply,
+    Event,
+    Odometry,
+    OperatorCommand,
+    Plan,
+    Reference,
+    Sighting,
+    SolverStatus,
+    TargetEstimate,
+    WrenchCommand,
+)
+from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.scenario import Scenario
+
+from . import reference
+from .fusion import geometry
+from .fusion.types import Measurement
+from .fusion.types import TargetEstimate as Fused
+from .guidance import Guidance
+from .nmpc import NmpcInput, NmpcPlan, make_solver
+from .prediction import CommandHistory, predict_state
+from .setup import estimator_of, nmpc_parameters
+
+_ODOMETRY_KEPT_NS = 2_000_000_000
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What a tick brings. Sightings may belong to earlier ticks."""
+
+    tick: int
+    time_ns: int
+    odometry: dict[int, Odometry]
+    sightings: tuple[Sighting, ...]
+    commands: tuple[OperatorCommand, ...] = ()
+
+
+@dataclass
+class Outputs:
+    """What a tick yields; dictionaries by chaser."""
+
+    target: TargetEstimate
+    wrenches: dict[int, WrenchCommand] = field(default_factory=dict)
+    references: dict[int, Reference] = field(default_factory=dict)
+    plans: dict[int, Plan] = field(default_factory=dict)
+    solver: SolverStatus | None = None
+    replies: list[CommandReply] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list)
+
+
+class Flight:
+    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver."""
+
+    def __init__(self, scenario: Scenario, now_s: Callable[[], float]) -> None:
+        self.scenario = scenario
+        self.guidance = Guidance(scenario)
+        self._now_s = now_s
+        self._camera = scenario.camera_model()
+        self._estimator = estimator_of(scenario)
+        self._parameters = nmpc_parameters(scenario)
+        self._solver = make_solver(scenario.controller.solver, self._parameters, len(scenario.chasers))
+        self._odometry: dict[tuple[int, int], Odometry] = {}
+        self._history = CommandHistory()
+        self._last_solve_ns: int | None = None
+        self._troubled: set[int] = set()
+
+    def step(self, inputs: Inputs) -> Outputs:
+        """Everything that one tick asks of the controller."""
+        now_s = inputs.time_ns / 1e9
+        for odometry in inputs.odometry.values():
+            self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
+        fused = self._estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
+        out = Outputs(target=self._target_message(inputs, fused))
+        self._events(out, inputs, [("info", text) for _, text in self._estimator.drain_events()])
+        if fused.status in ("tracking", "predicting"):
+            self.guidance.found(now_s)
+        elif fused.status == "lost":
+            self.guidance.lost(now_s)
+        for command in (*self.guidance.due_commands(now_s), *inputs.commands):
+            answer = self.guidance.command(command, now_s)
+            out.replies.append(
+                CommandReply(
+                    tick=inputs.tick,
+                    sim_time_ns=inputs.time_ns,
+                    command=command.command,
+                    chaser=command.chaser,
+                    accepted=answer.accepted,
+                    reason=answer.reason,
+                )
+            )
+        self._command(inputs, fused, out)
+        self._forget(inputs.time_ns)
+        return out
+
+    def _measurements(self, sightings: tuple[Sighting, ...]) -> list[Measurement]:
+        measurements = []
+        for s in sightings:
+            odometry = self._odometry.get((s.chaser, s.sim_time_ns))
+            if odometry is None:
+                continue  # exposed before this controller knew where that chaser was
+            hypotheses = tuple(
+                geometry.to_world(
+                    odometry.position_m,
+                    odometry.q_wxyz,
+                    self._camera.position_crf_m,
+                    self._camera.q_crf_irf_wxyz,
+                    solution.position_m,
+                    solution.q_wxyz,
+                    np.reshape(solution.covariance, (6, 6)),
+                )
+                for solution in s.solutions
+            )
+            measurements.append(Measurement(s.chaser, s.sim_time_ns, hypotheses, len(s.marker_ids)))
+        return measurements
+
+    def _command(self, inputs: Inputs, fused: Fused, out: Outputs) -> None:
+        """References, plan and commands of all chasers whose odometry is there."""
+        ids = tuple(sorted(inputs.odometry))
+        effective_ns = self.scenario.timing.effective_ns(inputs.tick)
+        known = fused.status in ("tracking", "predicting")
+        plan: NmpcPlan | None = None
+        took_s = 0.0
+        if known and ids:
+            ahead = self._estimator.estimate_at(effective_ns)
+            problem = self._problem(ids, inputs, ahead, effective_ns)
+            self._describe(ids, inputs, fused, out)
+            begun_s = self._now_s()
+            since_ns = 0 if self._last_solve_ns is None else inputs.time_ns - self._last_solve_ns
+            try:
+                plan = self._solver.solve(problem, since_ns / 1e9, ids)
+                self._last_solve_ns = inputs.time_ns
+            except (ValueError, ArithmeticError, RuntimeError) as error:
+                self._events(out, inputs, [("error", f"the solver refused: {error}")])
+            took_s = self._now_s() - begun_s
+        else:
+            self._describe((), inputs, fused, out)
+        for row, i in enumerate(ids):
+            usable = plan is not None and plan.status[row] != "failed"
+            if usable != (i not in self._troubled) and known:
+                text = f"chaser {i}: " + ("planned again" if usable else "no plan, braking")
+                self._events(out, inputs, [("info" if usable else "error", text)])
+                (self._troubled.discard if usable else self._troubled.add)(i)
+            if plan is not None and usable:
+                wrench, mode = plan.inputs[row, 0], "nmpc"
+                out.plans[i] = self._plan_message(i, inputs, effective_ns, plan, row)
+            else:
+                wrench, mode = brake_wrench(inputs.odometry[i], self.scenario.chaser), "brake"
+            self._history.add(i, effective_ns, wrench)
+            out.wrenches[i] = WrenchCommand(
+                tick=inputs.tick,
+                sim_time_ns=inputs.time_ns,
+                chaser=i,
+                effective_time_ns=effective_ns,
+                expires_ns=inputs.time_ns + round(self.scenario.controller.command_lifetime_s * 1e9),
+                mode="nmpc" if mode == "nmpc" else "brake",
+                force_N=vector(wrench[:3]),
+                torque_N_m=vector(wrench[3:]),
+            )
+        out.solver = SolverStatus(
+            tick=inputs.tick,
+            sim_time_ns=inputs.time_ns,
+            solver=self.scenario.controller.solver,
+            chasers=ids if plan is not None else (),
+            status=plan.status if plan is not None else (),
+            iterations=tuple(int(n) for n in plan.iterations) if plan is not None else (),
+            cost=vector(plan.cost) if plan is not None else (),
+            max_violation_m=vector(plan.max_violation_m) if plan is not None else (),
+            wall_solve_s=took_s,
+        )
+
+    def _problem(self, ids: tuple[int, ...], inputs: Inputs, ahead: Fused, effective_ns: int) -> NmpcInput:
+        """The NMPC's problem at the time when the commands take effect."""
+        p, s = self._parameters, self.scenario
+        times_s = np.arange(p.stages + 1) * p.dt_s
+        moving = (ahead.position_m, ahead.velocity_m_s, ahead.q_wxyz, ahead.omega_rad_s)
+        positions, _ = reference.predict_target(*moving, times_s)
+        states, references, u_ref = [], [], []
+        for i in ids:
+            offset = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s)
+            q_off = s.chasers[i].q_wxyz
+            states.append(predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser))
+            references.append(reference.reference_trajectory(*moving, offset[0], q_off, times_s))
+            if s.controller.feed_forward:
+                held = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s[:-1] + p.dt_s / 2)
+                u_ref.append(
+                    reference.feed_forward(
+                        ahead.omega_rad_s, *held, q_off, s.chaser.mass_kg, np.diag(s.chaser.inertia)
+                    )
+                )
+            else:
+                u_ref.append(np.zeros((p.stages, 6)))
+        n = len(ids)
+        return NmpcInput(
+            states=np.array(states),
+            references=np.array(references),
+            u_ref=np.array(u_ref),
+            target_positions=positions,
+            min_distance_target_m=np.full(n, s.limits.min_distance_target_m),
+            min_distance_chasers_m=s.limits.min_distance_chasers_m,
+            input_max=np.tile(p.input_limits(), (n, 1)),
+        )
+
+    def _describe(self, ids: tuple[int, ...], inputs: Inputs, fused: Fused, out: Outputs) -> None:
+        """Where every chaser is to be now, and its phase by how near it is to that."""
+        now_s = inputs.time_ns / 1e9
+        for i in ids:
+            offset = self.guidance.chasers[i].move.at(np.array([now_s]))[0][0]
+            position = fused.position_m + rotations.rotate(fused.q_wxyz, offset)
+            attitude = rotations.multiply(fused.q_wxyz, self.scenario.chasers[i].q_wxyz)
+            odometry = inputs.odometry[i]
+            error_m = float(np.linalg.norm(position - odometry.position_m))
+            error_rad = float(rotations.angle_between(attitude, odometry.q_wxyz))
+            self.guidance.observe(i, now_s, error_m, error_rad)
+            phase = self.guidance.chasers[i]
+            out.references[i] = Reference(
+                tick=inputs.tick,
+                sim_time_ns=inputs.time_ns,
+                chaser=i,
+                phase=phase.phase,  # type: ignore[arg-type]
+                phase_time_s=now_s - phase.since_s,
+                position_m=vector(position),
+                q_wxyz=vector(attitude),
+                offset_m=vector(offset),
+                min_distance_target_m=self.scenario.limits.min_distance_target_m,
+            )
+        changes = self.guidance.drain_events()
+        self._events(out, inputs, [("info", f"chaser {i}: {what} ({detail})") for i, what, detail in changes])
+
+    def _plan_message(self, i: int, inputs: Inputs, effective_ns: int, plan: NmpcPlan, row: int) -> Plan:
+        return Plan(
+            tick=inputs.tick,
+            sim_time_ns=effective_ns,
+            chaser=i,
+            step_s=self._parameters.dt_s,
+            positions_m=vector(plan.states[row, :, :3]),
+            quaternions_wxyz=vector(plan.states[row, :, 6:10]),
+            inputs=vector(plan.inputs[row]),
+        )
+
+    def _target_message(self, inputs: Inputs, fused: Fused) -> TargetEstimate:
+        seen = {s.chaser for s in inputs.sightings if s.solutions and s.sim_time_ns == inputs.time_ns}
+        return TargetEstimate(
+            tick=inputs.tick,
+            sim_time_ns=inputs.time_ns,
+            status=fused.status,  # type: ignore[arg-type]
+            position_m=vector(fused.position_m),
+            velocity_m_s=vector(fused.velocity_m_s),
+            q_wxyz=vector(fused.q_wxyz),
+            omega_rad_s=vector(fused.omega_rad_s),
+            covariance=vector(fused.covariance),
+            accepted=tuple(sorted(seen - set(fused.rejected))),
+            rejected=tuple(sorted(fused.rejected)),
+        )
+
+    def _events(self, out: Outputs, inputs: Inputs, told: list[tuple[str, str]]) -> None:
+        for level, text in told:
+            out.events.append(
+                Event(
+                    tick=inputs.tick,
+                    sim_time_ns=inputs.time_ns,
+                    process="controller",
+                    level=level,  # type: ignore[arg-type]
+                    what=text,
+                )
+            )
+
+    def _forget(self, now_ns: int) -> None:
+        old = [key for key in self._odometry if key[1] < now_ns - _ODOMETRY_KEPT_NS]
+        for key in old:
+            del self._odometry[key]
+        self._history.forget_before(now_ns)

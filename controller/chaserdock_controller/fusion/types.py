@@ -1,0 +1,135 @@
+"""What goes into and comes out of target state estimation. Arrays are float64; SI units and radians."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PoseHypothesis:
+    """One possible pose of the target.
+
+    position_m: (3,) origin of TRF in WRF, m.
+    q_wxyz: (4,) unit quaternion, TRF to WRF.
+    covariance: (6, 6), order (position in WRF axes, m; dtheta in TRF axes, rad) with
+        q_true = q (x) exp(dtheta).
+    """
+
+    position_m: Array
+    q_wxyz: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What one chaser saw in one exposure.
+
+    chaser: its number. time_ns: simulated time of the exposure. markers: how many markers it used.
+    hypotheses: one pose, two for the planar ambiguity of a single marker (the likelier first), none
+        for "sees nothing".
+    """
+
+    chaser: int
+    time_ns: int
+    hypotheses: tuple[PoseHypothesis, ...]
+    markers: int
+
+
+@dataclass(frozen=True, eq=False)
+class TargetEstimate:
+    """The fused state of the target at ``time_ns``.
+
+    position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
+    covariance: (12, 12), order (position WRF, velocity WRF, dtheta TRF, omega TRF).
+    status: "none" (nothing seen yet: pose and rates are zero, the covariance is 1e6 times identity),
+        "tracking" (a measurement was accepted a short while ago), "predicting" (none was: the motion
+        model alone), "lost" (too uncertain to be used).
+    sightings: number of chasers whose measurements were accepted at the newest exposure.
+    rejected: the chasers whose measurements were gated out at the newest exposure.
+    """
+
+    time_ns: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    covariance: Array
+    status: str
+    sightings: int
+    rejected: tuple[int, ...]
+
+
+class Estimator(Protocol):
+    """What ``make_estimator`` returns: see ``mekf.Mekf`` for the meaning of each member."""
+
+    @property
+    def accepted(self) -> int: ...
+
+    @property
+    def gated(self) -> int: ...
+
+    @property
+    def late_dropped(self) -> int: ...
+
+    @property
+    def reinitialisations(self) -> int: ...
+
+    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate: ...
+
+    def estimate_at(self, time_ns: int) -> TargetEstimate: ...
+
+    def drain_events(self) -> list[tuple[int, str]]: ...
+
+
+NO_ESTIMATE_VARIANCE = 1e6
+
+
+def no_estimate(time_ns: int) -> TargetEstimate:
+    """The estimate with status "none" at ``time_ns``."""
+    return TargetEstimate(
+        time_ns,
+        np.zeros(3),
+        np.zeros(3),
+        np.array([1.0, 0.0, 0.0, 0.0]),
+        np.zeros(3),
+        NO_ESTIMATE_VARIANCE * np.eye(12),
+        "none",
+        0,
+        (),
+    )
+
+
+def is_usable(measurement: Measurement) -> bool:
+    """Whether every hypothesis has the right shapes, finite numbers, a unit quaternion (to 1e-3) and a
+    symmetric, positive definite covariance."""
+    for h in measurement.hypotheses:
+        if h.position_m.shape != (3,) or h.q_wxyz.shape != (4,) or h.covariance.shape != (6, 6):
+            return False
+        if not (np.isfinite(h.position_m).all() and np.isfinite(h.covariance).all()):
+            return False
+        # Written so that a NaN fails, too.
+        if not abs(float(h.q_wxyz @ h.q_wxyz) - 1.0) < 1e-3:
+            return False
+        scale = float(np.abs(h.covariance).max())
+        if float(np.abs(h.covariance - h.covariance.T).max()) > 1e-6 * scale:
+            return False
+        try:
+            np.linalg.cholesky(h.covariance)
+        except np.linalg.LinAlgError:
+            return False
+    return True
+
+
+def content_key(m: Measurement) -> tuple[int, int, int, int, bytes]:
+    """Total order of measurements: time, chaser, and then content, so that no order of arrival matters."""
+    content = b"".join(
+        h.position_m.tobytes() + h.q_wxyz.tobytes() + h.covariance.tobytes() for h in m.hypotheses
+    )
+    return m.time_ns, m.chaser, len(m.hypotheses), m.markers, content

@@ -1,0 +1,223 @@
+"""What goes into and comes out of the NMPC, independent of the back end that solves it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+
+INTEGRATORS = ("rk4", "euler")
+
+STATUSES = ("solved", "iteration_limit", "infeasible_relaxed", "failed")
+SOLVED, ITERATION_LIMIT, INFEASIBLE_RELAXED, FAILED = STATUSES
+
+# A plan that enters a keep-out ball (or leaves the outer bound) by more than this is called relaxed.
+VIOLATION_TOLERANCE_M = 1e-4
+
+
+@dataclass(frozen=True)
+class NmpcParameters:
+    """Everything about the problem that stays the same from tick to tick. SI units, radians.
+
+    The weights are those of the paper's cost (eq. 3): ``weight_position`` per m^2, ``weight_orientation``
+    on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
+    (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
+    body axes. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
+    Raises ValueError, naming the field, for a value that makes no physical or mathematical sense.
+    """
+
+    mass_kg: float
+    inertia_kg_m2: Matrix3
+    force_max_N: float
+    torque_max_N_m: float
+    horizon_s: float = 3.0
+    dt_s: float = 0.1
+    falloff: float = 0.0
+    weight_position: float = 65.0
+    weight_orientation: float = 35.0
+    weight_force: float = 3.5
+    weight_torque: float = 40.0
+    weight_final_position: float = 3250.0
+    weight_final_orientation: float = 1750.0
+    max_reference_distance_m: float = 25.0
+    integrator: str = "rk4"
+
+    def __post_init__(self) -> None:
+        for name in ("mass_kg", "dt_s", "weight_force", "weight_torque", "max_reference_distance_m"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ValueError(f"{name} must be positive and finite, not {getattr(self, name)!r}")
+        for name in ("force_max_N", "torque_max_N_m", "weight_position", "weight_orientation"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ValueError(f"{name} must be finite and not negative, not {getattr(self, name)!r}")
+        for name in ("weight_final_position", "weight_final_orientation"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ValueError(f"{name} must be finite and not negative, not {getattr(self, name)!r}")
+        if not (math.isfinite(self.horizon_s) and round(self.horizon_s / self.dt_s) >= 1):
+            raise ValueError(f"horizon_s={self.horizon_s!r} is shorter than one step of dt_s={self.dt_s!r}")
+        if not 0.0 <= self.falloff <= 1.0:
+            raise ValueError(f"falloff must lie between 0 and 1, not {self.falloff!r}")
+        if self.integrator not in INTEGRATORS:
+            raise ValueError(f"integrator must be one of {', '.join(INTEGRATORS)}, not {self.integrator!r}")
+        inertia = np.asarray(self.inertia_kg_m2, dtype=float)
+        if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
+            raise ValueError("inertia_kg_m2 must be a finite 3 x 3 matrix")
+        if not np.allclose(inertia, inertia.T, rtol=1e-9, atol=0.0):
+            raise ValueError("inertia_kg_m2 must be symmetric")
+        if np.linalg.eigvalsh(inertia)[0] <= 0.0:
+            raise ValueError("inertia_kg_m2 must be positive definite")
+
+    @property
+    def stages(self) -> int:
+        """Number of prediction steps D = round(T / dt)."""
+        return round(self.horizon_s / self.dt_s)
+
+    def stage_weights(self) -> tuple[Array, Array]:
+        """Weights of position and orientation at stages 0..D, each (D+1,), the final ones included (eq. 3)."""
+        scale = 1.0 - self.falloff * np.arange(self.stages + 1) / self.stages
+        position, orientation = self.weight_position * scale, self.weight_orientation * scale
+        position[-1] += self.weight_final_position
+        orientation[-1] += self.weight_final_orientation
+        return position, orientation
+
+    def input_limits(self) -> Array:
+        """The box (6,): force (N) and torque (N m) per body axis."""
+        return np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
+
+
+@dataclass(frozen=True)
+class NmpcInput:
+    """One tick's problem for N chasers over D stages.
+
+    states (N, 13): p (WRF, m), v (WRF, m/s), q_wxyz (body to world), omega (body, rad/s).
+    references (N, D+1, 7): p (WRF, m), q_wxyz; stage 0 is now.
+    u_ref (N, D, 6): force (N) and torque (N m), body axes, from which the input cost is counted.
+    target_positions (D+1, 3): WRF, m. min_distance_target_m (N,); min_distance_chasers_m: one float or a
+    symmetric (N, N), diagonal ignored; 0 switches a constraint off. input_max (N, 6): N and N m, body axes.
+    """
+
+    states: Array
+    references: Array
+    u_ref: Array
+    target_positions: Array
+    min_distance_target_m: Array
+    min_distance_chasers_m: Array | float
+    input_max: Array
+
+
+@dataclass(frozen=True)
+class NmpcPlan:
+    """Answer for N chasers, rows in the order of the input.
+
+    inputs (N, D, 6): N and N m, body axes, within ``input_max``. states (N, D+1, 13): those inputs through
+    the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point reached);
+    "infeasible_relaxed" (the plan enters a keep-out zone, ``max_violation_m`` deep: no input avoids it,
+    or the start lies inside); "failed" (numerical breakdown: the inputs are then the shifted previous plan).
+    iterations (N,): interior-point iterations, 0 if none was needed. cost (N,): eq. 3 on ``states``.
+    """
+
+    inputs: Array
+    states: Array
+    status: tuple[str, ...]
+    iterations: IntArray
+    cost: Array
+    max_violation_m: Array
+
+
+class NmpcSolver(Protocol):
+    """What every back end offers."""
+
+    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan: ...
+
+    def reset(self) -> None: ...
+
+
+def _array(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    array = np.array(value, dtype=np.float64, order="C")
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+    if not np.isfinite(array).all():
+        raise ValueError(f"{name} holds a value that is not finite")
+    return array
+
+
+def _unit(name: str, quaternions: Array) -> None:
+    """Normalizes quaternions (..., 4) in place; they may drift, but not vanish."""
+    norm = np.sqrt(np.sum(quaternions * quaternions, axis=-1, keepdims=True))
+    if (np.abs(norm - 1.0) > 0.1).any():
+        raise ValueError(f"{name} holds a quaternion that is not of unit length")
+    quaternions /= norm
+
+
+def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
+    """A copy of ``problem`` with contiguous arrays, unit quaternions and (N, N) chaser distances.
+
+    Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
+    length, a negative distance or limit, an asymmetric distance matrix, or more than ``n_max`` chasers.
+    """
+    states = np.asarray(problem.states, dtype=np.float64)
+    if states.ndim != 2 or not 1 <= len(states) <= n_max:
+        raise ValueError(f"states must have shape (N, 13) with N from 1 to {n_max}, not {states.shape}")
+    n, d = len(states), params.stages
+    states = _array("states", states, (n, 13))
+    references = _array("references", problem.references, (n, d + 1, 7))
+    _unit("states", states[:, 6:10])
+    _unit("references", references[:, :, 3:7])
+    between = np.asarray(problem.min_distance_chasers_m, dtype=np.float64)
+    if between.ndim == 0:
+        between = np.full((n, n), float(between))
+    between = _array("min_distance_chasers_m", between, (n, n))
+    if (between != between.T).any():
+        raise ValueError("min_distance_chasers_m must be symmetric")
+    to_target = _array("min_distance_target_m", problem.min_distance_target_m, (n,))
+    input_max = _array("input_max", problem.input_max, (n, 6))
+    for name, value in (
+        ("min_distance_chasers_m", between),
+        ("min_distance_target_m", to_target),
+        ("input_max", input_max),
+    ):
+        if (value < 0.0).any():
+            raise ValueError(f"{name} must not be negative")
+    return NmpcInput(
+        states=states,
+        references=references,
+        u_ref=_array("u_ref", problem.u_ref, (n, d, 6)),
+        target_positions=_array("target_positions", problem.target_positions, (d + 1, 3)),
+        min_distance_target_m=to_target,
+        min_distance_chasers_m=between,
+        input_max=input_max,
+    )
+
+
+def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
+    """The chasers' identities, 0..N-1 if not given. Raises ValueError for a wrong number or a repetition."""
+    chosen = tuple(range(n)) if ids is None else tuple(int(i) for i in ids)
+    if len(chosen) != n or len(set(chosen)) != n:
+        raise ValueError(f"ids must be {n} different numbers, not {chosen}")
+    return chosen
+
+
+def check_shift(shift_s: float) -> float:
+    """The time since the previous solve, s. Raises ValueError if it is negative or not finite."""
+    if not (math.isfinite(shift_s) and shift_s >= 0.0):
+        raise ValueError(f"shift_s must be finite and not negative, not {shift_s!r}")
+    return float(shift_s)
+
+
+def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
+    """Piecewise constant inputs (D, 6) seen ``shift_s`` later on the same grid (D, 6).
+
+    Each new value is the mean of the old plan over its interval, so the impulse is kept; beyond the old
+    horizon the last value is held.
+    """
+    d = len(inputs)
+    whole, part = divmod(shift_s / dt_s, 1.0)
+    first = np.minimum(np.arange(d) + int(min(whole, d)), d - 1)
+    return (1.0 - part) * inputs[first] + part * inputs[np.minimum(first + 1, d - 1)]

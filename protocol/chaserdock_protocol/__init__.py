@@ -1,0 +1,1 @@
+"""What every chaserdock process shares: messages, topics, frames, time, transport, scenario."""

@@ -1,0 +1,51 @@
+"""Simulated time: whole physics steps, so that nothing is ever rounded twice."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Physics steps, ticks and latencies of a mission.
+
+    ``rate_hz`` ticks a second and ``picture_hz`` pictures a second, both whole divisors of ``physics_hz`` (pictures
+    of ticks, too). ``latency_steps`` is the time from exposure to actuation in physics steps.
+    """
+
+    physics_hz: int
+    rate_hz: int
+    picture_hz: int
+    latency_steps: int
+
+    @property
+    def steps_per_tick(self) -> int:
+        return self.physics_hz // self.rate_hz
+
+    @property
+    def ticks_per_picture(self) -> int:
+        return self.rate_hz // self.picture_hz
+
+    def step_of_tick(self, tick: int) -> int:
+        return tick * self.steps_per_tick
+
+    def time_ns(self, step: int) -> int:
+        """Simulated time of a physics step, nanoseconds, rounded down."""
+        return step * 1_000_000_000 // self.physics_hz
+
+    def tick_time_ns(self, tick: int) -> int:
+        return self.time_ns(self.step_of_tick(tick))
+
+    def effective_ns(self, tick: int) -> int:
+        """When a command that answers ``tick`` takes effect."""
+        return self.time_ns(self.step_of_tick(tick) + self.latency_steps)
+
+    def step_of_time(self, time_ns: int) -> int:
+        """The first physics step at or after a simulated time."""
+        return -(-time_ns * self.physics_hz // 1_000_000_000)
+
+    def ticks_in(self, duration_s: float) -> int:
+        return round(duration_s * self.rate_hz)
+
+    def has_pictures(self, tick: int) -> bool:
+        return tick % self.ticks_per_picture == 0

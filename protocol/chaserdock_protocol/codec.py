@@ -1,0 +1,86 @@
+"""Messages to bytes and back, with everything from outside checked at this boundary."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import Any, TypeVar
+
+import msgspec
+from msgspec import Struct
+
+from .messages import Message, encoding_of
+
+MAX_BYTES = 17_000_000
+UNIT_QUATERNION_TOLERANCE = 1e-6
+
+T = TypeVar("T", bound=Struct)
+
+_encoder = msgspec.msgpack.Encoder()
+
+
+class Rejected(Exception):
+    """A message that must not be used; ``reason`` is a short stable word to count it by."""
+
+    def __init__(self, reason: str, detail: str) -> None:
+        super().__init__(f"{reason}: {detail}")
+        self.reason = reason
+        self.detail = detail
+
+
+@lru_cache
+def _decoder(kind: type[Struct]) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(kind)
+
+
+def encode(message: Struct) -> bytes:
+    """Payload of a message: a msgpack map."""
+    return _encoder.encode(message)
+
+
+def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
+    """Message of type ``kind`` from a payload, checked.
+
+    Raises Rejected with reason ``encoding`` (another type or version than ``kind``'s), ``size``, ``format``
+    (no msgpack, wrong type or shape), ``not_finite`` or ``not_unit_quaternion``.
+    """
+    if encoding is not None and encoding != encoding_of(kind):
+        raise Rejected("encoding", f"got {encoding!r}, expected {encoding_of(kind)!r}")
+    if len(payload) > MAX_BYTES:
+        raise Rejected("size", f"{len(payload)} bytes, at most {MAX_BYTES}")
+    try:
+        message = _decoder(kind).decode(payload)
+    except (msgspec.DecodeError, RecursionError, UnicodeDecodeError) as error:
+        raise Rejected("format", str(error)) from None
+    check_numbers(message)
+    return message
+
+
+def check_numbers(message: Struct) -> None:
+    """Raises Rejected unless every float is finite and every ``q_wxyz`` of unit length."""
+    for name in message.__struct_fields__:
+        value = getattr(message, name)
+        if isinstance(value, float):
+            if not math.isfinite(value):
+                raise Rejected("not_finite", f"{name} is {value}")
+        elif isinstance(value, tuple):
+            for item in value:
+                if isinstance(item, float):
+                    if not math.isfinite(item):
+                        raise Rejected("not_finite", f"{name} holds {item}")
+                elif isinstance(item, Struct):
+                    check_numbers(item)
+            if name == "q_wxyz" and abs(math.hypot(*value) - 1.0) > UNIT_QUATERNION_TOLERANCE:
+                raise Rejected("not_unit_quaternion", f"{name} has length {math.hypot(*value)}")
+
+
+def vector(array: Any) -> tuple[float, ...]:
+    """Flat tuple of Python floats, as messages carry numbers (NumPy scalars do not encode)."""
+    return tuple(array.ravel().tolist())
+
+
+def without_wall_time(message: Message) -> dict[str, Any]:
+    """The message as a dictionary without its wall-clock fields: what two equal flights must agree in."""
+    return {
+        name: getattr(message, name) for name in message.__struct_fields__ if not name.startswith("wall_")
+    }

@@ -1,0 +1,132 @@
+"""Rotations: Hamilton quaternions, scalar first, unit length, body to world.
+
+``q_wxyz`` rotates a vector given in body axes into world axes: ``v_world = rotate(q, v_body)``.
+Every function takes arrays whose last axis is the quaternion (4) or vector (3) and broadcasts over
+the leading axes. Formulae: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def normalize(q: ArrayLike) -> Array:
+    """Unit quaternion (..., 4) along ``q`` (..., 4). Raises ValueError for a zero or non-finite one."""
+    q = np.asarray(q, dtype=float)
+    n = np.linalg.norm(q, axis=-1, keepdims=True)
+    if not np.all(np.isfinite(n)) or np.any(n == 0.0):
+        raise ValueError(f"quaternion cannot be normalized: {q.tolist()}")
+    return q / n
+
+
+def conjugate(q: ArrayLike) -> Array:
+    """Conjugate (..., 4): the inverse of a unit quaternion."""
+    return np.asarray(q, dtype=float) * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def multiply(a: ArrayLike, b: ArrayLike) -> Array:
+    """Hamilton product (..., 4): the rotation ``b`` followed by ``a`` (Sola eq. 12)."""
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    aw, ax, ay, az = (a[..., i] for i in range(4))
+    bw, bx, by, bz = (b[..., i] for i in range(4))
+    return np.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ],
+        axis=-1,
+    )
+
+
+def rotate(q: ArrayLike, v: ArrayLike) -> Array:
+    """Vector ``v`` (..., 3) in body axes, given in world axes (..., 3)."""
+    q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
+    w, u = q[..., :1], q[..., 1:]
+    t = 2.0 * np.cross(u, v)
+    return v + w * t + np.cross(u, t)
+
+
+def rotate_inverse(q: ArrayLike, v: ArrayLike) -> Array:
+    """Vector ``v`` (..., 3) in world axes, given in body axes (..., 3)."""
+    return rotate(conjugate(q), v)
+
+
+def exp(phi: ArrayLike) -> Array:
+    """Rotation vector (..., 3) in radians to unit quaternion (..., 4) (Sola eq. 101)."""
+    phi = np.asarray(phi, dtype=float)
+    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
+    # np.sinc(x) = sin(pi x) / (pi x): half the angle's sine over the angle, also at zero.
+    return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * phi], axis=-1)
+
+
+def log(q: ArrayLike) -> Array:
+    """Unit quaternion (..., 4) to the shortest rotation vector (..., 3), radians (Sola eq. 105)."""
+    q = np.asarray(q, dtype=float)
+    q = np.where(q[..., :1] < 0.0, -q, q)
+    n = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    half = np.arctan2(n, q[..., :1])
+    scale = np.where(n > 1e-9, 2.0 * half / np.where(n > 1e-9, n, 1.0), 2.0 / q[..., :1])
+    return scale * q[..., 1:]
+
+
+def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
+    """Angle (...) in radians, 0 to pi, of the rotation that takes attitude ``a`` to ``b``."""
+    return np.linalg.norm(log(multiply(conjugate(a), b)), axis=-1)
+
+
+def to_matrix(q: ArrayLike) -> Array:
+    """Rotation matrix (..., 3, 3), body to world, of unit quaternion ``q`` (..., 4)."""
+    q = np.asarray(q, dtype=float)
+    w, x, y, z = (q[..., i] for i in range(4))
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def from_matrix(r: ArrayLike) -> Array:
+    """Unit quaternion (4,), scalar part not negative, of a rotation matrix (3, 3), body to world.
+
+    Shepperd's method: the largest of the four squared components is the pivot.
+    """
+    r = np.asarray(r, dtype=float)
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    choice = int(np.argmax([trace, r[0, 0], r[1, 1], r[2, 2]]))
+    q = np.empty(4)
+    if choice == 0:
+        q[0] = 1.0 + trace
+        q[1] = r[2, 1] - r[1, 2]
+        q[2] = r[0, 2] - r[2, 0]
+        q[3] = r[1, 0] - r[0, 1]
+    else:
+        i = choice - 1
+        j, k = (i + 1) % 3, (i + 2) % 3
+        q[1 + i] = 1.0 + r[i, i] - r[j, j] - r[k, k]
+        q[1 + j] = r[j, i] + r[i, j]
+        q[1 + k] = r[k, i] + r[i, k]
+        q[0] = r[k, j] - r[j, k]
+    q = normalize(q)
+    return -q if q[0] < 0.0 else q
+
+
+def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float) -> Array:
+    """Attitude (..., 4) after ``dt_s`` at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
+    return multiply(q, exp(np.asarray(omega_body, dtype=float) * dt_s))
+
+
+def skew(v: ArrayLike) -> Array:
+    """Matrix (..., 3, 3) with ``skew(v) @ w == cross(v, w)``."""
+    v = np.asarray(v, dtype=float)
+    zero = np.zeros_like(v[..., 0])
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

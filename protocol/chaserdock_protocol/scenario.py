@@ -1,0 +1,401 @@
+"""The scenario file: TOML, every value checked, every error with its path and what would be right.
+
+Names are snake_case with their unit at the end; frames as everywhere: WRF world, CRF chaser, TRF target.
+"""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from . import rotations
+from .camera import Camera
+from .clock import Timing
+from .targets import target_model
+
+
+class ScenarioError(Exception):
+    """A scenario that cannot be flown; the text has one line a fault."""
+
+
+def _finite(value: float) -> float:
+    if not math.isfinite(value):
+        raise ValueError("must be a finite number")
+    return value
+
+
+def _unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    length = math.hypot(*q)
+    if abs(length - 1.0) > 1e-3:
+        raise ValueError(f"must be a quaternion (w, x, y, z) of unit length; this one has length {length:.6g}")
+    w, x, y, z = rotations.normalize(q).tolist()
+    return (w, x, y, z)
+
+
+Number = Annotated[float, AfterValidator(_finite)]
+Positive = Annotated[float, AfterValidator(_finite), Field(gt=0)]
+NotNegative = Annotated[float, AfterValidator(_finite), Field(ge=0)]
+Vector = tuple[Number, Number, Number]
+PositiveVector = tuple[Positive, Positive, Positive]
+UnitQuaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
+Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
+
+
+class Section(BaseModel):
+    """A table of the scenario file; unknown keys are errors."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Time(Section):
+    """Rates and latencies of simulated time."""
+
+    rate_hz: Annotated[int, Field(ge=1, le=240)] = 15
+    picture_hz: Annotated[int, Field(ge=1, le=240)] = 15
+    # Bullet's step is first order; at 1920 Hz its attitude error stays below the model check's 0.05 degrees.
+    physics_hz: Annotated[int, Field(ge=60, le=20000)] = 1920
+    latency_s: NotNegative = 1.0 / 30.0
+
+    @model_validator(mode="after")
+    def _divide(self) -> Time:
+        if self.physics_hz % self.rate_hz:
+            raise ValueError(f"physics_hz must be a multiple of rate_hz ({self.physics_hz}, {self.rate_hz})")
+        if self.rate_hz % self.picture_hz:
+            raise ValueError(f"rate_hz must be a multiple of picture_hz ({self.rate_hz}, {self.picture_hz})")
+        return self
+
+
+class Target(Section):
+    """The target's model (geometry and markers), initial state, and how it moves.
+
+    ``constant_rates`` and ``static`` prescribe the motion, as the paper does; ``torque_free`` is a rigid
+    body's (then ``inertia_kg_m2``, principal, and ``mass_kg`` count).
+    """
+
+    model: Name = "paper"
+    motion: Literal["constant_rates", "static", "torque_free"] = "constant_rates"
+    position_m: Vector = (0.0, 0.0, 0.0)
+    q_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.015, 0.0075, 0.03)
+    omega_rad_s: Vector = (0.015, 0.045, 0.03)
+    mass_kg: Positive = 1.25
+    inertia_kg_m2: PositiveVector | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> Target:
+        target_model(self.model)
+        if self.inertia_kg_m2 is not None:
+            _check_inertia(self.inertia_kg_m2)
+        return self
+
+
+def _check_inertia(i: tuple[float, float, float]) -> None:
+    if 2 * max(i) > sum(i) * (1 + 1e-9):
+        raise ValueError(f"inertia_kg_m2 {i}: no moment may exceed the sum of the other two (no body is like that)")
+
+
+def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Principal moments (kg m^2) of a homogeneous cuboid about its axes."""
+    x, y, z = (s * s for s in size_m)
+    return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
+
+
+class Body(Section):
+    """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's."""
+
+    mass_kg: Positive = 30.0
+    size_m: PositiveVector = (0.25, 0.25, 0.05)
+    inertia_kg_m2: PositiveVector | None = None
+    force_max_N: Positive = 2.0
+    torque_max_N_m: Positive = 0.05
+    probe_reach_m: Positive = 0.35
+    actuation: Literal["ideal"] = "ideal"
+
+    @model_validator(mode="after")
+    def _possible(self) -> Body:
+        if self.inertia_kg_m2 is not None:
+            _check_inertia(self.inertia_kg_m2)
+        return self
+
+    @property
+    def inertia(self) -> tuple[float, float, float]:
+        return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.size_m)
+
+
+class Effects(Section):
+    """What the camera does to the exact picture: a gain of 1 and 0 elsewhere switch an effect off.
+
+    Noise in grey levels (``read_noise``) and squared grey levels per grey level (``shot_noise``).
+    """
+
+    gain: Positive = 1.0
+    point_spread_px: NotNegative = 0.6
+    read_noise: NotNegative = 1.5
+    shot_noise: NotNegative = 0.025
+    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 92
+
+
+class CameraSection(Section):
+    """The chasers' camera, looking along the body's +X with its top towards +Z; ``sun_direction`` (WRF) points to the sun."""
+
+    width_px: Annotated[int, Field(ge=64, le=4096)] = 1280
+    height_px: Annotated[int, Field(ge=64, le=4096)] = 720
+    hfov_deg: Annotated[float, AfterValidator(_finite), Field(gt=5, lt=150)] = 60.0
+    position_m: Vector = (0.07, 0.0, 0.075)
+    sun_direction: Vector = (-0.4, -0.5, 0.77)
+    effects: Effects = Effects()
+
+
+class EstimatorSection(Section):
+    """How sightings become the target's odometry; the numbers are ``mekf``'s.
+
+    ``camera_bias_*``: one sigma of each camera's own calibration error, which is estimated (0: cameras are perfect).
+    """
+
+    name: Literal["mekf", "paper"] = "mekf"
+    camera_bias_position_m: NotNegative = 0.004
+    camera_bias_attitude_deg: NotNegative = 0.4
+
+
+class PerceptionSection(Section):
+    """How a picture becomes a pose."""
+
+    name: Literal["default", "paper"] = "default"
+
+
+class Controller(Section):
+    """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md)."""
+
+    solver: Literal["rti", "ipopt"] = "rti"
+    horizon_s: Positive = 3.0
+    dt_s: Positive = 0.1
+    falloff: Annotated[float, AfterValidator(_finite), Field(ge=0, le=1)] = 0.0
+    weight_position: NotNegative = 65.0
+    weight_orientation: NotNegative = 35.0
+    weight_force: Positive = 3.5
+    weight_torque: Positive = 40.0
+    weight_final_position: NotNegative = 3250.0
+    weight_final_orientation: NotNegative = 1750.0
+    integrator: Literal["rk4", "euler"] = "rk4"
+    feed_forward: bool = True
+    command_lifetime_s: Positive = 0.5
+
+    @model_validator(mode="after")
+    def _stages(self) -> Controller:
+        if round(self.horizon_s / self.dt_s) < 1:
+            raise ValueError(f"horizon_s ({self.horizon_s}) is shorter than one step dt_s ({self.dt_s})")
+        return self
+
+
+class Limits(Section):
+    """Distances that the controller keeps, centre to centre."""
+
+    min_distance_target_m: NotNegative = 0.35
+    min_distance_chasers_m: NotNegative = 0.35
+    max_reference_distance_m: Positive = 25.0
+
+
+class Approach(Section):
+    """How an approach is flown, and when a chaser counts as docked."""
+
+    dock_distance_m: Positive = 0.40
+    max_speed_m_s: Positive = 0.03
+    docked_position_m: Positive = 0.01
+    docked_angle_deg: Positive = 1.0
+    docked_time_s: Positive = 5.0
+
+
+class Chaser(Section):
+    """One chaser: its reference pose in TRF and where it starts, relative to that pose.
+
+    The start is ``start_offset_m`` (TRF) away from the reference position, turned by ``start_rotation_rad`` (rotation
+    vector, CRF) from the reference attitude, with ``start_velocity_m_s`` (WRF), not rotating.
+    """
+
+    position_m: Vector
+    q_wxyz: UnitQuaternion
+    start_offset_m: Vector = (0.0, 0.0, 0.0)
+    start_rotation_rad: Vector = (0.0, 0.0, 0.0)
+    start_velocity_m_s: Vector = (0.0, 0.0, 0.0)
+
+
+class TimelineEntry(Section):
+    """A command at a time of the mission."""
+
+    at_s: NotNegative
+    command: Literal["approach", "hold", "retreat", "abort", "goto"]
+    chasers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
+    offset_m: Vector | None = None
+
+    @model_validator(mode="after")
+    def _goto(self) -> TimelineEntry:
+        if (self.command == "goto") != (self.offset_m is not None):
+            raise ValueError("offset_m goes with the command goto, and goto needs it")
+        return self
+
+
+class Success(Section):
+    """What makes a run a success, judged on ground truth; what is left out is not asked."""
+
+    docked: tuple[int, ...] = ()
+    max_collisions: Annotated[int, Field(ge=0)] = 0
+    keep_distances: bool = True
+    steady_position_rms_m: Positive | None = None
+    steady_orientation_rms_deg: Positive | None = None
+    max_estimate_position_m: Positive | None = None
+    max_estimate_orientation_deg: Positive | None = None
+
+
+class Scenario(Section):
+    """A whole mission, resolved: what every process gets from the world."""
+
+    name: Name
+    description: str = ""
+    duration_s: Positive
+    settling_s: NotNegative = 20.0
+    steady_until_s: Positive | None = None
+    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    time: Time = Time()
+    target: Target = Target()
+    chaser: Body = Body()
+    camera: CameraSection = CameraSection()
+    perception: PerceptionSection = PerceptionSection()
+    estimator: EstimatorSection = EstimatorSection()
+    controller: Controller = Controller()
+    limits: Limits = Limits()
+    approach: Approach = Approach()
+    chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
+    timeline: tuple[TimelineEntry, ...] = ()
+    success: Success = Success()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Scenario:
+        _check_apart(self)
+        n = len(self.chasers)
+        for i, entry in enumerate(self.timeline):
+            for c in entry.chasers:
+                if c >= n:
+                    raise ValueError(f"timeline.{i}.chasers: there is no chaser {c}; this mission has 0 to {n - 1}")
+        for c in self.success.docked:
+            if c >= n:
+                raise ValueError(f"success.docked: there is no chaser {c}; this mission has 0 to {n - 1}")
+        return self
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(
+            physics_hz=self.time.physics_hz,
+            rate_hz=self.time.rate_hz,
+            picture_hz=self.time.picture_hz,
+            latency_steps=round(self.time.latency_s * self.time.physics_hz),
+        )
+
+    def camera_model(self) -> Camera:
+        """The chasers' camera, as perception, rendering and fusion use it."""
+        c = self.camera
+        return Camera.from_hfov(c.width_px, c.height_px, math.radians(c.hfov_deg), c.position_m)
+
+    @property
+    def ticks(self) -> int:
+        return self.timing.ticks_in(self.duration_s)
+
+    def start_pose(self, chaser: int) -> tuple[rotations.Array, rotations.Array]:
+        """Position (3,) WRF and attitude (4,) CRF to WRF of a chaser at time zero."""
+        c = self.chasers[chaser]
+        offset = [a + b for a, b in zip(c.position_m, c.start_offset_m, strict=True)]
+        position = self.target.position_m + rotations.rotate(self.target.q_wxyz, offset)
+        attitude = rotations.multiply(self.target.q_wxyz, c.q_wxyz)
+        return position, rotations.multiply(attitude, rotations.exp(c.start_rotation_rad))
+
+
+def _check_apart(scenario: Scenario) -> None:
+    starts = [scenario.start_pose(i)[0] for i in range(len(scenario.chasers))]
+    width = math.hypot(*scenario.chaser.size_m)
+    for i, a in enumerate(starts):
+        for j in range(i):
+            apart = math.dist(a, starts[j])
+            if apart < width:
+                raise ValueError(
+                    f"chasers.{j} and chasers.{i} start {apart:.3f} m apart, inside one another; "
+                    f"their bodies need {width:.3f} m"
+                )
+
+
+def _explain(error: ValidationError) -> list[str]:
+    lines = []
+    for fault in error.errors():
+        path = ".".join(str(p) for p in fault["loc"]) or "(scenario)"
+        message = fault["msg"].removeprefix("Value error, ")
+        value = fault.get("input")
+        shown = f" (got {value!r})" if isinstance(value, int | float | str | list | tuple) else ""
+        if fault["type"] == "missing":
+            message, shown = "is missing", ""
+        elif fault["type"] == "extra_forbidden":
+            message, shown = "is not a key that is known here", ""
+        lines.append(f"{path}: {message}{shown}")
+    return lines
+
+
+def parse_scenario(values: dict[str, Any], source: str) -> Scenario:
+    """Scenario from nested tables; raises ScenarioError with one line a fault, each with its path."""
+    try:
+        return Scenario.model_validate(values)
+    except ValidationError as error:
+        raise ScenarioError("\n".join(f"{source}: {line}" for line in _explain(error))) from None
+
+
+def scenario_from_json(text: str, source: str) -> Scenario:
+    """Scenario as the world sends it; raises ScenarioError."""
+    try:
+        return Scenario.model_validate_json(text)
+    except ValidationError as error:
+        raise ScenarioError("\n".join(f"{source}: {line}" for line in _explain(error))) from None
+
+
+def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
+    """Scenario file with ``key.path=value`` overrides (values in TOML's notation); raises ScenarioError."""
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: not UTF-8 text: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{path}: not TOML: {error}") from None
+    for text in overrides:
+        _override(values, text)
+    return parse_scenario(values, str(path))
+
+
+def _override(values: dict[str, Any], text: str) -> None:
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise ScenarioError(f"--set {text}: must be key.path=value")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    place: Any = values
+    keys = path.strip().split(".")
+    for key in keys[:-1]:
+        if isinstance(place, list):
+            place = _item(place, key, text)
+        else:
+            place = place.setdefault(key, {})
+        if not isinstance(place, dict | list):
+            raise ScenarioError(f"--set {text}: {key} is a value, not a table")
+    if isinstance(place, list):
+        _item(place, keys[-1], text)
+        place[int(keys[-1])] = parsed
+    else:
+        place[keys[-1]] = parsed
+
+
+def _item(place: list[Any], key: str, text: str) -> Any:
+    if not key.isdigit() or int(key) >= len(place):
+        raise ScenarioError(f"--set {text}: {key} must be a number from 0 to {len(place) - 1}")
+    return place[int(key)]

@@ -1,0 +1,145 @@
+"""The one table of topics: key, type, who may write and read it, how often, and how it is sent.
+
+Keys are relative to the run's namespace and begin with their publisher's name, so that a rule can hold a
+process to its own branch. ``truth/**`` is the world's, and no process that flies may read it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from msgspec import Struct
+
+from . import messages as m
+
+Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysis"]
+Qos = Literal["bulk", "state", "command", "event"]
+
+FLYING: frozenset[Role] = frozenset({"chaser", "controller"})
+_EVERYONE: frozenset[Role] = frozenset({"world", "chaser", "controller", "recorder", "operator", "analysis"})
+_WATCHERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis"})
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A key with one ``{chaser}`` or ``{process}`` place at most, and what goes over it.
+
+    ``rate`` is per tick (``tick``), per tick with pictures (``picture``), once a second of simulated time
+    (``second``), of wall time (``presence``), or when something happens (``event``).
+    """
+
+    key: str
+    kind: type[Struct]
+    writer: Role | Literal["any"]
+    readers: frozenset[Role]
+    rate: Literal["tick", "picture", "second", "presence", "event"]
+    qos: Qos
+
+    def key_of(self, place: int | str | None = None) -> str:
+        """The concrete key, for a chaser's number or a process' name where the key has a place."""
+        if "{" not in self.key:
+            if place is not None:
+                raise ValueError(f"topic {self.key} has no place for {place!r}")
+            return self.key
+        if place is None:
+            raise ValueError(f"topic {self.key} needs a chaser or process")
+        return self.key.format(chaser=place, process=place)
+
+
+def _topic(key, kind, writer, readers, rate, qos) -> Topic:
+    return Topic(key, kind, writer, frozenset(readers) | _WATCHERS, rate, qos)
+
+
+TICK = _topic("world/tick", m.Tick, "world", {"chaser", "controller"}, "tick", "state")
+END = _topic("world/end", m.MissionEnd, "world", {"chaser", "controller"}, "event", "event")
+IMAGE = _topic("world/chaser/{chaser}/image", m.Image, "world", {"chaser"}, "picture", "bulk")
+ODOMETRY = _topic(
+    "world/chaser/{chaser}/odometry", m.Odometry, "world", {"chaser", "controller"}, "tick", "state"
+)
+TRUTH_BODY = Topic(
+    "truth/body/{process}", m.BodyTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state"
+)
+TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state")
+SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "picture", "state")
+ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
+WRENCH = _topic("controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command")
+REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "controller", set(), "tick", "state")
+PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "state")
+TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "state")
+SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
+COMMAND = _topic("controller/command", m.CommandReply, "controller", set(), "event", "event")
+ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
+EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
+HEALTH = _topic("{process}/health", m.Health, "any", set(), "second", "event")
+PRESENCE = _topic("{process}/presence", m.Presence, "any", _EVERYONE, "presence", "event")
+FAREWELL = _topic("{process}/farewell", m.Farewell, "any", set(), "event", "event")
+
+TOPICS: tuple[Topic, ...] = (
+    TICK,
+    END,
+    IMAGE,
+    ODOMETRY,
+    TRUTH_BODY,
+    TRUTH_WORLD,
+    SIGHTING,
+    ACTUATORS,
+    WRENCH,
+    REFERENCE,
+    PLAN,
+    TARGET,
+    SOLVER,
+    COMMAND,
+    ACK,
+    EVENT,
+    HEALTH,
+    PRESENCE,
+    FAREWELL,
+)
+
+JOIN_KEY = "world/join"
+"""Query: JoinRequest -> JoinReply."""
+OPERATE_KEY = "controller/operate"
+"""Query: OperatorCommand -> CommandReply."""
+LIVE_KEY = "live/{process}"
+"""Liveliness token of a process."""
+
+
+def topic_of_key(key: str) -> tuple[Topic, str | None] | None:
+    """The topic a concrete key belongs to and what stands in its place, or None for a foreign key."""
+    for topic in TOPICS:
+        if "{" not in topic.key:
+            if key == topic.key:
+                return topic, None
+            continue
+        head, _, rest = topic.key.partition("{")
+        tail = rest.partition("}")[2]
+        if key.startswith(head) and key.endswith(tail):
+            place = key[len(head) : len(key) - len(tail)]
+            if place and _fits(topic, place):
+                return topic, place
+    return None
+
+
+def _fits(topic: Topic, place: str) -> bool:
+    if "{chaser}" in topic.key:
+        return place.isascii() and place.isdigit()
+    return is_process_name(place)
+
+
+def is_process_name(name: str) -> bool:
+    """Whether ``name`` is one of ours: ``world``, ``target`` (a body), ``controller``, ``recorder``, ``chaser/3`` …"""
+    head, slash, number = name.partition("/")
+    if head == "chaser":
+        return slash == "/" and number.isascii() and number.isdigit()
+    return slash == "" and head in {"world", "target", "controller", "recorder", "operator"}
+
+
+def may_read(role: Role, topic: Topic) -> bool:
+    """Whether a process of this role may subscribe to the topic."""
+    return role in topic.readers
+
+
+def may_write(role: Role, topic: Topic) -> bool:
+    """Whether a process of this role may publish on the topic."""
+    return topic.writer in ("any", role)

@@ -1,0 +1,322 @@
+"""The only module that imports zenoh: sessions with safe defaults, and typed topics on them.
+
+Defaults: no multicast, loopback only, an own namespace for every run, no shared memory. Callbacks run on
+Zenoh's threads and only put raw bytes into a queue, so that a slow reader of one topic never delays another
+(head-of-line blocking); decoding and checking happen in the reader's own thread.
+"""
+
+from __future__ import annotations
+
+import json
+import queue
+import threading
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import zenoh
+
+from . import codec, topics
+from .codec import Rejected
+from .messages import Message, encoding_of
+from .topics import Role, Topic
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+DEFAULT_NAMESPACE = "chaserdock"
+
+_PRIORITY = {
+    "bulk": zenoh.Priority.DATA,
+    "state": zenoh.Priority.DATA_HIGH,
+    "command": zenoh.Priority.REAL_TIME,
+    "event": zenoh.Priority.DATA_LOW,
+}
+
+
+class TransportError(Exception):
+    """The network could not be had as asked; the text is one clear line."""
+
+
+@dataclass(frozen=True)
+class Link:
+    """How a process reaches the others. ``lease_ms``: after that long a silent peer counts as lost."""
+
+    namespace: str = DEFAULT_NAMESPACE
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    mode: Literal["peer", "client", "router"] = "peer"
+    config: Path | None = None
+    lease_ms: int = 60_000
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message that passed all checks. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
+
+    topic: Topic
+    place: str | None
+    message: Any
+    sent_ns: int
+
+
+@dataclass(frozen=True)
+class Raw:
+    """What came over the wire, unopened."""
+
+    key: str
+    encoding: str
+    payload: bytes
+    sent_ns: int
+
+
+def zenoh_config(link: Link) -> zenoh.Config:
+    """Zenoh configuration of a link; raises TransportError for a bad file, namespace or endpoint."""
+    if not link.namespace or any(c in link.namespace for c in "/*$?#@ "):
+        raise TransportError(f"namespace {link.namespace!r}: must be one word without / * $ ? # @ or blanks")
+    try:
+        config = zenoh.Config.from_file(str(link.config)) if link.config else zenoh.Config()
+    except zenoh.ZError as error:
+        raise TransportError(f"Zenoh configuration {link.config}: {error}") from None
+    values: dict[str, Any] = {
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,
+    }
+    if link.config is None:
+        values |= {
+            "mode": link.mode,
+            "listen/endpoints": list(link.listen) if link.mode != "client" else [],
+            "connect/endpoints": list(link.connect),
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+            "transport/link/tx/lease": link.lease_ms,
+        }
+    try:
+        config.insert_json5("namespace", json.dumps(link.namespace))
+        for name, value in values.items():
+            config.insert_json5(name, json.dumps(value))
+    except zenoh.ZError as error:
+        raise TransportError(f"Zenoh option: {error}") from None
+    return config
+
+
+def _sent_ns(sample: zenoh.Sample) -> int:
+    stamp = sample.timestamp
+    return stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
+
+
+@dataclass
+class Counts:
+    """What a node has seen and refused, by topic."""
+
+    received: Counter[str] = field(default_factory=Counter)
+    rejected: Counter[str] = field(default_factory=Counter)
+    lost: Counter[str] = field(default_factory=Counter)
+    stale: int = 0
+
+
+class Node:
+    """One process on the network: publishes, subscribes and answers by the topics table.
+
+    Raises TransportError if the session cannot be opened, PermissionError for a topic that this role may
+    not read or write.
+    """
+
+    def __init__(self, name: str, role: Role, link: Link) -> None:
+        self.name = name
+        self.role = role
+        self.counts = Counts()
+        self._inbox: queue.SimpleQueue[tuple[Topic, str | None, Raw] | None] = queue.SimpleQueue()
+        self._latest: dict[str, tuple[Topic, str | None, Raw]] = {}
+        self._latest_lock = threading.Lock()
+        self._publishers: dict[str, zenoh.Publisher] = {}
+        self._numbers: Counter[str] = Counter()
+        self._last_seq: dict[str, int] = {}
+        self._declared: list[Any] = []
+        zenoh.init_log_from_env_or("error")
+        try:
+            self._session = zenoh.open(zenoh_config(link))
+        except zenoh.ZError as error:
+            raise TransportError(_open_error(error, link)) from None
+
+    # -- publishing ---------------------------------------------------------------------------------------
+
+    def advertise(self, topic: Topic, place: int | str | None = None, *, droppable: bool = False) -> str:
+        """Declares a publisher; ``droppable`` lets the transport drop messages rather than wait (real time)."""
+        if not topics.may_write(self.role, topic):
+            raise PermissionError(f"{self.role} may not write {topic.key}")
+        key = topic.key_of(place)
+        if key not in self._publishers:
+            self._publishers[key] = self._session.declare_publisher(
+                key,
+                encoding=encoding_of(topic.kind),
+                priority=_PRIORITY[topic.qos],
+                express=topic.qos == "command",
+                reliability=zenoh.Reliability.RELIABLE,
+                congestion_control=zenoh.CongestionControl.DROP if droppable else zenoh.CongestionControl.BLOCK,
+            )
+        return key
+
+    def publish(self, topic: Topic, message: Message, place: int | str | None = None) -> None:
+        """Numbers, encodes and sends a message."""
+        key = topic.key_of(place)
+        if key not in self._publishers:
+            self.advertise(topic, place)
+        payload = codec.encode(msgspec.structs.replace(message, seq=self._numbers[key]))
+        self._numbers[key] += 1
+        self._publishers[key].put(payload, timestamp=self._session.new_timestamp())
+
+    @property
+    def published(self) -> dict[str, int]:
+        """Messages published so far, by key."""
+        return dict(self._numbers)
+
+    # -- receiving ----------------------------------------------------------------------------------------
+
+    def subscribe(self, topic: Topic, place: int | str | None = None, *, latest: bool = False) -> None:
+        """Subscribes a topic, of all chasers or processes when ``place`` is None.
+
+        ``latest`` keeps only the newest sample of a key that waits to be read (pictures in real time).
+        """
+        if not topics.may_read(self.role, topic):
+            raise PermissionError(f"{self.role} may not read {topic.key}")
+        if place is None and "{chaser}" in topic.key:
+            expression = topic.key.format(chaser="*")
+        elif place is None and "{process}" in topic.key:
+            expression = topic.key.format(process="**")
+        else:
+            expression = topic.key_of(place)
+
+        def arrived(sample: zenoh.Sample) -> None:
+            key = str(sample.key_expr)
+            found = topics.topic_of_key(key)
+            if found is None or found[0] is not topic:
+                self.counts.rejected["key"] += 1
+                return
+            raw = Raw(key, str(sample.encoding), sample.payload.to_bytes(), _sent_ns(sample))
+            if latest:
+                with self._latest_lock:
+                    waiting = key in self._latest
+                    self._latest[key] = (topic, found[1], raw)
+                if not waiting:
+                    self._inbox.put(None)
+            else:
+                self._inbox.put((topic, found[1], raw))
+
+        self._declared.append(self._session.declare_subscriber(expression, arrived))
+
+    def subscribe_raw(self, expression: str, arrived: Callable[[Raw], None]) -> None:
+        """Everything on a key expression, unopened, on Zenoh's thread: for recorder and analysis alone."""
+        if self.role not in ("recorder", "analysis"):
+            raise PermissionError(f"{self.role} may not read {expression}")
+
+        def callback(sample: zenoh.Sample) -> None:
+            arrived(Raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes(), _sent_ns(sample)))
+
+        self._declared.append(self._session.declare_subscriber(expression, callback))
+
+    def receive(self, timeout_s: float | None) -> Received | None:
+        """The next message that passes all checks, or None when none came in time.
+
+        Messages that do not pass are counted in ``counts.rejected`` by topic and reason; gaps in ``seq``
+        in ``counts.lost``.
+        """
+        try:
+            item = self._inbox.get(timeout=timeout_s) if timeout_s != 0 else self._inbox.get_nowait()
+        except queue.Empty:
+            return None
+        if item is None:
+            with self._latest_lock:
+                key = next(iter(self._latest))
+                item = self._latest.pop(key)
+        return self._open(*item)
+
+    def _open(self, topic: Topic, place: str | None, raw: Raw) -> Received | None:
+        try:
+            message = codec.decode(topic.kind, raw.payload, raw.encoding)
+            if place is not None and str(getattr(message, "chaser", place)) != place:
+                raise Rejected("chaser", f"message of chaser {message.chaser} on {raw.key}")
+        except Rejected as refusal:
+            self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
+            return None
+        self.counts.received[raw.key] += 1
+        last = self._last_seq.get(raw.key)
+        if last is not None and message.seq > last + 1:
+            self.counts.lost[raw.key] += message.seq - last - 1
+        self._last_seq[raw.key] = message.seq
+        return Received(topic, place, message, raw.sent_ns)
+
+    # -- questions and presence ---------------------------------------------------------------------------
+
+    def answer(
+        self, key: str, request: type[msgspec.Struct], handle: Callable[[Any, Callable[[msgspec.Struct], None]], None]
+    ) -> None:
+        """Answers queries on a key: ``handle(message, reply)`` is called on Zenoh's thread and must not block.
+
+        ``reply`` may be called later and from any thread, once. A malformed query gets an error reply.
+        """
+
+        def arrived(query: zenoh.Query) -> None:
+            try:
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                message = codec.decode(request, payload, str(query.encoding))
+            except Rejected as refusal:
+                self.counts.rejected[f"{key}:{refusal.reason}"] += 1
+                query.reply_err(str(refusal))
+                query.drop()
+                return
+
+            def reply(result: msgspec.Struct) -> None:
+                query.reply(key, codec.encode(result), encoding=encoding_of(type(result)))
+                query.drop()
+
+            handle(message, reply)
+
+        self._declared.append(self._session.declare_queryable(key, arrived))
+
+    def ask(self, key: str, request: msgspec.Struct, reply: type[msgspec.Struct], timeout_s: float) -> Any:
+        """The first answer to a query, or None when nobody answers. Raises TransportError for an error reply."""
+        replies = self._session.get(
+            key, payload=codec.encode(request), encoding=encoding_of(type(request)), timeout=timeout_s
+        )
+        for answer in replies:
+            if answer.ok is not None:
+                try:
+                    return codec.decode(reply, answer.ok.payload.to_bytes(), str(answer.ok.encoding))
+                except Rejected as refusal:
+                    raise TransportError(f"answer on {key}: {refusal}") from None
+            if answer.err is not None and answer.err.payload.to_bytes() not in (b"Timeout", b""):
+                raise TransportError(f"{key}: {answer.err.payload.to_string()}")
+        return None
+
+    def announce(self) -> None:
+        """Declares this process' liveliness token."""
+        token = self._session.liveliness().declare_token(topics.LIVE_KEY.format(process=self.name))
+        self._declared.append(token)
+
+    def watch_liveliness(self, changed: Callable[[str, bool], None]) -> None:
+        """Calls ``changed(process, alive)`` on Zenoh's thread for every process that comes or goes."""
+        prefix = topics.LIVE_KEY.format(process="")
+
+        def callback(sample: zenoh.Sample) -> None:
+            name = str(sample.key_expr).removeprefix(prefix)
+            changed(name, sample.kind == zenoh.SampleKind.PUT)
+
+        expression = topics.LIVE_KEY.format(process="**")
+        self._declared.append(
+            self._session.liveliness().declare_subscriber(expression, callback, history=True)
+        )
+
+    def close(self) -> None:
+        """Closes the session; what was published is sent first."""
+        self._session.close()
+
+
+def _open_error(error: Exception, link: Link) -> str:
+    text = " ".join(str(error).split())
+    if "in use" in text.lower():
+        return f"cannot listen on {', '.join(link.listen)}: the port is in use; stop its owner or choose another with --listen"
+    return f"cannot open the Zenoh session (listen {', '.join(link.listen) or '-'}, connect {', '.join(link.connect) or '-'}): {text}"

@@ -1,0 +1,55 @@
+"""What drives a chaser in the world: commands held back until they take effect, bounded by the actuators.
+
+``ideal`` actuation gives the commanded wrench itself, cut off at the body's limits per axis.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass, field
+
+import numpy as np
+from chaserdock_protocol.messages import ActuatorCommand
+from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.scenario import Body
+
+
+@dataclass
+class IdealActuators:
+    """Commands of one chaser in the order of their effect, and what has been given so far."""
+
+    body: Body
+    wrench: Array = field(default_factory=lambda: np.zeros(6))
+    impulse: Array = field(default_factory=lambda: np.zeros(6))
+    absolute_impulse_N_s: float = 0.0
+    saturated: bool = False
+    late: int = 0
+    _waiting: list[tuple[int, int, Array]] = field(default_factory=list)
+
+    def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
+        """Takes a command that is to act from ``effective_step`` on; one that comes later acts at once, and is counted."""
+        limit = np.repeat([self.body.force_max_N, self.body.torque_max_N_m], 3)
+        asked = np.array([*command.force_N, *command.torque_N_m])
+        given = np.clip(asked, -limit, limit)
+        self.saturated |= bool(np.any(np.abs(asked) > limit * (1 + 1e-6)))
+        self.late += effective_step < now_step
+        heapq.heappush(self._waiting, (effective_step, command.seq, given))
+
+    def step(self, step: int, step_s: float) -> Array:
+        """The wrench (6,), body axes, that acts during physics step ``step``."""
+        while self._waiting and self._waiting[0][0] <= step:
+            self.wrench = heapq.heappop(self._waiting)[2]
+        self.impulse = self.impulse + self.wrench * step_s
+        self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * step_s
+        return self.wrench
+
+    def stop(self) -> None:
+        """The chaser is gone: nothing acts any more."""
+        self._waiting.clear()
+        self.wrench = np.zeros(6)
+
+    def take(self) -> tuple[Array, float, bool, int]:
+        """Impulse (6,), absolute impulse, saturated and late commands since the last call."""
+        out = self.impulse, self.absolute_impulse_N_s, self.saturated, self.late
+        self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = np.zeros(6), 0.0, False, 0
+        return out

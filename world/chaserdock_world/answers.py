@@ -1,0 +1,163 @@
+"""The world's ear: whom it expects an answer from in a tick, and what has come."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.clock import Timing
+from chaserdock_protocol.messages import ActuatorCommand, Event, Presence, RecorderAck, Tick
+from chaserdock_protocol.presence import PresenceTeller
+from chaserdock_protocol.runtime import say
+from chaserdock_protocol.transport import Node
+
+from .actuators import IdealActuators
+from .membership import Membership
+
+RECORDER_WINDOW_TICKS = 8
+"""How far the flight may be ahead of what the recorder has confirmed: bounds what lies in the network."""
+_IMPATIENT_S = 5.0
+
+
+class Answers:
+    """Collects the answers to the open tick. ``chasers``: ids expected; ``controller``: whether one is there."""
+
+    def __init__(
+        self,
+        node: Node,
+        membership: Membership,
+        teller: PresenceTeller,
+        timing: Timing,
+        actuators: dict[str, IdealActuators],
+        recorder_expected: bool,
+    ) -> None:
+        self.chasers: tuple[int, ...] = ()
+        self.controller = False
+        self._node = node
+        self._membership = membership
+        self._teller = teller
+        self._timing = timing
+        self._actuators = actuators
+        self._recorder_expected = recorder_expected
+        self._recorded_tick = -1
+        self._tick = -1
+        self._revision = 0
+        self._answered: set[int] = set()
+        self._warned_s = time.monotonic()
+
+    def missing_at_start(self) -> list[str]:
+        """Processes that are not joined up yet."""
+        wanted = [*self._actuators, "controller", *(["recorder"] if self._recorder_expected else [])]
+        linked = self._membership.linked(self._teller.heard())
+        return [name for name in wanted if name not in linked]
+
+    def open(self, tick: int, pictures: bool) -> None:
+        """Opens a tick: tells everyone who is expected to answer it."""
+        self._take_leave()
+        linked = self._membership.linked(self._teller.heard())
+        self.chasers = tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in linked)
+        self.controller = "controller" in linked
+        self._tick, self._pictures, self._revision = tick, pictures, 0
+        self._answered.clear()
+        self._tell()
+
+    def _tell(self) -> None:
+        message = Tick(
+            tick=self._tick,
+            sim_time_ns=self._timing.tick_time_ns(self._tick),
+            revision=self._revision,
+            pictures=self._pictures,
+            chasers=self.chasers,
+            controller=self.controller,
+        )
+        self._node.publish(topics.TICK, message)
+
+    def listen(self, timeout_s: float) -> None:
+        """Takes in one message, if one comes in time, and notes who left."""
+        received = self._node.receive(timeout_s)
+        match received.message if received is not None else None:
+            case ActuatorCommand() as command:
+                self._take_command(command)
+            case RecorderAck() as ack:
+                self._recorded_tick = max(self._recorded_tick, ack.tick)
+            case Presence() as presence:
+                if self._membership.presence_told(presence):
+                    self._teller.take(presence)
+        if self._take_leave():
+            self._revision += 1
+            self._tell()
+
+    def _take_command(self, command: ActuatorCommand) -> None:
+        actuators = self._actuators.get(f"chaser/{command.chaser}")
+        if actuators is None or command.tick > self._tick:
+            self._node.counts.rejected["actuators:unexpected"] += 1
+            return
+        if command.tick == self._tick:
+            if command.chaser in self._answered:
+                self._node.counts.rejected["actuators:twice"] += 1
+                return
+            self._answered.add(command.chaser)
+        effective = self._timing.step_of_time(command.effective_time_ns)
+        actuators.command(command, effective, self._timing.step_of_tick(max(self._tick, 0)))
+
+    def _take_leave(self) -> bool:
+        """Notes processes that are gone; True when that changes who is expected in the open tick."""
+        changed = False
+        for name in self._membership.who_left():
+            self._teller.forget(name)
+            self.warn("process lost", name)
+            if name == "recorder":
+                self._recorder_expected = False
+            elif name == "controller":
+                changed |= self.controller
+                self.controller = False
+            elif name in self._actuators:
+                self._actuators[name].stop()
+                changed |= any(f"chaser/{i}" == name for i in self.chasers)
+                self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
+        return changed and self._tick >= 0
+
+    def complete(self) -> bool:
+        """Whether all who are expected have answered the open tick and the recorder keeps up."""
+        kept_up = not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
+        return kept_up and self._answered.issuperset(self.chasers)
+
+    def warn(self, what: str, detail: str) -> None:
+        """Tells an event to the log and to people."""
+        time_ns = self._timing.tick_time_ns(max(self._tick, 0))
+        event = Event(
+            tick=self._tick, sim_time_ns=time_ns, process="world", level="warning", what=what, detail=detail
+        )
+        self._node.publish(topics.EVENT, event, "world")
+        say("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
+
+    def wait(self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]) -> bool:
+        """Listens until ``done``; False when ``stopped`` first. Says now and then what it waits for."""
+        self._warned_s = time.monotonic()
+        while not done():
+            if stopped():
+                return False
+            self.listen(0.02)
+            if time.monotonic() - self._warned_s > _IMPATIENT_S:
+                self._warned_s = time.monotonic()
+                say("world", f"waiting for {waiting_for()}")
+        return True
+
+    def listen_until(self, wall_s: float) -> None:
+        """Listens until a time of the monotonic wall clock."""
+        while (left := wall_s - time.monotonic()) > 0:
+            self.listen(min(left, 0.02))
+
+    def settle(self) -> None:
+        """All are there: presence is told less often from now on."""
+        self._teller.settled.set()
+
+    def farewell(self, tick: int, time_ns: int) -> None:
+        """The world's last messages."""
+        self._teller.farewell(tick, time_ns)
+
+    def who_is_slow(self) -> str:
+        """Names those whose answer to the open tick has not come."""
+        late = [f"chaser/{i}" for i in self.chasers if i not in self._answered]
+        return ", ".join(late) or "recorder"

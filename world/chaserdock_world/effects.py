@@ -1,0 +1,85 @@
+"""What a camera adds to the picture of the world: exposure, point spread, noise.
+
+(Lens distortion is geometry, and the renderer's.) Deterministic: a picture's noise depends on the seed,
+the chaser and the number of the picture alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+# The noise bank is larger than a picture by these (coprime) numbers of pixels: as many different offsets.
+_SPARE_ROWS, _SPARE_COLUMNS = 251, 256
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Strengths of the camera's effects; each is off at the value given in brackets.
+
+    ``gain`` (1): exposure, factor on grey levels. ``point_spread_px`` (0): sigma of a Gaussian blur.
+    ``read_noise`` (0): standard deviation in grey levels. ``shot_noise`` (0): variance in squared grey
+    levels per grey level, i.e. 255 over the number of electrons at white.
+    Raises ValueError for negative or non-finite strengths.
+    """
+
+    gain: float = 1.0
+    point_spread_px: float = 0.6
+    read_noise: float = 1.5
+    shot_noise: float = 0.025
+
+    def __post_init__(self) -> None:
+        for name in ("gain", "point_spread_px", "read_noise", "shot_noise"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise ValueError(f"{name} must be finite and not negative: {value}")
+
+
+NO_EFFECTS = Effects(1.0, 0.0, 0.0, 0.0)
+
+
+class CameraEffects:
+    """Applies ``effects`` to pictures of one size; ``seed`` fixes all noise it will ever give."""
+
+    def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
+        self.effects = effects
+        self.seed = seed
+        self._shape = (height_px, width_px)
+        level = np.arange(256, dtype=np.float64)
+        sigma = np.sqrt(effects.read_noise**2 + effects.shot_noise * level)
+        self._sigma = sigma.astype(np.float32)
+        self._bank: NDArray[np.float32] | None = None
+        if sigma.any():
+            # One bank of white noise, read at a random place for each picture: drawing fresh noise for
+            # every picture costs several times what the rest of the effects does.
+            generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 0])))
+            size = (height_px + _SPARE_ROWS, width_px + _SPARE_COLUMNS)
+            self._bank = generator.standard_normal(size, dtype=np.float32)
+
+    def apply(self, image: NDArray[np.uint8], chaser: int, picture: int) -> NDArray[np.uint8]:
+        """Picture ``picture`` of chaser ``chaser`` (both from 0), as the camera gives it (h, w), uint8.
+
+        The given image is not changed. Raises ValueError for another size or type than stated before.
+        """
+        if image.shape != self._shape or image.dtype != np.uint8:
+            raise ValueError(f"expected a uint8 picture of {self._shape}, got {image.dtype} {image.shape}")
+        out = image
+        if self.effects.gain != 1.0:
+            out = cv2.convertScaleAbs(out, alpha=self.effects.gain)
+        if self.effects.point_spread_px > 0.0:
+            sigma = self.effects.point_spread_px
+            width = 2 * int(np.ceil(3.0 * sigma)) + 1
+            out = cv2.GaussianBlur(out, (width, width), sigma, borderType=cv2.BORDER_REPLICATE)
+        if self._bank is not None:
+            # The 1 keeps these streams apart from the bank's own.
+            seeds = np.random.SeedSequence([self.seed, 1, chaser, picture]).generate_state(3)
+            row, column = int(seeds[0]) % (_SPARE_ROWS + 1), int(seeds[1]) % (_SPARE_COLUMNS + 1)
+            noise = self._bank[row : row + self._shape[0], column : column + self._shape[1]]
+            scale = cv2.LUT(out, self._sigma)
+            sign = 1.0 if seeds[2] & 1 else -1.0
+            cv2.multiply(scale, noise, dst=scale, scale=sign)
+            out = cv2.add(out, scale, dtype=cv2.CV_8U)
+        return np.array(out, dtype=np.uint8) if out is image else np.asarray(out, dtype=np.uint8)

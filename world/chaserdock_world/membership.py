@@ -1,0 +1,99 @@
+"""Who takes part: the world admits processes, sees them come and go, and knows who is joined up with whom."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass, field
+
+from chaserdock_protocol import presence, topics
+from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
+
+
+@dataclass
+class Membership:
+    """The world's view of the processes of its mission; called from Zenoh's threads and from the loop."""
+
+    chasers: int
+    run_id: str
+    mode: str
+    scenario_json: str
+    _alive: set[str] = field(default_factory=set)
+    _admitted: dict[str, str] = field(default_factory=dict)
+    _heard: dict[str, frozenset[str]] = field(default_factory=dict)
+    _instances: dict[str, str] = field(default_factory=dict)
+    _left: list[str] = field(default_factory=list)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def admit(self, request: JoinRequest) -> JoinReply:
+        """Answers a process that wants to join: refused with the reason, or told the mission."""
+        reason = self._objection(request)
+        if reason:
+            return JoinReply(accepted=False, reason=reason)
+        with self._lock:
+            self._admitted[request.process] = request.instance
+        return JoinReply(
+            accepted=True,
+            reason="",
+            run_id=self.run_id,
+            mode="realtime" if self.mode == "realtime" else "lockstep",
+            scenario_json=self.scenario_json,
+        )
+
+    def _objection(self, request: JoinRequest) -> str:
+        name = request.process
+        if not topics.is_process_name(name) or name == "target":
+            return f"{name!r} is no process of a mission"
+        if name == "world":
+            return "this mission has its world already; choose another --namespace for a second one"
+        if name.startswith("chaser/") and int(name.partition("/")[2]) >= self.chasers:
+            return f"there is no {name} in this mission; its chasers are 0 to {self.chasers - 1}"
+        with self._lock:
+            if name in self._alive and self._admitted.get(name) != request.instance:
+                return f"{name} is already running in this mission"
+        return ""
+
+    def alive_changed(self, name: str, alive: bool) -> None:
+        """A liveliness token came or went."""
+        with self._lock:
+            if alive:
+                self._alive.add(name)
+            elif name in self._alive:
+                self._alive.discard(name)
+                self._heard.pop(name, None)
+                self._left.append(name)
+
+    def presence_told(self, message: Presence) -> bool:
+        """Notes whom a process has heard; False when it was never admitted under that instance."""
+        with self._lock:
+            if self._admitted.get(message.process) != message.instance:
+                return False
+            self._heard[message.process] = frozenset(message.heard)
+            return True
+
+    def who_left(self) -> list[str]:
+        """Processes lost since the last call."""
+        with self._lock:
+            left, self._left = self._left, []
+            return left
+
+    def linked(self, world_heard: frozenset[str]) -> set[str]:
+        """Processes that are alive and joined up with all they deal with."""
+        with self._lock:
+            heard = {name: h for name, h in self._heard.items() if name in self._alive}
+            heard["world"] = world_heard
+            present = {"world", *(n for n in heard if n.startswith("chaser/") or n == "controller")}
+            return {
+                name
+                for name in heard
+                if name != "world"
+                and all(
+                    name in heard[o] and o in heard[name]
+                    for o in presence.partners_of(name, present)
+                    if o in heard
+                )
+            }
+
+    def alive(self) -> set[str]:
+        """Processes whose liveliness token is there."""
+        with self._lock:
+            return set(self._alive)

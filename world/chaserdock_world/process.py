@@ -1,0 +1,123 @@
+"""The world process: owns simulated time, flies the bodies, takes the pictures, knows the truth.
+
+Lock-step: a tick ends when every expected answer to it has come; nothing depends on the order of arrival or
+on the wall clock. Real time: a tick ends when the wall clock says so.
+"""
+
+from __future__ import annotations
+
+import time
+import uuid
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd
+from chaserdock_protocol.presence import PresenceTeller, new_instance
+from chaserdock_protocol.runtime import ProcessOptions, Stop, say
+from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
+from chaserdock_protocol.transport import Node, TransportError
+
+from .actuators import IdealActuators
+from .answers import Answers
+from .cameras import Cameras
+from .membership import Membership
+from .publish import publish_odometry, publish_truth
+
+
+def main(options: ProcessOptions) -> int:
+    """Runs the world of ``options.scenario``; 0 when it was flown to its end, 1 when not, 2 for bad input."""
+    node: Node | None = None
+    try:
+        scenario = load_world_scenario(options)
+        node = Node("world", "world", options.link)
+        refuse_second_world(node)
+        return fly(scenario, options, node, Stop(options.watch_parent))
+    except (ScenarioError, TransportError) as error:
+        say("world", str(error))
+        return 2
+    finally:
+        if node is not None:
+            node.close()
+
+
+def load_world_scenario(options: ProcessOptions) -> Scenario:
+    """The scenario of the options, with overrides and seed; raises ScenarioError."""
+    if options.scenario is None:
+        raise ScenarioError("the world needs a scenario file")
+    overrides = options.overrides if options.seed is None else (*options.overrides, f"seed={options.seed}")
+    return load_scenario(options.scenario, overrides)
+
+
+def refuse_second_world(node: Node) -> None:
+    """Raises TransportError if a world already answers in this namespace."""
+    reply = node.ask(
+        topics.JOIN_KEY, JoinRequest(process="world", instance=new_instance()), JoinReply, timeout_s=0.5
+    )
+    if reply is not None:
+        raise TransportError(reply.reason)
+
+
+def gather(scenario: Scenario, options: ProcessOptions, node: Node, actuators: dict) -> Answers:
+    """Opens the world's ears and doors: from here on processes can join."""
+    membership = Membership(
+        chasers=len(scenario.chasers),
+        run_id=uuid.uuid4().hex[:12],
+        mode=options.mode,
+        scenario_json=scenario.model_dump_json(),
+    )
+    node.subscribe(topics.ACTUATORS)
+    node.subscribe(topics.ACK)
+    node.watch_liveliness(membership.alive_changed)
+    node.answer(topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request)))
+    for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD):
+        node.advertise(topic)
+    for i in range(len(scenario.chasers)):
+        node.advertise(topics.ODOMETRY, i)
+        node.advertise(topics.IMAGE, i, droppable=options.mode == "realtime")
+    teller = PresenceTeller(node, new_instance())
+    return Answers(node, membership, teller, scenario.timing, actuators, options.recorder_expected)
+
+
+def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> int:
+    """Gathers the processes, flies all ticks, ends the mission; the process' status."""
+    from .physics import Physics  # PyBullet has no wheels beyond Python 3.11: see cli
+
+    cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
+    actuators = {f"chaser/{i}": IdealActuators(scenario.chaser) for i in range(len(scenario.chasers))}
+    answers = gather(scenario, options, node, actuators)
+    say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
+    started = answers.wait(
+        lambda: not answers.missing_at_start(), stop, lambda: ", ".join(answers.missing_at_start())
+    )
+    answers.settle()
+    reason = "flown to its end" if started else "stopped before the first tick"
+    begun_s, tick, contacts = time.monotonic(), 0, set()
+    while started:
+        states = {name: physics.state(name) for name in physics.bodies}
+        publish_truth(node, states, tick, timing, actuators, contacts)
+        publish_odometry(node, states, tick, timing)
+        if tick == scenario.ticks:
+            break
+        pictures = timing.has_pictures(tick)
+        answers.open(tick, pictures)
+        for i in answers.chasers if pictures else ():
+            number = tick // timing.ticks_per_picture
+            node.publish(topics.IMAGE, cameras.picture(i, number, tick, timing.tick_time_ns(tick), states), i)
+        if options.mode == "lockstep":
+            answers.wait(answers.complete, stop, answers.who_is_slow)
+        else:
+            answers.listen_until(begun_s + (tick + 1) / timing.rate_hz)
+        if stop() or not answers.chasers:
+            reason = "stopped" if stop() else "no chaser is left"
+            break
+        contacts = set()
+        for step in range(physics.step_count, timing.step_of_tick(tick + 1)):
+            physics.step({name: a.step(step, 1.0 / timing.physics_hz) for name, a in actuators.items()})
+            if physics.step_count % max(1, timing.physics_hz // 240) == 0:
+                contacts.update(physics.contacts())
+        tick += 1
+    complete = started and tick == scenario.ticks
+    time_ns = timing.tick_time_ns(tick)
+    node.publish(topics.END, MissionEnd(tick=tick, sim_time_ns=time_ns, reason=reason, complete=complete))
+    answers.farewell(tick, time_ns)
+    say("world", f"{reason} at {time_ns / 1e9:.2f} s")
+    return 0 if complete else 1

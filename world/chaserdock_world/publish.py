@@ -1,0 +1,68 @@
+"""What the world tells at the beginning of a tick: odometry to those who fly, the truth to the log."""
+
+from __future__ import annotations
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.clock import Timing
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import BodyTruth, Odometry, WorldTruth
+from chaserdock_protocol.transport import Node
+
+from .actuators import IdealActuators
+from .physics import BodyState
+
+
+def publish_odometry(node: Node, states: dict[str, BodyState], tick: int, timing: Timing) -> None:
+    """Every chaser's own state, as its navigation knows it (assumed known, as in the paper)."""
+    for name, state in states.items():
+        if not name.startswith("chaser/"):
+            continue
+        chaser = int(name.partition("/")[2])
+        message = Odometry(
+            tick=tick, sim_time_ns=timing.tick_time_ns(tick), chaser=chaser, **_state_fields(state)
+        )
+        node.publish(topics.ODOMETRY, message, chaser)
+
+
+def publish_truth(
+    node: Node,
+    states: dict[str, BodyState],
+    tick: int,
+    timing: Timing,
+    actuators: dict[str, IdealActuators],
+    contacts: set[tuple[str, str]],
+) -> None:
+    """Ground truth of all bodies, and what happened since the last tick."""
+    time_ns = timing.tick_time_ns(tick)
+    saturated, late = [], 0
+    for name, state in states.items():
+        given = {}
+        if name in actuators:
+            impulse, absolute, cut, came_late = actuators[name].take()
+            given = {
+                "impulse_N_s": vector(impulse[:3]),
+                "angular_impulse_N_m_s": vector(impulse[3:]),
+                "absolute_impulse_N_s": absolute,
+            }
+            late += came_late
+            if cut:
+                saturated.append(int(name.partition("/")[2]))
+        message = BodyTruth(tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **given)
+        node.publish(topics.TRUTH_BODY, message, name)
+    world = WorldTruth(
+        tick=tick,
+        sim_time_ns=time_ns,
+        contacts=tuple(sorted(contacts)),
+        saturated=tuple(saturated),
+        late_commands=late,
+    )
+    node.publish(topics.TRUTH_WORLD, world)
+
+
+def _state_fields(state: BodyState) -> dict[str, tuple[float, ...]]:
+    return {
+        "position_m": vector(state.position_m),
+        "velocity_m_s": vector(state.velocity_m_s),
+        "q_wxyz": vector(state.q_wxyz),
+        "omega_rad_s": vector(state.omega_rad_s),
+    }

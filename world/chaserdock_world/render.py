@@ -1,0 +1,334 @@
+"""Pictures of textured cuboids, exactly projected: each visible face is warped with OpenCV, supersampled.
+
+Order of painting: boxes do not overlap, so between any two there is a separating plane; the one on the
+camera's side of it can hide the other and is painted later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from chaserdock_protocol import rotations
+from chaserdock_protocol.camera import Camera
+from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.targets import Box, TargetModel, face_rotation
+from numpy.typing import ArrayLike, NDArray
+
+from chaserdock_world import textures
+from chaserdock_world.occlusion import PlacedBox, paint_order
+
+NEAR_M = 0.01
+"""Nothing nearer to the camera's plane than this is drawn."""
+
+AMBIENT = 0.35
+"""Share of the light that comes from everywhere; the rest is the sun's, by Lambert's cosine law."""
+
+SPACE_LEVEL = 4
+_STARS = 400
+_FINEST_TEXEL_M = 0.00025
+# Grey level of reflectance 1 in full sun: below 255, so that noise does not clip on white.
+_WHITE_LEVEL = 235.0
+# Pixels of the supersampled patch up to which 4 x 4 samples a pixel are taken instead of 2 x 2.
+_FINE_PATCH_PX = 500_000
+
+Obstacle = tuple[Sequence[Box], ArrayLike, ArrayLike]
+"""Boxes in the axes of a body, its position (3,) in WRF and its attitude (4,), body -> WRF."""
+
+
+def chaser_boxes(
+    size_m: tuple[float, float, float] = (0.25, 0.25, 0.05), probe_reach_m: float = 0.35
+) -> tuple[Box, ...]:
+    """Boxes, in CRF, of a chaser: its body and a thin docking probe along +X up to ``probe_reach_m``.
+
+    Raises ValueError when the probe does not reach beyond the body.
+    """
+    front = size_m[0] / 2.0
+    if probe_reach_m <= front:
+        raise ValueError(f"the probe ({probe_reach_m} m) must reach beyond the body's front ({front} m)")
+    length = probe_reach_m - front
+    probe = Box((length, 0.012, 0.012), (front + length / 2.0, 0.0, 0.0), shade=0.45)
+    return (Box(size_m, shade=0.3), probe)
+
+
+@dataclass(frozen=True)
+class _Face:
+    """One face in IRF: centre (3,), unit vectors right and up, width and height in metres, grey level at
+    reflectance 1, the clipped outline (n, 2) in ideal pixels, and whether all of it lies in front."""
+
+    centre: Array
+    right: Array
+    up: Array
+    width_m: float
+    height_m: float
+    level: float
+    outline_px: Array
+    in_front: bool
+    box: Box
+    index: int
+    textured: bool
+
+
+class Renderer:
+    """Draws what ``camera`` sees of a target and of other bodies.
+
+    Keeps textures and lookup tables, no state: equal arguments give equal pictures. Raises ValueError when
+    the camera's distortion cannot be inverted everywhere in the picture.
+    """
+
+    def __init__(self, camera: Camera, model: TargetModel):
+        self.camera = camera
+        self.model = model
+        self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {}
+        self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
+        # The canvas is the ideal picture; with lens distortion it reaches beyond the frame.
+        self._origin = np.zeros(2)
+        self._size = (camera.width_px, camera.height_px)
+        if camera.distortion:
+            self._prepare_distortion()
+        generator = np.random.Generator(np.random.PCG64(20230619))
+        stars = generator.standard_normal((_STARS, 3))
+        self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)
+        self._star_levels = (30.0 + 150.0 * generator.random(_STARS) ** 3).astype(np.uint8)
+
+    def render(
+        self,
+        camera_position_w_m: ArrayLike,
+        camera_q_w_irf_wxyz: ArrayLike,
+        target_p_w_m: ArrayLike,
+        target_q_w_trf_wxyz: ArrayLike,
+        obstacles: Sequence[Obstacle] = (),
+        light_direction_w: ArrayLike = (-0.4, -0.5, 0.77),
+    ) -> NDArray[np.uint8]:
+        """Picture (h, w), uint8, of the target and the ``obstacles``, lens distortion included.
+
+        ``camera_position_w_m`` (3,), ``camera_q_w_irf_wxyz`` (4,): see `Camera.irf_pose_in_world`.
+        ``light_direction_w`` (3,), any length: from the scene to the sun. No shadows are cast.
+        Raises ValueError for a zero light direction.
+        """
+        q_w_irf = np.asarray(camera_q_w_irf_wxyz, dtype=float)
+        position = np.asarray(camera_position_w_m, dtype=float)
+        light = np.asarray(light_direction_w, dtype=float)
+        length = float(np.linalg.norm(light))
+        if not (np.isfinite(length) and length > 0.0):
+            raise ValueError("the light needs a direction other than zero")
+        to_sun = rotations.rotate_inverse(q_w_irf, light / length)
+
+        placed: list[PlacedBox] = []
+        faces: list[list[_Face]] = []
+        bodies: list[Obstacle] = [(self.model.boxes, target_p_w_m, target_q_w_trf_wxyz), *obstacles]
+        for body, (boxes, p_w, q_w) in enumerate(bodies):
+            q_irf_body = rotations.multiply(rotations.conjugate(q_w_irf), q_w)
+            p_irf = rotations.rotate_inverse(q_w_irf, np.asarray(p_w, dtype=float) - position)
+            r_body = rotations.to_matrix(q_irf_body)
+            for index, box in enumerate(boxes):
+                centre = p_irf + r_body @ np.asarray(box.position_m)
+                r_box = r_body @ rotations.to_matrix(box.q_wxyz)
+                if not self._may_be_seen(centre, box):
+                    continue
+                seen = self._visible_faces(box, index, body == 0, centre, r_box, to_sun)
+                if seen:
+                    outline = np.concatenate([face.outline_px for face in seen])
+                    low, high = outline.min(axis=0), outline.max(axis=0)
+                    placed.append(PlacedBox(centre, r_box, np.asarray(box.size_m) / 2.0, low, high))
+                    faces.append(seen)
+
+        canvas = self._background(q_w_irf)
+        if faces:
+            ordered = [face for i in paint_order(placed) for face in faces[i]]
+            self._paint(canvas, ordered)
+        if self._maps is None:
+            return canvas
+        return np.asarray(cv2.remap(canvas, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
+
+    def _prepare_distortion(self) -> None:
+        width, height = self._size
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
+        ideal = self.camera.undistort(grid)
+        if not np.all(np.isfinite(ideal)):
+            raise ValueError("the lens distortion cannot be inverted everywhere in the picture")
+        low = np.floor(ideal.min(axis=(0, 1))) - 1.0
+        high = np.ceil(ideal.max(axis=(0, 1))) + 2.0
+        if np.any(high - low > 4.0 * np.array(self._size)):
+            raise ValueError("the lens distortion is too strong to be rendered")
+        self._origin = low
+        self._size = (int(high[0] - low[0]), int(high[1] - low[1]))
+        maps = (ideal - low).astype(np.float32)
+        self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
+
+    def _background(self, q_w_irf: Array) -> NDArray[np.uint8]:
+        width, height = self._size
+        canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
+        directions = self._stars @ rotations.to_matrix(q_w_irf)
+        front = directions[:, 2] > 0.1
+        px = np.rint(self.camera.project_ideal(directions[front]) - self._origin).astype(int)
+        inside = (px[:, 0] >= 0) & (px[:, 0] < width) & (px[:, 1] >= 0) & (px[:, 1] < height)
+        canvas[px[inside, 1], px[inside, 0]] = self._star_levels[front][inside]
+        return canvas
+
+    def _may_be_seen(self, centre: Array, box: Box) -> bool:
+        """False when the box's bounding sphere lies behind the near plane or beside the field of view."""
+        radius = 0.5 * float(np.linalg.norm(box.size_m))
+        x, y, z = centre.tolist()
+        if z + radius < NEAR_M:
+            return False
+        left, top = (self._origin - 0.5 - (self.camera.cx_px, self.camera.cy_px)).tolist()
+        right, bottom = left + self._size[0], top + self._size[1]
+        for offset, low, high, focal in (
+            (x, left, right, self.camera.fx_px),
+            (y, top, bottom, self.camera.fy_px),
+        ):
+            for bound, sign in ((low, 1.0), (high, -1.0)):
+                # Signed distance from the plane through the eye and that border of the canvas.
+                if sign * (focal * offset - bound * z) / np.hypot(focal, bound) < -radius:
+                    return False
+        return True
+
+    def _visible_faces(
+        self, box: Box, index: int, is_target: bool, centre: Array, r_box: Array, to_sun: Array
+    ) -> list[_Face]:
+        found = []
+        for face in range(6):
+            width, height, depth = _face_extent(box.size_m, face)
+            right, up, normal = (r_box @ _FACE_AXES[face]).T
+            middle = centre + depth * normal
+            if normal @ middle >= 0.0:  # seen from behind
+                continue
+            corners = middle + np.outer(_CORNERS[:, 0] * width, right) + np.outer(_CORNERS[:, 1] * height, up)
+            in_front = bool(np.all(corners[:, 2] >= NEAR_M))
+            outline = self._clip(corners)
+            if len(outline) < 3:
+                continue
+            px = self.camera.project_ideal(outline) - self._origin
+            level = _WHITE_LEVEL * (AMBIENT + (1.0 - AMBIENT) * max(0.0, float(normal @ to_sun)))
+            textured = is_target and self._texture(index, face, 0, 0) is not None
+            found.append(
+                _Face(middle, right, up, width, height, level, px, in_front, box, 6 * index + face, textured)
+            )
+        return found
+
+    def _clip(self, corners: Array) -> Array:
+        """The part (n, 3) of a face (4, 3) that is in front and on the canvas (Sutherland-Hodgman)."""
+        c = self.camera
+        left, top = (self._origin - 1.0 - (c.cx_px, c.cy_px)).tolist()
+        right, bottom = left + self._size[0] + 1.0, top + self._size[1] + 1.0
+        planes = np.array(
+            [
+                [0.0, 0.0, 1.0, -NEAR_M],
+                [c.fx_px, 0.0, -left, 0.0],
+                [-c.fx_px, 0.0, right, 0.0],
+                [0.0, c.fy_px, -top, 0.0],
+                [0.0, -c.fy_px, bottom, 0.0],
+            ]
+        )
+        outside = corners @ planes[:, :3].T + planes[:, 3] < 0.0
+        if not outside.any():
+            return corners
+        if outside.all(axis=0).any():
+            return corners[:0]
+        polygon = corners
+        for plane in planes[outside.any(axis=0)]:
+            distance = polygon @ plane[:3] + plane[3]
+            kept: list[Array] = []
+            for i in range(len(polygon)):
+                d0, d1 = distance[i - 1], distance[i]
+                if (d0 < 0.0) != (d1 < 0.0):
+                    kept.append(polygon[i - 1] + (polygon[i] - polygon[i - 1]) * (d0 / (d0 - d1)))
+                if d1 >= 0.0:
+                    kept.append(polygon[i])
+            if len(kept) < 3:
+                return corners[:0]
+            polygon = np.array(kept)
+        return polygon
+
+    def _paint(self, canvas: NDArray[np.uint8], faces: list[_Face]) -> None:
+        """Paints faces, back to front, onto a supersampled copy of the part of the canvas they cover."""
+        outline = np.concatenate([face.outline_px for face in faces])
+        x0, y0 = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 1, 0).tolist()
+        x1, y1 = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 2, self._size).tolist()
+        if x1 <= x0 or y1 <= y0:
+            return
+        view = canvas[y0:y1, x0:x1]
+        samples = 4 if 16 * view.size <= _FINE_PATCH_PX else 2
+        size = (samples * (x1 - x0), samples * (y1 - y0))
+        patch = np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        # Ideal pixel of the camera -> sample of the patch; pixel centres are integers in both.
+        shift = (samples - 1) / 2.0 - samples * (self._origin + np.array([x0, y0]))
+        to_patch = np.array([[samples, 0.0, shift[0]], [0.0, samples, shift[1]], [0.0, 0.0, 1.0]])
+        for face in faces:
+            outline = (face.outline_px - (x0, y0)) * samples + (samples - 1) / 2.0
+            if face.textured:
+                self._paint_texture(patch, face, to_patch, outline)
+            else:
+                value = round(face.level * face.box.shade)
+                fixed = np.rint(outline * 16.0).astype(np.int32)
+                cv2.fillConvexPoly(patch, fixed, value, cv2.LINE_8, 4)
+        cv2.resize(patch, (x1 - x0, y1 - y0), dst=view, interpolation=cv2.INTER_AREA)
+
+    def _paint_texture(self, patch: NDArray[np.uint8], face: _Face, to_patch: Array, outline: Array) -> None:
+        low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 2, 0)
+        high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 3, (patch.shape[1], patch.shape[0]))
+        if np.any(high <= low):
+            return
+        to_patch = to_patch @ self.camera.matrix()
+        texture = self._texture_for(face, to_patch, outline)
+        rows, columns = texture.shape
+        # Texel (column, row, 1) -> point of the face in IRF -> sample of the patch.
+        texel = np.array([[1.0, 0.0, 0.5 - columns / 2.0], [0.0, -1.0, rows / 2.0 - 0.5], [0.0, 0.0, 1.0]])
+        basis = np.stack(
+            [face.right * face.width_m / columns, face.up * face.height_m / rows, face.centre], axis=-1
+        )
+        to_roi = np.array([[1.0, 0.0, -low[0]], [0.0, 1.0, -low[1]], [0.0, 0.0, 1.0]]) @ to_patch
+        homography = np.linalg.inv(to_roi @ basis @ texel)
+        homography /= np.abs(homography).max()
+        roi = patch[low[1] : high[1], low[0] : high[0]]
+        size = (roi.shape[1], roi.shape[0])
+        lit = cv2.convertScaleAbs(texture, alpha=face.level / 255.0)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        if face.in_front:
+            # A transparent border blends over half a texel on either side of the face's edge.
+            cv2.warpPerspective(lit, homography, size, roi, flags, cv2.BORDER_TRANSPARENT)
+            return
+        # Part of the face is behind the camera, where the homography mirrors it: paint the rest alone.
+        warped = cv2.warpPerspective(lit, homography, size, None, flags, cv2.BORDER_REPLICATE)
+        mask = np.zeros(roi.shape, dtype=np.uint8)
+        cv2.fillConvexPoly(mask, np.rint((outline - low) * 16.0).astype(np.int32), 255, cv2.LINE_8, 4)
+        cv2.copyTo(warped, mask, roi)
+
+    def _texture_for(self, face: _Face, to_patch: Array, outline: Array) -> NDArray[np.uint8]:
+        """The texture whose texels are, at the middle of the visible part, about a sample wide and high."""
+        # Ray through the middle of the outline, cut with the face's plane.
+        ray = np.linalg.solve(to_patch, np.append(outline.mean(axis=0), 1.0))
+        normal = np.cross(face.right, face.up)
+        point = ray * (normal @ face.centre) / (normal @ ray)
+        level = []
+        for axis in (face.right, face.up):
+            moved = to_patch @ axis  # derivative of homogeneous sample coordinates per metre
+            at = to_patch @ point
+            samples_per_m = np.linalg.norm((moved[:2] - at[:2] / at[2] * moved[2]) / at[2])
+            level.append(max(0, round(-float(np.log2(max(samples_per_m, 1.0) * _FINEST_TEXEL_M)))))
+        texture = self._texture(face.index // 6, face.index % 6, level[0], level[1])
+        assert texture is not None
+        return texture
+
+    def _texture(self, box_index: int, face: int, level_x: int, level_y: int) -> NDArray[np.uint8] | None:
+        key = (box_index, face, level_x, level_y)
+        if key not in self._textures:
+            box = self.model.boxes[box_index]
+            width, height, _ = _face_extent(box.size_m, face)
+            columns = max(2, round(width / (_FINEST_TEXEL_M * 2**level_x)))
+            rows = max(2, round(height / (_FINEST_TEXEL_M * 2**level_y)))
+            self._textures[key] = textures.face_texture(self.model, box, face, columns, rows)
+        return self._textures[key]
+
+
+_FACE_AXES = [rotations.to_matrix(face_rotation(face)) for face in range(6)]
+_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
+
+
+def _face_extent(size_m: tuple[float, float, float], face: int) -> tuple[float, float, float]:
+    """As `targets.face_extent`, without its general rotation: faces come in pairs along x, y and z."""
+    x, y, z = size_m
+    return ((y, z, x / 2.0), (x, z, y / 2.0), (x, y, z / 2.0))[face // 2]

@@ -8,7 +8,12 @@ import pytest
 from chaserdock_controller.nmpc import NmpcParameters
 from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, linearize, step
 from chaserdock_controller.nmpc.problem import derivative, dynamics
-from chaserdock_controller.reference import feed_forward, predict_target, reference_state, reference_trajectory
+from chaserdock_controller.reference import (
+    feed_forward,
+    predict_target,
+    reference_state,
+    reference_trajectory,
+)
 from chaserdock_protocol import rotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -97,7 +102,19 @@ def test_jacobians_equal_casadis_in_the_tangent_space(integrator: str, seed: int
     out, c_mat, b_mat = np.empty(13), np.empty((12, 6)), np.empty((12, 6))
     nodes, weights = RK_NODES[integrator], RK_WEIGHTS[integrator]
     linearize(
-        x, u, 0.1, nodes, weights, MASS_KG, MATRIX, INVERSE, out, c_mat, b_mat, np.empty(24), np.empty((24, 9))
+        x,
+        u,
+        0.1,
+        nodes,
+        weights,
+        MASS_KG,
+        MATRIX,
+        INVERSE,
+        out,
+        c_mat,
+        b_mat,
+        np.empty(54),
+        np.empty((27, 9)),
     )
     np.testing.assert_allclose(out, x_next, rtol=0, atol=1e-13)
     np.testing.assert_allclose(full_a(c_mat, 0.1), lower @ np.array(jac_x(x, u)) @ lift, rtol=0, atol=1e-12)
@@ -111,7 +128,19 @@ def test_jacobians_equal_finite_differences(seed: int, integrator: str) -> None:
     out, c_mat, b_mat = np.empty(13), np.empty((12, 6)), np.empty((12, 6))
     nodes, weights = RK_NODES[integrator], RK_WEIGHTS[integrator]
     linearize(
-        x, u, 0.1, nodes, weights, MASS_KG, MATRIX, INVERSE, out, c_mat, b_mat, np.empty(24), np.empty((24, 9))
+        x,
+        u,
+        0.1,
+        nodes,
+        weights,
+        MASS_KG,
+        MATRIX,
+        INVERSE,
+        out,
+        c_mat,
+        b_mat,
+        np.empty(54),
+        np.empty((27, 9)),
     )
     a_mat, e = full_a(c_mat, 0.1), 1e-6
     for j in range(12):
@@ -131,7 +160,8 @@ def newton_euler(x: Array, u: Array) -> Array:
     q_dot = 0.5 * np.concatenate([[-v @ omega], w * omega + np.cross(v, omega)])
     torque = u[3:] - np.cross(omega, MATRIX @ omega)
     acceleration = rotations.to_matrix(q) @ u[:3] / MASS_KG
-    return np.concatenate([x[3:6], acceleration, q_dot, np.linalg.solve(MATRIX, torque)])
+    omega_dot: Array = np.linalg.solve(MATRIX, torque).astype(np.float64)
+    return np.concatenate([x[3:6], acceleration, q_dot, omega_dot])
 
 
 def integrate_finely(x: Array, u: Array, duration_s: float, steps: int) -> Array:
@@ -240,7 +270,7 @@ def test_feed_forward_alone_holds_the_reference(omega: Array, closing: float) ->
     def offsets(t: Array) -> Array:
         return np.exp(-closing * t)[:, None] * offset
 
-    middle = h * (np.arange(n) + 0.5)
+    middle = np.arange(0.5, n, dtype=np.float64) * h
     held = offsets(middle)
     inputs = feed_forward(omega, held, -closing * held, closing**2 * held, Q_OFF, MASS_KG, INERTIA)
     x = reference_state(P0, V0, Q0, omega, offset, -closing * offset, Q_OFF)

@@ -42,7 +42,7 @@ NO_BIAS = MekfParameters(
 )
 Q0 = rot.normalize([0.4, -0.5, 0.6, 0.2])
 
-deterministic = settings(derandomize=True, deadline=None, max_examples=50)
+deterministic = settings(derandomize=True, deadline=None, max_examples=30)
 vectors = st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3).map(np.array)
 rotation_vectors = st.lists(st.floats(-1.7, 1.7), min_size=3, max_size=3).map(np.array)
 

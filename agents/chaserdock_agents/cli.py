@@ -263,6 +263,29 @@ def summary(log: Annotated[Path, typer.Argument(help="a mission.mcap")]) -> None
     raise typer.Exit(0 if result["success"] else 1)
 
 
+@app.command()
+def snapshot(
+    log: Annotated[Path, typer.Argument(help="a mission.mcap")],
+    at: Annotated[float, typer.Option(help="simulated time, seconds")],
+    out: Annotated[Path, typer.Option(help="picture to write: .png or .jpg")],
+    width: Annotated[int, typer.Option(min=64, max=4096, help="width of one camera's picture, pixels")] = 640,
+) -> None:
+    """Draw what every camera saw at a moment of a recorded flight, detections included."""
+    import cv2
+    from chaserdock_protocol.log import LogError
+
+    from chaserdock_agents.analysis.snapshot import snapshot as draw
+
+    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
+        raise fail(f"--out {out}: must end in .png or .jpg")
+    try:
+        picture = draw(log, at, width)
+    except LogError as error:
+        raise fail(str(error)) from None
+    if not cv2.imwrite(str(out), picture):
+        raise fail(f"--out {out}: cannot be written")
+
+
 def main() -> None:
     """Entry point; a closed pipe (``| head``) is no error."""
     try:

@@ -28,7 +28,7 @@ class Progress:
     mode: str
     quiet: bool
     flying: bool = False
-    _odometry: dict[int, Odometry] = field(default_factory=dict)
+    _odometry: dict[tuple[int, int], Odometry] = field(default_factory=dict)
     _reference: dict[int, Reference] = field(default_factory=dict)
     _target: TargetEstimate | None = None
     _time_ns: int = 0
@@ -56,7 +56,8 @@ class Progress:
                     self.flying, self._begun_s = True, time.monotonic()
                 self._time_ns = message.sim_time_ns
             case Odometry():
-                self._odometry[message.chaser] = message
+                self._odometry[message.chaser, message.tick] = message
+                self._odometry.pop((message.chaser, message.tick - 50), None)
             case Reference():
                 self._reference[message.chaser] = message
             case TargetEstimate():
@@ -77,7 +78,8 @@ class Progress:
 
     def errors(self, chaser: int) -> tuple[float, float] | None:
         """Position (m) and orientation (rad) error of a chaser from its reference, as the controller sees it."""
-        here, there = self._odometry.get(chaser), self._reference.get(chaser)
+        there = self._reference.get(chaser)
+        here = self._odometry.get((chaser, there.tick)) if there is not None else None
         if here is None or there is None:
             return None
         position = float(np.linalg.norm(np.subtract(here.position_m, there.position_m)))

@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _SHORTEST_S = 2.0
+# Factors of the derivatives of powers 1 to 5, and 2 to 5.
+_FIRST = np.arange(1.0, 6.0)[:, None]
+_SECOND = np.array([2.0, 6.0, 12.0, 20.0])[:, None]
 _SAMPLES = np.linspace(0.0, 1.0, 41)
 
 
@@ -34,12 +37,12 @@ class Move:
         """Positions, velocities, accelerations (K, 3) at times (K,); at rest before and after."""
         t = np.asarray(times_s, dtype=float) - self.start_s
         inside = ((t >= 0.0) & (t <= self.duration_s))[:, None]
-        t = np.clip(t, 0.0, self.duration_s)[:, None]
         c = self.coefficients
-        position = sum(c[k] * t**k for k in range(6))
-        velocity = sum(k * c[k] * t ** (k - 1) for k in range(1, 6))
-        acceleration = sum(k * (k - 1) * c[k] * t ** (k - 2) for k in range(2, 6))
-        return np.asarray(position), np.where(inside, velocity, 0.0), np.where(inside, acceleration, 0.0)
+        powers = np.vander(np.clip(t, 0.0, self.duration_s), 6, increasing=True)
+        position = powers @ c
+        velocity = powers[:, :5] @ (c[1:] * _FIRST)
+        acceleration = powers[:, :4] @ (c[2:] * _SECOND)
+        return position, np.where(inside, velocity, 0.0), np.where(inside, acceleration, 0.0)
 
     def over_at(self, time_s: float) -> bool:
         """Whether it has ended."""

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+
 import numpy as np
-from chaserdock_protocol import rotations
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Body
@@ -38,31 +40,45 @@ class CommandHistory:
             self._sent[chaser] = sent[last:]
 
 
-def _slope(x: Array, wrench: Array, mass_kg: float, inertia: Array) -> Array:
-    q, omega = x[6:10], x[10:]
-    return np.concatenate(
-        [
-            x[3:6],
-            rotations.rotate(q, wrench[:3]) / mass_kg,
-            0.5 * rotations.multiply(q, np.concatenate([[0.0], omega])),
-            (wrench[3:] - np.cross(omega, inertia * omega)) / inertia,
-        ]
-    )
+def _slope(x: Sequence[float], wrench: Sequence[float], mass_kg: float, inertia: Sequence[float]) -> list[float]:
+    # Plain floats: a handful of numbers, several times a tick and chaser.
+    _, _, _, vx, vy, vz, w, i, j, k, a, b, c = x
+    fx, fy, fz, tx, ty, tz = wrench
+    ia, ib, ic = inertia
+    cx, cy, cz = 2.0 * (j * fz - k * fy), 2.0 * (k * fx - i * fz), 2.0 * (i * fy - j * fx)
+    return [
+        vx,
+        vy,
+        vz,
+        (fx + w * cx + (j * cz - k * cy)) / mass_kg,
+        (fy + w * cy + (k * cx - i * cz)) / mass_kg,
+        (fz + w * cz + (i * cy - j * cx)) / mass_kg,
+        0.5 * (-i * a - j * b - k * c),
+        0.5 * (w * a + j * c - k * b),
+        0.5 * (w * b + k * a - i * c),
+        0.5 * (w * c + i * b - j * a),
+        (tx - (b * ic * c - c * ib * b)) / ia,
+        (ty - (c * ia * a - a * ic * c)) / ib,
+        (tz - (a * ib * b - b * ia * a)) / ic,
+    ]
 
 
-def integrate(x: Array, wrench: Array, body: Body, duration_s: float) -> Array:
+def integrate(state: Array, wrench: Array, body: Body, duration_s: float) -> Array:
     """State (13,): p, v (WRF), q_wxyz, omega (body) after ``duration_s`` under a constant body-frame wrench (RK4)."""
-    inertia = np.asarray(body.inertia)
-    steps = max(1, int(np.ceil(duration_s / _STEP_S)))
+    u, inertia, mass_kg = wrench.tolist(), body.inertia, body.mass_kg
+    x = state.tolist()
+    steps = max(1, math.ceil(duration_s / _STEP_S))
     h = duration_s / steps
     for _ in range(steps):
-        k1 = _slope(x, wrench, body.mass_kg, inertia)
-        k2 = _slope(x + h / 2 * k1, wrench, body.mass_kg, inertia)
-        k3 = _slope(x + h / 2 * k2, wrench, body.mass_kg, inertia)
-        k4 = _slope(x + h * k3, wrench, body.mass_kg, inertia)
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        x[6:10] = rotations.normalize(x[6:10])
-    return x
+        k1 = _slope(x, u, mass_kg, inertia)
+        k2 = _slope([a + h / 2 * b for a, b in zip(x, k1, strict=True)], u, mass_kg, inertia)
+        k3 = _slope([a + h / 2 * b for a, b in zip(x, k2, strict=True)], u, mass_kg, inertia)
+        k4 = _slope([a + h * b for a, b in zip(x, k3, strict=True)], u, mass_kg, inertia)
+        slopes = zip(x, k1, k2, k3, k4, strict=True)
+        x = [a + h / 6 * (b + 2 * c + 2 * d + e) for a, b, c, d, e in slopes]
+        norm = math.hypot(*x[6:10])
+        x[6:10] = [a / norm for a in x[6:10]]
+    return np.array(x)
 
 
 def predict_state(odometry: Odometry, history: CommandHistory, until_ns: int, body: Body) -> Array:

@@ -6,7 +6,7 @@ The target moves at constant velocity (WRF) and constant body rate. Pure functio
 from __future__ import annotations
 
 import numpy as np
-from chaserdock_protocol.rotations import conjugate, exp, multiply, normalize, rotate, rotate_inverse
+from chaserdock_protocol.rotations import conjugate, cross, exp, multiply, normalize, rotate, rotate_inverse
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
@@ -67,7 +67,7 @@ def reference_state(
     """
     q, q_off = normalize(q_wxyz), normalize(q_off_wxyz)
     omega, offset = np.asarray(omega_rad_s, dtype=float), np.asarray(offset_position_m, dtype=float)
-    relative = np.asarray(offset_velocity_m_s, dtype=float) + np.cross(omega, offset)
+    relative = np.asarray(offset_velocity_m_s, dtype=float) + cross(omega, offset)
     return np.concatenate(
         [
             np.asarray(position_m, dtype=float) + rotate(q, offset),
@@ -104,9 +104,9 @@ def feed_forward(
         np.asarray(offset_velocity_m_s, dtype=float),
         np.asarray(offset_acceleration_m_s2, dtype=float),
     )
-    acceleration = a + 2.0 * np.cross(omega, v) + np.cross(omega, np.cross(omega, p))
+    acceleration = a + 2.0 * cross(omega, v) + cross(omega, cross(omega, p))
     q_off = normalize(q_off_wxyz)
     omega_body = rotate_inverse(q_off, omega)
-    torque = np.cross(omega_body, np.asarray(inertia_kg_m2, dtype=float) @ omega_body)
+    torque = cross(omega_body, np.asarray(inertia_kg_m2, dtype=float) @ omega_body)
     force = mass_kg * rotate_inverse(q_off, acceleration)
     return np.concatenate([force, np.broadcast_to(torque, force.shape)], axis=1)

@@ -142,17 +142,20 @@ def target_model(name: str) -> TargetModel:
 
 
 def clear_margin_m(model: TargetModel, marker: Marker) -> float:
-    """Width of the plain white border of a marker: up to its nearest neighbour, the end of the white paint or
-    the edge of its face, whichever comes first."""
+    """Width of the plain white border along the sides of a marker: up to its nearest neighbour, the end of the
+    white paint or the edge of its face, whichever comes first."""
     q_marker_trf = rotations.conjugate(marker.q_trf_marker_wxyz)
     half = marker.side_m / 2.0
     clear = model.white_margin_m
-    for other in model.markers:
+    positions = np.array([other.position_trf_m for other in model.markers])
+    depths = rotations.rotate(q_marker_trf, positions - np.array(marker.position_trf_m))[:, 2]
+    for i in np.flatnonzero(np.abs(depths) < 1e-6):
+        other = model.markers[i]
         corners = rotations.rotate(q_marker_trf, other.corners_trf_m() - np.array(marker.position_trf_m))
         if other.id != marker.id and np.all(np.abs(corners[:, 2]) < 1e-6):
-            # Gap between two squares: the wider of those along the two axes.
-            gap = np.maximum(corners[:, :2].min(axis=0) - half, -half - corners[:, :2].max(axis=0)).max()
-            clear = min(clear, float(gap))
+            gaps = np.maximum(corners[:, :2].min(axis=0) - half, -half - corners[:, :2].max(axis=0))
+            if gaps.min() < 0.0:  # beside one of the sides, and not off a corner
+                clear = min(clear, float(gaps.max()))
     for box in model.boxes:
         q_marker_box = rotations.multiply(q_marker_trf, box.q_wxyz)
         centre = rotations.rotate(q_marker_trf, np.array(box.position_m) - marker.position_trf_m)

@@ -13,6 +13,8 @@ from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Body
 
+from .physics import Physics
+
 
 @dataclass
 class IdealActuators:
@@ -35,12 +37,19 @@ class IdealActuators:
         self.late += effective_step < now_step
         heapq.heappush(self._waiting, (effective_step, command.seq, given))
 
-    def step(self, step: int, step_s: float) -> Array:
-        """The wrench (6,), body axes, that acts during physics step ``step``."""
+    def next_change(self, step: int) -> int | None:
+        """The first step after ``step`` at which another command takes effect, if one waits."""
+        return min((w[0] for w in self._waiting if w[0] > step), default=None)
+
+    def act(self, step: int, steps: int, step_s: float) -> Array:
+        """The wrench (6,), body axes, that acts from physics step ``step`` on, for ``steps`` steps of ``step_s``.
+
+        There must be no change in between (see ``next_change``).
+        """
         while self._waiting and self._waiting[0][0] <= step:
             self.wrench = heapq.heappop(self._waiting)[2]
-        self.impulse = self.impulse + self.wrench * step_s
-        self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * step_s
+        self.impulse = self.impulse + self.wrench * (steps * step_s)
+        self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * steps * step_s
         return self.wrench
 
     def stop(self) -> None:
@@ -53,3 +62,16 @@ class IdealActuators:
         out = self.impulse, self.absolute_impulse_N_s, self.saturated, self.late
         self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = np.zeros(6), 0.0, False, 0
         return out
+
+
+def fly_to(
+    end_step: int, physics: Physics, actuators: dict[str, IdealActuators], step_s: float
+) -> set[tuple[str, str]]:
+    """Advances the physics to ``end_step`` under what the actuators give; the pairs of bodies that touched."""
+    touched: set[tuple[str, str]] = set()
+    while (step := physics.step_count) < end_step:
+        changes = (a.next_change(step) for a in actuators.values())
+        until = min((c for c in changes if c is not None), default=end_step)
+        steps = min(until, end_step) - step
+        touched |= physics.advance(steps, {name: a.act(step, steps, step_s) for name, a in actuators.items()})
+    return touched

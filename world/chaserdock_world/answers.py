@@ -132,7 +132,9 @@ class Answers:
         self._node.publish(topics.EVENT, event, "world")
         say("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
 
-    def wait(self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]) -> bool:
+    def wait(
+        self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]
+    ) -> bool:
         """Listens until ``done``; False when ``stopped`` first. Says now and then what it waits for."""
         self._warned_s = time.monotonic()
         while not done():

@@ -27,7 +27,9 @@ class Cameras:
         # A chaser's own body lies behind its lens; its probe does not.
         self._own, self._others = (probe,), (body, probe)
 
-    def picture(self, chaser: int, number: int, tick: int, time_ns: int, states: dict[str, BodyState]) -> Image:
+    def picture(
+        self, chaser: int, number: int, tick: int, time_ns: int, states: dict[str, BodyState]
+    ) -> Image:
         """Picture ``number`` of chaser ``chaser`` of the bodies ``states``, exposed at ``time_ns``."""
         own = f"chaser/{chaser}"
         obstacles: list[Obstacle] = [

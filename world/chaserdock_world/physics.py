@@ -30,14 +30,15 @@ class BodyState:
 
 
 class Physics:
-    """The bodies of a scenario in a PyBullet world of their own; ``step`` advances one physics step."""
+    """The bodies of a scenario in a PyBullet world of their own; ``advance`` moves them on."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.step_count = 0
         self._scenario = scenario
         self._prescribed = scenario.target.motion != "torque_free"
-        # How often Bullet's copy of a prescribed target is moved along; ``state`` is exact at any step.
-        self._steps_per_pose = max(1, scenario.time.physics_hz // 240)
+        # How often contacts are looked for and Bullet's copy of a prescribed target is moved along; that
+        # target's ``state`` is exact at any step.
+        self._steps_per_look = max(1, scenario.time.physics_hz // 240)
         self._bullet = BulletClient(connection_mode=pybullet.DIRECT)
         self._bullet.setGravity(0, 0, 0)
         self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)
@@ -100,21 +101,32 @@ class Physics:
         q = rotations.normalize([xyzw[3], *xyzw[:3]])
         return BodyState(np.array(position), np.array(velocity), q, rotations.rotate_inverse(q, omega_world))
 
-    def step(self, wrenches: dict[str, Array]) -> None:
-        """One physics step; ``wrenches`` maps a chaser's name to force and torque (6,) in its body axes, N and N m."""
-        for name, wrench in wrenches.items():
-            body = self._bodies[name]
-            force, torque = wrench[:3].tolist(), wrench[3:].tolist()
-            self._bullet.applyExternalForce(body, -1, force, [0, 0, 0], pybullet.LINK_FRAME)
-            self._bullet.applyExternalTorque(body, -1, torque, pybullet.LINK_FRAME)
-        self._bullet.stepSimulation()
-        self.step_count += 1
+    def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
+        """Makes ``steps`` physics steps under constant wrenches; returns the pairs of bodies that touched.
+
+        ``wrenches`` maps a chaser's name to force and torque (6,) in its body axes, N and N m.
+        """
+        pushes = [(self._bodies[n], w[:3].tolist(), w[3:].tolist()) for n, w in wrenches.items() if w.any()]
         moves = self._prescribed and self._scenario.target.motion != "static"
-        if moves and self.step_count % self._steps_per_pose == 0:
-            state = self.state(TARGET)
-            body = self._bodies[TARGET]
-            self._bullet.resetBasePositionAndOrientation(body, state.position_m.tolist(), _xyzw(state.q_wxyz))
-            self._set_velocity(body, state)
+        touched: set[tuple[str, str]] = set()
+        bullet, frame = self._bullet, pybullet.LINK_FRAME
+        for _ in range(steps):
+            # Bullet forgets external forces after every step.
+            for body, force, torque in pushes:
+                bullet.applyExternalForce(body, -1, force, (0, 0, 0), frame)
+                bullet.applyExternalTorque(body, -1, torque, frame)
+            bullet.stepSimulation()
+            self.step_count += 1
+            if self.step_count % self._steps_per_look == 0:
+                if moves:
+                    self._move_target()
+                touched.update(self.contacts())
+        return touched
+
+    def _move_target(self) -> None:
+        state, body = self.state(TARGET), self._bodies[TARGET]
+        self._bullet.resetBasePositionAndOrientation(body, state.position_m.tolist(), _xyzw(state.q_wxyz))
+        self._set_velocity(body, state)
 
     def contacts(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies that touch or overlap now, sorted."""

@@ -16,10 +16,11 @@ from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
 
-from .actuators import IdealActuators
+from .actuators import IdealActuators, fly_to
 from .answers import Answers
 from .cameras import Cameras
 from .membership import Membership
+from .physics import Physics
 from .publish import publish_odometry, publish_truth
 
 
@@ -79,8 +80,6 @@ def gather(scenario: Scenario, options: ProcessOptions, node: Node, actuators: d
 
 def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> int:
     """Gathers the processes, flies all ticks, ends the mission; the process' status."""
-    from .physics import Physics  # PyBullet has no wheels beyond Python 3.11: see cli
-
     cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
     actuators = {f"chaser/{i}": IdealActuators(scenario.chaser) for i in range(len(scenario.chasers))}
     answers = gather(scenario, options, node, actuators)
@@ -90,7 +89,8 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     )
     answers.settle()
     reason = "flown to its end" if started else "stopped before the first tick"
-    begun_s, tick, contacts = time.monotonic(), 0, set()
+    begun_s, tick = time.monotonic(), 0
+    contacts: set[tuple[str, str]] = set()
     while started:
         states = {name: physics.state(name) for name in physics.bodies}
         publish_truth(node, states, tick, timing, actuators, contacts)
@@ -109,11 +109,7 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
         if stop() or not answers.chasers:
             reason = "stopped" if stop() else "no chaser is left"
             break
-        contacts = set()
-        for step in range(physics.step_count, timing.step_of_tick(tick + 1)):
-            physics.step({name: a.step(step, 1.0 / timing.physics_hz) for name, a in actuators.items()})
-            if physics.step_count % max(1, timing.physics_hz // 240) == 0:
-                contacts.update(physics.contacts())
+        contacts = fly_to(timing.step_of_tick(tick + 1), physics, actuators, 1.0 / timing.physics_hz)
         tick += 1
     complete = started and tick == scenario.ticks
     time_ns = timing.tick_time_ns(tick)

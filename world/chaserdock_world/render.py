@@ -28,11 +28,11 @@ AMBIENT = 0.35
 
 SPACE_LEVEL = 4
 _STARS = 400
-_FINEST_TEXEL_M = 0.00025
 # Grey level of reflectance 1 in full sun: below 255, so that noise does not clip on white.
 _WHITE_LEVEL = 235.0
-# Pixels of the supersampled patch up to which 4 x 4 samples a pixel are taken instead of 2 x 2.
-_FINE_PATCH_PX = 500_000
+# Samples a pixel along each axis: the most that keep the samples of the painted patch below the limit.
+# (Textures are area averages, so even one sample a pixel puts corners to within 0.03 px.)
+_SAMPLES = ((4, 500_000), (2, 1_000_000))
 
 Obstacle = tuple[Sequence[Box], ArrayLike, ArrayLike]
 """Boxes in the axes of a body, its position (3,) in WRF and its attitude (4,), body -> WRF."""
@@ -81,7 +81,12 @@ class Renderer:
     def __init__(self, camera: Camera, model: TargetModel):
         self.camera = camera
         self.model = model
-        self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {}
+        # By box, face and the halvings of its resolution across and up; coarser ones are made when needed.
+        self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {
+            (index, face, 0, 0): textures.finest_texture(model, index, face)
+            for index in range(len(model.boxes))
+            for face in range(6)
+        }
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
         # The canvas is the ideal picture; with lens distortion it reaches beyond the frame.
         self._origin = np.zeros(2)
@@ -146,8 +151,20 @@ class Renderer:
     def _prepare_distortion(self) -> None:
         width, height = self._size
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-        ideal = self.camera.undistort(grid)
-        if not np.all(np.isfinite(ideal)):
+        # As Camera.undistort, which is slow for a million points.
+        matrix = self.camera.matrix()
+        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
+        found = cv2.undistortPoints(
+            grid.reshape(-1, 1, 2),
+            matrix,
+            np.array(self.camera.distortion),
+            None,
+            None,
+            matrix,
+            criteria=criteria,
+        )
+        ideal = np.asarray(found, dtype=float).reshape(grid.shape)
+        if not np.all(np.abs(self.camera.distort(ideal) - grid) < 1e-3):
             raise ValueError("the lens distortion cannot be inverted everywhere in the picture")
         low = np.floor(ideal.min(axis=(0, 1))) - 1.0
         high = np.ceil(ideal.max(axis=(0, 1))) + 2.0
@@ -251,7 +268,7 @@ class Renderer:
         if x1 <= x0 or y1 <= y0:
             return
         view = canvas[y0:y1, x0:x1]
-        samples = 4 if 16 * view.size <= _FINE_PATCH_PX else 2
+        samples = next((n for n, limit in _SAMPLES if n * n * view.size <= limit), 1)
         size = (samples * (x1 - x0), samples * (y1 - y0))
         patch = np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
         # Ideal pixel of the camera -> sample of the patch; pixel centres are integers in both.
@@ -308,7 +325,7 @@ class Renderer:
             moved = to_patch @ axis  # derivative of homogeneous sample coordinates per metre
             at = to_patch @ point
             samples_per_m = np.linalg.norm((moved[:2] - at[:2] / at[2] * moved[2]) / at[2])
-            level.append(max(0, round(-float(np.log2(max(samples_per_m, 1.0) * _FINEST_TEXEL_M)))))
+            level.append(max(0, round(-float(np.log2(max(samples_per_m, 1.0) * textures.FINEST_TEXEL_M)))))
         texture = self._texture(face.index // 6, face.index % 6, level[0], level[1])
         assert texture is not None
         return texture
@@ -316,11 +333,13 @@ class Renderer:
     def _texture(self, box_index: int, face: int, level_x: int, level_y: int) -> NDArray[np.uint8] | None:
         key = (box_index, face, level_x, level_y)
         if key not in self._textures:
-            box = self.model.boxes[box_index]
-            width, height, _ = _face_extent(box.size_m, face)
-            columns = max(2, round(width / (_FINEST_TEXEL_M * 2**level_x)))
-            rows = max(2, round(height / (_FINEST_TEXEL_M * 2**level_y)))
-            self._textures[key] = textures.face_texture(self.model, box, face, columns, rows)
+            finest = self._textures[box_index, face, 0, 0]
+            if finest is None:
+                return None
+            size = (max(2, finest.shape[1] >> level_x), max(2, finest.shape[0] >> level_y))
+            # The mean over the area again, so that edges stay where they are.
+            coarse = cv2.resize(finest, size, interpolation=cv2.INTER_AREA)
+            self._textures[key] = np.asarray(coarse, dtype=np.uint8)
         return self._textures[key]
 
 

@@ -6,6 +6,8 @@ resolution, so rendering from a coarser texture blurs a marker but does not shif
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import cv2
 import numpy as np
 from chaserdock_protocol import rotations
@@ -13,6 +15,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from numpy.typing import NDArray
 
+FINEST_TEXEL_M = 0.00025
 # Reflectance of the printed white and black: neither paint is perfect.
 WHITE, BLACK = 0.95, 0.05
 
@@ -56,18 +59,20 @@ def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marke
     return found
 
 
-def face_texture(
-    model: TargetModel, box: Box, face: int, columns: int, rows: int, max_value: float = 255.0
-) -> NDArray[np.uint8] | None:
-    """Reflectance times ``max_value`` (rows, columns) of one face; None for a face without markers.
+@lru_cache(maxsize=64)
+def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.uint8] | None:
+    """Reflectance times 255 (rows, columns), at FINEST_TEXEL_M, of one face; None for a face without markers.
 
     Column 0 is at the left and row 0 on top, as seen from outside with the face's up direction upwards.
+    Read-only, and shared by all who ask for the same face.
     """
+    box = model.boxes[box_index]
     markers = markers_on_face(model, box, face)
     if not markers:
         return None
     width, height, _ = face_extent(box.size_m, face)
-    texture = np.full((rows, columns), float(box.shade))
+    shape = (max(2, round(height / FINEST_TEXEL_M)), max(2, round(width / FINEST_TEXEL_M)))
+    texture = np.full(shape, box.shade, dtype=np.float32)
     white = np.full((1, 1), WHITE)
     for marker, centre, _ in markers:  # all white borders first: they may reach under other markers
         half = marker.side_m / 2.0 + model.white_margin_m
@@ -75,11 +80,13 @@ def face_texture(
     for marker, centre, quarters in markers:
         cells = np.rot90(marker_cells(model.dictionary, marker.id), quarters)
         _print(texture, np.where(cells > 0, WHITE, BLACK), centre, marker.side_m / 2.0, width, height)
-    return np.rint(texture * max_value).astype(np.uint8)
+    finished = np.rint(texture * np.float32(255.0)).astype(np.uint8)
+    finished.setflags(write=False)
+    return finished
 
 
 def _print(
-    texture: Array, cells: Array, centre: Array, half_m: float, width_m: float, height_m: float
+    texture: NDArray[np.float32], cells: Array, centre: Array, half_m: float, width_m: float, height_m: float
 ) -> None:
     """Prints a square of cells, in place, by the share of each texel that each cell covers."""
     rows, columns = texture.shape
@@ -91,10 +98,10 @@ def _print(
     top, bottom = max(int(np.floor(y[0])), 0), min(int(np.ceil(y[-1])), rows)
     across = _coverage(x, left, right)
     down = _coverage(y, top, bottom)
-    covered = down.sum(axis=0)[:, None] * across.sum(axis=0)[None, :]
     patch = texture[top:bottom, left:right]
-    patch *= 1.0 - covered
-    patch += down.T @ cells @ across
+    uncovered = 1.0 - np.outer(down.sum(axis=0), across.sum(axis=0)).astype(np.float32)
+    patch *= uncovered
+    patch += (down.T @ cells @ across).astype(np.float32)
 
 
 def _coverage(edges: Array, first: int, last: int) -> Array:

@@ -39,10 +39,10 @@ _MAX_MOVE_PX = 4.0
 
 # Strips: borders narrower than this; sigma of an edge (pixel, lens and sampling together) and, as a standard
 # deviation of its logarithm, how well that is known; samples beyond the outer edge; Gauss-Newton steps.
-_STRIP_PX = 4.5
-_EDGE_SIGMA_PX, _EDGE_SIGMA_SPREAD = 0.75, 0.1
+_STRIP_PX = 4.0
+_EDGE_SIGMA_PX, _EDGE_SIGMA_SPREAD = 0.75, 0.15
 _STRIP_BEYOND_PX = 0.8
-_STRIP_ROWS, _STRIP_TAPS, _STRIP_STEPS = 20, 15, 5
+_STRIP_ROWS, _STRIP_TAPS, _STRIP_STEPS = 20, 15, 4
 # Corners of markers with cells or borders of few pixels are less certain: relative sigma
 # sqrt(1 + (this / width)^2), from the errors found in rendered pictures.
 _UNCERTAIN_PX = 2.0
@@ -69,6 +69,12 @@ class _Sides:
     normal: Array
     extent: Array
 
+    def one_by_one(self, quad: NDArray[np.intp], side: NDArray[np.intp]) -> _Sides:
+        """Chosen sides (k,), each as if it were the only one (k, 1) of its quad."""
+        chosen = (quad, side)
+        start, vector = self.start[chosen][:, None], self.vector[chosen][:, None]
+        return _Sides(start, vector, self.normal[chosen][:, None], self.extent[chosen][:, None])
+
 
 def refine(
     image: NDArray[np.uint8], camera: Camera, corners_ideal_px: Array, cells: int, margin_share: Array
@@ -91,12 +97,17 @@ def refine(
     good &= moved < _MAX_MOVE_PX
     refined = np.where(good[:, None, None], refined, corners)
 
-    narrow = np.minimum(_sides(refined).extent.min(axis=1) * margin_share, np.inf) < _STRIP_PX
-    chosen = np.flatnonzero(good & narrow)
-    if len(chosen):
-        refined[chosen], fitted = _strip_pass(image, camera, refined[chosen], cells, margin_share[chosen])
-        good[chosen] &= fitted
-    finest = _sides(refined).extent.min(axis=1) * np.minimum(margin_share, 1.0 / cells)
+    sides = _sides(refined)
+    width = sides.extent * margin_share[:, None]
+    quad, side = np.nonzero((width < _STRIP_PX) & good[:, None])
+    if len(quad):
+        shift = np.zeros_like(width)
+        shift[quad, side] = _strip_shift(
+            image, camera, sides.one_by_one(quad, side), cells, width[quad, side]
+        )
+        refined, crossing = _corners_of(sides, shift, shift, good)
+        good &= crossing
+    finest = sides.extent.min(axis=1) * np.minimum(margin_share, 1.0 / cells)
     sigma = np.sqrt(1.0 + (_UNCERTAIN_PX / np.maximum(finest, 0.1)) ** 2)
     return Refined(refined, good, sigma)
 
@@ -161,16 +172,15 @@ def _centroid_pass(
     return _corners_of(sides, level - 0.5 * slope, level + 0.5 * slope, np.all(enough, axis=1))
 
 
-def _strip_pass(
-    image: NDArray[np.uint8], camera: Camera, corners: Array, cells: int, margin_share: Array
-) -> tuple[Array, NDArray[np.bool_]]:
-    """Moves each side by what the mean profile across it says of a blurred strip of known width.
+def _strip_shift(
+    image: NDArray[np.uint8], camera: Camera, sides: _Sides, cells: int, border_px: Array
+) -> Array:
+    """How far out (k,) sides (k, 1) have to be moved, from the profile of a blurred strip of known width.
 
     Model: b + a Phi((s - e) / sigma) - d Phi((s - e - m) / sigma), with Phi the normal distribution function
     and m the border's width; b, a, d, e by least squares, sigma with a prior.
     """
-    sides = _sides(corners)
-    width = (margin_share[:, None] * sides.extent)[..., None]  # m
+    width = border_px[:, None, None]  # m
     inner = np.clip(_REACH_CELLS / cells * sides.extent, _REACH_LEAST_PX, _PASSES[-1].reach_px)
     outer = np.minimum(width[..., 0] + _STRIP_BEYOND_PX, _PASSES[-1].reach_px)
     s = (outer + inner)[..., None] * np.linspace(0.0, 1.0, _STRIP_TAPS) - inner[..., None]
@@ -204,10 +214,7 @@ def _strip_pass(
         step = np.linalg.solve(normal, right[..., None])[..., 0]
         shift = np.clip(shift + np.clip(step[..., 3], -0.4, 0.4), -1.0, 1.0)
         log_sigma = log_sigma + np.clip(step[..., 4], -0.2, 0.2)
-    shift = np.where(width[..., 0] < _STRIP_PX, shift, 0.0)
-    return _corners_of(
-        sides, shift, shift, np.all(inside.sum(axis=-1) >= _MIN_ROWS_SHARE * _STRIP_ROWS, axis=1)
-    )
+    return shift[:, 0]
 
 
 def _normal_pdf(z: Array) -> Array:

@@ -34,7 +34,9 @@ def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dicti
 
 
 def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple[pnp.PoseSolution, ...]:
-    """EPnP on all corners (n, 4, 2) of markers whose corners are at ``points_trf_m`` (n, 4, 3): one pose, or none when it is not finite or behind.
+    """EPnP on all corners (n, 4, 2), ideal pixels, of markers with corners at ``points_trf_m`` (n, 4, 3).
+
+    One pose, or none when it is not finite or behind the camera.
 
     Its covariance is the first-order one at that pose, from its own residuals.
     """

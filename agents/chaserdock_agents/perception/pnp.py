@@ -31,6 +31,9 @@ MAX_RMS_PX = 2.0
 # The second solution of a plane is kept when its -2 log likelihood is no more than this above the first's.
 _AMBIGUITY_LIMIT = 25.0
 _CANDIDATE_MARKERS = 6
+# A lone marker is a false id when this many others ought to be as plain to see and none is.
+_MAX_MISSING = 3
+_FRAME_MARGIN_PX = 8.0
 
 
 @dataclass(frozen=True)
@@ -103,9 +106,10 @@ def solve(
 
     ``which`` (n,): row of ``table`` of each detection, a row may occur more than once; ``corners_ideal_px``
     (n, 4, 2); ``relative_sigma`` (n,): uncertainty of a detection's corners, over that of the best.
-    None (and no indices) when nothing is explained well, when a single marker is seen at a grazing angle, or
-    when the detections fall into two camps of equal strength that contradict each other. Two when the markers
-    lie in one plane and its tilt cannot be told from its mirror image.
+    None (and no indices) when nothing is explained well, when a single marker is seen at a grazing angle or
+    without the many others that its pose would show, or when the detections fall into two camps of equal
+    strength that contradict each other. Two when the markers lie in one plane and its tilt cannot be told from
+    its mirror image.
     """
     nothing: tuple[tuple[PoseSolution, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
     if not len(which):
@@ -131,7 +135,13 @@ def solve(
     if not solutions or solutions[0].reprojection_rms_px > MAX_RMS_PX:
         return nothing
     if len(used) == 1:
-        solutions = [s for s in solutions if _view_cosine(table, int(seen.which[0]), s) >= MIN_SINGLE_COSINE]
+        row = int(seen.which[0])
+        solutions = [
+            s
+            for s in solutions
+            if _view_cosines(table, s)[row] >= MIN_SINGLE_COSINE
+            and _missing(camera, table, row, s) < _MAX_MISSING
+        ]
     return (tuple(solutions), used) if solutions else nothing
 
 
@@ -291,10 +301,25 @@ def _marker_errors(seen: _Seen, pose: _Pose) -> Array:
     return np.where(np.isfinite(error) & facing, error, np.inf)
 
 
-def _view_cosine(table: MarkerTable, row: int, solution: PoseSolution) -> float:
-    normal = rotations.rotate(solution.q_irf_trf_wxyz, table.rotations[row][:, 2])
-    centre = rotations.rotate(solution.q_irf_trf_wxyz, table.origins[row]) + solution.position_irf_m
-    return float(-normal @ centre / np.linalg.norm(centre))
+def _view_cosines(table: MarkerTable, solution: PoseSolution) -> Array:
+    """Cosine (m,) of the angle at which each marker is seen: 1 from straight ahead, negative from behind."""
+    rotation = rotations.to_matrix(solution.q_irf_trf_wxyz)
+    centres = table.origins @ rotation.T + solution.position_irf_m
+    normals = table.rotations[:, :, 2] @ rotation.T
+    return -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
+
+
+def _missing(camera: Camera, table: MarkerTable, row: int, solution: PoseSolution) -> int:
+    """How many markers other than ``row`` should be as plain to see as that one, if the pose were right."""
+    at = table.corners @ rotations.to_matrix(solution.q_irf_trf_wxyz).T + solution.position_irf_m
+    px = camera.project_ideal(at)
+    size = np.abs(px[:, (1, 2, 3, 0)] - px).max(axis=-1).min(axis=-1)
+    frame = np.array([camera.width_px, camera.height_px]) - 1.0 - _FRAME_MARGIN_PX
+    inside = ((px > _FRAME_MARGIN_PX) & (px < frame)).all(axis=(1, 2))
+    cosines = _view_cosines(table, solution)
+    plain = inside & (size >= 0.6 * size[row]) & (cosines >= max(0.3, 0.7 * float(cosines[row])))
+    plain[row] = False
+    return int(plain.sum())
 
 
 def _matrix(rotation_vector: object) -> Array:

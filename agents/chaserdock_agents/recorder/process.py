@@ -15,12 +15,13 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.log import LogError, LogWriter
 from chaserdock_protocol.messages import ActuatorCommand, Farewell, MissionEnd, Presence, RecorderAck, SolverStatus, Tick
-from chaserdock_protocol.presence import JoinRefused, PresenceTeller, join, new_instance
+from chaserdock_protocol.presence import JoinRefused, PresenceTeller, health_of, join, new_instance
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.transport import Node, Raw, TransportError
 
 LOG_NAME = "mission.mcap"
 _DRAIN_S = 10.0
+_HEALTH_TICKS = 15
 
 
 def main(options: ProcessOptions) -> int:
@@ -130,6 +131,8 @@ class Recorder:
         if held > self._acked:
             self._acked = held
             self.node.publish(topics.ACK, RecorderAck(tick=held))
+            if held % _HEALTH_TICKS == 0:
+                self.node.publish(topics.HEALTH, health_of(self.node, held, 0), "recorder")
 
     def missing(self) -> dict[str, int]:
         """Messages that were published, by their publishers' own account, and never came."""

@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from chaserdock_controller.nmpc.checks import check_ids, check_input, check_shift, warm_start
 from chaserdock_controller.nmpc.cost import plan_cost
 from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, roll
 from chaserdock_controller.nmpc.planes import plan_violation
@@ -27,10 +28,6 @@ from chaserdock_controller.nmpc.types import (
     NmpcInput,
     NmpcParameters,
     NmpcPlan,
-    check_ids,
-    check_input,
-    check_shift,
-    shift_inputs,
 )
 
 MAX_ITERATIONS = 200
@@ -98,19 +95,17 @@ class IpoptSolver:
         n, d = len(checked.states), params.stages
         names = check_ids(ids, n)
         shift_s = check_shift(shift_s)
-        u = np.empty((n, d, 6))
-        for row, name in enumerate(names):
-            last = self._plans.get(name)
-            u[row] = checked.u_ref[row] if last is None else shift_inputs(last, shift_s, params.dt_s)
         limits = checked.input_max
-        u = np.clip(u, -limits[:, None, :], limits[:, None, :])
+        u = warm_start(self._plans, names, checked, shift_s, params.dt_s)
         x = np.empty((n, d + 1, 13))
         x[:, 0] = checked.states
         self._roll(x, u)
 
         programme = self._programme(n)
         nlp = programme.nlp
-        farthest = float(np.max(np.linalg.norm(checked.states[:, :3] - checked.references[:, -1, :3], axis=-1)))
+        farthest = float(
+            np.max(np.linalg.norm(checked.states[:, :3] - checked.references[:, -1, :3], axis=-1))
+        )
         between = np.asarray(checked.min_distance_chasers_m)
         upper = between[np.triu_indices(n, 1)]
         parameters: list[Array] = []
@@ -137,7 +132,9 @@ class IpoptSolver:
             u = np.ascontiguousarray(np.clip(solution, -limits[:, None, :], limits[:, None, :]))
             self._roll(x, u)
         cost, violation = np.empty(n), np.empty(n)
-        plan_cost(x, u, checked.references, checked.u_ref, self._weights_p, self._weights_q, self._weights_u, cost)
+        plan_cost(
+            x, u, checked.references, checked.u_ref, self._weights_p, self._weights_q, self._weights_u, cost
+        )
         plan_violation(
             x, checked.references, checked.target_positions, checked.min_distance_target_m, between,
             params.max_reference_distance_m, violation,

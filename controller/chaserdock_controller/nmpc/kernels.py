@@ -71,32 +71,21 @@ def step(x, u, h, nodes, weights, mass, inertia, inverse, out, work):
 def linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, c_mat, b_mat, work, sens):
     """One step as in `step`, with its Jacobians C (12, 6) and B (12, 6).
 
-    work (24,); sens (24, 9) holds the sensitivities to [dtheta, domega, torque] of, in rows: q at the stage
-    (4), omega at the stage (3), q' (4), omega' (3), acceleration (3), their sums p (3) and v (3).
-    The sums for q and omega are kept in rows 20..23 and in c_mat's and b_mat's last rows.
+    work (54,) and sens (27, 9) are scratch. sens holds the sensitivities to [dtheta, domega, torque] of, in
+    rows: q' (4), omega' (3) and acceleration (3) at the last stage; the sums for p (3), v (3), q (4) and
+    omega (3); q at the start (4).
     """
     q, w, kq, kw, a = work[0:4], work[4:7], work[7:11], work[11:14], work[14:17]
-    dq, dw, dkq, dkw, da, dp, dv = (
-        sens[0:4],
-        sens[4:7],
-        sens[7:11],
-        sens[11:14],
-        sens[14:17],
-        sens[17:20],
-        sens[20:23],
-    )
-    sum_q = np.zeros((4, 9))
-    dq0 = np.zeros((4, 9))
-    sum_w = np.zeros((3, 9))
-    m = np.empty((3, 4))
-    jac = np.empty((3, 3))
-    rot = np.zeros((3, 3))
+    m, jac, rot = work[24:36].reshape((3, 4)), work[36:45].reshape((3, 3)), work[45:54].reshape((3, 3))
+    dkq, dkw, da = sens[0:4], sens[4:7], sens[7:10]
+    dp, dv, sum_q, sum_w, dq0 = sens[10:13], sens[13:16], sens[16:20], sens[20:23], sens[23:27]
     sens[:] = 0.0
     work[:] = 0.0
     c_mat[:] = 0.0
     b_mat[:] = 0.0
     for i in range(13):
         out[i] = x[i]
+    per_mass = 1.0 / mass
     # dq = q (x) (0, dtheta / 2)
     w0, x0, y0, z0 = 0.5 * x[6], 0.5 * x[7], 0.5 * x[8], 0.5 * x[9]
     sum_q[0, 0], sum_q[0, 1], sum_q[0, 2] = -x0, -y0, -z0
@@ -113,19 +102,13 @@ def linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, c_mat, b_mat
         b = h * weights[s]
         for i in range(4):
             q[i] = x[6 + i] + c * kq[i]
-            for j in range(9):
-                dq[i, j] = dq0[i, j] + c * dkq[i, j]
         for i in range(3):
             w[i] = x[10 + i] + c * kw[i]
             out[i] += b * (x[3 + i] + c * a[i])
-            for j in range(9):
-                dw[i, j] = c * dkw[i, j]
-                dp[i, j] += b * c * da[i, j]
-            dw[i, 3 + i] += 1.0
             for j in range(3):
-                b_mat[i, j] += b * c * rot[i, j] / mass
+                b_mat[i, j] += b * c * rot[i, j]
         body_rates(q, w, u, mass, inertia, inverse, a, kq, kw)
-        # d(rotate(q, F))/dq, and the rotation itself, which is d(rotate)/dF
+        # d(acceleration)/dq, and the rotation over the mass, which is d(acceleration)/dF
         f0, f1, f2, qw, qx, qy, qz = u[0], u[1], u[2], q[0], q[1], q[2], q[3]
         dot = qx * f0 + qy * f1 + qz * f2
         m[0, 0] = 2.0 * (qy * f2 - qz * f1)
@@ -149,6 +132,11 @@ def linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, c_mat, b_mat
         rot[2, 0] = 2.0 * (qx * qz - qw * qy)
         rot[2, 1] = 2.0 * (qy * qz + qw * qx)
         rot[2, 2] = 1.0 - 2.0 * (qx * qx + qy * qy)
+        for i in range(3):
+            for j in range(4):
+                m[i, j] *= per_mass
+            for j in range(3):
+                rot[i, j] *= per_mass
         # d omega' / d omega = I^-1 ([I w]x - [w]x I)
         l0 = inertia[0, 0] * w[0] + inertia[0, 1] * w[1] + inertia[0, 2] * w[2]
         l1 = inertia[1, 0] * w[0] + inertia[1, 1] * w[1] + inertia[1, 2] * w[2]
@@ -168,29 +156,43 @@ def linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, c_mat, b_mat
                 g1 -= l0
             for i in range(3):
                 jac[i, j] = inverse[i, 0] * g0 + inverse[i, 1] * g1 + inverse[i, 2] * g2
+        bc = b * c
         for j in range(9):
-            d0, d1, d2, d3 = dq[0, j], dq[1, j], dq[2, j], dq[3, j]
-            e0, e1, e2 = dw[0, j], dw[1, j], dw[2, j]
-            dkq[0, j] = 0.5 * (-d1 * w[0] - d2 * w[1] - d3 * w[2] - qx * e0 - qy * e1 - qz * e2)
-            dkq[1, j] = 0.5 * (d0 * w[0] + d2 * w[2] - d3 * w[1] + qw * e0 + qy * e2 - qz * e1)
-            dkq[2, j] = 0.5 * (d0 * w[1] + d3 * w[0] - d1 * w[2] + qw * e1 + qz * e0 - qx * e2)
-            dkq[3, j] = 0.5 * (d0 * w[2] + d1 * w[1] - d2 * w[0] + qw * e2 + qx * e1 - qy * e0)
+            d0, d1 = dq0[0, j] + c * dkq[0, j], dq0[1, j] + c * dkq[1, j]
+            d2, d3 = dq0[2, j] + c * dkq[2, j], dq0[3, j] + c * dkq[3, j]
+            e0, e1, e2 = c * dkw[0, j], c * dkw[1, j], c * dkw[2, j]
+            if j == 3:
+                e0 += 1.0
+            elif j == 4:
+                e1 += 1.0
+            elif j == 5:
+                e2 += 1.0
+            g0 = 0.5 * (-d1 * w[0] - d2 * w[1] - d3 * w[2] - qx * e0 - qy * e1 - qz * e2)
+            g1 = 0.5 * (d0 * w[0] + d2 * w[2] - d3 * w[1] + qw * e0 + qy * e2 - qz * e1)
+            g2 = 0.5 * (d0 * w[1] + d3 * w[0] - d1 * w[2] + qw * e1 + qz * e0 - qx * e2)
+            g3 = 0.5 * (d0 * w[2] + d1 * w[1] - d2 * w[0] + qw * e2 + qx * e1 - qy * e0)
+            dkq[0, j], dkq[1, j], dkq[2, j], dkq[3, j] = g0, g1, g2, g3
+            sum_q[0, j] += b * g0
+            sum_q[1, j] += b * g1
+            sum_q[2, j] += b * g2
+            sum_q[3, j] += b * g3
             for i in range(3):
-                dkw[i, j] = jac[i, 0] * e0 + jac[i, 1] * e1 + jac[i, 2] * e2
-                da[i, j] = (m[i, 0] * d0 + m[i, 1] * d1 + m[i, 2] * d2 + m[i, 3] * d3) / mass
+                t = jac[i, 0] * e0 + jac[i, 1] * e1 + jac[i, 2] * e2
+                if j >= 6:
+                    t += inverse[i, j - 6]
+                dkw[i, j] = t
+                sum_w[i, j] += b * t
+                t = m[i, 0] * d0 + m[i, 1] * d1 + m[i, 2] * d2 + m[i, 3] * d3
+                dp[i, j] += bc * da[i, j]
+                da[i, j] = t
+                dv[i, j] += b * t
         for i in range(3):
             out[3 + i] += b * a[i]
             out[10 + i] += b * kw[i]
             for j in range(3):
-                dkw[i, 6 + j] += inverse[i, j]
-                b_mat[3 + i, j] += b * rot[i, j] / mass
-            for j in range(9):
-                dv[i, j] += b * da[i, j]
-                sum_w[i, j] += b * dkw[i, j]
+                b_mat[3 + i, j] += b * rot[i, j]
         for i in range(4):
             out[6 + i] += b * kq[i]
-            for j in range(9):
-                sum_q[i, j] += b * dkq[i, j]
     norm = np.sqrt(out[6] * out[6] + out[7] * out[7] + out[8] * out[8] + out[9] * out[9])
     for i in range(4):
         out[6 + i] /= norm
@@ -227,8 +229,8 @@ def roll_linearized(x, u, limits, h, nodes, weights, mass, inertia, inverse, c_m
 
     B is that of the scaled inputs u / limits (N, 6): its columns are multiplied by the limits.
     """
-    work = np.empty(24)
-    sens = np.empty((24, 9))
+    work = np.empty(54)
+    sens = np.empty((27, 9))
     for i in range(u.shape[0]):
         for k in range(u.shape[1]):
             linearize(

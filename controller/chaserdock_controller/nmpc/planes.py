@@ -149,7 +149,7 @@ def build_rows(x, references, targets, to_target, between, outer, reach, row_a, 
                 room = 0.0
                 for c in range(3):
                     room += 0.5 * use[c] * (x[i, k, c] - x[j, k, c])
-                room -= 0.5 * d + MARGIN_M
+                room -= 0.5 * (d + MARGIN_M)
                 _push(row_a[i], row_c[i], n_rows[i], k, use, 1.0, room, reach[i, k])
                 _push(row_a[j], row_c[j], n_rows[j], k, use, -1.0, room, reach[j, k])
 

@@ -180,7 +180,7 @@ def build_nlp(n: int, params: NmpcParameters) -> Nlp:
     )
 
 
-def slack_l1_weight(params: NmpcParameters, farthest_m: float) -> float:
-    """L1 weight of the slacks when the farthest chaser is ``farthest_m`` from its reference."""
-    slope = 2.0 * (params.weight_final_position + params.weight_position) * farthest_m
+def slack_l1_weight(params: NmpcParameters, distance_m: float) -> float:
+    """L1 weight of the slacks of a chaser ``distance_m`` from its reference (of the farthest, if one for all)."""
+    slope = 2.0 * (params.weight_final_position + params.weight_position) * distance_m
     return max(SLACK_L1, SLACK_L1_OVER_SLOPE * slope)

@@ -16,6 +16,7 @@ import numpy as np
 from numba import njit
 
 from chaserdock_controller.nmpc import cost, ipm, riccati
+from chaserdock_controller.nmpc.checks import check_ids, check_input, check_shift, warm_start
 from chaserdock_controller.nmpc.cost import plan_cost, quadratic_model
 from chaserdock_controller.nmpc.ipm import BROKEN, LIMIT, solve_qp
 from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, roll, roll_linearized
@@ -31,10 +32,6 @@ from chaserdock_controller.nmpc.types import (
     NmpcInput,
     NmpcParameters,
     NmpcPlan,
-    check_ids,
-    check_input,
-    check_shift,
-    shift_inputs,
 )
 
 
@@ -47,7 +44,7 @@ def _make_kernel(source: str):
     @njit(cache=True, error_model="numpy")
     def optimize(
         x, u, refs, u_ref, limits, c_mats, b_mats, h, weights_p, weights_q, weights_u,
-        row_a, row_c, n_rows, w1, w2, codes, iterations, residuals,
+        row_a, row_c, n_rows, prices, w2, codes, iterations, residuals,
     ):  # fmt: skip
         """One QP for each chaser about x (N, D+1, 13), u (N, D, 6); the new inputs replace u.
 
@@ -70,7 +67,7 @@ def _make_kernel(source: str):
             )  # fmt: skip
             code, iterations[i], residuals[i, 0], residuals[i, 1], _, _ = solve_qp(
                 c_mats[i], b_mats[i], h, q_pos, q_att, qx, r_diag, r, w_bar, row_a[i], row_c[i], n_rows[i],
-                w1, w2, dx, dw,
+                prices[i], w2, dx, dw,
             )  # fmt: skip
             for k in range(stages):
                 for c in range(6):
@@ -152,12 +149,8 @@ class RtiSolver:
         n, d = len(checked.states), params.stages
         names = check_ids(ids, n)
         shift_s = check_shift(shift_s)
-        u = np.empty((n, d, 6))
-        for row, name in enumerate(names):
-            last = self._plans.get(name)
-            u[row] = checked.u_ref[row] if last is None else shift_inputs(last, shift_s, params.dt_s)
         limits = checked.input_max
-        u = np.clip(u, -limits[:, None, :], limits[:, None, :])
+        u = warm_start(self._plans, names, checked, shift_s, params.dt_s)
 
         x = np.empty((n, d + 1, 13))
         x[:, 0] = checked.states
@@ -176,10 +169,11 @@ class RtiSolver:
         )  # fmt: skip
         codes, iterations = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
         cost_, residuals, violation = np.empty(n), np.empty((n, 2)), np.empty(n)
-        farthest = float(np.sqrt(np.max(np.sum((checked.states[:, :3] - refs[:, -1, :3]) ** 2, axis=1))))
+        away = np.sqrt(np.sum((checked.states[:, :3] - refs[:, -1, :3]) ** 2, axis=1))
+        prices = np.array([slack_l1_weight(params, float(m)) for m in away])
         _optimize(
             x, u, refs, checked.u_ref, limits, c_mats, b_mats, h, self._weights_p, self._weights_q,
-            self._weights_u, row_a, row_c, n_rows, slack_l1_weight(params, farthest), SLACK_L2,
+            self._weights_u, row_a, row_c, n_rows, prices, SLACK_L2,
             codes, iterations, residuals,
         )  # fmt: skip
         roll(x, u, h, nodes, weights, params.mass_kg, self._inertia, self._inverse)

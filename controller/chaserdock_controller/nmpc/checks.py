@@ -1,0 +1,149 @@
+"""What every back end does to a problem before solving it: check it, and find where to start from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+
+from chaserdock_controller.nmpc.types import Array, NmpcInput, NmpcParameters
+
+# Measured quaternions are normalized; one this far off is a mistake, not a rounding error.
+QUATERNION_NORM_TOLERANCE = 0.1
+
+
+def _array(name: str, value: object, shape: tuple[int, ...]) -> Array:
+    array = np.array(value, dtype=np.float64, order="C")
+    if array.shape != shape:
+        raise ValueError(f"{name} must have shape {shape}, not {array.shape}")
+    return array
+
+
+@njit(cache=True, error_model="numpy")
+def _normalize_rows(array, first, stop):
+    """Normalizes the quaternions in columns first..first+3 of ``array`` (K, stop) in place.
+
+    Returns 1 for a value that is not finite, 2 for a quaternion far off unit length, else 0.
+    """
+    bad = 0
+    for i in range(len(array)):
+        norm = 0.0
+        for j in range(stop):
+            if not np.isfinite(array[i, j]):
+                return 1
+        for j in range(first, first + 4):
+            norm += array[i, j] * array[i, j]
+        norm = np.sqrt(norm)
+        if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
+            bad = 2
+        else:
+            for j in range(first, first + 4):
+                array[i, j] /= norm
+    return bad
+
+
+@njit(cache=True, error_model="numpy")
+def _smallest(array):
+    """The least value of a flat array; NaN if any value is not finite."""
+    least = np.inf
+    for value in array:
+        if not np.isfinite(value):
+            return np.nan
+        least = min(least, value)
+    return least
+
+
+def _poses(name: str, array: Array, first: int) -> None:
+    code = _normalize_rows(array.reshape(-1, array.shape[-1]), first, array.shape[-1])
+    if code == 1:
+        raise ValueError(f"{name} holds a value that is not finite")
+    if code == 2:
+        raise ValueError(f"{name} holds a quaternion that is not of unit length")
+
+
+def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
+    """A copy of ``problem`` with contiguous arrays, unit quaternions and (N, N) chaser distances.
+
+    Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
+    length, a negative distance or limit, an asymmetric distance matrix, or more than ``n_max`` chasers.
+    """
+    states = np.asarray(problem.states, dtype=np.float64)
+    if states.ndim != 2 or not 1 <= len(states) <= n_max:
+        raise ValueError(f"states must have shape (N, 13) with N from 1 to {n_max}, not {states.shape}")
+    n, d = len(states), params.stages
+    states = _array("states", states, (n, 13))
+    references = _array("references", problem.references, (n, d + 1, 7))
+    _poses("states", states, 6)
+    _poses("references", references, 3)
+    between = np.asarray(problem.min_distance_chasers_m, dtype=np.float64)
+    if between.ndim == 0:
+        between = np.full((n, n), float(between))
+    between = _array("min_distance_chasers_m", between, (n, n))
+    if n > 1 and (between != between.T).any():
+        raise ValueError("min_distance_chasers_m must be symmetric")
+    to_target = _array("min_distance_target_m", problem.min_distance_target_m, (n,))
+    input_max = _array("input_max", problem.input_max, (n, 6))
+    u_ref = _array("u_ref", problem.u_ref, (n, d, 6))
+    targets = _array("target_positions", problem.target_positions, (d + 1, 3))
+    for name, value, may_be_negative in (
+        ("min_distance_chasers_m", between, False),
+        ("min_distance_target_m", to_target, False),
+        ("input_max", input_max, False),
+        ("u_ref", u_ref, True),
+        ("target_positions", targets, True),
+    ):
+        least = _smallest(value.ravel())
+        if math.isnan(least):
+            raise ValueError(f"{name} holds a value that is not finite")
+        if least < 0.0 and not may_be_negative:
+            raise ValueError(f"{name} must not be negative")
+    return NmpcInput(
+        states=states,
+        references=references,
+        u_ref=u_ref,
+        target_positions=targets,
+        min_distance_target_m=to_target,
+        min_distance_chasers_m=between,
+        input_max=input_max,
+    )
+
+
+def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
+    """The chasers' identities, 0..N-1 if not given. Raises ValueError for a wrong number or a repetition."""
+    chosen = tuple(range(n)) if ids is None else tuple(int(i) for i in ids)
+    if len(chosen) != n or len(set(chosen)) != n:
+        raise ValueError(f"ids must be {n} different numbers, not {chosen}")
+    return chosen
+
+
+def check_shift(shift_s: float) -> float:
+    """The time since the previous solve, s. Raises ValueError if it is negative or not finite."""
+    if not (math.isfinite(shift_s) and shift_s >= 0.0):
+        raise ValueError(f"shift_s must be finite and not negative, not {shift_s!r}")
+    return float(shift_s)
+
+
+def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
+    """Piecewise constant inputs (..., D, 6) seen ``shift_s`` later on the same grid (..., D, 6).
+
+    Each new value is the mean of the old plan over its interval, so the impulse is kept; beyond the old
+    horizon the last value is held.
+    """
+    d = inputs.shape[-2]
+    whole, part = divmod(shift_s / dt_s, 1.0)
+    first = np.minimum(np.arange(d) + int(min(whole, d)), d - 1)
+    return (1.0 - part) * inputs[..., first, :] + part * inputs[..., np.minimum(first + 1, d - 1), :]
+
+
+def warm_start(
+    plans: dict[int, Array], names: tuple[int, ...], problem: NmpcInput, shift_s: float, dt_s: float
+) -> Array:
+    """Inputs (N, D, 6) to start from, within the box: each chaser's shifted plan, its u_ref if it has none."""
+    start = problem.u_ref.copy()
+    known = [row for row, name in enumerate(names) if name in plans]
+    if known:
+        start[known] = shift_inputs(np.stack([plans[names[row]] for row in known]), shift_s, dt_s)
+    limits = problem.input_max[:, None, :]
+    return np.minimum(np.maximum(start, -limits), limits)

@@ -1,0 +1,251 @@
+"""The NMPC's own quadratic programme, held against dense linear algebra, and what it refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_controller.nmpc import (
+    NmpcInput,
+    kernels,
+    make_solver,
+    planes,
+    riccati,
+)
+from chaserdock_controller.nmpc.cost import plan_cost, quadratic_model
+from chaserdock_controller.nmpc.ipm import CONVERGED, MU_STOP, solve_qp
+from chaserdock_controller.nmpc.problem import SLACK_L1, SLACK_L2
+from chaserdock_protocol import rotations
+from nmpc_cases import (
+    INVERSE,
+    MASS_KG,
+    MATRIX,
+    NODES,
+    PARAMS,
+    WEIGHTS,
+    Array,
+    at_rest,
+    far_start,
+    fixed_problem,
+    fresh,
+    solver,
+    tumbling,
+)
+
+
+def qp_data(problem: NmpcInput, u: Array) -> tuple[list[list[Any]], list[list[Any]], Array]:
+    """solve_qp's matrices for each chaser, linearized about u (N, D, 6), and the rolled states."""
+    n, d = len(problem.states), PARAMS.stages
+    weights_p, weights_q = PARAMS.stage_weights()
+    weights_u = np.array([3.5] * 3 + [40.0] * 3)
+    x, c, b = np.empty((n, d + 1, 13)), np.empty((n, d, 12, 6)), np.empty((n, d, 12, 6))
+    x[:, 0] = problem.states
+    kernels.roll_linearized(x, u, problem.input_max, 0.1, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE, c, b)
+    row_a, row_c = np.zeros((n, d + 1, n + 1, 3)), np.zeros((n, d + 1, n + 1))
+    n_rows = np.zeros((n, d + 1), dtype=np.int64)
+    planes.build_rows(
+        x, problem.references, problem.target_positions, problem.min_distance_target_m,
+        np.full((n, n), problem.min_distance_chasers_m), 25.0, np.full((n, d + 1), 10.0), row_a, row_c, n_rows,
+    )  # fmt: skip
+    data, rows = [], []
+    for i in range(n):
+        q_pos, q_att, qx = np.empty((d + 1, 3, 3)), np.empty((d + 1, 3, 3)), np.empty((d + 1, 12))
+        r_diag, r, w_bar = np.empty((d, 6)), np.empty((d, 6)), np.empty((d, 6))
+        quadratic_model(
+            x[i], u[i], problem.references[i], problem.u_ref[i], problem.input_max[i],
+            weights_p, weights_q, weights_u, q_pos, q_att, qx, r_diag, r, w_bar,
+        )  # fmt: skip
+        data.append([c[i], b[i], 0.1, q_pos, q_att, qx, r_diag, r, w_bar])
+        rows.append([row_a[i], row_c[i], n_rows[i]])
+    return data, rows, x
+
+
+def condensed(data: list[Any]) -> tuple[Array, Array, Array]:
+    """Dense gradient, Hessian (6 D) and the maps (D+1, 12, 6 D) from inputs to states, by brute force."""
+    c, b, h, q_pos, q_att, qx, r_diag, r, _ = data
+    d = len(c)
+    maps = np.zeros((d + 1, 12, 6 * d))
+    for k in range(d):
+        a = np.zeros((12, 12))
+        a[:6, :6] = np.eye(6)
+        a[:3, 3:6] = h * np.eye(3)
+        a[:, 6:] = c[k]
+        maps[k + 1] = a @ maps[k]
+        maps[k + 1][:, 6 * k : 6 * k + 6] += b[k]
+    hessian, gradient = np.diag(r_diag.ravel()), r.ravel().copy()
+    for k in range(d + 1):
+        q = np.zeros((12, 12))
+        q[:3, :3], q[6:9, 6:9] = q_pos[k], q_att[k]
+        hessian += maps[k].T @ q @ maps[k]
+        gradient += maps[k].T @ qx[k]
+    return gradient, hessian, maps
+
+
+def random_inputs(seed: int, n: int, share: float) -> Array:
+    rng = np.random.default_rng(seed)
+    return share * PARAMS.input_limits() * rng.uniform(-1, 1, size=(n, PARAMS.stages, 6))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_riccati_minimizes_the_quadratic_model(seed: int) -> None:
+    problem_at, states = tumbling(1)
+    states[:, :3] += 0.1
+    data, _, _ = qp_data(problem_at(states, 0.0), random_inputs(seed, 1, 0.5))
+    c, b, h, q_pos, q_att, qx, r_diag, r, _ = data[0]
+    gain, chol = np.empty((30, 6, 12)), np.zeros((30, 6, 6))
+    dx, dw = np.zeros((31, 12)), np.zeros((30, 6))
+    assert riccati.factor(c, b, h, q_pos, q_att, r_diag, gain, chol)
+    riccati.solve(c, b, h, gain, chol, qx, r, dx, dw)
+    gradient, hessian, maps = condensed(data[0])
+    expected = -np.linalg.solve(hessian, gradient)
+    np.testing.assert_allclose(dw.ravel(), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(dx, maps @ dw.ravel(), rtol=0, atol=1e-8)
+
+
+def test_quadratic_model_is_the_costs_first_order() -> None:
+    """Its gradient equals finite differences of the nonlinear cost along the nonlinear dynamics."""
+    problem_at, states = tumbling(1)
+    states[0, 6:10] = rotations.multiply(states[0, 6:10], rotations.exp([0.8, -0.5, 0.4]))
+    problem, u = problem_at(states, 0.0), random_inputs(3, 1, 0.5)
+    gradient, _, _ = condensed(qp_data(problem, u)[0][0])
+
+    def cost(inputs: Array) -> float:
+        x, value = np.empty((1, 31, 13)), np.empty(1)
+        x[:, 0] = states
+        kernels.roll(x, inputs, 0.1, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE)
+        weights = np.array([3.5] * 3 + [40.0] * 3)
+        plan_cost(x, inputs, problem.references, problem.u_ref, *PARAMS.stage_weights(), weights, value)
+        return float(value[0])
+
+    limits = PARAMS.input_limits()
+    for k in (0, 7, 29):
+        for j in range(6):
+            e = np.zeros_like(u)
+            e[0, k, j] = 1e-4 * limits[j]
+            slope = (cost(u + e) - cost(u - e)) / 2e-4
+            assert gradient[6 * k + j] == pytest.approx(slope, rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_interior_point_meets_the_kkt_conditions(seed: int) -> None:
+    """Two chasers swapping, saturated, with distances active; conditions evaluated densely."""
+    rng = np.random.default_rng(seed)
+    states = np.array([at_rest(np.array([-0.25, 0.6, 0.0])), at_rest(np.array([0.25, 0.6, 0.05]))])
+    states[:, 3:6] = rng.normal(scale=0.05, size=(2, 3))
+    problem = fixed_problem(states, np.array([[0.8, 0.5, 0], [-0.8, 0.5, 0.0]]), rotations.exp([0, 0, 0.7]))
+    data, rows, _ = qp_data(problem, random_inputs(seed, 2, 0.3))
+    active = 0
+    for one, (row_a, row_c, n_rows) in zip(data, rows, strict=True):
+        dx, dw = np.zeros((31, 12)), np.zeros((30, 6))
+        # The Python source of the kernel, so that the test does not wait for a second compilation.
+        run: Callable[..., Any] = solve_qp.py_func
+        code, iterations, _, mu, lam, box = run(*one, row_a, row_c, n_rows, SLACK_L1, SLACK_L2, dx, dw)
+        assert code == CONVERGED
+        assert 0 < iterations < 30
+        gradient, hessian, maps = condensed(one)
+        w = one[-1] + dw
+        assert np.all(np.abs(w) < 1.0)
+        stationarity = gradient + hessian @ dw.ravel() - (box[:, :, 0] - box[:, :, 1]).ravel()
+        for k in range(1, 31):
+            for m in range(n_rows[k]):
+                normal = maps[k][:3].T @ row_a[k, m]
+                stationarity -= lam[k, m] * normal
+                gap = normal @ dw.ravel() - row_c[k, m]
+                slack = max(-gap, 0.0)
+                assert 0.0 < lam[k, m] < SLACK_L1 + SLACK_L2 * slack + 1.0
+                assert lam[k, m] * (gap + slack) < 60 * MU_STOP * len(w)
+                active += lam[k, m] > 1.0
+        assert np.max(np.abs(stationarity)) < 1e-5 * np.max(np.abs(gradient))
+        assert np.all(box > 0.0)
+        assert mu <= MU_STOP
+        assert np.max(np.minimum(box[:, :, 0] * (1 + w), 1e9)) < 400 * MU_STOP
+    assert active > 0
+
+
+def test_free_solution_needs_no_interior_point() -> None:
+    problem_at, states = tumbling(4)
+    plan = fresh("rti", 4).solve(problem_at(states, 0.0), 0.0)
+    assert plan.status == ("solved",) * 4
+    assert not plan.iterations.any()
+
+
+# Bad input
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"mass_kg": 0.0}, "mass_kg"),
+        ({"mass_kg": float("nan")}, "mass_kg"),
+        ({"weight_position": -1.0}, "weight_position"),
+        ({"weight_torque": 0.0}, "weight_torque"),
+        ({"horizon_s": 0.04}, "horizon_s"),
+        ({"dt_s": 0.0}, "dt_s"),
+        ({"falloff": 1.5}, "falloff"),
+        ({"force_max_N": -2.0}, "force_max_N"),
+        ({"integrator": "heun"}, "integrator"),
+        ({"max_reference_distance_m": 0.0}, "max_reference_distance_m"),
+        ({"inertia_kg_m2": ((1.0, 2.0, 0.0), (2.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "positive definite"),
+        ({"inertia_kg_m2": ((1.0, 0.1, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))}, "symmetric"),
+    ],
+)
+def test_parameters_are_checked(change: dict[str, object], word: str) -> None:
+    with pytest.raises(ValueError, match=word):
+        replace(PARAMS, **change)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("name", ["rti", "ipopt"])
+@pytest.mark.parametrize(
+    ("field", "value", "word"),
+    [
+        ("states", np.full((1, 13), np.nan), "finite"),
+        ("states", np.zeros((1, 12)), "shape"),
+        ("states", np.zeros((1, 13)), "quaternion"),
+        ("states", np.zeros((0, 13)), "shape"),
+        ("references", np.zeros((1, 30, 7)), "references"),
+        ("u_ref", np.full((1, 30, 6), np.inf), "u_ref"),
+        ("target_positions", np.zeros((31, 2)), "target_positions"),
+        ("min_distance_target_m", np.array([-0.1]), "min_distance_target_m"),
+        ("min_distance_chasers_m", np.zeros((2, 2)), "min_distance_chasers_m"),
+        ("input_max", np.full((1, 6), -1.0), "input_max"),
+    ],
+)
+def test_problems_are_checked(name: str, field: str, value: Array, word: str) -> None:
+    problem_at, states = tumbling(1)
+    problem = replace(problem_at(states, 0.0), **{field: value})
+    with pytest.raises(ValueError, match=word):
+        fresh(name, 1).solve(problem, 0.0)
+
+
+def test_calls_are_checked() -> None:
+    problem_at, states = tumbling(2)
+    problem = problem_at(states, 0.0)
+    with pytest.raises(ValueError, match="N from 1 to 1"):
+        fresh("rti", 1).solve(problem, 0.0)
+    chosen = fresh("rti", 2)
+    with pytest.raises(ValueError, match="ids"):
+        chosen.solve(problem, 0.0, ids=[3, 3])
+    with pytest.raises(ValueError, match="shift_s"):
+        chosen.solve(problem, -0.1)
+    lopsided = replace(problem, min_distance_chasers_m=np.array([[0.0, 0.3], [0.4, 0.0]]))
+    with pytest.raises(ValueError, match="symmetric"):
+        chosen.solve(lopsided, 0.0)
+    with pytest.raises(ValueError, match="rti, ipopt"):
+        make_solver("snopt", PARAMS, 1)
+    with pytest.raises(ValueError, match="n_chasers"):
+        make_solver("rti", PARAMS, 0)
+
+
+def test_inputs_are_not_written_to() -> None:
+    problem_at, states = far_start(2)
+    problem = problem_at(states, 0.0)
+    before = [np.copy(getattr(problem, f)) for f in problem.__dataclass_fields__]
+    plan = fresh("rti", 2).solve(problem, 0.0)
+    kept = plan.inputs.copy()
+    solver("rti", 2).solve(problem, 0.1)
+    for old, f in zip(before, problem.__dataclass_fields__, strict=True):
+        np.testing.assert_array_equal(old, getattr(problem, f))
+    np.testing.assert_array_equal(kept, plan.inputs)

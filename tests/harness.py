@@ -31,9 +31,9 @@ SHORT = (
 def chaserdock(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
     """Starts the program, as an installed command would."""
     env = {**os.environ, **SINGLE_THREADED, **options.pop("env", {})}
-    return subprocess.Popen(
-        [sys.executable, "-m", "chaserdock_agents", *arguments], env=env, cwd=ROOT, **options
-    )
+    command = [sys.executable, "-m", "chaserdock_agents", *arguments]
+    process: subprocess.Popen[bytes] = subprocess.Popen(command, env=env, cwd=ROOT, **options)
+    return process
 
 
 def finished(*arguments: str, timeout_s: float = 120.0, **options: Any) -> tuple[int, str]:

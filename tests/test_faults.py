@@ -102,15 +102,17 @@ def foreign_session(by_hand: ByHand) -> zenoh.Session:
 
 def malformed_messages() -> list[tuple[str, bytes, str]]:
     """Keys, payloads and encodings that every process must refuse."""
-    still = {"position_m": (0.0,) * 3, "velocity_m_s": (0.0,) * 3, "omega_rad_s": (0.0,) * 3}
-    odometry = Odometry(chaser=0, q_wxyz=(1.0, 0.0, 0.0, 0.0), **still)
+    zero = (0.0, 0.0, 0.0)
+    odometry = Odometry(
+        chaser=0, q_wxyz=(1.0, 0.0, 0.0, 0.0), position_m=zero, velocity_m_s=zero, omega_rad_s=zero
+    )
     wrench = WrenchCommand(
         chaser=0,
         effective_time_ns=0,
         expires_ns=10**15,
         mode="nmpc",
-        force_N=(0.0,) * 3,
-        torque_N_m=(0.0,) * 3,
+        force_N=zero,
+        torque_N_m=zero,
     )
     sighting = Sighting(
         chaser=0, status="nothing", solutions=(), marker_ids=(), corners_px=(), rejected_ids=()
@@ -131,7 +133,7 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
 
 
 def test_refusals_in_flight(tmp_path: Path) -> None:
-    """Second world, second chaser, chaser out of range, malformed messages, commands: answered, and the flight goes on."""
+    """Second world, second chaser, chaser out of range, malformed messages, commands; the flight goes on."""
     by_hand = ByHand.at_free_port("refusals")
     reach = ["--namespace", by_hand.namespace, "-e", by_hand.endpoint]
     log = tmp_path / "mission.mcap"
@@ -244,6 +246,7 @@ def test_interrupted_run_closes_its_log(how: signal.Signals, tmp_path: Path) -> 
 def test_killed_launcher_leaves_no_process(tmp_path: Path) -> None:
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG))
     log = tmp_path / "run" / "mission.mcap"
+    children: list[psutil.Process] = []
     try:
         wait_for_log(log, FLYING_BYTES)
         children = descendants(mission)

@@ -148,7 +148,7 @@ def test_late_processes_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_realtime_flies(tmp_path: Path) -> None:
-    status, said = run("single", tmp_path / "run", *SHORT, arguments=["--mode", "realtime"])
+    _, said = run("single", tmp_path / "run", *SHORT, arguments=["--mode", "realtime"])
     result = summary(tmp_path / "run")
     assert result["mode"] == "realtime"
     assert result["ticks"] == 90, said

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from contextlib import suppress
 from fractions import Fraction
 from typing import Any
 
@@ -149,7 +150,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.JoinRequest(process="chaser/0", instance="abc"),
     m.JoinReply(accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}"),
 )
-BY_TYPE = {type(s): s for s in SAMPLES}
+BY_TYPE: dict[type[msgspec.Struct], msgspec.Struct] = {type(s): s for s in SAMPLES}
 
 
 def named(sample: msgspec.Struct) -> str:
@@ -225,7 +226,6 @@ JUNK = [
     b"junk",
     msgpack.packb([1, 2]),
     msgpack.packb({1: 2}),
-    b"\x81\xa1\xff\x00",  # a key that is not UTF-8
     b"\x81\xa1x" + b"\x91" * 200_000,  # an unknown field, nested beyond any stack
     b"\xdf\xff\xff\xff\xff",  # a map that claims four thousand million entries
 ]
@@ -234,17 +234,20 @@ JUNK = [
 @pytest.mark.parametrize("payload", JUNK, ids=range(len(JUNK)))
 def test_junk_is_rejected(payload: bytes) -> None:
     for kind in m.VERSION:
-        # An acknowledgement has defaults only; all others lack their fields as well.
         assert rejection(kind, payload).reason == "format"
+
+
+def test_text_must_be_utf8() -> None:
+    payload = codec.encode(BY_TYPE[m.Event]).replace(b"process lost", b"process \xff\xfe\xfdt")
+    assert rejection(m.Event, payload).reason == "format"
 
 
 @given(st.binary(max_size=300), st.sampled_from(list(m.VERSION)))
 @quick
 def test_no_bytes_raise_anything_but_rejected(payload: bytes, kind: type[msgspec.Struct]) -> None:
-    try:
-        codec.decode(kind, payload)
-    except Rejected as refusal:
-        assert refusal.reason in {"format", "not_finite", "not_unit_quaternion"}
+    # Any other exception fails the test; whatever passes has its numbers checked.
+    with suppress(Rejected):
+        codec.check_numbers(codec.decode(kind, payload))
 
 
 @given(st.sampled_from(SAMPLES), st.data())
@@ -253,17 +256,16 @@ def test_flipped_bytes_raise_nothing_but_rejected(sample: msgspec.Struct, data: 
     payload = bytearray(codec.encode(sample))
     for _ in range(data.draw(st.integers(1, 4))):
         payload[data.draw(st.integers(0, len(payload) - 1))] = data.draw(st.integers(0, 255))
-    try:
-        message = codec.decode(type(sample), bytes(payload))
-    except Rejected:
-        return
-    codec.check_numbers(message)
+    with suppress(Rejected):
+        codec.check_numbers(codec.decode(type(sample), bytes(payload)))
 
 
 def places_of_floats(values: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     if isinstance(values, float):
         return [path]
-    items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+    items = (
+        values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+    )
     return [place for key, value in items for place in places_of_floats(value, (*path, key))]
 
 
@@ -276,7 +278,12 @@ def with_value(values: Any, path: tuple[Any, ...], value: Any) -> Any:
     return copy
 
 
-FLOATS = [(s, p) for s in SAMPLES for p in places_of_floats(plain(s)) if p[-1] in (0, 5, 35, 143) or isinstance(p[-1], str)]
+def telling(place: str | int) -> bool:
+    """Of long tuples, some numbers do."""
+    return isinstance(place, str) or place in (0, 5, 35, 143)
+
+
+FLOATS = [(s, p) for s in SAMPLES for p in places_of_floats(plain(s)) if telling(p[-1])]
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])

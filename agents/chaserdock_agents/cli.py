@@ -43,14 +43,20 @@ class Command(StrEnum):
 
 
 ScenarioArg = Annotated[str, typer.Argument(help="scenario file, or the name of one that is shipped")]
-SetOpt = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a scenario value")]
+SetOpt = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a scenario value")
+]
 SeedOpt = Annotated[int | None, typer.Option(help="seed of everything random")]
 ModeOpt = Annotated[Mode, typer.Option(help="lockstep waits for every answer; realtime for nobody")]
 NamespaceOpt = Annotated[str, typer.Option(help="keeps runs apart")]
-ConnectOpt = Annotated[list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="such as tcp/host:7447")]
+ConnectOpt = Annotated[
+    list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="such as tcp/host:7447")
+]
 ListenOpt = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT")]
 NetModeOpt = Annotated[str, typer.Option("--net-mode", "-m", help="peer or client")]
-ConfigOpt = Annotated[Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")]
+ConfigOpt = Annotated[
+    Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
+]
 LeaseOpt = Annotated[int, typer.Option("--lease-ms", help="after that long a silent process counts as lost")]
 WatchOpt = Annotated[bool, typer.Option("--watch-parent", hidden=True)]
 OutOpt = Annotated[Path | None, typer.Option("--out", help="folder for log and summary; runs/… by default")]
@@ -64,7 +70,12 @@ def fail(text: str) -> typer.Exit:
 
 
 def link_of(
-    namespace: str, connect: list[str] | None, listen: list[str] | None, mode: str, config: Path | None, lease_ms: int
+    namespace: str,
+    connect: list[str] | None,
+    listen: list[str] | None,
+    mode: str,
+    config: Path | None,
+    lease_ms: int,
 ):
     """The link that the network options describe."""
     from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
@@ -170,7 +181,9 @@ def chaser(
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
     lease_ms: LeaseOpt = 60_000,
-    patience: Annotated[float | None, typer.Option(help="seconds to wait for a world; for ever by default")] = None,
+    patience: Annotated[
+        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
+    ] = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """One chaser: sees the target, drives its actuators."""
@@ -190,7 +203,9 @@ def controller(
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
     lease_ms: LeaseOpt = 60_000,
-    patience: Annotated[float | None, typer.Option(help="seconds to wait for a world; for ever by default")] = None,
+    patience: Annotated[
+        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
+    ] = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """The central controller: fuses what all chasers see, plans for all of them."""
@@ -209,7 +224,9 @@ def record(
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
     lease_ms: LeaseOpt = 60_000,
-    patience: Annotated[float | None, typer.Option(help="seconds to wait for a world; for ever by default")] = None,
+    patience: Annotated[
+        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
+    ] = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """The recorder: every message into OUT/mission.mcap."""

@@ -132,7 +132,9 @@ def run_mission(
         raise RunError(str(error)) from None
     words = folder / "processes"
     if (folder / "mission.mcap").exists():
-        raise RunError(f"{folder} holds a mission.mcap already; a log is never overwritten, choose another --out")
+        raise RunError(
+            f"{folder} holds a mission.mcap already; a log is never overwritten, choose another --out"
+        )
     try:
         words.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -170,7 +172,9 @@ def start_all(
     network = [*network, "--lease-ms", "2000" if mode == "realtime" else "600000"]
     patient = ["--patience", str(_PATIENCE_S)]
     sets = [item for override in overrides for item in ("--set", override)]
-    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, "-l", "tcp/127.0.0.1:0"], words)
+    fleet.start(
+        "world", ["world", str(path), "--mode", mode, *sets, *network, "-l", "tcp/127.0.0.1:0"], words
+    )
     fleet.start("controller", ["controller", *network, *patient], words)
     for i in range(len(scenario.chasers)):
         fleet.start(f"chaser/{i}", ["chaser", str(i), *network, *patient], words)

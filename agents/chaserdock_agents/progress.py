@@ -45,7 +45,14 @@ class Progress:
 
     def subscribe(self, node: Node) -> None:
         """Subscribes what is shown."""
-        for topic in (topics.TICK, topics.ODOMETRY, topics.REFERENCE, topics.TARGET, topics.EVENT, topics.COMMAND):
+        for topic in (
+            topics.TICK,
+            topics.ODOMETRY,
+            topics.REFERENCE,
+            topics.TARGET,
+            topics.EVENT,
+            topics.COMMAND,
+        ):
             node.subscribe(topic)
 
     def take(self, message: object) -> None:
@@ -63,7 +70,9 @@ class Progress:
             case TargetEstimate():
                 self._target = message
             case Event():
-                self.say(f"{message.sim_time_ns / 1e9:7.2f} s  {message.process}: {message.what} {message.detail}")
+                self.say(
+                    f"{message.sim_time_ns / 1e9:7.2f} s  {message.process}: {message.what} {message.detail}"
+                )
             case CommandReply():
                 said = "accepted" if message.accepted else "refused"
                 text = f"{message.command} chaser {message.chaser}: {said} ({message.reason})"

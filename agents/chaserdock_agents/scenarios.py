@@ -6,7 +6,7 @@ from pathlib import Path
 
 _HERE = Path(__file__).resolve()
 # In a source tree the folder lies beside agents/, in an installed package inside it.
-SHIPPED = (_HERE.parents[2] / "scenarios", _HERE.parent / "scenarios")
+SHIPPED = (_HERE.parents[2] / "scenarios", _HERE.parent / "shipped")
 
 
 def find_scenario(name: str) -> Path | None:

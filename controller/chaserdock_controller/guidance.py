@@ -47,9 +47,7 @@ class Guidance:
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self.events: list[tuple[int, str, str]] = []
-        self.chasers = [
-            ChaserGuidance("acquire", 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers
-        ]
+        self.chasers = [ChaserGuidance("acquire", 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
         self._due = sorted(scenario.timeline, key=lambda entry: entry.at_s)
 
     def found(self, now_s: float) -> None:
@@ -81,9 +79,8 @@ class Guidance:
         c = self.chasers[i]
         if c.phase == "acquire":
             return Answer(False, "the target has not been found yet")
-        if what == c.phase or (what == "approach" and c.phase == "docked"):
-            if what != "goto":
-                return Answer(True, f"already in phase {c.phase}")
+        if what != "goto" and (what == c.phase or (what == "approach" and c.phase == "docked")):
+            return Answer(True, f"already in phase {c.phase}")
         speed = self._scenario.approach.max_speed_m_s
         nominal = np.asarray(self._scenario.chasers[i].position_m)
         match what:
@@ -137,9 +134,8 @@ class Guidance:
         if c.phase in ("retreat", "abort", "goto") and c.move.over_at(now_s):
             self._enter(i, "hold", now_s, c.move)
         elif c.phase in ("approach", "docked") and c.move.over_at(now_s):
-            inside = (
-                position_error_m <= approach.docked_position_m
-                and angle_error_rad <= math.radians(approach.docked_angle_deg)
+            inside = position_error_m <= approach.docked_position_m and angle_error_rad <= math.radians(
+                approach.docked_angle_deg
             )
             since = (c.inside_since_s if c.inside_since_s is not None else now_s) if inside else None
             self.chasers[i] = ChaserGuidance(c.phase, c.since_s, c.move, since)
@@ -148,7 +144,9 @@ class Guidance:
             elif c.phase == "docked" and since is None:
                 self._enter(i, "approach", now_s, c.move)
 
-    def _enter(self, i: int, phase: str, now_s: float, move: Move, inside_since_s: float | None = None) -> None:
+    def _enter(
+        self, i: int, phase: str, now_s: float, move: Move, inside_since_s: float | None = None
+    ) -> None:
         before = self.chasers[i].phase
         self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s)
         if phase != before:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _SHORTEST_S = 2.0
+_LONGEST_S = 1e5
 # Factors of the derivatives of powers 1 to 5, and 2 to 5.
 _FIRST = np.arange(1.0, 6.0)[:, None]
 _SECOND = np.array([2.0, 6.0, 12.0, 20.0])[:, None]
@@ -60,7 +61,7 @@ def _quintic(p: Array, v: Array, a: Array, goal: Array, duration_s: float) -> Ar
     t = duration_s
     rest = np.array([goal - p - v * t - a * t * t / 2.0, -v - a * t, -a])
     system = np.array([[t**3, t**4, t**5], [3 * t**2, 4 * t**3, 5 * t**4], [6 * t, 12 * t**2, 20 * t**3]])
-    return np.vstack([p, v, a / 2.0, np.linalg.solve(system, rest)])
+    return np.asarray(np.vstack([p, v, a / 2.0, np.linalg.solve(system, rest)]), dtype=np.float64)
 
 
 def move_to(current: Move, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
@@ -74,13 +75,12 @@ def move_to(current: Move, goal_m: ArrayLike, now_s: float, max_speed_m_s: float
     goal = np.asarray(goal_m, dtype=float)
     speed = max(max_speed_m_s, float(np.linalg.norm(v)))
     duration = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(goal - p)) / max_speed_m_s)
-    for _ in range(60):
+    while True:
         move = Move(now_s, duration, _quintic(p, v, a, goal, duration))
         fastest = np.linalg.norm(move.at(now_s + duration * _SAMPLES)[1], axis=1).max()
-        if fastest <= speed * 1.001:
-            break
+        if fastest <= speed * 1.001 or duration > _LONGEST_S:
+            return move
         duration *= 1.1
-    return move
 
 
 def stop(current: Move, now_s: float, max_speed_m_s: float) -> Move:

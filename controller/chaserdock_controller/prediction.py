@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 
@@ -28,7 +29,7 @@ class CommandHistory:
         sent = self._sent.get(chaser, [])
         edges = [from_ns, *sorted({t for t, _ in sent if from_ns < t < to_ns}), to_ns]
         out = []
-        for begin, end in zip(edges[:-1], edges[1:], strict=True):
+        for begin, end in itertools.pairwise(edges):
             acting = [w for t, w in sent if t <= begin]
             out.append((begin, end, acting[-1] if acting else np.zeros(6)))
         return out
@@ -40,7 +41,9 @@ class CommandHistory:
             self._sent[chaser] = sent[last:]
 
 
-def _slope(x: Sequence[float], wrench: Sequence[float], mass_kg: float, inertia: Sequence[float]) -> list[float]:
+def _slope(
+    x: Sequence[float], wrench: Sequence[float], mass_kg: float, inertia: Sequence[float]
+) -> list[float]:
     # Plain floats: a handful of numbers, several times a tick and chaser.
     _, _, _, vx, vy, vz, w, i, j, k, a, b, c = x
     fx, fy, fz, tx, ty, tz = wrench

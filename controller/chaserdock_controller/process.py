@@ -25,6 +25,7 @@ from chaserdock_protocol.transport import Node, TransportError
 
 from .flight import Flight, Inputs, Outputs
 
+
 def main(options: ProcessOptions) -> int:
     """Runs the controller; 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
     node: Node | None = None
@@ -153,4 +154,3 @@ class Controller:
     def farewell(self) -> None:
         """The last messages of this process."""
         self.teller.farewell(self.done_tick, self.tick.sim_time_ns if self.tick else 0)
-

@@ -74,8 +74,11 @@ def check_numbers(message: Struct) -> None:
                 raise Rejected("not_unit_quaternion", f"{name} has length {math.hypot(*value)}")
 
 
-def vector(array: Any) -> tuple[float, ...]:
-    """Flat tuple of Python floats, as messages carry numbers (NumPy scalars do not encode)."""
+def vector(array: Any) -> Any:
+    """Flat tuple of Python floats, as messages carry numbers (NumPy scalars do not encode).
+
+    Typed Any, as only the caller knows the length that its field wants.
+    """
     return tuple(array.ravel().tolist())
 
 

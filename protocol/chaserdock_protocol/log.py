@@ -8,20 +8,25 @@ versions lie inside as an attachment and a metadata record.
 
 from __future__ import annotations
 
+import os
+import struct
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import zstandard
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
-from mcap.records import Attachment, Channel, Metadata
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Chunk, Metadata
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import StreamReader
-from mcap.writer import CompressionType, Writer
+from mcap.stream_reader import breakup_chunk
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from . import codec, topics
 from .codec import Rejected
@@ -30,7 +35,16 @@ from .topics import Topic
 
 SCENARIO_ATTACHMENT = "scenario.json"
 METADATA = "chaserdock"
-_PACKAGES = ("chaserdock", "casadi", "eclipse-zenoh", "mcap", "msgspec", "numba", "numpy", "opencv-python-headless")
+_PACKAGES = (
+    "chaserdock",
+    "casadi",
+    "eclipse-zenoh",
+    "mcap",
+    "msgspec",
+    "numba",
+    "numpy",
+    "opencv-python-headless",
+)
 
 
 class LogError(Exception):
@@ -51,6 +65,10 @@ class Record:
 class _Header(msgspec.Struct):
     sim_time_ns: int = 0
 
+
+_RECORD_HEAD = struct.Struct("<BQ")
+# What the parsers of a damaged record raise.
+_DAMAGE = (McapError, ValueError, KeyError, struct.error, zstandard.ZstdError)
 
 _header = msgspec.msgpack.Decoder(_Header)
 
@@ -96,7 +114,7 @@ class LogWriter:
             self._sequence[channel] = 0
         try:
             self._last_time_ns = max(0, _header.decode(payload).sim_time_ns)
-        except (msgspec.DecodeError, OverflowError):
+        except (msgspec.DecodeError, OverflowError, RecursionError, UnicodeDecodeError):
             self.unreadable += 1
         try:
             self._writer.add_message(
@@ -123,7 +141,9 @@ class LogWriter:
             schema = schema_of(found[0].kind) if known and found else b"{}"
             self._schemas[name] = self._writer.register_schema(name, "jsonschema", schema)
         message_encoding = "msgpack" if encoding.startswith("application/msgpack") else "unknown"
-        return self._writer.register_channel(key, message_encoding, self._schemas[name], {"zenoh_encoding": encoding})
+        return self._writer.register_channel(
+            key, message_encoding, self._schemas[name], {"zenoh_encoding": encoding}
+        )
 
     def close(self) -> None:
         """Writes index and footer and closes the file."""
@@ -131,37 +151,49 @@ class LogWriter:
         self._file.close()
 
 
-def _raw_messages(path: Path, keys: Iterable[str] | None) -> Iterator[tuple[Channel, McapMessage]]:
-    wanted = None if keys is None else list(keys)
+def _records(path: Path) -> Iterator[tuple[int, ReadDataStream]]:
+    """Opcode and content of every record up to the summary.
+
+    A log whose writer was killed ends with its last whole record: what was flushed before is good. Raises
+    LogError for a file that cannot be read, is no log, or is damaged.
+    """
     try:
         with path.open("rb") as file:
-            try:
-                reader = make_reader(file)
-                for _, channel, message in reader.iter_messages(topics=wanted, log_time_order=False):
-                    yield channel, message
-                return
-            except McapError:
-                # No footer: the writer was killed. The records up to there are good.
-                file.seek(0)
-            channels: dict[int, Channel] = {}
-            try:
-                for record in StreamReader(file).records:
-                    if isinstance(record, Channel):
-                        channels[record.id] = record
-                    elif isinstance(record, McapMessage):
-                        channel = channels[record.channel_id]
-                        if wanted is None or channel.topic in wanted:
-                            yield channel, record
-            except (McapError, EOFError, OSError):
-                return
+            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+                raise LogError(f"{path}: no MCAP log")
+            left = os.fstat(file.fileno()).st_size - file.tell()
+            while left >= _RECORD_HEAD.size:
+                opcode, length = _RECORD_HEAD.unpack(file.read(_RECORD_HEAD.size))
+                left -= _RECORD_HEAD.size + length
+                if left < 0 or opcode == Opcode.DATA_END:
+                    return
+                yield opcode, ReadDataStream(BytesIO(file.read(length)))
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def _raw_messages(path: Path, keys: Iterable[str] | None) -> Iterator[tuple[Channel, McapMessage]]:
+    wanted = None if keys is None else set(keys)
+    channels: dict[int, Channel] = {}
+    for opcode, content in _records(path):
+        if opcode != Opcode.CHUNK:
+            continue
+        try:
+            inside = breakup_chunk(Chunk.read(content), validate_crc=True)
+        except _DAMAGE as error:
+            raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
+        channels |= {record.id: record for record in inside if isinstance(record, Channel)}
+        for record in inside:
+            if isinstance(record, McapMessage):
+                channel = channels[record.channel_id]
+                if wanted is None or channel.topic in wanted:
+                    yield channel, record
 
 
 def read_log(path: Path, keys: Iterable[str] | None = None) -> Iterator[Record]:
     """Messages of a log in file order, opened and checked; those that do not pass are left out.
 
-    Raises LogError when the file cannot be read.
+    Raises LogError when the file cannot be read, is no log, or where it is damaged; a log cut off is read up to there.
     """
     for channel, message in _raw_messages(path, keys):
         found = topics.topic_of_key(channel.topic)
@@ -187,20 +219,19 @@ def read_scenario(path: Path) -> tuple[str, dict[str, str]]:
     scenario: str | None = None
     data: dict[str, str] = {}
     try:
-        with path.open("rb") as file:
-            for record in StreamReader(file).records:
-                if isinstance(record, Attachment) and record.name == SCENARIO_ATTACHMENT:
-                    scenario = record.data.decode()
-                elif isinstance(record, Metadata) and record.name == METADATA:
-                    data = record.metadata
-                if scenario is not None and data:
-                    break
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except (McapError, EOFError, UnicodeDecodeError) as error:
-        raise LogError(f"{path}: no MCAP log, or damaged at its beginning: {error}") from None
+        for opcode, content in _records(path):
+            if opcode == Opcode.ATTACHMENT:
+                attachment = Attachment.read(content)
+                if attachment.name == SCENARIO_ATTACHMENT:
+                    scenario = attachment.data.decode()
+            elif opcode == Opcode.METADATA:
+                metadata = Metadata.read(content)
+                if metadata.name == METADATA:
+                    data = metadata.metadata
+            if scenario is not None and data:
+                break
+    except _DAMAGE as error:
+        raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
     if scenario is None:
         raise LogError(f"{path}: holds no scenario; was it recorded by chaserdock?")
     return scenario, data
-
-

@@ -287,31 +287,28 @@ class JoinReply(Struct, frozen=True, kw_only=True):
 
 
 VERSION: dict[type[Struct], int] = {
-    t: 1
-    for t in (
-        Tick,
-        MissionEnd,
-        Image,
-        Odometry,
-        BodyTruth,
-        WorldTruth,
-        Sighting,
-        TargetEstimate,
-        Reference,
-        WrenchCommand,
-        Plan,
-        SolverStatus,
-        ActuatorCommand,
-        Event,
-        Health,
-        RecorderAck,
-        OperatorCommand,
-        CommandReply,
-        Presence,
-        Farewell,
-        JoinRequest,
-        JoinReply,
-    )
+    Tick: 1,
+    MissionEnd: 1,
+    Image: 1,
+    Odometry: 1,
+    BodyTruth: 1,
+    WorldTruth: 1,
+    Sighting: 1,
+    TargetEstimate: 1,
+    Reference: 1,
+    WrenchCommand: 1,
+    Plan: 1,
+    SolverStatus: 1,
+    ActuatorCommand: 1,
+    Event: 1,
+    Health: 1,
+    RecorderAck: 1,
+    OperatorCommand: 1,
+    CommandReply: 1,
+    Presence: 1,
+    Farewell: 1,
+    JoinRequest: 1,
+    JoinReply: 1,
 }
 """Version of every message type that may stand alone on the wire."""
 

@@ -46,7 +46,9 @@ def join(
                 raise JoinRefused(reply.reason)
             return reply
         if patience_s is not None and time.monotonic() - begun > patience_s:
-            raise JoinRefused(f"no world answered within {patience_s:.0f} s; is it running, and on the same namespace?")
+            raise JoinRefused(
+                f"no world answered within {patience_s:.0f} s; is it running, and on the same namespace?"
+            )
         time.sleep(0.02)
     return None
 

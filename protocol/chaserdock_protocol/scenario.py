@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,11 +16,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from . import rotations
 from .camera import Camera
 from .clock import Timing
+from .scenario_text import ScenarioError, explain, override
 from .targets import target_model
-
-
-class ScenarioError(Exception):
-    """A scenario that cannot be flown; the text has one line a fault."""
 
 
 def _finite(value: float) -> float:
@@ -31,7 +29,9 @@ def _finite(value: float) -> float:
 def _unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     length = math.hypot(*q)
     if abs(length - 1.0) > 1e-3:
-        raise ValueError(f"must be a quaternion (w, x, y, z) of unit length; this one has length {length:.6g}")
+        raise ValueError(
+            f"must be a quaternion (w, x, y, z) of unit length; this one has length {length:.6g}"
+        )
     w, x, y, z = rotations.normalize(q).tolist()
     return (w, x, y, z)
 
@@ -95,7 +95,9 @@ class Target(Section):
 
 def _check_inertia(i: tuple[float, float, float]) -> None:
     if 2 * max(i) > sum(i) * (1 + 1e-9):
-        raise ValueError(f"inertia_kg_m2 {i}: no moment may exceed the sum of the other two (no body is like that)")
+        raise ValueError(
+            f"inertia_kg_m2 {i}: no moment may exceed the sum of the other two (no body is like that)"
+        )
 
 
 def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -140,7 +142,7 @@ class Effects(Section):
 
 
 class CameraSection(Section):
-    """The chasers' camera, looking along the body's +X with its top towards +Z; ``sun_direction`` (WRF) points to the sun."""
+    """The chasers' camera, looking along the body's +X, its top towards +Z; ``sun_direction`` (WRF): to the sun."""
 
     width_px: Annotated[int, Field(ge=64, le=4096)] = 1280
     height_px: Annotated[int, Field(ge=64, le=4096)] = 720
@@ -222,6 +224,12 @@ class Chaser(Section):
     start_rotation_rad: Vector = (0.0, 0.0, 0.0)
     start_velocity_m_s: Vector = (0.0, 0.0, 0.0)
 
+    @model_validator(mode="after")
+    def _outside(self) -> Chaser:
+        if not any(self.position_m):
+            raise ValueError("position_m must not be the target's own origin: the approach line begins there")
+        return self
+
 
 class TimelineEntry(Section):
     """A command at a time of the mission."""
@@ -241,7 +249,7 @@ class TimelineEntry(Section):
 class Success(Section):
     """What makes a run a success, judged on ground truth; what is left out is not asked."""
 
-    docked: tuple[int, ...] = ()
+    docked: tuple[Annotated[int, Field(ge=0)], ...] = ()
     max_collisions: Annotated[int, Field(ge=0)] = 0
     keep_distances: bool = True
     steady_position_rms_m: Positive | None = None
@@ -275,14 +283,11 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
         _check_apart(self)
-        n = len(self.chasers)
-        for i, entry in enumerate(self.timeline):
-            for c in entry.chasers:
-                if c >= n:
-                    raise ValueError(f"timeline.{i}.chasers: there is no chaser {c}; this mission has 0 to {n - 1}")
-        for c in self.success.docked:
-            if c >= n:
-                raise ValueError(f"success.docked: there is no chaser {c}; this mission has 0 to {n - 1}")
+        named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
+        last = len(self.chasers) - 1
+        for where, chasers in (*named, ("success.docked", self.success.docked)):
+            if max(chasers, default=0) > last:
+                raise ValueError(f"{where}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
         return self
 
     @property
@@ -325,35 +330,21 @@ def _check_apart(scenario: Scenario) -> None:
                 )
 
 
-def _explain(error: ValidationError) -> list[str]:
-    lines = []
-    for fault in error.errors():
-        path = ".".join(str(p) for p in fault["loc"]) or "(scenario)"
-        message = fault["msg"].removeprefix("Value error, ")
-        value = fault.get("input")
-        shown = f" (got {value!r})" if isinstance(value, int | float | str | list | tuple) else ""
-        if fault["type"] == "missing":
-            message, shown = "is missing", ""
-        elif fault["type"] == "extra_forbidden":
-            message, shown = "is not a key that is known here", ""
-        lines.append(f"{path}: {message}{shown}")
-    return lines
+def _checked(validate: Callable[[Any], Scenario], values: Any, source: str) -> Scenario:
+    try:
+        return validate(values)
+    except ValidationError as error:
+        raise ScenarioError("\n".join(f"{source}: {line}" for line in explain(error))) from None
 
 
 def parse_scenario(values: dict[str, Any], source: str) -> Scenario:
     """Scenario from nested tables; raises ScenarioError with one line a fault, each with its path."""
-    try:
-        return Scenario.model_validate(values)
-    except ValidationError as error:
-        raise ScenarioError("\n".join(f"{source}: {line}" for line in _explain(error))) from None
+    return _checked(Scenario.model_validate, values, source)
 
 
 def scenario_from_json(text: str, source: str) -> Scenario:
     """Scenario as the world sends it; raises ScenarioError."""
-    try:
-        return Scenario.model_validate_json(text)
-    except ValidationError as error:
-        raise ScenarioError("\n".join(f"{source}: {line}" for line in _explain(error))) from None
+    return _checked(Scenario.model_validate_json, text, source)
 
 
 def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
@@ -367,35 +358,5 @@ def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     for text in overrides:
-        _override(values, text)
+        override(values, text)
     return parse_scenario(values, str(path))
-
-
-def _override(values: dict[str, Any], text: str) -> None:
-    path, equals, value = text.partition("=")
-    if not equals or not path.strip():
-        raise ScenarioError(f"--set {text}: must be key.path=value")
-    try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        parsed = value.strip()
-    place: Any = values
-    keys = path.strip().split(".")
-    for key in keys[:-1]:
-        if isinstance(place, list):
-            place = _item(place, key, text)
-        else:
-            place = place.setdefault(key, {})
-        if not isinstance(place, dict | list):
-            raise ScenarioError(f"--set {text}: {key} is a value, not a table")
-    if isinstance(place, list):
-        _item(place, keys[-1], text)
-        place[int(keys[-1])] = parsed
-    else:
-        place[keys[-1]] = parsed
-
-
-def _item(place: list[Any], key: str, text: str) -> Any:
-    if not key.isdigit() or int(key) >= len(place):
-        raise ScenarioError(f"--set {text}: {key} must be a number from 0 to {len(place) - 1}")
-    return place[int(key)]

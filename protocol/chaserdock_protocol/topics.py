@@ -60,10 +60,14 @@ ODOMETRY = _topic(
 TRUTH_BODY = Topic(
     "truth/body/{process}", m.BodyTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state"
 )
-TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state")
+TRUTH_WORLD = Topic(
+    "truth/world", m.WorldTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state"
+)
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "picture", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
-WRENCH = _topic("controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command")
+WRENCH = _topic(
+    "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
+)
 REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "controller", set(), "tick", "state")
 PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "state")
 TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "state")
@@ -123,15 +127,20 @@ def topic_of_key(key: str) -> tuple[Topic, str | None] | None:
 
 def _fits(topic: Topic, place: str) -> bool:
     if "{chaser}" in topic.key:
-        return place.isascii() and place.isdigit()
+        return _is_number(place)
     return is_process_name(place)
+
+
+def _is_number(text: str) -> bool:
+    # Written in one way only: with leading zeros a chaser would have several names and keys.
+    return text.isascii() and text.isdigit() and (text == "0" or text[0] != "0")
 
 
 def is_process_name(name: str) -> bool:
     """Whether ``name`` is one of ours: ``world``, ``target`` (a body), ``controller``, ``recorder``, ``chaser/3`` …"""
     head, slash, number = name.partition("/")
     if head == "chaser":
-        return slash == "/" and number.isascii() and number.isdigit()
+        return slash == "/" and _is_number(number)
     return slash == "" and head in {"world", "target", "controller", "recorder", "operator"}
 
 

@@ -127,7 +127,7 @@ class Node:
 
     def __init__(self, name: str, role: Role, link: Link) -> None:
         self.name = name
-        self.role = role
+        self.role: Role = role
         self.counts = Counts()
         self._inbox: queue.SimpleQueue[tuple[Topic, str | None, Raw] | None] = queue.SimpleQueue()
         self._latest: dict[str, tuple[Topic, str | None, Raw]] = {}
@@ -156,7 +156,9 @@ class Node:
                 priority=_PRIORITY[topic.qos],
                 express=topic.qos == "command",
                 reliability=zenoh.Reliability.RELIABLE,
-                congestion_control=zenoh.CongestionControl.DROP if droppable else zenoh.CongestionControl.BLOCK,
+                congestion_control=zenoh.CongestionControl.DROP
+                if droppable
+                else zenoh.CongestionControl.BLOCK,
             )
         return key
 
@@ -214,7 +216,9 @@ class Node:
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def callback(sample: zenoh.Sample) -> None:
-            arrived(Raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes(), _sent_ns(sample)))
+            arrived(
+                Raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes(), _sent_ns(sample))
+            )
 
         self._declared.append(self._session.declare_subscriber(expression, callback))
 
@@ -236,7 +240,7 @@ class Node:
 
     def _open(self, topic: Topic, place: str | None, raw: Raw) -> Received | None:
         try:
-            message = codec.decode(topic.kind, raw.payload, raw.encoding)
+            message: Any = codec.decode(topic.kind, raw.payload, raw.encoding)
             if place is not None and str(getattr(message, "chaser", place)) != place:
                 raise Rejected("chaser", f"message of chaser {message.chaser} on {raw.key}")
         except Rejected as refusal:
@@ -252,7 +256,10 @@ class Node:
     # -- questions and presence ---------------------------------------------------------------------------
 
     def answer(
-        self, key: str, request: type[msgspec.Struct], handle: Callable[[Any, Callable[[msgspec.Struct], None]], None]
+        self,
+        key: str,
+        request: type[msgspec.Struct],
+        handle: Callable[[Any, Callable[[msgspec.Struct], None]], None],
     ) -> None:
         """Answers queries on a key: ``handle(message, reply)`` is called on Zenoh's thread and must not block.
 
@@ -317,6 +324,9 @@ class Node:
 
 def _open_error(error: Exception, link: Link) -> str:
     text = " ".join(str(error).split())
+    listen, connect = ", ".join(link.listen) or "-", ", ".join(link.connect) or "-"
     if "in use" in text.lower():
-        return f"cannot listen on {', '.join(link.listen)}: the port is in use; stop its owner or choose another with --listen"
-    return f"cannot open the Zenoh session (listen {', '.join(link.listen) or '-'}, connect {', '.join(link.connect) or '-'}): {text}"
+        return (
+            f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"
+        )
+    return f"cannot open the Zenoh session (listen {listen}, connect {connect}): {text}"

@@ -26,16 +26,19 @@ class IdealActuators:
     absolute_impulse_N_s: float = 0.0
     saturated: bool = False
     late: int = 0
-    _waiting: list[tuple[int, int, Array]] = field(default_factory=list)
+    _waiting: list[tuple[int, int, int, Array]] = field(default_factory=list)
+    _taken: int = 0
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
-        """Takes a command that is to act from ``effective_step`` on; one that comes later acts at once, and is counted."""
+        """Takes a command that is to act from ``effective_step`` on; a late one acts at once, and is counted."""
         limit = np.repeat([self.body.force_max_N, self.body.torque_max_N_m], 3)
         asked = np.array([*command.force_N, *command.torque_N_m])
         given = np.clip(asked, -limit, limit)
         self.saturated |= bool(np.any(np.abs(asked) > limit * (1 + 1e-6)))
         self.late += effective_step < now_step
-        heapq.heappush(self._waiting, (effective_step, command.seq, given))
+        # A chaser started anew counts from zero again: then the last to come decides, and arrays are never compared.
+        self._taken += 1
+        heapq.heappush(self._waiting, (effective_step, command.seq, self._taken, given))
 
     def next_change(self, step: int) -> int | None:
         """The first step after ``step`` at which another command takes effect, if one waits."""
@@ -47,7 +50,7 @@ class IdealActuators:
         There must be no change in between (see ``next_change``).
         """
         while self._waiting and self._waiting[0][0] <= step:
-            self.wrench = heapq.heappop(self._waiting)[2]
+            self.wrench = heapq.heappop(self._waiting)[3]
         self.impulse = self.impulse + self.wrench * (steps * step_s)
         self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * steps * step_s
         return self.wrench

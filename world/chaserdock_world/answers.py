@@ -30,6 +30,7 @@ class Answers:
         teller: PresenceTeller,
         timing: Timing,
         actuators: dict[str, IdealActuators],
+        step_now: Callable[[], int],
         recorder_expected: bool,
     ) -> None:
         self.chasers: tuple[int, ...] = ()
@@ -39,6 +40,7 @@ class Answers:
         self._teller = teller
         self._timing = timing
         self._actuators = actuators
+        self._step_now = step_now
         self._recorder_expected = recorder_expected
         self._recorded_tick = -1
         self._tick = -1
@@ -99,7 +101,7 @@ class Answers:
                 return
             self._answered.add(command.chaser)
         effective = self._timing.step_of_time(command.effective_time_ns)
-        actuators.command(command, effective, self._timing.step_of_tick(max(self._tick, 0)))
+        actuators.command(command, effective, self._step_now())
 
     def _take_leave(self) -> bool:
         """Notes processes that are gone; True when that changes who is expected in the open tick."""

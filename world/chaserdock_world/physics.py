@@ -36,10 +36,10 @@ class Physics:
         self.step_count = 0
         self._scenario = scenario
         self._prescribed = scenario.target.motion != "torque_free"
-        # How often contacts are looked for and Bullet's copy of a prescribed target is moved along; that
-        # target's ``state`` is exact at any step.
-        self._steps_per_look = max(1, scenario.time.physics_hz // 240)
+        # How often Bullet's copy of a prescribed target is moved along; its ``state`` is exact at any step.
+        self._steps_per_move = max(1, scenario.time.physics_hz // 120)
         self._bullet = BulletClient(connection_mode=pybullet.DIRECT)
+        self._client: int = self._bullet._client  # the wrapper is too slow for what happens every step
         self._bullet.setGravity(0, 0, 0)
         self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)
         self._bodies: dict[str, int] = {TARGET: self._add_target(scenario)}
@@ -109,18 +109,20 @@ class Physics:
         pushes = [(self._bodies[n], w[:3].tolist(), w[3:].tolist()) for n, w in wrenches.items() if w.any()]
         moves = self._prescribed and self._scenario.target.motion != "static"
         touched: set[tuple[str, str]] = set()
-        bullet, frame = self._bullet, pybullet.LINK_FRAME
+        frame, client = pybullet.LINK_FRAME, self._client
+        force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
         for _ in range(steps):
             # Bullet forgets external forces after every step.
             for body, force, torque in pushes:
-                bullet.applyExternalForce(body, -1, force, (0, 0, 0), frame)
-                bullet.applyExternalTorque(body, -1, torque, frame)
-            bullet.stepSimulation()
+                force_on(body, -1, force, (0, 0, 0), frame, client)
+                torque_on(body, -1, torque, frame, client)
+            pybullet.stepSimulation(client)
             self.step_count += 1
-            if self.step_count % self._steps_per_look == 0:
-                if moves:
-                    self._move_target()
+            # A bounce lasts a single step: look after every one.
+            if pybullet.getContactPoints(physicsClientId=client):
                 touched.update(self.contacts())
+            if moves and self.step_count % self._steps_per_move == 0:
+                self._move_target()
         return touched
 
     def _move_target(self) -> None:
@@ -129,11 +131,13 @@ class Physics:
         self._set_velocity(body, state)
 
     def contacts(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of bodies that touch or overlap now, sorted."""
+        """Pairs of bodies that touched or overlapped in the last step, sorted."""
         pairs = {
             tuple(sorted((self._names[c[1]], self._names[c[2]])))
             for c in self._bullet.getContactPoints()
-            if c[8] <= 0.0
+            # Bullet pushes bodies apart that would meet within the step while there is still a gap (c[8], the
+            # distance); that they did meet, the force (c[9]) tells.
+            if c[8] <= 0.0 or c[9] > 0.0
         }
         return tuple(sorted((a, b) for a, b in pairs))
 

@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections.abc import Callable
 
 from chaserdock_protocol import topics
+from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd
 from chaserdock_protocol.presence import PresenceTeller, new_instance
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
@@ -57,7 +59,13 @@ def refuse_second_world(node: Node) -> None:
         raise TransportError(reply.reason)
 
 
-def gather(scenario: Scenario, options: ProcessOptions, node: Node, actuators: dict) -> Answers:
+def gather(
+    scenario: Scenario,
+    options: ProcessOptions,
+    node: Node,
+    actuators: dict[str, IdealActuators],
+    physics: Physics,
+) -> Answers:
     """Opens the world's ears and doors: from here on processes can join."""
     membership = Membership(
         chasers=len(scenario.chasers),
@@ -75,22 +83,68 @@ def gather(scenario: Scenario, options: ProcessOptions, node: Node, actuators: d
         node.advertise(topics.ODOMETRY, i)
         node.advertise(topics.IMAGE, i, droppable=options.mode == "realtime")
     teller = PresenceTeller(node, new_instance())
-    return Answers(node, membership, teller, scenario.timing, actuators, options.recorder_expected)
+    return Answers(
+        node,
+        membership,
+        teller,
+        scenario.timing,
+        actuators,
+        lambda: physics.step_count,
+        options.recorder_expected,
+    )
+
+
+Contacts = set[tuple[str, str]]
+
+
+def pass_lockstep(
+    tick: int,
+    begun_s: float,
+    answers: Answers,
+    stop: Stop,
+    timing: Timing,
+    fly_to_step: Callable[[int], Contacts],
+) -> Contacts:
+    """Flies a tick whose end waits for all answers; the pairs of bodies that touched."""
+    end = timing.step_of_tick(tick + 1)
+    # No answer to this tick can act before its latency has passed: fly that far while they think.
+    contacts = fly_to_step(min(end, timing.step_of_tick(tick) + timing.latency_steps))
+    if answers.wait(answers.complete, stop, answers.who_is_slow):
+        contacts |= fly_to_step(end)
+    return contacts
+
+
+def pass_realtime(
+    tick: int,
+    begun_s: float,
+    answers: Answers,
+    stop: Stop,
+    timing: Timing,
+    fly_to_step: Callable[[int], Contacts],
+) -> Contacts:
+    """Flies a tick at the pace of the wall clock, in slices, so that a command acts when it comes, not before."""
+    contacts: Contacts = set()
+    slices = max(1, timing.steps_per_tick // max(1, timing.physics_hz // 240))
+    for k in range(1, slices + 1):
+        step = timing.step_of_tick(tick) + timing.steps_per_tick * k // slices
+        answers.listen_until(begun_s + step / timing.physics_hz)
+        contacts |= fly_to_step(step)
+    return contacts
 
 
 def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> int:
     """Gathers the processes, flies all ticks, ends the mission; the process' status."""
     cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
     actuators = {f"chaser/{i}": IdealActuators(scenario.chaser) for i in range(len(scenario.chasers))}
-    answers = gather(scenario, options, node, actuators)
+    answers = gather(scenario, options, node, actuators, physics)
     say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
     started = answers.wait(
         lambda: not answers.missing_at_start(), stop, lambda: ", ".join(answers.missing_at_start())
     )
     answers.settle()
     reason = "flown to its end" if started else "stopped before the first tick"
-    begun_s, tick = time.monotonic(), 0
-    contacts: set[tuple[str, str]] = set()
+    begun_s, tick, step_s = time.monotonic(), 0, 1.0 / timing.physics_hz
+    contacts: Contacts = set()
     while started:
         states = {name: physics.state(name) for name in physics.bodies}
         publish_truth(node, states, tick, timing, actuators, contacts)
@@ -102,14 +156,13 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
         for i in answers.chasers if pictures else ():
             number = tick // timing.ticks_per_picture
             node.publish(topics.IMAGE, cameras.picture(i, number, tick, timing.tick_time_ns(tick), states), i)
-        if options.mode == "lockstep":
-            answers.wait(answers.complete, stop, answers.who_is_slow)
-        else:
-            answers.listen_until(begun_s + (tick + 1) / timing.rate_hz)
+        pass_tick = pass_lockstep if options.mode == "lockstep" else pass_realtime
+        contacts = pass_tick(
+            tick, begun_s, answers, stop, timing, lambda step: fly_to(step, physics, actuators, step_s)
+        )
         if stop() or not answers.chasers:
             reason = "stopped" if stop() else "no chaser is left"
             break
-        contacts = fly_to(timing.step_of_tick(tick + 1), physics, actuators, 1.0 / timing.physics_hz)
         tick += 1
     complete = started and tick == scenario.ticks
     time_ns = timing.tick_time_ns(tick)

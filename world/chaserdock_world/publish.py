@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.codec import vector
@@ -36,7 +38,7 @@ def publish_truth(
     time_ns = timing.tick_time_ns(tick)
     saturated, late = [], 0
     for name, state in states.items():
-        given = {}
+        given: dict[str, Any] = {}
         if name in actuators:
             impulse, absolute, cut, came_late = actuators[name].take()
             given = {
@@ -59,7 +61,7 @@ def publish_truth(
     node.publish(topics.TRUTH_WORLD, world)
 
 
-def _state_fields(state: BodyState) -> dict[str, tuple[float, ...]]:
+def _state_fields(state: BodyState) -> dict[str, Any]:
     return {
         "position_m": vector(state.position_m),
         "velocity_m_s": vector(state.velocity_m_s),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -50,10 +51,12 @@ def _view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px:
     try:
         grey = decode_picture(image)
     except BadPicture as error:
-        raise LogError(f"picture of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}") from None
+        raise LogError(
+            f"picture of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}"
+        ) from None
     # People see the dark side of things better after a gamma correction; the cameras had no such luck.
     gamma = np.array([255 * (v / 255) ** 0.6 for v in range(256)]).astype(np.uint8)
-    view = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
+    view: Any = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
     scale = width_px / image.width_px
     view = cv2.resize(view, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA)
     if sighting is not None and sighting.sim_time_ns == image.sim_time_ns:

@@ -52,7 +52,11 @@ def estimate_errors(flight: Flight) -> dict[str, Array]:
     known = np.array([s in ("tracking", "predicting") for s in flight.estimate_status], dtype=bool)
     truth = flight.truth["target"]
     index = {round(t * 1e9): k for k, t in enumerate(truth.time_s)}
-    rows = [(k, index[key]) for k in np.flatnonzero(known) if (key := round(flight.estimate.time_s[k] * 1e9)) in index]
+    rows = [
+        (k, index[key])
+        for k in np.flatnonzero(known)
+        if (key := round(flight.estimate.time_s[k] * 1e9)) in index
+    ]
     a = np.array([r[0] for r in rows], dtype=int)
     b = np.array([r[1] for r in rows], dtype=int)
     e = flight.estimate
@@ -84,7 +88,9 @@ def _greatest(x: Array) -> float | None:
 
 
 def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
-    out: dict[str, float | None] = {n: float(np.percentile(x, p)) if len(x) else None for n, p in names.items()}
+    out: dict[str, float | None] = {
+        n: float(np.percentile(x, p)) if len(x) else None for n, p in names.items()
+    }
     return out | {"max": _greatest(x)}
 
 
@@ -151,7 +157,9 @@ def summary_of(flight: Flight) -> dict[str, Any]:
         }
     flown = [n for n in names if n in flight.truth]
     between = [
-        float(np.min(_distance(flight.truth[a], flight.truth[b]))) for k, a in enumerate(flown) for b in flown[:k]
+        float(np.min(_distance(flight.truth[a], flight.truth[b])))
+        for k, a in enumerate(flown)
+        for b in flown[:k]
     ]
     errors = estimate_errors(flight)
     late = errors["time_s"] >= s.settling_s
@@ -221,16 +229,24 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         out.append(f"{result['collisions']} collisions, at most {s.success.max_collisions} allowed")
     nearest = result["min_distance_chasers_m"]
     if s.success.keep_distances and nearest is not None and nearest < s.limits.min_distance_chasers_m:
-        out.append(f"two chasers came within {nearest:.3f} m; the limit is {s.limits.min_distance_chasers_m:g} m")
+        out.append(
+            f"two chasers came within {nearest:.3f} m; the limit is {s.limits.min_distance_chasers_m:g} m"
+        )
     for i, c in result["chasers"].items():
         distance = c["min_distance_target_m"]
         if s.success.keep_distances and distance < s.limits.min_distance_target_m:
-            out.append(
-                f"chaser {i} came within {distance:.3f} m of the target; the limit is {s.limits.min_distance_target_m:g} m"
-            )
+            limit = s.limits.min_distance_target_m
+            out.append(f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m")
         if int(i) in s.success.docked and not c["docked"]:
             out.append(f"chaser {i} is not docked")
-        _limit(out, f"chaser {i}: steady position RMS", c["steady"]["position_mse_m2"], s.success.steady_position_rms_m, 1.0, "m")
+        _limit(
+            out,
+            f"chaser {i}: steady position RMS",
+            c["steady"]["position_mse_m2"],
+            s.success.steady_position_rms_m,
+            1.0,
+            "m",
+        )
         _limit(
             out,
             f"chaser {i}: steady orientation RMS",
@@ -256,7 +272,9 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
     return out
 
 
-def _limit(out: list[str], what: str, mean_square: float | None, limit: float | None, factor: float, unit: str) -> None:
+def _limit(
+    out: list[str], what: str, mean_square: float | None, limit: float | None, factor: float, unit: str
+) -> None:
     if limit is None:
         return
     value = None if mean_square is None else math.sqrt(mean_square) * factor

@@ -26,13 +26,17 @@ def decode_picture(image: Image) -> NDArray[np.uint8]:
     data = np.frombuffer(image.data, dtype=np.uint8)
     if image.encoding == "mono8":
         if data.size != shape[0] * shape[1]:
-            raise BadPicture(f"{data.size} bytes, a mono8 picture of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}")
+            raise BadPicture(
+                f"{data.size} bytes, a mono8 picture of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
+            )
         return data.reshape(shape)
     picture: Any = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
     if picture is None:
         raise BadPicture(f"{data.size} bytes that are no JPEG")
     if picture.shape != shape:
-        raise BadPicture(f"a JPEG of {picture.shape[1]} x {picture.shape[0]}, stated as {shape[1]} x {shape[0]}")
+        raise BadPicture(
+            f"a JPEG of {picture.shape[1]} x {picture.shape[0]}, stated as {shape[1]} x {shape[0]}"
+        )
     return picture
 
 

@@ -7,9 +7,8 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
 from chaserdock_protocol.scenario import Body
 
-def refusal(
-    command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int
-) -> str | None:
+
+def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int) -> str | None:
     """Why a wrench command must not be flown, or None.
 
     ``last_tick`` is the newest tick whose command was flown, ``now_ns`` the newest simulated time known.

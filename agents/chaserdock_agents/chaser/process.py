@@ -73,7 +73,9 @@ class Chaser:
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
         self._perception = Perception(
-            self.scenario.camera_model(), target_model(self.scenario.target.model), self.scenario.perception.name
+            self.scenario.camera_model(),
+            target_model(self.scenario.target.model),
+            self.scenario.perception.name,
         )
 
     def open(self, instance: str, realtime: bool) -> None:
@@ -115,10 +117,14 @@ class Chaser:
         begun_s = time.perf_counter()
         sighting = look(self._perception, image, prediction_from(self.sighting))
         took_s = time.perf_counter() - begun_s
-        if sighting.status == "bad_picture" and (self.sighting is None or self.sighting.status != "bad_picture"):
+        if sighting.status == "bad_picture" and (
+            self.sighting is None or self.sighting.status != "bad_picture"
+        ):
             self._warn("bad picture", sighting.detail, image.tick, image.sim_time_ns)
         self.sighting = sighting
-        self.node.publish(topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number)
+        self.node.publish(
+            topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number
+        )
 
     def _fly(self, command: WrenchCommand) -> None:
         now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0

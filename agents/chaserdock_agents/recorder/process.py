@@ -14,7 +14,15 @@ from pathlib import Path
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.log import LogError, LogWriter
-from chaserdock_protocol.messages import ActuatorCommand, Farewell, MissionEnd, Presence, RecorderAck, SolverStatus, Tick
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    Farewell,
+    MissionEnd,
+    Presence,
+    RecorderAck,
+    SolverStatus,
+    Tick,
+)
 from chaserdock_protocol.presence import JoinRefused, PresenceTeller, health_of, join, new_instance
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.transport import Node, Raw, TransportError
@@ -25,7 +33,7 @@ _HEALTH_TICKS = 15
 
 
 def main(options: ProcessOptions) -> int:
-    """Records into ``options.out``; 0 when complete, 1 when stopped early or with messages missing, 2 if it could not."""
+    """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
     node: Node | None = None
     try:
         node = Node("recorder", "recorder", options.link)
@@ -151,7 +159,11 @@ class Recorder:
         """Whether the mission is over and all that was published is here, or has had its time to come."""
         if self.ended_s is None:
             return False
-        everyone = {"world", "controller", *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser"))}
+        everyone = {
+            "world",
+            "controller",
+            *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser")),
+        }
         complete = everyone <= self._said_goodbye and not self.missing() and self.idle()
         return complete or time.monotonic() - self.ended_s > _DRAIN_S
 

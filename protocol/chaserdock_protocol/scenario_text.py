@@ -1,0 +1,60 @@
+"""Scenarios as people write them: overriding a value by its path, and telling what is wrong and where."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+from pydantic import ValidationError
+
+
+class ScenarioError(Exception):
+    """A scenario that cannot be flown; the text has one line a fault."""
+
+
+def explain(error: ValidationError) -> list[str]:
+    """One line a fault: path, what would be right, what was given."""
+    lines = []
+    places = [fault["loc"] for fault in error.errors()]
+    for fault in error.errors():
+        # A faulty item also makes its array too short; the item says it all.
+        if fault["type"] == "too_short" and any(p[:-1] == fault["loc"] for p in places):
+            continue
+        path = ".".join(str(p) for p in fault["loc"]) or "(scenario)"
+        message = fault["msg"].removeprefix("Value error, ")
+        value = fault.get("input")
+        shown = f" (got {value!r})" if isinstance(value, int | float | str | list | tuple) else ""
+        if fault["type"] == "missing":
+            message, shown = "is missing", ""
+        elif fault["type"] == "extra_forbidden":
+            message, shown = "is not a key that is known here", ""
+        lines.append(f"{path}: {message}{shown}")
+    return lines
+
+
+def override(values: dict[str, Any], text: str) -> None:
+    """Sets ``key.path=value`` in nested tables and arrays, the value in TOML's notation; raises ScenarioError."""
+    path, equals, value = text.partition("=")
+    if not equals or not path.strip():
+        raise ScenarioError(f"--set {text}: must be key.path=value")
+    try:
+        parsed = tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        parsed = value.strip()
+    place: Any = values
+    keys = path.strip().split(".")
+    for key in keys[:-1]:
+        place = _item(place, key, text) if isinstance(place, list) else place.setdefault(key, {})
+        if not isinstance(place, dict | list):
+            raise ScenarioError(f"--set {text}: {key} is a value, not a table")
+    if isinstance(place, list):
+        _item(place, keys[-1], text)
+        place[int(keys[-1])] = parsed
+    else:
+        place[keys[-1]] = parsed
+
+
+def _item(place: list[Any], key: str, text: str) -> Any:
+    if not (key.isascii() and key.isdigit()) or int(key) >= len(place):
+        raise ScenarioError(f"--set {text}: {key} must be a number from 0 to {len(place) - 1}")
+    return place[int(key)]

@@ -1,0 +1,377 @@
+"""The mission log: what goes in comes out, for us and for tools that know nothing of us, whole or cut off."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgpack
+import pytest
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol import messages as m
+from chaserdock_protocol.log import (
+    SCENARIO_ATTACHMENT,
+    LogError,
+    LogWriter,
+    count_messages,
+    read_log,
+    read_scenario,
+)
+from mcap.reader import make_reader
+
+V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
+SCENARIO = '{"name": "a scenario"}'
+
+
+class Clock:
+    """A wall clock that goes when told."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def flight(ticks: int) -> Iterator[tuple[topics.Topic, int | str | None, m.Message]]:
+    """What a short mission with two chasers would publish."""
+    for k in range(ticks):
+        head = {"seq": k, "tick": k, "sim_time_ns": k * 66_666_666}
+        yield topics.TICK, None, m.Tick(**head, pictures=True, chasers=(0, 1), controller=True)
+        for i in (0, 1):
+            state = {
+                "position_m": (float(k), float(i), 0.5),
+                "velocity_m_s": V,
+                "q_wxyz": Q,
+                "omega_rad_s": V,
+            }
+            yield topics.ODOMETRY, i, m.Odometry(**head, chaser=i, **state)
+            yield topics.TRUTH_BODY, f"chaser/{i}", m.BodyTruth(**head, body=f"chaser/{i}", **state)
+        picture = bytes((k * 7 + j * j) % 251 for j in range(64))
+        yield (
+            topics.IMAGE,
+            1,
+            m.Image(**head, chaser=1, width_px=8, height_px=8, encoding="mono8", data=picture),
+        )
+
+
+def record(
+    writer: LogWriter, topic: topics.Topic, place: int | str | None, message: m.Message, sent: int
+) -> None:
+    writer.write(topic.key_of(place), m.encoding_of(topic.kind), codec.encode(message), sent)
+
+
+def written(path: Path, ticks: int = 20) -> list[tuple[str, m.Message, int]]:
+    """Writes a whole log; what is in it: key, message, wall clock."""
+    writer, out = LogWriter(path), []
+    writer.describe(SCENARIO, {"run_id": "r1", "mode": "lockstep"})
+    for n, (topic, place, message) in enumerate(flight(ticks)):
+        record(writer, topic, place, message, 1_000_000 + n)
+        out.append((topic.key_of(place), message, 1_000_000 + n))
+    writer.close()
+    return out
+
+
+# -- round trip -------------------------------------------------------------------------------------------
+
+
+def test_what_is_written_is_read_in_order(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    expected = written(path)
+    records = list(read_log(path))
+    assert [(r.key, r.message, r.sent_ns) for r in records] == expected
+    assert {r.place for r in records} == {None, "0", "1", "chaser/0", "chaser/1"}
+    for r in records:
+        assert r.topic.key_of(r.place) == r.key
+        assert type(r.message) is r.topic.kind
+
+
+def test_keys_select_and_counts_count(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    expected = written(path, 7)
+    wanted = [topics.TICK.key_of(), topics.ODOMETRY.key_of(1)]
+    assert [r.message for r in read_log(path, wanted)] == [x for key, x, _ in expected if key in wanted]
+    assert list(read_log(path, [])) == []
+    assert count_messages(path) == {
+        "truth/body/chaser/0": 7,
+        "truth/body/chaser/1": 7,
+        "world/chaser/0/odometry": 7,
+        "world/chaser/1/image": 7,
+        "world/chaser/1/odometry": 7,
+        "world/tick": 7,
+    }
+
+
+def test_scenario_and_versions_lie_in_the_log(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    written(path, 1)
+    scenario, data = read_scenario(path)
+    assert scenario == SCENARIO
+    assert data["run_id"] == "r1"
+    assert data["mode"] == "lockstep"
+    assert data["version.chaserdock"]
+    assert data["version.numpy"].count(".") >= 1
+
+
+# -- other people's readers -------------------------------------------------------------------------------
+
+
+def test_mcaps_own_reader_and_plain_msgpack_read_it_all(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    expected = written(path)
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        header = reader.get_header()
+        assert header.profile == "chaserdock"
+        assert header.library.startswith("chaserdock ")
+        seen = list(reader.iter_messages(log_time_order=False))
+        attachments = list(reader.iter_attachments())
+        summary = reader.get_summary()
+    assert len(seen) == len(expected)
+    sequence: dict[str, int] = {}
+    for (schema, channel, message), (key, original, sent_ns) in zip(seen, expected, strict=True):
+        assert channel.topic == key
+        assert channel.message_encoding == "msgpack"
+        assert message.data == codec.encode(original)  # verbatim
+        values = msgpack.unpackb(message.data)
+        assert values["tick"] == original.tick
+        assert list(values) == list(original.__struct_fields__)
+        assert message.log_time == original.sim_time_ns
+        assert message.publish_time == sent_ns
+        assert message.sequence == sequence.get(key, 0)
+        sequence[key] = message.sequence + 1
+        assert schema is not None
+        assert schema.encoding == "jsonschema"
+        assert schema.name == m.encoding_of(type(original)).rpartition(";")[2]
+        assert channel.metadata["zenoh_encoding"] == m.encoding_of(type(original))
+        properties = json.loads(schema.data)["$defs"][type(original).__name__]["properties"]
+        assert set(properties) == set(values)
+    assert [(a.name, a.media_type, a.data) for a in attachments] == [
+        (SCENARIO_ATTACHMENT, "application/json", SCENARIO.encode())
+    ]
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == len(expected)
+    assert {c.topic for c in summary.channels.values()} == {key for key, _, _ in expected}
+
+
+def test_every_topic_gets_its_schema(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path)
+    keys = {}
+    for topic in topics.TOPICS:
+        place = 3 if "{chaser}" in topic.key else "chaser/3" if "{process}" in topic.key else None
+        keys[topic.key_of(place)] = topic
+        writer.write(topic.key_of(place), m.encoding_of(topic.kind), b"\x80", 5)
+    writer.close()
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert {c.topic for c in summary.channels.values()} == set(keys)
+    for channel in summary.channels.values():
+        assert summary.schemas[channel.schema_id].data == m.schema_of(keys[channel.topic].kind)
+
+
+def test_equal_messages_give_equal_messages_whatever_the_wall_clock(tmp_path: Path) -> None:
+    a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    written(a)
+    written(b)
+    assert [r.message for r in read_log(a)] == [r.message for r in read_log(b)]
+
+
+# -- not everything is a good message ---------------------------------------------------------------------
+
+GARBAGE = [
+    b"",
+    b"\xc1garbage",
+    b"\xff" * 50,
+    msgpack.packb("just text"),
+    msgpack.packb({"sim_time_ns": "noon"}),
+    msgpack.packb({"sim_time_ns": -5}),
+    msgpack.packb({"sim_time_ns": 2**64 - 1}),
+    msgpack.packb({"sim_time_ns": None}),
+    b"\x81\xa1\xff\x00",
+    b"\x81\xab\xff\xfe_time_n\xff\x00",
+    b"\x81\xa1x" + b"\x91" * 200_000,
+]
+
+
+def test_garbage_is_recorded_verbatim_counted_and_not_handed_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path)
+    key, encoding = topics.ODOMETRY.key_of(0), m.encoding_of(m.Odometry)
+    good = next(x for t, p, x in flight(3) if t is topics.ODOMETRY and x.tick == 2 and p == 0)
+    record(writer, topics.ODOMETRY, 0, good, 5)
+    for payload in GARBAGE:
+        writer.write(key, encoding, payload, 6)
+    record(writer, topics.ODOMETRY, 0, good, 7)
+    # Those whose header cannot be read are counted as unreadable; a time below zero is read, and taken as zero.
+    assert writer.messages == len(GARBAGE) + 2
+    assert 7 <= writer.unreadable <= 9
+    writer.close()
+    assert [(r.message, r.sent_ns) for r in read_log(path)] == [(good, 5), (good, 7)]
+    assert count_messages(path) == {key: len(GARBAGE) + 2}
+    with path.open("rb") as file:
+        stored = [x.data for _, _, x in make_reader(file).iter_messages(log_time_order=False)]
+    assert stored == [codec.encode(good), *GARBAGE, codec.encode(good)]
+
+
+def test_unreadable_messages_take_the_time_of_the_one_before(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path)
+    record(writer, topics.TICK, None, m.Tick(sim_time_ns=77, pictures=False, chasers=(), controller=False), 5)
+    writer.write("world/tick", m.encoding_of(m.Tick), b"\xc1", 0)
+    assert writer.unreadable == 1
+    writer.close()
+    with path.open("rb") as file:
+        stored = [(x.log_time, x.publish_time) for _, _, x in make_reader(file).iter_messages()]
+    assert stored == [(77, 5), (77, 77)]
+
+
+def test_foreign_keys_and_versions_are_kept_and_not_handed_out(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path)
+    payload = codec.encode(m.RecorderAck(tick=3))
+    writer.write("somebody/else", "text/plain", b"hello", 5)
+    writer.write(topics.ACK.key_of(), m.encoding_of(m.RecorderAck).replace("v1", "v2"), payload, 6)
+    writer.write(topics.ACK.key_of(), m.encoding_of(m.RecorderAck), payload, 7)
+    writer.close()
+    assert [r.sent_ns for r in read_log(path)] == [7]
+    assert count_messages(path) == {"recorder/ack": 2, "somebody/else": 1}
+    with path.open("rb") as file:
+        kinds = [
+            (channel.message_encoding, schema.name if schema else None, x.data)
+            for schema, channel, x in make_reader(file).iter_messages(log_time_order=False)
+        ]
+    assert kinds == [
+        ("unknown", "unknown", b"hello"),
+        ("msgpack", "unknown", payload),
+        ("msgpack", "chaserdock.RecorderAck.v1", payload),
+    ]
+
+
+# -- files ------------------------------------------------------------------------------------------------
+
+
+def test_a_log_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    written(path)
+    before = path.read_bytes()
+    with pytest.raises(LogError, match="already exists; a log is never overwritten"):
+        LogWriter(path)
+    assert path.read_bytes() == before
+    with pytest.raises(LogError, match="cannot be created: No such file or directory"):
+        LogWriter(tmp_path / "nowhere" / "a.mcap")
+
+
+def test_files_that_are_no_log_are_one_clear_line(tmp_path: Path) -> None:
+    for reader in (read_scenario, count_messages, lambda p: list(read_log(p))):
+        with pytest.raises(LogError, match="cannot be read: No such file or directory"):
+            reader(tmp_path / "none.mcap")
+        with pytest.raises(LogError, match="cannot be read: Is a directory"):
+            reader(tmp_path)
+    other = tmp_path / "other.mcap"
+    for content in (b"", b"text, and not a log at all " * 20, bytes(1000)):
+        other.write_bytes(content)
+        with pytest.raises(LogError, match="no MCAP log"):
+            read_scenario(other)
+        with pytest.raises(LogError, match="no MCAP log"):
+            list(read_log(other))
+        with pytest.raises(LogError, match="no MCAP log"):
+            count_messages(other)
+
+
+def test_a_log_without_scenario_says_so(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path)
+    record(writer, topics.ACK, None, m.RecorderAck(tick=1), 1)
+    writer.close()
+    with pytest.raises(LogError, match="holds no scenario; was it recorded by chaserdock"):
+        read_scenario(path)
+
+
+# -- unclean ends -----------------------------------------------------------------------------------------
+
+
+def test_a_flush_comes_with_time_and_makes_all_before_it_readable(tmp_path: Path) -> None:
+    path, clock = tmp_path / "a.mcap", Clock()
+    writer = LogWriter(path, clock)
+    acks = [m.RecorderAck(tick=k, sim_time_ns=k) for k in range(40)]
+    on_disk = []
+    for ack in acks:
+        clock.now_s += 0.05
+        record(writer, topics.ACK, None, ack, 1)
+        on_disk.append(len(list(read_log(path))) if path.stat().st_size > 8 else 0)
+    # A second of wall time without being flushed never passes, and not every message is a flush.
+    for k, held in enumerate(on_disk):
+        assert k + 1 - held <= 20
+    assert 2 <= len(set(on_disk)) <= 6
+    clock.now_s += 10.0
+    record(writer, topics.ACK, None, m.RecorderAck(tick=99), 1)
+    assert [r.message.tick for r in read_log(path)] == [*range(40), 99]
+    writer.close()
+
+
+def test_without_time_passing_nothing_is_flushed_and_flush_does(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path, Clock())
+    for k in range(50):
+        record(writer, topics.ACK, None, m.RecorderAck(tick=k), 1)
+    assert b"recorder/ack" not in path.read_bytes()
+    writer.flush()
+    assert len(list(read_log(path))) == 50
+    writer.close()
+
+
+def test_a_log_cut_off_anywhere_yields_the_messages_before(tmp_path: Path) -> None:
+    """Cut at many places, inside and between records: never an error, never a wrong or repeated message."""
+    path, clock = tmp_path / "a.mcap", Clock()
+    writer = LogWriter(path, clock)
+    writer.describe(SCENARIO, {"run_id": "r1"})
+    expected, flushed = [], []
+    for n, (topic, place, message) in enumerate(flight(12)):
+        record(writer, topic, place, message, n + 1)
+        expected.append((topic.key_of(place), message))
+        if n % 10 == 9:
+            writer.flush()
+            flushed.append((path.stat().st_size, n + 1))
+    writer.close()
+    data, cut = path.read_bytes(), tmp_path / "cut.mcap"
+    assert len(flushed) == 7
+    sizes = [size for size, _ in flushed]
+    ends = {*range(sizes[0], len(data), 23), *sizes, *(s + 1 for s in sizes), *(s - 1 for s in sizes[1:])}
+    for end in sorted(ends | set(range(len(data) - 120, len(data)))):
+        cut.write_bytes(data[:end])
+        records = [(r.key, r.message) for r in read_log(cut)]
+        held = max(n for size, n in flushed if size <= end)
+        assert len(records) >= held, end
+        assert records == expected[: len(records)], end
+        assert sum(count_messages(cut).values()) == len(records)
+        assert read_scenario(cut)[0] == SCENARIO
+
+
+def test_damage_is_told_or_harmless_and_never_makes_up_messages(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path, Clock())
+    expected = []
+    for n, (topic, place, message) in enumerate(flight(12)):
+        record(writer, topic, place, message, n + 1)
+        expected.append((topic.key_of(place), message))
+        if n % 10 == 9:
+            writer.flush()
+    writer.close()
+    data, told = path.read_bytes(), 0
+    for place in range(0, len(data), 97):
+        damaged = bytearray(data)
+        damaged[place] ^= 0x55
+        path.write_bytes(bytes(damaged))
+        records = []
+        try:
+            for r in read_log(path):
+                records.append((r.key, r.message))
+        except LogError:
+            told += 1
+        rest = iter(expected)
+        assert all(found in rest for found in records), place  # in order, as they were, none twice
+    assert told > 10

@@ -224,6 +224,30 @@ def test_killed_process_does_not_stop_the_others(victim: tuple[str, ...], tmp_pa
         assert result["target_estimate"]["max_position_error_m"] < 0.01
 
 
+def test_frozen_controller_in_real_time(tmp_path: Path) -> None:
+    """The chaser brakes when commands stop coming, refuses those that come too late, and goes on with fresh ones."""
+    out = tmp_path / "run"
+    arguments = ("run", "single", "--mode", "realtime", "--out", str(out), "-q")
+    mission = chaserdock(*arguments, *sets(*SHORT, "duration_s=15.0"))
+    try:
+        wait_for_log(out / "mission.mcap", FLYING_BYTES)
+        controller = find_child(mission, "controller")
+        controller.suspend()
+        time.sleep(1.5)  # less than the lease
+        controller.resume()
+        mission.wait(timeout=120)
+    finally:
+        mission.kill()
+        mission.wait()
+    flown = [r.message for r in read_log(out / "mission.mcap", ["chaser/0/actuators"])]
+    braking = [m.tick for m in flown if m.source == "brake"]
+    assert 5 < len(braking) < 60
+    assert max(m.tick for m in flown if m.source == "command") > max(braking) + 15
+    result = summary(out)
+    assert any("no command, braking" in e["what"] for e in result["events"])
+    assert any("command refused" in e["what"] for e in result["events"])
+
+
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])
 def test_interrupted_run_closes_its_log(how: signal.Signals, tmp_path: Path) -> None:
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), *sets(*LONG))

@@ -51,6 +51,7 @@ class Fleet:
 
     children: list[Child] = field(default_factory=list)
     peak_memory_bytes: int = 0
+    cpu_s: dict[str, float] = field(default_factory=dict)
 
     def start(self, name: str, arguments: list[str], folder: Path) -> None:
         """Starts one; it ends by itself when this launcher dies, however that happens (its stdin closes)."""
@@ -69,13 +70,15 @@ class Fleet:
     def running(self) -> list[Child]:
         return [c for c in self.children if c.process.poll() is None]
 
-    def measure_memory(self) -> None:
-        """Notes the memory of all processes together (proportional set size where the system tells it)."""
+    def measure(self) -> None:
+        """Notes every process' CPU time and their memory together (proportional set size where the system tells it)."""
         total = 0
         for child in self.running():
             try:
-                info = psutil.Process(child.process.pid).memory_full_info()
+                process = psutil.Process(child.process.pid)
+                info, times = process.memory_full_info(), process.cpu_times()
                 total += getattr(info, "pss", 0) or info.rss
+                self.cpu_s[child.name] = times.user + times.system
             except (psutil.NoSuchProcess, psutil.AccessDenied):
                 continue
         self.peak_memory_bytes = max(self.peak_memory_bytes, total)
@@ -195,7 +198,7 @@ def watch(fleet: Fleet, hub: Node, scenario: Scenario, progress: Progress, stop:
                 ended = received.message
         if time.monotonic() - measured_s > 2.0:
             measured_s = time.monotonic()
-            fleet.measure_memory()
+            fleet.measure()
         if stop.asked and not stop.passed_on:
             stop.passed_on = True
             progress.say("stopping: the log is being closed")
@@ -232,7 +235,7 @@ def judge(fleet: Fleet, folder: Path, failure: str | None) -> int:
     if failure is not None:
         summary["failures"] = [failure, *summary["failures"]]
         summary["success"] = False
-    summary["peak_memory_bytes"] = fleet.peak_memory_bytes
+    summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     print(text_of(summary))
     print(f"log, summary and the processes' words: {folder}")

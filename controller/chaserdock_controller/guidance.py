@@ -60,7 +60,7 @@ class Guidance:
         """The target is not known any more: whoever moved relative to it stops there."""
         for i, c in enumerate(self.chasers):
             if c.phase in ("approach", "retreat", "goto", "abort"):
-                self._enter(i, "hold", now_s, stop(c.move, now_s, self._scenario.approach.max_speed_m_s))
+                self._enter(i, "hold", now_s, stop(c.move, now_s))
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
         """Commands of the scenario's time line that have come due since the last call."""
@@ -85,7 +85,7 @@ class Guidance:
         nominal = np.asarray(self._scenario.chasers[i].position_m)
         match what:
             case "hold":
-                self._enter(i, "hold", now_s, stop(c.move, now_s, speed))
+                self._enter(i, "hold", now_s, stop(c.move, now_s))
             case "approach":
                 if reason := self._why_not_approach(i, now_s):
                     return Answer(False, reason)

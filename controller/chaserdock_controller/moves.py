@@ -1,7 +1,9 @@
-"""Smooth changes of a reference position: fifth-degree polynomials between states of motion. Pure functions.
+"""Smooth changes of a reference position: polynomials between states of motion. Pure functions.
 
-A quintic that starts with given position, velocity and acceleration and ends at rest is the motion of least
-jerk between them (T. Flash and N. Hogan, 1985); continuous acceleration keeps the feed-forward continuous.
+A change from rest to rest is the fifth-degree polynomial, the motion of least jerk between two places (T. Flash and
+N. Hogan, 1985). One out of a motion is that, plus what brings the motion so far to rest: a single polynomial with
+initial acceleration overshoots the more the longer it takes, and a bound on its speed may be out of reach.
+Acceleration is continuous throughout, so that the feed-forward is.
 """
 
 from __future__ import annotations
@@ -14,20 +16,32 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 _SHORTEST_S = 2.0
-_LONGEST_S = 1e5
+_STOP_S = 3.0
 # Factors of the derivatives of powers 1 to 5, and 2 to 5.
 _FIRST = np.arange(1.0, 6.0)[:, None]
 _SECOND = np.array([2.0, 6.0, 12.0, 20.0])[:, None]
-_SAMPLES = np.linspace(0.0, 1.0, 41)
+_SAMPLES_PER_PART = np.linspace(0.0, 1.0, 41)
+
+
+@dataclass(frozen=True)
+class Part:
+    """``duration_s`` long; ``coefficients`` (6, 3) of powers of time, metres and seconds. Ends at rest."""
+
+    duration_s: float
+    coefficients: Array
 
 
 @dataclass(frozen=True)
 class Move:
-    """From ``start_s`` on, ``duration_s`` long; ``coefficients`` (6, 3) of powers of time, metres and seconds."""
+    """From ``start_s`` on, ``duration_s`` long: the sum of ``parts``, which all begin at ``start_s``."""
 
     start_s: float
-    duration_s: float
-    coefficients: Array
+    parts: tuple[Part, ...]
+
+    @property
+    def duration_s(self) -> float:
+        """Until the last part has ended, seconds."""
+        return max(part.duration_s for part in self.parts)
 
     @property
     def goal_m(self) -> Array:
@@ -37,53 +51,64 @@ class Move:
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
         """Positions, velocities, accelerations (K, 3) at times (K,); at rest before and after."""
         t = np.asarray(times_s, dtype=float) - self.start_s
-        inside = ((t >= 0.0) & (t <= self.duration_s))[:, None]
-        c = self.coefficients
-        powers = np.vander(np.clip(t, 0.0, self.duration_s), 6, increasing=True)
-        position = powers @ c
-        velocity = powers[:, :5] @ (c[1:] * _FIRST)
-        acceleration = powers[:, :4] @ (c[2:] * _SECOND)
-        return position, np.where(inside, velocity, 0.0), np.where(inside, acceleration, 0.0)
+        position, velocity, acceleration = np.zeros((3, len(t), 3))
+        for part in self.parts:
+            inside = ((t >= 0.0) & (t <= part.duration_s))[:, None]
+            c = part.coefficients
+            powers = np.vander(np.clip(t, 0.0, part.duration_s), 6, increasing=True)
+            position += powers @ c
+            velocity += np.where(inside, powers[:, :5] @ (c[1:] * _FIRST), 0.0)
+            acceleration += np.where(inside, powers[:, :4] @ (c[2:] * _SECOND), 0.0)
+        return position, velocity, acceleration
 
     def over_at(self, time_s: float) -> bool:
         """Whether it has ended."""
         return time_s >= self.start_s + self.duration_s
+
+    def _fastest(self) -> float:
+        times = np.concatenate([self.start_s + part.duration_s * _SAMPLES_PER_PART for part in self.parts])
+        return float(np.linalg.norm(self.at(times)[1], axis=1).max())
 
 
 def stay(position_m: ArrayLike, time_s: float) -> Move:
     """A move that stays where it is."""
     coefficients = np.zeros((6, 3))
     coefficients[0] = position_m
-    return Move(time_s, 0.0, coefficients)
+    return Move(time_s, (Part(0.0, coefficients),))
 
 
-def _quintic(p: Array, v: Array, a: Array, goal: Array, duration_s: float) -> Array:
-    t = duration_s
-    rest = np.array([goal - p - v * t - a * t * t / 2.0, -v - a * t, -a])
-    system = np.array([[t**3, t**4, t**5], [3 * t**2, 4 * t**3, 5 * t**4], [6 * t, 12 * t**2, 20 * t**3]])
-    return np.asarray(np.vstack([p, v, a / 2.0, np.linalg.solve(system, rest)]), dtype=np.float64)
+def stop(current: Move, now_s: float) -> Move:
+    """A move that brings ``current`` to rest a little further on its way.
+
+    Its velocity is the cubic from that of ``current``, with its acceleration, to zero and zero.
+    """
+    p, v, a = (x[0] for x in current.at(np.array([now_s])))
+    if not (v.any() or a.any()):
+        return stay(p, now_s)
+    t, none = _STOP_S, np.zeros(3)
+    cubic, quartic = -(3.0 * v / t + 2.0 * a) / t / 3.0, (2.0 * v / t + a) / t**2 / 4.0
+    return Move(now_s, (Part(t, np.array([p, v, a / 2.0, cubic, quartic, none])),))
+
+
+def _straight(way: Array, duration_s: float) -> Part:
+    share = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]) / duration_s ** np.arange(6)
+    return Part(duration_s, np.outer(share, way))
 
 
 def move_to(current: Move, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
-    """A move from wherever ``current`` is at ``now_s`` to rest at ``goal_m`` (3,), never faster than ``max_speed_m_s``.
+    """A move from wherever ``current`` is at ``now_s`` to rest at ``goal_m`` (3,), not faster than ``max_speed_m_s``.
 
-    If ``current`` is faster than that now, it is never faster than now. Raises ValueError unless the speed is positive.
+    If stopping takes more than that, it is not faster than ``stop``. Raises ValueError unless the speed is positive.
     """
     if not max_speed_m_s > 0.0:
         raise ValueError(f"max_speed_m_s must be positive, not {max_speed_m_s}")
-    p, v, a = (x[0] for x in current.at(np.array([now_s])))
-    goal = np.asarray(goal_m, dtype=float)
-    speed = max(max_speed_m_s, float(np.linalg.norm(v)))
-    duration = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(goal - p)) / max_speed_m_s)
-    while True:
-        move = Move(now_s, duration, _quintic(p, v, a, goal, duration))
-        fastest = np.linalg.norm(move.at(now_s + duration * _SAMPLES)[1], axis=1).max()
-        if fastest <= speed * 1.001 or duration > _LONGEST_S:
-            return move
-        duration *= 1.1
-
-
-def stop(current: Move, now_s: float, max_speed_m_s: float) -> Move:
-    """A move that brings ``current`` to rest a little further on its way."""
-    p, v, _ = (x[0] for x in current.at(np.array([now_s])))
-    return move_to(current, p + v * 1.5, now_s, max_speed_m_s)
+    stopping = stop(current, now_s)
+    way = np.asarray(goal_m, dtype=float) - stopping.goal_m
+    limit = max(max_speed_m_s, stopping._fastest()) * 1.001
+    duration_s = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(way)) / max_speed_m_s)
+    move = Move(now_s, (*stopping.parts, _straight(way, duration_s)))
+    # The longer the way takes, the less it adds to the speed of stopping: this ends.
+    while move._fastest() > limit:
+        duration_s *= 1.1
+        move = Move(now_s, (*stopping.parts, _straight(way, duration_s)))
+    return move

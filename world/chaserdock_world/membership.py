@@ -24,6 +24,11 @@ class Membership:
     _left: list[str] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
+    @property
+    def realtime(self) -> bool:
+        """Whether the wall clock ends a tick."""
+        return self.mode == "realtime"
+
     def admit(self, request: JoinRequest) -> JoinReply:
         """Answers a process that wants to join: refused with the reason, or told the mission."""
         reason = self._objection(request)
@@ -35,7 +40,7 @@ class Membership:
             accepted=True,
             reason="",
             run_id=self.run_id,
-            mode="realtime" if self.mode == "realtime" else "lockstep",
+            mode="realtime" if self.realtime else "lockstep",
             scenario_json=self.scenario_json,
         )
 

@@ -62,6 +62,7 @@ class Flight:
     counts: dict[str, int]
     lost: dict[str, int]
     rejected: dict[str, int]
+    expected: dict[int, tuple[int, ...]]
     latency_s: Array
     wall_time_s: float
     digest: str
@@ -85,6 +86,7 @@ class _Collector:
     lost: dict[str, int] = field(default_factory=dict)
     hashes: dict[str, Any] = field(default_factory=dict)
     wall: list[int] = field(default_factory=list)
+    expected: dict[int, tuple[int, ...]] = field(default_factory=dict)
 
     def take(self, record: Record) -> None:
         message = record.message
@@ -96,6 +98,7 @@ class _Collector:
             content = msgspec.msgpack.encode(without_wall_time(message))
             self.hashes.setdefault(record.key, hashlib.sha256()).update(content)
         if record.topic is topics.TICK:
+            self.expected[message.tick] = message.chasers
             self.wall.append(record.sent_ns)
         elif record.topic is topics.IMAGE:
             self.sent[message.chaser, message.tick] = record.sent_ns
@@ -168,6 +171,7 @@ def load_flight(log: Path) -> Flight:
         counts=dict(sorted(c.counts.items())),
         lost=c.lost,
         rejected=dict(rejected),
+        expected=c.expected,
         latency_s=np.array(c.latency),
         wall_time_s=(c.wall[-1] - c.wall[0]) / 1e9 if len(c.wall) > 1 else 0.0,
         digest=digest.hexdigest(),

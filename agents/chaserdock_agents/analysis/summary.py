@@ -122,6 +122,12 @@ def dock_time(flight: Flight, chaser: int) -> float | None:
     return float(since) if time_s[-1] - since >= approach.docked_time_s else None
 
 
+def _unanswered(flight: Flight) -> int:
+    """Commands that a tick expected and that never came (in lock-step none can be missing)."""
+    expected = sum(len(chasers) for chasers in flight.expected.values())
+    return max(0, expected - sum(n for key, n in flight.counts.items() if key.endswith("/actuators")))
+
+
 def _contacts(flight: Flight) -> int:
     """How many times two bodies came to touch."""
     number, before = 0, set()
@@ -188,6 +194,8 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             "nees_mean": float(np.mean(errors["nees"][late])) if np.any(late) else None,
         },
         "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
+        "late_commands": sum(w.late_commands for w in flight.world),
+        "unanswered": _unanswered(flight),
         "solver": {
             "name": s.controller.solver,
             "solve_s": _percentiles(solve_s, {"p50": 50, "p95": 95}),
@@ -309,6 +317,12 @@ def text_of(result: dict[str, Any]) -> str:
             f"{math.degrees(estimate['orientation_rms_rad']):.3f} deg; largest error "
             f"{estimate['max_position_error_m'] * 1e3:.2f} mm, "
             f"{math.degrees(estimate['max_orientation_error_rad']):.3f} deg; mean NEES {estimate['nees_mean']:.2f} of 6"
+        )
+    if result["mode"] == "realtime" and result["latency_s"]["p50"] is not None:
+        latency = result["latency_s"]
+        lines.append(
+            f"  exposure to command: median {latency['p50'] * 1e3:.1f} ms, p99 {latency['p99'] * 1e3:.1f} ms; "
+            f"{result['late_commands']} commands late, {result['unanswered']} never came"
         )
     lines += [f"  not met: {failure}" for failure in result["failures"]]
     return "\n".join(lines)

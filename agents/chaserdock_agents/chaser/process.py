@@ -69,9 +69,12 @@ class Chaser:
     sighting: Sighting | None = None
     tick: Tick | None = None
     flown_tick: int = -1
+    flown_ns: int | None = None
+    realtime: bool = False
 
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
+        self._forgotten = self._refusing = False
         self._perception = Perception(
             self.scenario.camera_model(),
             target_model(self.scenario.target.model),
@@ -81,6 +84,7 @@ class Chaser:
     def open(self, instance: str, realtime: bool) -> None:
         """Opens the topics, then tells its presence."""
         node, i = self.node, self.number
+        self.realtime = realtime
         node.advertise(topics.SIGHTING, i)
         node.advertise(topics.ACTUATORS, i)
         node.subscribe(topics.IMAGE, i, latest=realtime)
@@ -99,6 +103,7 @@ class Chaser:
             case Odometry() as odometry:
                 self.odometry = odometry
                 self._brake_if_alone()
+                self._brake_if_forgotten(odometry)
             case WrenchCommand() as command:
                 self._fly(command)
             case Tick() as tick:
@@ -130,10 +135,13 @@ class Chaser:
         now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0
         why_not = refusal(command, self.number, self.scenario.chaser, self.flown_tick, now_ns)
         if why_not is None:
+            self.flown_ns, self._forgotten, self._refusing = command.sim_time_ns, False, False
             self._send(passed_on(command))
             return
         self.node.counts.stale += 1
-        self._warn("command refused", why_not, command.tick, now_ns)
+        if not self._refusing:  # the first of a row; all are counted
+            self._warn("command refused", why_not, command.tick, now_ns)
+        self._refusing = True
         # A tick of the world must be answered, if not with this command then with a safe one.
         if self.odometry is not None and command.tick == self.odometry.tick > self.flown_tick:
             self._send(self._braking(self.odometry))
@@ -145,6 +153,21 @@ class Chaser:
             return
         if self.number in tick.chasers and tick.tick > self.flown_tick:
             self._send(self._braking(odometry))
+
+    def _brake_if_forgotten(self, odometry: Odometry) -> None:
+        """In real time nobody waits for the controller: when its commands stop coming, the chaser comes to rest."""
+        if not self.realtime:
+            return
+        if self.flown_ns is None:
+            self.flown_ns = odometry.sim_time_ns
+        silent_ns = odometry.sim_time_ns - self.flown_ns
+        if silent_ns <= self.scenario.controller.command_lifetime_s * 1e9:
+            return
+        if not self._forgotten:
+            self._forgotten = True
+            self._warn("no command, braking", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns)
+        # Not noted as this tick's answer: the controller's, should it still come, is better.
+        self.node.publish(topics.ACTUATORS, self._braking(odometry), self.number)
 
     def _braking(self, odometry: Odometry) -> ActuatorCommand:
         return brake(odometry, self.scenario.chaser, self.scenario.timing.effective_ns(odometry.tick))

@@ -18,6 +18,7 @@ _MIN_PERIMETER_PX = 40.0
 _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
 # A larger share of the picture than this is no saving.
 _REGION_LIMIT = 0.7
+_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 Region = tuple[int, int, int, int]
 
@@ -81,8 +82,8 @@ def region_of(
     camera: Camera, model: TargetModel, position_irf_m: ArrayLike, q_irf_trf_wxyz: ArrayLike
 ) -> Region | None:
     """Where in the picture a target with this predicted pose is; None for "look at all of it"."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-    points = rotations.rotate(q_irf_trf_wxyz, corners * model.size_m) + np.asarray(position_irf_m)
+    turn = rotations.to_matrix(q_irf_trf_wxyz)
+    points = (_CUBE * model.size_m) @ turn.T + np.asarray(position_irf_m)
     if not np.all(np.isfinite(points)) or np.any(points[:, 2] < 0.02):
         return None
     px = camera.project(points)

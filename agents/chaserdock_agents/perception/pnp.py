@@ -7,6 +7,7 @@ sigma^2 (J'J)^-1 as covariance. OpenCV's EPnP is left alone: it fails on coplana
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -31,9 +32,15 @@ MAX_RMS_PX = 2.0
 # The second solution of a plane is kept when its -2 log likelihood is no more than this above the first's.
 _AMBIGUITY_LIMIT = 25.0
 _CANDIDATE_MARKERS = 6
+# Of a plane's two coarse poses, one this much nearer to the refined pose than the other is that very pose.
+_SAME_POSE_SHARE = 0.25
 # A lone marker is a false id when this many others ought to be as plain to see and none is.
 _MAX_MISSING = 3
 _FRAME_MARGIN_PX = 8.0
+# Refinement ends when a step has lowered the squared error by no more than the first share of it, or promises
+# to lower it by no more than the second.
+_LEAST_GAIN, _LEAST_PROMISE = 1e-5, 2e-6
+_ZERO = np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -88,6 +95,8 @@ class _Seen:
     sigma: Array
 
     def part(self, of: Indices) -> _Seen:
+        if len(of) == len(self.which):  # indices are ascending and distinct: all of them
+            return self
         return _Seen(
             self.camera, self.table, self.which[of], self.points[of], self.pixels[of], self.sigma[of]
         )
@@ -119,8 +128,8 @@ def solve(
     if found is None:
         return nothing
     pose, used = found
-    others = np.setdiff1d(np.arange(len(which)), used)
-    if len(others) >= len(used):
+    if len(which) >= 2 * len(used):
+        others = np.delete(np.arange(len(which)), used)
         rival = _consensus(seen.part(others))
         if rival is not None and len(rival[1]) >= len(used):
             return nothing
@@ -129,7 +138,7 @@ def solve(
     poses = [pose]
     first = table.rotations[seen.which[0]][:, 2] if len(used) else np.zeros(3)
     if np.ptp(seen.points @ first) < 1e-6:  # all in one plane: there may be a second pose
-        poses += _plane_poses(seen)
+        poses += _other_than(pose, _plane_poses(seen))
     floor = SIGMA_FLOOR_SINGLE_PX if len(used) == 1 else SIGMA_FLOOR_PX
     solutions = _solutions(seen, poses, floor)
     if not solutions or solutions[0].reprojection_rms_px > MAX_RMS_PX:
@@ -161,18 +170,24 @@ def pose_covariance(
     undetermined or has points behind the camera.
     """
     pose = _Pose(position, rotation)
-    residual, jacobian = _residual(camera, points_trf_m, pixels, 1.0 / sigma, pose)
-    if not (np.all(np.isfinite(residual)) and np.all(np.isfinite(jacobian))):
+    found = _residual(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
+    if found is None:
         return None
+    residual, jacobian = found
     rss = float(residual @ residual)
-    variance = max(floor_px**2, rss / (len(residual) - 6))
+    # By position and dtheta: a turn phi in the camera's axes is R dtheta.
+    jacobian = np.concatenate([jacobian[:, 3:], jacobian[:, :3] @ rotation], axis=1)
     information = jacobian.T @ jacobian
+    if not (math.isfinite(rss) and math.isfinite(float(information.sum()))):
+        return None
+    variance = max(floor_px**2, rss / (len(residual) - 6))
     # Metres and radians are scaled to comparable size before the condition is judged.
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
+    scale = scale * scale[:, None]
+    values, vectors = np.linalg.eigh(information * scale)
     if not values[0] > 1e-12 * values[-1]:
         return None
-    inverse = (vectors / values) @ vectors.T * np.outer(scale, scale)
+    inverse = (vectors / values) @ vectors.T * scale
     return variance * 0.5 * (inverse + inverse.T), rss
 
 
@@ -257,23 +272,40 @@ def _plane_poses(seen: _Seen) -> list[_Pose]:
     return poses
 
 
+def _other_than(pose: _Pose, candidates: list[_Pose]) -> list[_Pose]:
+    """``candidates`` without the one that would be refined to ``pose``, which is refined, where that is plain:
+    of two, the one several times nearer to it than the other."""
+    if len(candidates) != 2:
+        return candidates
+    near, far = sorted(candidates, key=lambda candidate: _angle(candidate.rotation, pose.rotation))
+    if _angle(near.rotation, pose.rotation) < _SAME_POSE_SHARE * _angle(far.rotation, pose.rotation):
+        return [far]
+    return candidates
+
+
+def _angle(a: Array, b: Array) -> float:
+    """Angle, 0 to pi, between two rotation matrices (their distance by Frobenius is sqrt(8) sin(angle / 2))."""
+    difference = (a - b).ravel()
+    return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
+
+
 def _solutions(seen: _Seen, poses: list[_Pose], floor_px: float) -> list[PoseSolution]:
     """Refined, distinct poses, best first, of which the later ones are about as likely as the first."""
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
     found: list[tuple[float, PoseSolution]] = []
+    kept: list[Array] = []
     for number, pose in enumerate(poses):
         refined = pose if number == 0 else _refine(seen, pose)  # the first one comes refined
-        if refined is None:
+        if refined is None or any(_angle(refined.rotation, other) < 1e-3 for other in kept):
             continue
         position, rotation = refined.position, refined.rotation
-        q = rotations.from_matrix(rotation)
-        if any(float(rotations.angle_between(q, other.q_irf_trf_wxyz)) < 1e-3 for _, other in found):
-            continue
         result = pose_covariance(seen.camera, points, pixels, position, rotation, floor_px, sigma)
         if result is None:
             continue
+        kept.append(rotation)
         rms = reprojection_rms_px(seen.camera, points, pixels, position, rotation)
+        q = rotations.from_matrix(rotation)
         found.append((result[1], PoseSolution(position, q, result[0], rms)))
     if not found:
         return []
@@ -327,55 +359,46 @@ def _matrix(rotation_vector: object) -> Array:
 
 
 def _residual(
-    camera: Camera, points: Array, pixels: Array, weight: Array, pose: _Pose
-) -> tuple[Array, Array]:
-    """Reprojection error (2n,) and its Jacobian (2n, 6) by position and by dtheta, R_true = R exp([dtheta]x).
-
-    d(R exp([dtheta]x) X) = -R [X]x dtheta, so a row g of the projection's derivative (g by the point in IRF)
-    gives X x (R' g) by dtheta.
-    """
-    at = points @ pose.rotation.T + pose.position
-    n = len(points)
-    z = at[:, 2]
-    if not np.all(z > 1e-6):
-        return np.full(2 * n, np.nan), np.full((2 * n, 6), np.nan)
-    focal = np.array([camera.fx_px, camera.fy_px])
-    slope = at[:, :2] / z[:, None]
-    residual = (slope * focal + (camera.cx_px, camera.cy_px) - pixels) * weight[:, None]
-    jacobian = np.zeros((n, 2, 6))
-    scale = (weight / z)[:, None] * focal
-    jacobian[:, 0, 0], jacobian[:, 1, 1] = scale[:, 0], scale[:, 1]
-    jacobian[:, :, 2] = -scale * slope
-    body = jacobian[:, :, :3] @ pose.rotation  # rows g' R
-    x, y, z = points[:, 0:1], points[:, 1:2], points[:, 2:3]
-    jacobian[:, :, 3] = y * body[:, :, 2] - z * body[:, :, 1]
-    jacobian[:, :, 4] = z * body[:, :, 0] - x * body[:, :, 2]
-    jacobian[:, :, 5] = x * body[:, :, 1] - y * body[:, :, 0]
-    return residual.ravel(), jacobian.reshape(2 * n, 6)
+    matrix: Array, points: Array, pixels: Array, weight: Array, pose: _Pose
+) -> tuple[Array, Array] | None:
+    """Weighted reprojection error (2n,) and its Jacobian (2n, 6) by a turn phi in the camera's axes and by
+    position, R_true = exp([phi]x) R; None for points behind the camera. ``weight`` (2n,): of each number."""
+    turned = points @ pose.rotation.T
+    if not float(turned[:, 2].min()) + float(pose.position[2]) > 1e-6:
+        return None
+    # Points turned beforehand: OpenCV's derivative by the rotation vector, taken at zero, is that by phi.
+    projected, jacobian = cv2.projectPoints(turned, _ZERO, pose.position, matrix, None)
+    return (np.ravel(projected) - pixels.ravel()) * weight, jacobian[:, :6] * weight[:, None]
 
 
 def _refine(seen: _Seen, pose: _Pose) -> _Pose | None:
     """The pose of least weighted squared error near ``pose``; None when that has points behind."""
-    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-    weight = 1.0 / np.repeat(seen.sigma, 4)
-    residual, jacobian = _residual(seen.camera, points, pixels, weight, pose)
-    cost = float(residual @ residual)
-    if not np.isfinite(cost):
+    matrix, points, pixels = seen.camera.matrix(), seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
+    weight = np.repeat(1.0 / seen.sigma, 8)
+    found = _residual(matrix, points, pixels, weight, pose)
+    cost = math.inf if found is None else float(found[0] @ found[0])
+    if found is None or not math.isfinite(cost):
         return None
+    residual, jacobian = found
     damping = 1e-7
     for _ in range(20):
+        gradient = residual @ jacobian
         information = jacobian.T @ jacobian
-        information[np.diag_indices(6)] *= 1.0 + damping
-        information[np.diag_indices(6)] += 1e-12
-        step = -np.linalg.solve(information, jacobian.T @ residual)
-        trial = _Pose(pose.position + step[:3], pose.rotation @ _matrix(step[3:]))
-        new_residual, new_jacobian = _residual(seen.camera, points, pixels, weight, trial)
-        new_cost = float(new_residual @ new_residual)
-        if np.isfinite(new_cost) and new_cost <= cost:
+        information.ravel()[::7] = information.diagonal() * (1.0 + damping) + 1e-12
+        step = -np.linalg.solve(information, gradient)
+        trial = _Pose(pose.position + step[3:], _matrix(step[:3]) @ pose.rotation)
+        # The gain that the linear model promises. A step, not one shortened by damping, that promises next to
+        # nothing is the last one, and too short to be wrong: it need not be tried.
+        if damping < 1e-3 and -float(step @ gradient) <= _LEAST_PROMISE * cost + 1e-12:
+            return trial
+        found = _residual(matrix, points, pixels, weight, trial)
+        new_cost = math.inf if found is None else float(found[0] @ found[0])
+        if found is not None and new_cost <= cost:
             gain = cost - new_cost
-            pose, residual, jacobian, cost = trial, new_residual, new_jacobian, new_cost
+            pose, cost = trial, new_cost
+            residual, jacobian = found
             damping = max(damping * 0.1, 1e-9)
-            if gain <= 1e-5 * cost + 1e-12:
+            if gain <= _LEAST_GAIN * cost + 1e-12:
                 break
         else:
             damping *= 100.0

@@ -26,7 +26,16 @@ def fly(overrides: tuple[str, ...]) -> dict[str, Any]:
     """One flight; its summary. Raises SystemExit when it was no success."""
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "run"
-        command = [sys.executable, "-m", "chaserdock_agents", "run", "four-chaser-docking", "--out", str(out), "-q"]
+        command = [
+            sys.executable,
+            "-m",
+            "chaserdock_agents",
+            "run",
+            "four-chaser-docking",
+            "--out",
+            str(out),
+            "-q",
+        ]
         command += [item for override in overrides for item in ("--set", override)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         if done.returncode != 0:
@@ -75,7 +84,9 @@ def main() -> None:
     for name, value in result.items():
         print(f"{name:{width}}  {value:.5g}")
     if options.json is not None:
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False)
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+        )
         about = {
             "command": " ".join(sys.argv),
             "commit": commit.stdout.strip(),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import cv2
@@ -196,7 +195,6 @@ def test_equal_pictures_give_equal_sightings(perception: Perception) -> None:
     again, _, _ = view()
     assert image == again
     assert look(perception, image, None) == look(perception, again, None)
-    assert dataclasses.is_dataclass(scenario().camera_model())
 
 
 def test_a_prediction_comes_from_the_best_solution_if_there_is_one(perception: Perception) -> None:

@@ -143,8 +143,8 @@ def test_start_pose_is_the_reference_moved_in_trf_and_turned_in_crf() -> None:
 
 def test_latency_and_rates_become_whole_steps() -> None:
     timing = parse_scenario(good(), "x").timing
-    assert (timing.physics_hz, timing.rate_hz, timing.picture_hz) == (1920, 15, 15)
-    assert timing.latency_steps == 64
+    assert (timing.physics_hz, timing.rate_hz, timing.picture_hz) == (960, 15, 15)
+    assert timing.latency_steps == 32
 
 
 def test_inertia_defaults_to_the_cuboids() -> None:
@@ -214,7 +214,7 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("target.inertia_kg_m2", [1.0, 5.0, 1.0], "target", "inertia_kg_m2"),
     ("chaser.inertia_kg_m2", [1.0, 0.0, 1.0], "chaser.inertia_kg_m2.1", "greater than 0"),
     ("time.rate_hz", 16, "time", "multiple of picture_hz (16, 15)"),
-    ("time.rate_hz", 45, "time", "multiple of rate_hz (1920, 45)"),
+    ("time.rate_hz", 45, "time", "multiple of rate_hz (960, 45)"),
     ("time.picture_hz", 2, "time", "multiple of picture_hz (15, 2)"),
     ("time.rate_hz", 0, "time.rate_hz", "greater than or equal to 1"),
     ("time.rate_hz", 7.5, "time.rate_hz", "integer"),

@@ -98,13 +98,14 @@ def _straight(way: Array, duration_s: float) -> Part:
 def move_to(current: Move, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
     """A move from wherever ``current`` is at ``now_s`` to rest at ``goal_m`` (3,), not faster than ``max_speed_m_s``.
 
-    If stopping takes more than that, it is not faster than ``stop``. Raises ValueError unless the speed is positive.
+    If stopping takes more than that, it is not faster than ``stop`` (both within half a percent). Raises
+    ValueError unless the speed is positive.
     """
     if not max_speed_m_s > 0.0:
         raise ValueError(f"max_speed_m_s must be positive, not {max_speed_m_s}")
     stopping = stop(current, now_s)
     way = np.asarray(goal_m, dtype=float) - stopping.goal_m
-    limit = max(max_speed_m_s, stopping._fastest()) * 1.001
+    limit = max(max_speed_m_s, stopping._fastest()) * 1.005  # more than what lies between two samples
     duration_s = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(way)) / max_speed_m_s)
     move = Move(now_s, (*stopping.parts, _straight(way, duration_s)))
     # The longer the way takes, the less it adds to the speed of stopping: this ends.

@@ -56,8 +56,7 @@ class Time(Section):
 
     rate_hz: Annotated[int, Field(ge=1, le=240)] = 15
     picture_hz: Annotated[int, Field(ge=1, le=240)] = 15
-    # Bullet's step is first order; at 1920 Hz its attitude error stays below the model check's 0.05 degrees.
-    physics_hz: Annotated[int, Field(ge=60, le=20000)] = 1920
+    physics_hz: Annotated[int, Field(ge=60, le=20000)] = 960
     latency_s: NotNegative = 1.0 / 30.0
 
     @model_validator(mode="after")
@@ -138,7 +137,7 @@ class Effects(Section):
     point_spread_px: NotNegative = 0.6
     read_noise: NotNegative = 1.5
     shot_noise: NotNegative = 0.025
-    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 92
+    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 85
 
 
 class CameraSection(Section):

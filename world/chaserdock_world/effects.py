@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 # The noise bank is larger than a picture by these (coprime) numbers of pixels: as many different offsets.
 _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
+# Fixed-point steps a unit of white noise: 16 bits hold eight standard deviations.
+_NOISE_STEPS = 4096.0
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,10 @@ NO_EFFECTS = Effects(1.0, 0.0, 0.0, 0.0)
 
 
 class CameraEffects:
-    """Applies ``effects`` to pictures of one size; ``seed`` fixes all noise it will ever give."""
+    """Applies ``effects`` to pictures of one size; ``seed`` fixes all noise it will ever give.
+
+    Keeps scratch memory: not for several threads at once.
+    """
 
     def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
         self.effects = effects
@@ -50,14 +55,19 @@ class CameraEffects:
         self._shape = (height_px, width_px)
         level = np.arange(256, dtype=np.float64)
         sigma = np.sqrt(effects.read_noise**2 + effects.shot_noise * level)
-        self._sigma = sigma.astype(np.float32)
-        self._bank: NDArray[np.float32] | None = None
+        self._bank: NDArray[np.int16] | None = None
         if sigma.any():
             # One bank of white noise, read at a random place for each picture: drawing fresh noise for
             # every picture costs several times what the rest of the effects does.
             generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 0])))
             size = (height_px + _SPARE_ROWS, width_px + _SPARE_COLUMNS)
-            self._bank = generator.standard_normal(size, dtype=np.float32)
+            noise = generator.standard_normal(size, dtype=np.float32) * np.float32(_NOISE_STEPS)
+            self._bank = np.clip(np.rint(noise), -32767, 32767).astype(np.int16)
+            # Steps a grey level of standard deviation: a power of two, as many as 16 bits hold.
+            steps = 2.0 ** min(np.floor(np.log2(32767.0 / sigma.max())), 64.0)
+            self._sigma = np.rint(sigma * steps).astype(np.int16)
+            self._to_levels = 1.0 / (_NOISE_STEPS * steps)
+            self._work = np.empty(self._shape, dtype=np.int16)
 
     def apply(self, image: NDArray[np.uint8], chaser: int, picture: int) -> NDArray[np.uint8]:
         """Picture ``picture`` of chaser ``chaser`` (both from 0), as the camera gives it (h, w), uint8.
@@ -78,8 +88,13 @@ class CameraEffects:
             seeds = np.random.SeedSequence([self.seed, 1, chaser, picture]).generate_state(3)
             row, column = int(seeds[0]) % (_SPARE_ROWS + 1), int(seeds[1]) % (_SPARE_COLUMNS + 1)
             noise = self._bank[row : row + self._shape[0], column : column + self._shape[1]]
-            scale = cv2.LUT(out, self._sigma)
             sign = 1.0 if seeds[2] & 1 else -1.0
-            cv2.multiply(scale, noise, dst=scale, scale=sign)
-            out = cv2.add(out, scale, dtype=cv2.CV_8U)
+            # Grey levels are whole, so noise rounded to whole ones before it is added is no loss.
+            work = self._work
+            cv2.LUT(out, self._sigma, dst=work)
+            cv2.multiply(work, noise, dst=work, scale=sign * self._to_levels)
+            np.clip(work, -255, 255, out=work)  # so that the sum stays within 16 bits
+            work += out
+            np.clip(work, 0, 255, out=work)
+            return work.astype(np.uint8)
         return np.array(out, dtype=np.uint8) if out is image else np.asarray(out, dtype=np.uint8)

@@ -16,6 +16,8 @@ from chaserdock_protocol.scenario import Scenario, cuboid_inertia
 from chaserdock_protocol.targets import TargetModel, target_model
 from pybullet_utils.bullet_client import BulletClient
 
+from .gyroscopic import midpoint_torque
+
 TARGET = "target"
 
 
@@ -45,6 +47,10 @@ class Physics:
         self._bodies: dict[str, int] = {TARGET: self._add_target(scenario)}
         for i in range(len(scenario.chasers)):
             self._bodies[f"chaser/{i}"] = self._add_chaser(scenario, i)
+        # Bodies whose motion is Bullet's, with their principal moments of inertia.
+        self._free = {f"chaser/{i}": scenario.chaser.inertia for i in range(len(scenario.chasers))}
+        if not self._prescribed:
+            self._free[TARGET] = self._target_inertia(scenario)
         self._names = {number: name for name, number in self._bodies.items()}
 
     @property
@@ -72,8 +78,13 @@ class Physics:
     def _add_target(self, scenario: Scenario) -> int:
         target, model = scenario.target, target_model(scenario.target.model)
         mass = 0.0 if self._prescribed else target.mass_kg
-        inertia = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, model.size_m)
+        inertia = self._target_inertia(scenario)
         return self._add(self._box_shape(model), mass, inertia, prescribed_state(scenario, 0.0))
+
+    @staticmethod
+    def _target_inertia(scenario: Scenario) -> tuple[float, float, float]:
+        target, model = scenario.target, target_model(scenario.target.model)
+        return target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, model.size_m)
 
     def _box_shape(self, model: TargetModel) -> int:
         boxes = model.boxes
@@ -106,16 +117,24 @@ class Physics:
 
         ``wrenches`` maps a chaser's name to force and torque (6,) in its body axes, N and N m.
         """
-        pushes = [(self._bodies[n], w[:3].tolist(), w[3:].tolist()) for n, w in wrenches.items() if w.any()]
+        still = np.zeros(6)
+        pushes = []
+        for name, inertia in self._free.items():
+            wrench = wrenches.get(name, still)
+            pushes.append((self._bodies[name], inertia, wrench[:3].tolist(), wrench[3:].tolist()))
+        step_s = 1.0 / self._scenario.time.physics_hz
         moves = self._prescribed and self._scenario.target.motion != "static"
         touched: set[tuple[str, str]] = set()
         frame, client = pybullet.LINK_FRAME, self._client
         force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
+        pose_of, rates_of = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
         for _ in range(steps):
             # Bullet forgets external forces after every step.
-            for body, force, torque in pushes:
+            for body, inertia, force, torque in pushes:
+                attitude, rate = pose_of(body, client)[1], rates_of(body, client)[1]
+                x, y, z = midpoint_torque(inertia, attitude, rate, torque, step_s)
                 force_on(body, -1, force, (0, 0, 0), frame, client)
-                torque_on(body, -1, torque, frame, client)
+                torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
             pybullet.stepSimulation(client)
             self.step_count += 1
             # A bounce lasts a single step: look after every one.
@@ -135,8 +154,7 @@ class Physics:
         pairs = {
             tuple(sorted((self._names[c[1]], self._names[c[2]])))
             for c in self._bullet.getContactPoints()
-            # Bullet pushes bodies apart that would meet within the step while there is still a gap (c[8], the
-            # distance); that they did meet, the force (c[9]) tells.
+            # Bullet stops bodies at a distance (c[8]) of zero, give or take rounding: the force (c[9]) tells as well.
             if c[8] <= 0.0 or c[9] > 0.0
         }
         return tuple(sorted((a, b) for a, b in pairs))

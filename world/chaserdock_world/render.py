@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
@@ -93,6 +94,21 @@ class Renderer:
         self._size = (camera.width_px, camera.height_px)
         if camera.distortion:
             self._prepare_distortion()
+        # Planes n x + d >= 0 (n_x, n_y, n_z, d) within which a point is in front and on the canvas, with a
+        # pixel to spare; and, of the canvas' borders, unit normals into it.
+        left, top = (self._origin - 1.0 - (camera.cx_px, camera.cy_px)).tolist()
+        right, bottom = left + self._size[0] + 1.0, top + self._size[1] + 1.0
+        self._planes = np.array(
+            [
+                [0.0, 0.0, 1.0, -NEAR_M],
+                [camera.fx_px, 0.0, -left, 0.0],
+                [-camera.fx_px, 0.0, right, 0.0],
+                [0.0, camera.fy_px, -top, 0.0],
+                [0.0, -camera.fy_px, bottom, 0.0],
+            ]
+        )
+        borders = self._planes[1:, :3] - [0.0, 0.0, 0.5]
+        self._borders = (borders / np.linalg.norm(borders, axis=1, keepdims=True)).tolist()
         generator = np.random.Generator(np.random.PCG64(20230619))
         stars = generator.standard_normal((_STARS, 3))
         self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)
@@ -129,15 +145,16 @@ class Renderer:
             p_irf = rotations.rotate_inverse(q_w_irf, np.asarray(p_w, dtype=float) - position)
             r_body = rotations.to_matrix(q_irf_body)
             for index, box in enumerate(boxes):
-                centre = p_irf + r_body @ np.asarray(box.position_m)
-                r_box = r_body @ rotations.to_matrix(box.q_wxyz)
-                if not self._may_be_seen(centre, box):
+                shape = _shape(box)
+                centre = p_irf + r_body @ shape.position
+                if not self._may_be_seen(centre.tolist(), shape.radius):
                     continue
+                r_box = r_body @ shape.rotation
                 seen = self._visible_faces(box, index, body == 0, centre, r_box, to_sun)
                 if seen:
                     outline = np.concatenate([face.outline_px for face in seen])
                     low, high = outline.min(axis=0), outline.max(axis=0)
-                    placed.append(PlacedBox(centre, r_box, np.asarray(box.size_m) / 2.0, low, high))
+                    placed.append(PlacedBox(centre, r_box, shape.half, low, high))
                     faces.append(seen)
 
         canvas = self._background(q_w_irf)
@@ -185,68 +202,65 @@ class Renderer:
         canvas[px[inside, 1], px[inside, 0]] = self._star_levels[front][inside]
         return canvas
 
-    def _may_be_seen(self, centre: Array, box: Box) -> bool:
-        """False when the box's bounding sphere lies behind the near plane or beside the field of view."""
-        radius = 0.5 * float(np.linalg.norm(box.size_m))
-        x, y, z = centre.tolist()
+    def _may_be_seen(self, centre: list[float], radius: float) -> bool:
+        """False when a sphere lies behind the near plane or beside the field of view."""
+        x, y, z = centre
         if z + radius < NEAR_M:
             return False
-        left, top = (self._origin - 0.5 - (self.camera.cx_px, self.camera.cy_px)).tolist()
-        right, bottom = left + self._size[0], top + self._size[1]
-        for offset, low, high, focal in (
-            (x, left, right, self.camera.fx_px),
-            (y, top, bottom, self.camera.fy_px),
-        ):
-            for bound, sign in ((low, 1.0), (high, -1.0)):
-                # Signed distance from the plane through the eye and that border of the canvas.
-                if sign * (focal * offset - bound * z) / np.hypot(focal, bound) < -radius:
-                    return False
-        return True
+        return all(a * x + b * y + c * z >= -radius for a, b, c in self._borders)
 
     def _visible_faces(
         self, box: Box, index: int, is_target: bool, centre: Array, r_box: Array, to_sun: Array
     ) -> list[_Face]:
+        shape = _shape(box)
+        axes = (r_box @ _FACE_AXES).swapaxes(1, 2)  # rows: right, up, normal
+        middles = centre + shape.depths * axes[:, 2]
+        facing = np.flatnonzero((axes[:, 2] * middles).sum(axis=1) < 0.0)  # not seen from behind
+        axes, middles = axes[facing], middles[facing]
+        corners = (middles[:, None] + shape.across[facing] * axes[:, None, 0]) + shape.along[facing] * axes[
+            :, None, 1
+        ]
+        in_front = np.logical_and.reduce(corners[..., 2] >= NEAR_M, axis=1)
+        distances: Array = corners @ self._planes[:, :3].T + self._planes[:, 3]
+        outside = distances < 0.0
+        cut = np.logical_or.reduce(outside, axis=(1, 2))
+        pixels = self.camera.project_ideal(corners) - self._origin
+        cosines = (axes[:, 2] @ to_sun).tolist()
         found = []
-        for face in range(6):
-            width, height, depth = _face_extent(box.size_m, face)
-            right, up, normal = (r_box @ _FACE_AXES[face]).T
-            middle = centre + depth * normal
-            if normal @ middle >= 0.0:  # seen from behind
-                continue
-            corners = middle + np.outer(_CORNERS[:, 0] * width, right) + np.outer(_CORNERS[:, 1] * height, up)
-            in_front = bool(np.all(corners[:, 2] >= NEAR_M))
-            outline = self._clip(corners)
-            if len(outline) < 3:
-                continue
-            px = self.camera.project_ideal(outline) - self._origin
-            level = _WHITE_LEVEL * (AMBIENT + (1.0 - AMBIENT) * max(0.0, float(normal @ to_sun)))
+        for k, face in enumerate(facing.tolist()):
+            px = pixels[k]
+            if cut[k]:
+                polygon = self._clip(corners[k], outside[k])
+                if len(polygon) < 3:
+                    continue
+                px = self.camera.project_ideal(polygon) - self._origin
+            width, height, _ = _face_extent(box.size_m, face)
+            level = _WHITE_LEVEL * (AMBIENT + (1.0 - AMBIENT) * max(0.0, cosines[k]))
             textured = is_target and self._texture(index, face, 0, 0) is not None
             found.append(
-                _Face(middle, right, up, width, height, level, px, in_front, box, 6 * index + face, textured)
+                _Face(
+                    middles[k],
+                    axes[k, 0],
+                    axes[k, 1],
+                    width,
+                    height,
+                    level,
+                    px,
+                    bool(in_front[k]),
+                    box,
+                    6 * index + face,
+                    textured,
+                )
             )
         return found
 
-    def _clip(self, corners: Array) -> Array:
-        """The part (n, 3) of a face (4, 3) that is in front and on the canvas (Sutherland-Hodgman)."""
-        c = self.camera
-        left, top = (self._origin - 1.0 - (c.cx_px, c.cy_px)).tolist()
-        right, bottom = left + self._size[0] + 1.0, top + self._size[1] + 1.0
-        planes = np.array(
-            [
-                [0.0, 0.0, 1.0, -NEAR_M],
-                [c.fx_px, 0.0, -left, 0.0],
-                [-c.fx_px, 0.0, right, 0.0],
-                [0.0, c.fy_px, -top, 0.0],
-                [0.0, -c.fy_px, bottom, 0.0],
-            ]
-        )
-        outside = corners @ planes[:, :3].T + planes[:, 3] < 0.0
-        if not outside.any():
-            return corners
+    def _clip(self, corners: Array, outside: NDArray[np.bool_]) -> Array:
+        """The part (n, 3) of a face (4, 3) that is in front and on the canvas (Sutherland-Hodgman);
+        ``outside`` (4, 5): which corners lie outside of which planes."""
         if outside.all(axis=0).any():
             return corners[:0]
         polygon = corners
-        for plane in planes[outside.any(axis=0)]:
+        for plane in self._planes[outside.any(axis=0)]:
             distance = polygon @ plane[:3] + plane[3]
             kept: list[Array] = []
             for i in range(len(polygon)):
@@ -318,7 +332,7 @@ class Renderer:
         """The texture whose texels are, at the middle of the visible part, about a sample wide and high."""
         # Ray through the middle of the outline, cut with the face's plane.
         ray = np.linalg.solve(to_patch, np.append(outline.mean(axis=0), 1.0))
-        normal = np.cross(face.right, face.up)
+        normal = rotations.cross(face.right, face.up)
         point = ray * (normal @ face.centre) / (normal @ ray)
         level = []
         for axis in (face.right, face.up):
@@ -343,7 +357,7 @@ class Renderer:
         return self._textures[key]
 
 
-_FACE_AXES = [rotations.to_matrix(face_rotation(face)) for face in range(6)]
+_FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
 _CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
 
 
@@ -351,3 +365,33 @@ def _face_extent(size_m: tuple[float, float, float], face: int) -> tuple[float, 
     """As `targets.face_extent`, without its general rotation: faces come in pairs along x, y and z."""
     x, y, z = size_m
     return ((y, z, x / 2.0), (x, z, y / 2.0), (x, y, z / 2.0))[face // 2]
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """What a box's own figures give: ``position`` (3,), ``rotation`` (3, 3), ``half`` edges (3,), ``radius`` of
+    its bounding sphere; by face, distance of the middle ``depths`` (6, 1) and of the corners from it ``across``
+    and ``along`` (6, 4, 1), metres."""
+
+    position: Array
+    rotation: Array
+    half: Array
+    radius: float
+    depths: Array
+    across: Array
+    along: Array
+
+
+@lru_cache(maxsize=1024)
+def _shape(box: Box) -> _Shape:
+    extents = np.array([_face_extent(box.size_m, face) for face in range(6)])
+    size = np.array(box.size_m)
+    return _Shape(
+        np.array(box.position_m),
+        rotations.to_matrix(box.q_wxyz),
+        size / 2.0,
+        0.5 * float(np.linalg.norm(size)),
+        extents[:, 2:],
+        (_CORNERS[:, 0] * extents[:, :1])[..., None],
+        (_CORNERS[:, 1] * extents[:, 1:2])[..., None],
+    )

@@ -30,14 +30,33 @@ def decode_picture(image: Image) -> NDArray[np.uint8]:
                 f"{data.size} bytes, a mono8 picture of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
             )
         return data.reshape(shape)
-    picture: Any = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    if picture is None:
+    # Asked first, as OpenCV would take the memory for whatever size the header claims, and other formats too.
+    size = _jpeg_size(image.data)
+    if size is None:
         raise BadPicture(f"{data.size} bytes that are no JPEG")
-    if picture.shape != shape:
-        raise BadPicture(
-            f"a JPEG of {picture.shape[1]} x {picture.shape[0]}, stated as {shape[1]} x {shape[0]}"
-        )
+    if size != shape:
+        raise BadPicture(f"a JPEG of {size[1]} x {size[0]}, stated as {shape[1]} x {shape[0]}")
+    picture: Any = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if picture is None or picture.shape != shape:
+        raise BadPicture(f"{data.size} bytes of a damaged JPEG")
     return picture
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int] | None:
+    """Height and width in a JPEG's frame header (ITU-T T.81, B.2.2), None if there is none."""
+    if data[:2] != b"\xff\xd8":
+        return None
+    place = 2
+    while place + 9 <= len(data) and data[place] == 0xFF:
+        marker = data[place + 1]
+        if marker == 0xFF:  # a fill byte
+            place += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # these three begin no frame
+            head = data[place + 5 : place + 9]
+            return int.from_bytes(head[:2], "big"), int.from_bytes(head[2:], "big")
+        else:
+            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+    return None
 
 
 def look(perception: Perception, image: Image, predicted: Prediction | None) -> Sighting:

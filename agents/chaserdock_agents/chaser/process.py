@@ -165,7 +165,9 @@ class Chaser:
             return
         if not self._forgotten:
             self._forgotten = True
-            self._warn("no command, braking", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns)
+            self._warn(
+                "no command, braking", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns
+            )
         # Not noted as this tick's answer: the controller's, should it still come, is better.
         self.node.publish(topics.ACTUATORS, self._braking(odometry), self.number)
 

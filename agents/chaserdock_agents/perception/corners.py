@@ -15,6 +15,7 @@ markers in a picture these calls are the cost.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -63,6 +64,7 @@ _STRIP_RIDGE = 1e-6 * np.eye(5)
 # sqrt(1 + (this / width)^2), from the errors found in rendered pictures.
 _UNCERTAIN_PX = 2.0
 
+_NO_MAP: Any = None  # both coordinates are in the other map; OpenCV's annotations want an array here too
 _NEXT, _BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 
 
@@ -151,7 +153,7 @@ def _profiles(
     x, y = at.real[..., ::last], at.imag[..., ::last]
     inside = (x >= 0.0) & (x <= width - 1) & (y >= 0.0) & (y <= height - 1)
     pixels = at.astype(np.complex64).view(np.float32).reshape(-1, at.shape[2], 2)
-    levels = cv2.remap(image, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)  # pyright: ignore[reportCallIssue, reportArgumentType]
+    levels = cv2.remap(image, pixels, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return np.asarray(levels, dtype=np.uint8).reshape(at.shape), inside[..., 0] & inside[..., 1]
 
 
@@ -228,7 +230,7 @@ def _strip_shift(
         normal, right = products[..., :5] + _STRIP_RIDGE, products[..., 5:]
         normal[:, 4, 4] += prior
         right[:, 4, 0] += prior * (np.log(_EDGE_SIGMA_PX) - log_sigma)
-        step = np.linalg.solve(normal, right)
+        step = np.asarray(np.linalg.solve(normal, right), dtype=float)
         shift = _limited(shift + _limited(step[:, 3, 0], 0.4), 1.0)
         log_sigma = log_sigma + _limited(step[:, 4, 0], 0.2)
     return shift

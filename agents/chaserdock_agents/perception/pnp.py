@@ -19,6 +19,8 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
+from chaserdock_agents.perception.refine import Pose, refine, residual_of, rotation_matrix
+
 Indices = NDArray[np.intp]
 
 # Corner noise is never taken to be below this, pixels; a single marker leaves but two degrees of freedom.
@@ -37,10 +39,6 @@ _SAME_POSE_SHARE = 0.25
 # A lone marker is a false id when this many others ought to be as plain to see and none is.
 _MAX_MISSING = 3
 _FRAME_MARGIN_PX = 8.0
-# Refinement ends when a step has lowered the squared error by no more than the first share of it, or promises
-# to lower it by no more than the second.
-_LEAST_GAIN, _LEAST_PROMISE = 1e-5, 2e-6
-_ZERO = np.zeros(3)
 
 
 @dataclass(frozen=True)
@@ -100,12 +98,6 @@ class _Seen:
         return _Seen(
             self.camera, self.table, self.which[of], self.points[of], self.pixels[of], self.sigma[of]
         )
-
-
-@dataclass(frozen=True)
-class _Pose:
-    position: Array  # (3,)
-    rotation: Array  # (3, 3), TRF -> IRF
 
 
 def solve(
@@ -169,8 +161,8 @@ def pose_covariance(
     s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``. None when the geometry leaves the pose
     undetermined or has points behind the camera.
     """
-    pose = _Pose(position, rotation)
-    found = _residual(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
+    pose = Pose(position, rotation)
+    found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
     if found is None:
         return None
     residual, jacobian = found
@@ -199,10 +191,10 @@ def reprojection_rms_px(
     return float(np.sqrt((error**2).sum(axis=-1).mean()))
 
 
-def _consensus(seen: _Seen) -> tuple[_Pose, Indices] | None:
+def _consensus(seen: _Seen) -> tuple[Pose, Indices] | None:
     """The pose on which the most markers agree, refined, and which of ``seen`` these are."""
     best: tuple[int, float] | None = None
-    pose, error = _Pose(np.zeros(3), np.eye(3)), np.zeros(0)
+    pose, error = Pose(np.zeros(3), np.eye(3)), np.zeros(0)
     for candidate in _candidates(seen):
         candidate_error = _marker_errors(seen, candidate)
         near = candidate_error < _COARSE_GATE_PX
@@ -219,7 +211,7 @@ def _consensus(seen: _Seen) -> tuple[_Pose, Indices] | None:
         return None
     used = _one_of_each(seen.which, error, _COARSE_GATE_PX)
     for _ in range(3):
-        refined = _refine(seen.part(used), pose)
+        refined = _refined(seen.part(used), pose)
         if refined is None:
             return None
         pose, error = refined, _marker_errors(seen, refined)
@@ -235,7 +227,7 @@ def _consensus(seen: _Seen) -> tuple[_Pose, Indices] | None:
     return pose, used
 
 
-def _candidates(seen: _Seen) -> Iterator[_Pose]:
+def _candidates(seen: _Seen) -> Iterator[Pose]:
     """Coarse poses to choose from, the likeliest first."""
     if len(seen.which) > 1:
         points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
@@ -246,13 +238,18 @@ def _candidates(seen: _Seen) -> Iterator[_Pose]:
         except cv2.error:  # degenerate corners
             rvecs, tvecs = (), ()
         for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
-            yield _Pose(np.asarray(tvec, dtype=float).ravel(), _matrix(rvec))
+            yield Pose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
     size = np.abs(seen.pixels[:, (1, 2, 3, 0)] - seen.pixels).sum(axis=-1).min(axis=-1)
     for i in np.argsort(-size, kind="stable")[:_CANDIDATE_MARKERS]:
         yield from _plane_poses(seen.part(np.array([i])))
 
 
-def _plane_poses(seen: _Seen) -> list[_Pose]:
+def _refined(seen: _Seen, pose: Pose) -> Pose | None:
+    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
+    return refine(seen.camera.matrix(), points, pixels, np.repeat(1.0 / seen.sigma, 8), pose)
+
+
+def _plane_poses(seen: _Seen) -> list[Pose]:
     """Both IPPE poses of the target from points in the plane of the first marker."""
     to_trf, origin = seen.table.rotations[seen.which[0]], seen.table.origins[seen.which[0]]
     flat = (seen.points.reshape(-1, 3) - origin) @ to_trf
@@ -265,14 +262,14 @@ def _plane_poses(seen: _Seen) -> list[_Pose]:
         return []
     poses = []
     for rvec, tvec in zip(rvecs, tvecs, strict=True):
-        rotation = _matrix(rvec) @ to_trf.T
+        rotation = rotation_matrix(rvec) @ to_trf.T
         position = np.asarray(tvec, dtype=float).ravel() - rotation @ origin
         if np.all(np.isfinite(rotation)) and np.all(np.isfinite(position)):
-            poses.append(_Pose(position, rotation))
+            poses.append(Pose(position, rotation))
     return poses
 
 
-def _other_than(pose: _Pose, candidates: list[_Pose]) -> list[_Pose]:
+def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:
     """``candidates`` without the one that would be refined to ``pose``, which is refined, where that is plain:
     of two, the one several times nearer to it than the other."""
     if len(candidates) != 2:
@@ -289,14 +286,14 @@ def _angle(a: Array, b: Array) -> float:
     return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
 
 
-def _solutions(seen: _Seen, poses: list[_Pose], floor_px: float) -> list[PoseSolution]:
+def _solutions(seen: _Seen, poses: list[Pose], floor_px: float) -> list[PoseSolution]:
     """Refined, distinct poses, best first, of which the later ones are about as likely as the first."""
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
     found: list[tuple[float, PoseSolution]] = []
     kept: list[Array] = []
     for number, pose in enumerate(poses):
-        refined = pose if number == 0 else _refine(seen, pose)  # the first one comes refined
+        refined = pose if number == 0 else _refined(seen, pose)  # the first one comes refined
         if refined is None or any(_angle(refined.rotation, other) < 1e-3 for other in kept):
             continue
         position, rotation = refined.position, refined.rotation
@@ -324,7 +321,7 @@ def _one_of_each(which: Indices, error: Array, gate_px: float) -> Indices:
     return np.array(sorted(kept.values()), dtype=np.intp)
 
 
-def _marker_errors(seen: _Seen, pose: _Pose) -> Array:
+def _marker_errors(seen: _Seen, pose: Pose) -> Array:
     """Distance (n,) in pixels of each marker's worst corner; infinite if behind or seen from behind."""
     at = seen.points @ pose.rotation.T + pose.position
     error = np.sqrt(((seen.camera.project_ideal(at) - seen.pixels) ** 2).sum(axis=-1)).max(axis=-1)
@@ -352,56 +349,3 @@ def _missing(camera: Camera, table: MarkerTable, row: int, solution: PoseSolutio
     plain = inside & (size >= 0.6 * size[row]) & (cosines >= max(0.3, 0.7 * float(cosines[row])))
     plain[row] = False
     return int(plain.sum())
-
-
-def _matrix(rotation_vector: object) -> Array:
-    return np.asarray(cv2.Rodrigues(np.asarray(rotation_vector, dtype=float))[0], dtype=float)
-
-
-def _residual(
-    matrix: Array, points: Array, pixels: Array, weight: Array, pose: _Pose
-) -> tuple[Array, Array] | None:
-    """Weighted reprojection error (2n,) and its Jacobian (2n, 6) by a turn phi in the camera's axes and by
-    position, R_true = exp([phi]x) R; None for points behind the camera. ``weight`` (2n,): of each number."""
-    turned = points @ pose.rotation.T
-    if not float(turned[:, 2].min()) + float(pose.position[2]) > 1e-6:
-        return None
-    # Points turned beforehand: OpenCV's derivative by the rotation vector, taken at zero, is that by phi.
-    projected, jacobian = cv2.projectPoints(turned, _ZERO, pose.position, matrix, None)
-    return (np.ravel(projected) - pixels.ravel()) * weight, jacobian[:, :6] * weight[:, None]
-
-
-def _refine(seen: _Seen, pose: _Pose) -> _Pose | None:
-    """The pose of least weighted squared error near ``pose``; None when that has points behind."""
-    matrix, points, pixels = seen.camera.matrix(), seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-    weight = np.repeat(1.0 / seen.sigma, 8)
-    found = _residual(matrix, points, pixels, weight, pose)
-    cost = math.inf if found is None else float(found[0] @ found[0])
-    if found is None or not math.isfinite(cost):
-        return None
-    residual, jacobian = found
-    damping = 1e-7
-    for _ in range(20):
-        gradient = residual @ jacobian
-        information = jacobian.T @ jacobian
-        information.ravel()[::7] = information.diagonal() * (1.0 + damping) + 1e-12
-        step = -np.linalg.solve(information, gradient)
-        trial = _Pose(pose.position + step[3:], _matrix(step[:3]) @ pose.rotation)
-        # The gain that the linear model promises. A step, not one shortened by damping, that promises next to
-        # nothing is the last one, and too short to be wrong: it need not be tried.
-        if damping < 1e-3 and -float(step @ gradient) <= _LEAST_PROMISE * cost + 1e-12:
-            return trial
-        found = _residual(matrix, points, pixels, weight, trial)
-        new_cost = math.inf if found is None else float(found[0] @ found[0])
-        if found is not None and new_cost <= cost:
-            gain = cost - new_cost
-            pose, cost = trial, new_cost
-            residual, jacobian = found
-            damping = max(damping * 0.1, 1e-9)
-            if gain <= _LEAST_GAIN * cost + 1e-12:
-                break
-        else:
-            damping *= 100.0
-            if damping > 1e9:
-                break
-    return pose

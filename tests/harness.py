@@ -32,7 +32,7 @@ def chaserdock(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
     """Starts the program, as an installed command would."""
     env = {**os.environ, **SINGLE_THREADED, **options.pop("env", {})}
     command = [sys.executable, "-m", "chaserdock_agents", *arguments]
-    process = subprocess.Popen(command, env=env, cwd=ROOT, text=False, **options)
+    process: Any = subprocess.Popen(command, env=env, cwd=ROOT, **options)
     return process
 
 

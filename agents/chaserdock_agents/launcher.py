@@ -42,7 +42,7 @@ class Child:
     def last_words(self) -> str:
         """The last line it said."""
         lines = self.words.read_text(errors="replace").strip().splitlines()
-        return lines[-1] if lines else f"{self.name}: ended without a word"
+        return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: ended without a word"
 
 
 @dataclass

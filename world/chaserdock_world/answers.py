@@ -8,7 +8,7 @@ from collections.abc import Callable
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.messages import ActuatorCommand, Event, Presence, RecorderAck, Tick
-from chaserdock_protocol.presence import PresenceTeller
+from chaserdock_protocol.presence import PresenceTeller, health_of
 from chaserdock_protocol.runtime import say
 from chaserdock_protocol.transport import Node
 
@@ -63,6 +63,9 @@ class Answers:
         self._tick, self._pictures, self._revision = tick, pictures, 0
         self._answered.clear()
         self._tell()
+        if tick > 0 and tick % self._timing.rate_hz == 0:
+            health = health_of(self._node, tick, self._timing.tick_time_ns(tick))
+            self._node.publish(topics.HEALTH, health, "world")
 
     def _tell(self) -> None:
         message = Tick(

@@ -1,0 +1,79 @@
+"""One sample of every message."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from chaserdock_protocol import messages as m
+
+EYE12 = tuple(1.0 if i % 13 == 0 else 0.0 for i in range(144))
+EYE6 = tuple(1.0 if i % 7 == 0 else 0.0 for i in range(36))
+V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
+HEAD: dict[str, Any] = {"seq": 7, "tick": 12, "sim_time_ns": 800_000_000}
+SOLUTION = m.PoseSolution(position_m=V, q_wxyz=Q, covariance=EYE6, reprojection_rms_px=0.125)
+
+SAMPLES: tuple[msgspec.Struct, ...] = (
+    m.Tick(**HEAD, revision=1, pictures=True, chasers=(0, 3), controller=False),
+    m.MissionEnd(**HEAD, reason="flown to its end", complete=True),
+    m.Image(**HEAD, chaser=2, width_px=4, height_px=2, encoding="mono8", data=bytes(range(8))),
+    m.Odometry(**HEAD, chaser=255, position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
+    m.BodyTruth(**HEAD, body="chaser/0", position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
+    m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
+    m.Sighting(
+        **HEAD,
+        chaser=1,
+        status="seen",
+        solutions=(SOLUTION, SOLUTION),
+        marker_ids=(0, 4),
+        corners_px=tuple(float(i) for i in range(16)),
+        rejected_ids=(17,),
+        wall_estimate_s=0.01,
+    ),
+    m.TargetEstimate(
+        **HEAD,
+        status="tracking",
+        position_m=V,
+        velocity_m_s=V,
+        q_wxyz=Q,
+        omega_rad_s=V,
+        covariance=EYE12,
+        accepted=(0,),
+        rejected=(),
+    ),
+    m.Reference(
+        **HEAD,
+        chaser=0,
+        phase="approach",
+        phase_time_s=1.5,
+        position_m=V,
+        q_wxyz=Q,
+        offset_m=V,
+        min_distance_target_m=0.35,
+    ),
+    m.WrenchCommand(
+        **HEAD, chaser=0, effective_time_ns=9, expires_ns=10, mode="nmpc", force_N=V, torque_N_m=V
+    ),
+    m.Plan(**HEAD, chaser=0, step_s=0.1, positions_m=V * 2, quaternions_wxyz=Q * 2, inputs=V * 2),
+    m.SolverStatus(
+        **HEAD,
+        solver="rti",
+        chasers=(0,),
+        status=("solved",),
+        iterations=(3,),
+        cost=(1.5,),
+        max_violation_m=(0.0,),
+        wall_solve_s=0.01,
+    ),
+    m.ActuatorCommand(**HEAD, chaser=0, effective_time_ns=9, source="brake", force_N=V, torque_N_m=V),
+    m.Event(**HEAD, process="world", level="warning", what="process lost", detail="chaser/1 — ∆"),
+    m.Health(**HEAD, process="chaser/0", rejected={"world/tick:format": 2}, lost=1, stale=0),
+    m.RecorderAck(**HEAD),
+    m.OperatorCommand(**HEAD, command="goto", chaser=1, offset_m=V),
+    m.CommandReply(**HEAD, command="goto", chaser=1, accepted=False, reason="no"),
+    m.Presence(**HEAD, process="chaser/0", instance="abc", heard=("controller", "world")),
+    m.Farewell(**HEAD, process="chaser/0", published={"chaser/0/sighting": 4}),
+    m.JoinRequest(process="chaser/0", instance="abc"),
+    m.JoinReply(accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}"),
+)
+BY_TYPE: dict[type[msgspec.Struct], msgspec.Struct] = {type(s): s for s in SAMPLES}

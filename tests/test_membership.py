@@ -1,0 +1,109 @@
+"""Who takes part in a mission: joining, leaving, and who has heard whom."""
+
+from __future__ import annotations
+
+import pytest
+from chaserdock_protocol.messages import JoinRequest, Presence
+from chaserdock_world.membership import Membership
+
+
+def membership(chasers: int = 2, mode: str = "lockstep") -> Membership:
+    return Membership(chasers=chasers, run_id="run-1", mode=mode, scenario_json='{"a": 1}')
+
+
+def joined(members: Membership, *names: str) -> Membership:
+    for name in names:
+        assert members.admit(JoinRequest(process=name, instance=f"{name}-1")).accepted
+        members.alive_changed(name, True)
+    return members
+
+
+def tell(members: Membership, name: str, *heard: str, instance: str | None = None) -> bool:
+    return members.presence_told(Presence(process=name, instance=instance or f"{name}-1", heard=heard))
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_who_may_join_is_told_the_mission(mode: str) -> None:
+    for name in ("chaser/0", "chaser/1", "controller", "recorder"):
+        reply = membership(mode=mode).admit(JoinRequest(process=name, instance="i"))
+        assert (reply.accepted, reply.reason) == (True, "")
+        assert (reply.run_id, reply.mode, reply.scenario_json) == ("run-1", mode, '{"a": 1}')
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("chaser/2", "there is no chaser/2 in this mission; its chasers are 0 to 1"),
+        ("chaser/99999999999999999999", "there is no chaser/99999999999999999999"),
+        ("chaser/01", "'chaser/01' is no process of a mission"),
+        ("chaser/-1", "is no process of a mission"),
+        ("chaser", "is no process of a mission"),
+        ("target", "'target' is no process of a mission"),
+        ("", "'' is no process of a mission"),
+        ("hacker", "is no process of a mission"),
+        ("world", "this mission has its world already"),
+    ],
+)
+def test_who_may_not_join_is_told_why(name: str, reason: str) -> None:
+    members = membership()
+    reply = members.admit(JoinRequest(process=name, instance="i"))
+    assert not reply.accepted
+    assert reason in reply.reason
+    assert reply.scenario_json == ""
+    assert not tell(members, name, instance="i")
+
+
+def test_nobody_joins_twice_at_a_time_and_anybody_comes_back() -> None:
+    members = joined(membership(), "chaser/0")
+    twin = JoinRequest(process="chaser/0", instance="another")
+    assert members.admit(twin).reason == "chaser/0 is already running in this mission"
+    assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-1")).accepted  # asked again
+    members.alive_changed("chaser/0", False)
+    assert members.who_left() == ["chaser/0"]
+    assert members.who_left() == []
+    assert members.admit(twin).accepted
+    assert not tell(members, "chaser/0", "world")  # the old one has nothing to say any more
+    assert tell(members, "chaser/0", "world", instance="another")
+
+
+def test_leaving_without_having_come_is_nothing() -> None:
+    members = membership()
+    members.alive_changed("chaser/0", False)
+    assert members.who_left() == []
+    assert members.alive() == set()
+
+
+def test_linked_are_those_who_have_heard_each_other_both_ways() -> None:
+    members = joined(membership(1), "chaser/0", "controller")
+    assert members.linked(frozenset()) == set()
+    everyone = frozenset({"chaser/0", "controller"})
+    tell(members, "chaser/0", "world", "controller")
+    tell(members, "controller", "world", "chaser/0")
+    assert members.linked(everyone) == {"chaser/0", "controller"}
+    assert members.linked(frozenset({"controller"})) == {"controller"}  # the world has not heard the chaser
+    tell(members, "controller", "world")  # not any more
+    assert members.linked(everyone) == set()
+    tell(members, "controller", "chaser/0")  # has not heard the world
+    assert members.linked(everyone) == {"chaser/0"}
+
+
+def test_chasers_need_not_hear_each_other_and_the_recorder_must_hear_all() -> None:
+    members = joined(membership(2), "chaser/0", "chaser/1", "controller", "recorder")
+    tell(members, "chaser/0", "world", "controller")
+    tell(members, "chaser/1", "world", "controller")
+    tell(members, "controller", "world", "chaser/0", "chaser/1")
+    tell(members, "recorder", "world", "chaser/0", "controller")
+    everyone = frozenset({"chaser/0", "chaser/1", "controller", "recorder"})
+    assert members.linked(everyone) == {"chaser/0", "chaser/1", "controller"}
+
+
+def test_who_is_gone_links_nobody_up_and_is_linked_no_more() -> None:
+    members = joined(membership(1), "chaser/0", "controller")
+    tell(members, "chaser/0", "world", "controller")
+    tell(members, "controller", "world", "chaser/0")
+    everyone = frozenset({"chaser/0", "controller"})
+    members.alive_changed("controller", False)
+    assert members.linked(everyone) == {"chaser/0"}
+    assert members.alive() == {"chaser/0"}
+    members.alive_changed("controller", True)
+    assert members.linked(everyone) == {"chaser/0"}  # back, and not heard anew

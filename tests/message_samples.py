@@ -71,7 +71,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.RecorderAck(**HEAD),
     m.OperatorCommand(**HEAD, command="goto", chaser=1, offset_m=V),
     m.CommandReply(**HEAD, command="goto", chaser=1, accepted=False, reason="no"),
-    m.Presence(**HEAD, process="chaser/0", instance="abc", heard=("controller", "world")),
+    m.Presence(**HEAD, process="chaser/0", instance="abc", heard={"controller": "c1", "world": "w1"}),
     m.Farewell(**HEAD, process="chaser/0", published={"chaser/0/sighting": 4}),
     m.JoinRequest(process="chaser/0", instance="abc"),
     m.JoinReply(accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}"),

@@ -8,7 +8,14 @@ from chaserdock_world.membership import Membership
 
 
 def membership(chasers: int = 2, mode: str = "lockstep") -> Membership:
-    return Membership(chasers=chasers, run_id="run-1", mode=mode, scenario_json='{"a": 1}')
+    return Membership(
+        chasers=chasers, run_id="run-1", mode=mode, scenario_json='{"a": 1}', instance="world-1"
+    )
+
+
+def first(*names: str) -> dict[str, str]:
+    """The first instance of each process."""
+    return {name: f"{name}-1" for name in names}
 
 
 def joined(members: Membership, *names: str) -> Membership:
@@ -19,7 +26,8 @@ def joined(members: Membership, *names: str) -> Membership:
 
 
 def tell(members: Membership, name: str, *heard: str, instance: str | None = None) -> bool:
-    return members.presence_told(Presence(process=name, instance=instance or f"{name}-1", heard=heard))
+    message = Presence(process=name, instance=instance or f"{name}-1", heard=first(*heard))
+    return members.presence_told(message)
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
@@ -75,12 +83,12 @@ def test_leaving_without_having_come_is_nothing() -> None:
 
 def test_linked_are_those_who_have_heard_each_other_both_ways() -> None:
     members = joined(membership(1), "chaser/0", "controller")
-    assert members.linked(frozenset()) == set()
-    everyone = frozenset({"chaser/0", "controller"})
+    assert members.linked({}) == set()
+    everyone = first("chaser/0", "controller")
     tell(members, "chaser/0", "world", "controller")
     tell(members, "controller", "world", "chaser/0")
     assert members.linked(everyone) == {"chaser/0", "controller"}
-    assert members.linked(frozenset({"controller"})) == {"controller"}  # the world has not heard the chaser
+    assert members.linked(first("controller")) == {"controller"}  # the world has not heard the chaser
     tell(members, "controller", "world")  # not any more
     assert members.linked(everyone) == set()
     tell(members, "controller", "chaser/0")  # has not heard the world
@@ -93,7 +101,7 @@ def test_chasers_need_not_hear_each_other_and_the_recorder_must_hear_all() -> No
     tell(members, "chaser/1", "world", "controller")
     tell(members, "controller", "world", "chaser/0", "chaser/1")
     tell(members, "recorder", "world", "chaser/0", "controller")
-    everyone = frozenset({"chaser/0", "chaser/1", "controller", "recorder"})
+    everyone = first("chaser/0", "chaser/1", "controller", "recorder")
     assert members.linked(everyone) == {"chaser/0", "chaser/1", "controller"}
 
 
@@ -101,9 +109,37 @@ def test_who_is_gone_links_nobody_up_and_is_linked_no_more() -> None:
     members = joined(membership(1), "chaser/0", "controller")
     tell(members, "chaser/0", "world", "controller")
     tell(members, "controller", "world", "chaser/0")
-    everyone = frozenset({"chaser/0", "controller"})
+    everyone = first("chaser/0", "controller")
     members.alive_changed("controller", False)
     assert members.linked(everyone) == {"chaser/0"}
     assert members.alive() == {"chaser/0"}
     members.alive_changed("controller", True)
     assert members.linked(everyone) == {"chaser/0"}  # back, and not heard anew
+
+
+def test_who_has_heard_an_earlier_start_has_not_heard_this_one() -> None:
+    members = joined(membership(1), "chaser/0", "controller")
+    tell(members, "chaser/0", "world", "controller")
+    tell(members, "controller", "world", "chaser/0")
+    members.alive_changed("chaser/0", False)
+    assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-2")).accepted
+    members.alive_changed("chaser/0", True)
+    tell(members, "chaser/0", "world", "controller", instance="chaser/0-2")
+    again = {**first("controller"), "chaser/0": "chaser/0-2"}
+    assert members.linked(again) == set()  # the controller still talks of the first one
+    heard = {"world": "world-1", "chaser/0": "chaser/0-2"}
+    assert members.presence_told(Presence(process="controller", instance="controller-1", heard=heard))
+    assert members.linked(again) == {"chaser/0", "controller"}
+
+
+def test_of_two_that_join_at_once_the_second_is_refused() -> None:
+    now_s = [100.0]
+    members = membership(1)
+    members.now_s = lambda: now_s[0]
+    assert members.admit(JoinRequest(process="chaser/0", instance="a")).accepted
+    assert (
+        "another chaser/0 is just joining"
+        in members.admit(JoinRequest(process="chaser/0", instance="b")).reason
+    )
+    now_s[0] += 6.0  # the first never came
+    assert members.admit(JoinRequest(process="chaser/0", instance="b")).accepted

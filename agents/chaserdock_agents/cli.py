@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from chaserdock_protocol.errors import ChaserdockError
 
 from chaserdock_agents.scenarios import find_scenario
 
@@ -128,15 +129,11 @@ def run(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="no progress")] = False,
 ) -> None:
     """Fly a scenario on this machine: start every process, record, judge."""
-    from chaserdock_agents.launcher import RunError, run_mission
+    from chaserdock_agents.launcher import run_mission
 
     path = _found(scenario)
     folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
-    try:
-        status = run_mission(path, folder, mode.value, seed, tuple(overrides or ()), quiet)
-    except RunError as error:
-        raise fail(str(error)) from None
-    raise typer.Exit(status)
+    raise typer.Exit(run_mission(path, folder, mode.value, seed, tuple(overrides or ()), quiet))
 
 
 @app.command()
@@ -252,13 +249,10 @@ def command(
     timeout: Annotated[float, typer.Option(help="seconds to wait for the answer")] = 5.0,
 ) -> None:
     """Tell a chaser of a running mission what to do; status 1 when refused, 2 when nobody answers."""
-    from chaserdock_agents.operator import OperatorError, send_command
+    from chaserdock_agents.operator import send_command
 
     link = link_of(namespace, connect, None, net_mode, config, 60_000)
-    try:
-        reply = send_command(link, what.value, number, offset, timeout)
-    except OperatorError as error:
-        raise fail(str(error)) from None
+    reply = send_command(link, what.value, number, offset, timeout)
     print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
     raise typer.Exit(0 if reply.accepted else 1)
 
@@ -268,14 +262,9 @@ def summary(log: Annotated[Path, typer.Argument(help="a mission.mcap")]) -> None
     """Judge a recorded flight again and print its summary as JSON; status 0 only if it was a success."""
     import json
 
-    from chaserdock_protocol.log import LogError
-
     from chaserdock_agents.analysis.summary import summarize
 
-    try:
-        result = summarize(log)
-    except LogError as error:
-        raise fail(str(error)) from None
+    result = summarize(log)
     print(json.dumps(result, indent=2))
     raise typer.Exit(0 if result["success"] else 1)
 
@@ -289,17 +278,12 @@ def snapshot(
 ) -> None:
     """Draw what every camera saw at a moment of a recorded flight, detections included."""
     import cv2
-    from chaserdock_protocol.log import LogError
 
     from chaserdock_agents.analysis.snapshot import snapshot as draw
 
     if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
         raise fail(f"--out {out}: must end in .png or .jpg")
-    try:
-        picture = draw(log, at, width)
-    except LogError as error:
-        raise fail(str(error)) from None
-    if not cv2.imwrite(str(out), picture):
+    if not cv2.imwrite(str(out), draw(log, at, width)):
         raise fail(f"--out {out}: cannot be written")
 
 
@@ -307,6 +291,8 @@ def main() -> None:
     """Entry point; a closed pipe (``| head``) is no error."""
     try:
         app()
+    except ChaserdockError as error:
+        sys.exit(fail(str(error)).exit_code)
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)

@@ -16,9 +16,10 @@ from types import FrameType
 
 import psutil
 from chaserdock_protocol import topics
+from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.runtime import SINGLE_THREADED
-from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
+from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.transport import Link, Node, TransportError
 
 from .progress import Progress
@@ -27,7 +28,7 @@ _PATIENCE_S = 120
 _END_S = 30.0
 
 
-class RunError(Exception):
+class RunError(ChaserdockError):
     """The run could not be started; one clear line."""
 
 
@@ -126,13 +127,10 @@ def run_mission(
 ) -> int:
     """Flies a scenario; log, summary and the processes' words go to ``folder``. 0 if the flight was a success.
 
-    Raises RunError when it cannot be started at all.
+    Raises RunError, ScenarioError or TransportError when it cannot be started at all.
     """
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
-    try:
-        scenario = load_scenario(path, overrides)
-    except ScenarioError as error:
-        raise RunError(str(error)) from None
+    scenario = load_scenario(path, overrides)
     words = folder / "processes"
     if (folder / "mission.mcap").exists():
         raise RunError(
@@ -145,10 +143,7 @@ def run_mission(
     namespace = f"run-{uuid.uuid4().hex[:12]}"
     # A silent peer is given up after the lease; in lock-step a stopped process is waited for instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
-    try:
-        hub, endpoint = open_hub(namespace, lease_ms)
-    except TransportError as error:
-        raise RunError(str(error)) from None
+    hub, endpoint = open_hub(namespace, lease_ms)
     stop = _Stop()
     fleet = Fleet()
     try:

@@ -5,25 +5,23 @@ from __future__ import annotations
 import time
 
 from chaserdock_protocol import topics
+from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import CommandReply, OperatorCommand
-from chaserdock_protocol.transport import Link, Node, TransportError
+from chaserdock_protocol.transport import Link, Node
 
 
-class OperatorError(Exception):
+class OperatorError(ChaserdockError):
     """The command could not be put to anybody."""
 
 
 def send_command(
     link: Link, command: str, chaser: int, offset_m: tuple[float, float, float] | None, timeout_s: float
 ) -> CommandReply:
-    """Puts a command to the controller; raises OperatorError when nobody answers in time."""
+    """Puts a command to the controller; raises OperatorError when nobody answers in time, TransportError."""
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z goes with goto, and goto needs it")
     request = OperatorCommand(command=command, chaser=chaser, offset_m=offset_m)  # type: ignore[arg-type]
-    try:
-        node = Node("operator", "operator", link)
-    except TransportError as error:
-        raise OperatorError(str(error)) from None
+    node = Node("operator", "operator", link)
     try:
         begun_s = time.monotonic()
         while time.monotonic() - begun_s < timeout_s:
@@ -35,7 +33,5 @@ def send_command(
             f"no controller answered within {timeout_s:g} s (namespace {link.namespace}, "
             f"connect {', '.join(link.connect)}); is a mission running there?"
         )
-    except TransportError as error:
-        raise OperatorError(str(error)) from None
     finally:
         node.close()

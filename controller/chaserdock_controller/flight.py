@@ -35,6 +35,19 @@ from .setup import estimator_of, nmpc_parameters
 _ODOMETRY_KEPT_NS = 2_000_000_000
 
 
+COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
+"""Resolution of commands: 15 uN and 0.24 uN m, 17 and 18 bits of the paper's actuators.
+
+A command word is finite anyway. Here it also swallows what another SIMD level or BLAS changes in the last bits, which
+pictures in whole grey levels would otherwise blow up to their own noise.
+"""
+
+
+def in_steps(wrench: Array, limits: Array) -> Array:
+    """The nearest wrench (6,) that a command can carry, within ``limits`` (6,)."""
+    return np.clip(np.rint(wrench / COMMAND_STEP) * COMMAND_STEP, -limits, limits)
+
+
 @dataclass(frozen=True)
 class Inputs:
     """What a tick brings. Sightings may belong to earlier ticks."""
@@ -156,6 +169,7 @@ class Flight:
                 out.plans[i] = self._plan_message(i, inputs, effective_ns, plan, row)
             else:
                 wrench, mode = brake_wrench(inputs.odometry[i], self.scenario.chaser), "brake"
+            wrench = in_steps(wrench, self._parameters.input_limits())
             self._history.add(i, effective_ns, wrench)
             out.wrenches[i] = WrenchCommand(
                 tick=inputs.tick,

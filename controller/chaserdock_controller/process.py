@@ -11,6 +11,7 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     CommandReply,
+    JoinReply,
     MissionEnd,
     Odometry,
     OperatorCommand,
@@ -18,23 +19,18 @@ from chaserdock_protocol.messages import (
     Sighting,
     Tick,
 )
-from chaserdock_protocol.presence import JoinRefused, PresenceTeller, health_of, join, new_instance
-from chaserdock_protocol.runtime import ProcessOptions, Stop, say
-from chaserdock_protocol.scenario import Scenario, ScenarioError, scenario_from_json
-from chaserdock_protocol.transport import Node, TransportError
+from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
+from chaserdock_protocol.runtime import ProcessOptions, Stop
+from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.transport import Node
 
 from .flight import Flight, Inputs, Outputs
 
 
 def main(options: ProcessOptions) -> int:
     """Runs the controller; 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
-    node: Node | None = None
-    try:
-        node = Node("controller", "controller", options.link)
-        stop, instance = Stop(options.watch_parent), new_instance()
-        mission = join(node, instance, stop, options.patience_s)
-        if mission is None:
-            return 1
+
+    def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
         controller = Controller(node, scenario, Flight(scenario, time.perf_counter))
         controller.open(instance)
@@ -42,12 +38,8 @@ def main(options: ProcessOptions) -> int:
             controller.listen()
         controller.farewell()
         return 0 if controller.ended else 1
-    except (TransportError, JoinRefused, ScenarioError) as error:
-        say("controller", str(error))
-        return 2
-    finally:
-        if node is not None:
-            node.close()
+
+    return take_part("controller", "controller", options, work)
 
 
 @dataclass

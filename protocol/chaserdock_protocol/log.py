@@ -30,6 +30,7 @@ from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
 
 from . import codec, topics
 from .codec import Rejected
+from .errors import ChaserdockError
 from .messages import encoding_of, schema_of
 from .topics import Topic
 
@@ -47,7 +48,7 @@ _PACKAGES = (
 )
 
 
-class LogError(Exception):
+class LogError(ChaserdockError):
     """A log that cannot be used; the text is one clear line."""
 
 

@@ -255,11 +255,11 @@ class CommandReply(Message, frozen=True, kw_only=True):
 
 
 class Presence(Message, frozen=True, kw_only=True):
-    """Who a process is, and whose presence has reached it (see ``presence``)."""
+    """Who a process is, and whose presence has reached it: process name to instance (see ``presence``)."""
 
     process: Text
     instance: Text
-    heard: tuple[Text, ...]
+    heard: dict[str, str]
 
 
 class Farewell(Message, frozen=True, kw_only=True):

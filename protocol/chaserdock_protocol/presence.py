@@ -15,14 +15,17 @@ import uuid
 from collections.abc import Callable
 
 from . import topics
+from .errors import ChaserdockError
 from .messages import Farewell, Health, JoinReply, JoinRequest, Presence
+from .runtime import ProcessOptions, Stop, say
+from .topics import Role
 from .transport import Node
 
 EARLY_PERIOD_S = 0.05
 STEADY_PERIOD_S = 1.0
 
 
-class JoinRefused(Exception):
+class JoinRefused(ChaserdockError):
     """The world does not take this process; the text says why."""
 
 
@@ -53,6 +56,31 @@ def join(
     return None
 
 
+def take_part(
+    name: str, role: Role, options: ProcessOptions, work: Callable[[Node, JoinReply, str, Stop], int]
+) -> int:
+    """The main of every process but the world: opens its node, joins the mission, does its ``work``; its status.
+
+    ``work(node, mission, instance, stop)`` is called once the world has answered. 1 when stopped before that, 2, with
+    the reason said, for a ChaserdockError.
+    """
+    node: Node | None = None
+    try:
+        node = Node(name, role, options.link)
+        stop, instance = Stop(options.watch_parent), new_instance()
+        mission = join(node, instance, stop, options.patience_s)
+        if mission is None:
+            return 1
+        node.announce()  # at once: while it prepares itself (compiling, say) nobody else may take its place
+        return work(node, mission, instance, stop)
+    except ChaserdockError as error:
+        say(name, str(error))
+        return 2
+    finally:
+        if node is not None:
+            node.close()
+
+
 def partners_of(process: str, present: set[str]) -> set[str]:
     """Those among ``present`` that ``process`` must have heard, and that must have heard it, before it flies."""
     if process.startswith("chaser/"):
@@ -76,7 +104,6 @@ class PresenceTeller:
         """Set once flying: presence is then told once a second only."""
         node.advertise(topics.PRESENCE, node.name)
         node.subscribe(topics.PRESENCE)
-        node.announce()
         self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
         self._thread.start()
 
@@ -85,10 +112,10 @@ class PresenceTeller:
         with self._lock:
             self._heard[message.process] = message.instance
 
-    def heard(self) -> frozenset[str]:
-        """Processes heard so far."""
+    def heard(self) -> dict[str, str]:
+        """Processes heard so far, with the instance that was heard."""
         with self._lock:
-            return frozenset(self._heard)
+            return dict(sorted(self._heard.items()))
 
     def forget(self, process: str) -> None:
         """A process is gone; it has to be heard again."""
@@ -97,9 +124,7 @@ class PresenceTeller:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            message = Presence(
-                process=self._node.name, instance=self._instance, heard=tuple(sorted(self.heard()))
-            )
+            message = Presence(process=self._node.name, instance=self._instance, heard=self.heard())
             self._node.publish(topics.PRESENCE, message, self._node.name)
             self._stop.wait(STEADY_PERIOD_S if self.settled.is_set() else EARLY_PERIOD_S)
 

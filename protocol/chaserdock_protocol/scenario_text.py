@@ -7,8 +7,10 @@ from typing import Any
 
 from pydantic import ValidationError
 
+from .errors import ChaserdockError
 
-class ScenarioError(Exception):
+
+class ScenarioError(ChaserdockError):
     """A scenario that cannot be flown; the text has one line a fault."""
 
 

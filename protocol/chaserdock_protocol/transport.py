@@ -21,6 +21,7 @@ import zenoh
 
 from . import codec, topics
 from .codec import Rejected
+from .errors import ChaserdockError
 from .messages import Message, encoding_of
 from .topics import Role, Topic
 
@@ -35,7 +36,7 @@ _PRIORITY = {
 }
 
 
-class TransportError(Exception):
+class TransportError(ChaserdockError):
     """The network could not be had as asked; the text is one clear line."""
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import threading
+import time
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from chaserdock_protocol import presence, topics
 from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
+
+JOINING_S = 5.0
+"""Between being admitted and being seen alive a process has that long before another may take its place."""
 
 
 @dataclass
@@ -19,7 +25,10 @@ class Membership:
     scenario_json: str
     _alive: set[str] = field(default_factory=set)
     _admitted: dict[str, str] = field(default_factory=dict)
-    _heard: dict[str, frozenset[str]] = field(default_factory=dict)
+    instance: str = ""
+    now_s: Callable[[], float] = time.monotonic
+    _admitted_s: dict[str, float] = field(default_factory=dict)
+    _heard: dict[str, dict[str, str]] = field(default_factory=dict)
     _instances: dict[str, str] = field(default_factory=dict)
     _left: list[str] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -36,6 +45,7 @@ class Membership:
             return JoinReply(accepted=False, reason=reason)
         with self._lock:
             self._admitted[request.process] = request.instance
+            self._admitted_s[request.process] = self.now_s()
         return JoinReply(
             accepted=True,
             reason="",
@@ -53,8 +63,11 @@ class Membership:
         if name.startswith("chaser/") and int(name.partition("/")[2]) >= self.chasers:
             return f"there is no {name} in this mission; its chasers are 0 to {self.chasers - 1}"
         with self._lock:
-            if name in self._alive and self._admitted.get(name) != request.instance:
-                return f"{name} is already running in this mission"
+            if self._admitted.get(name, request.instance) != request.instance:
+                if name in self._alive:
+                    return f"{name} is already running in this mission"
+                if self.now_s() - self._admitted_s.get(name, -math.inf) < JOINING_S:
+                    return f"another {name} is just joining this mission"
         return ""
 
     def alive_changed(self, name: str, alive: bool) -> None:
@@ -65,6 +78,7 @@ class Membership:
             elif name in self._alive:
                 self._alive.discard(name)
                 self._heard.pop(name, None)
+                self._admitted_s.pop(name, None)
                 self._left.append(name)
 
     def presence_told(self, message: Presence) -> bool:
@@ -72,7 +86,7 @@ class Membership:
         with self._lock:
             if self._admitted.get(message.process) != message.instance:
                 return False
-            self._heard[message.process] = frozenset(message.heard)
+            self._heard[message.process] = dict(message.heard)
             return True
 
     def who_left(self) -> list[str]:
@@ -81,11 +95,19 @@ class Membership:
             left, self._left = self._left, []
             return left
 
-    def linked(self, world_heard: frozenset[str]) -> set[str]:
-        """Processes that are alive and joined up with all they deal with."""
+    def linked(self, world_heard: dict[str, str]) -> set[str]:
+        """Processes that are alive and joined up with all they deal with; ``world_heard``: whom the world has heard.
+
+        Only the instances that are here now count: whoever has heard an earlier start of a process has not heard it.
+        """
         with self._lock:
-            heard = {name: h for name, h in self._heard.items() if name in self._alive}
-            heard["world"] = world_heard
+            here = {**self._admitted, "world": self.instance}
+            known = {**self._heard, "world": world_heard}
+            heard = {
+                name: {o for o, instance in others.items() if here.get(o) == instance}
+                for name, others in known.items()
+                if name in self._alive or name == "world"
+            }
             present = {"world", *(n for n in heard if n.startswith("chaser/") or n == "controller")}
             return {
                 name

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
+from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd
 from chaserdock_protocol.presence import PresenceTeller, new_instance
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
@@ -34,7 +35,7 @@ def main(options: ProcessOptions) -> int:
         node = Node("world", "world", options.link)
         refuse_second_world(node)
         return fly(scenario, options, node, Stop(options.watch_parent))
-    except (ScenarioError, TransportError) as error:
+    except ChaserdockError as error:
         say("world", str(error))
         return 2
     finally:
@@ -72,6 +73,7 @@ def gather(
         run_id=uuid.uuid4().hex[:12],
         mode=options.mode,
         scenario_json=scenario.model_dump_json(),
+        instance=new_instance(),
     )
     node.subscribe(topics.ACTUATORS)
     node.subscribe(topics.ACK)
@@ -82,7 +84,8 @@ def gather(
     for i in range(len(scenario.chasers)):
         node.advertise(topics.ODOMETRY, i)
         node.advertise(topics.IMAGE, i, droppable=options.mode == "realtime")
-    teller = PresenceTeller(node, new_instance())
+    teller = PresenceTeller(node, membership.instance)
+    node.announce()
     return Answers(
         node,
         membership,

@@ -12,6 +12,7 @@ from chaserdock_protocol.messages import (
     ActuatorCommand,
     Event,
     Image,
+    JoinReply,
     MissionEnd,
     Odometry,
     Presence,
@@ -19,11 +20,11 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.presence import JoinRefused, PresenceTeller, health_of, join, new_instance
-from chaserdock_protocol.runtime import ProcessOptions, Stop, say
-from chaserdock_protocol.scenario import Scenario, ScenarioError, scenario_from_json
+from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
+from chaserdock_protocol.runtime import ProcessOptions, Stop
+from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.targets import target_model
-from chaserdock_protocol.transport import Node, TransportError
+from chaserdock_protocol.transport import Node
 
 from chaserdock_agents.perception import Perception
 
@@ -34,27 +35,17 @@ from .pilot import brake, passed_on, refusal
 def main(options: ProcessOptions) -> int:
     """Runs chaser ``options.chaser``; 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
     cv2.setNumThreads(1)
-    name = f"chaser/{options.chaser}"
-    node: Node | None = None
-    try:
-        node = Node(name, "chaser", options.link)
-        stop, instance = Stop(options.watch_parent), new_instance()
-        mission = join(node, instance, stop, options.patience_s)
-        if mission is None:
-            return 1
-        scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
-        chaser = Chaser(node, scenario, int(options.chaser or 0))
+    number = int(options.chaser or 0)
+
+    def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+        chaser = Chaser(node, scenario_from_json(mission.scenario_json, "the world's scenario"), number)
         chaser.open(instance, realtime=mission.mode == "realtime")
         while not (chaser.ended or stop()):
             chaser.listen()
         chaser.farewell()
         return 0 if chaser.ended else 1
-    except (TransportError, JoinRefused, ScenarioError) as error:
-        say(name, str(error))
-        return 2
-    finally:
-        if node is not None:
-            node.close()
+
+    return take_part(f"chaser/{number}", "chaser", options, work)
 
 
 @dataclass

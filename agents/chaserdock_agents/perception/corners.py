@@ -15,9 +15,7 @@ markers in a picture these calls are the cost.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import cv2
 import numpy as np
 from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.rotations import Array
@@ -64,7 +62,6 @@ _STRIP_RIDGE = 1e-6 * np.eye(5)
 # sqrt(1 + (this / width)^2), from the errors found in rendered pictures.
 _UNCERTAIN_PX = 2.0
 
-_NO_MAP: Any = None  # both coordinates are in the other map; OpenCV's annotations want an array here too
 _NEXT, _BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 
 
@@ -139,7 +136,7 @@ def _sides(corners: Points) -> _Sides:
 
 def _profiles(
     image: NDArray[np.uint8], camera: Camera, sides: _Sides, along: Array, across: Array
-) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+) -> tuple[Array, NDArray[np.bool_]]:
     """Grey levels (k, rows, taps) at ``along`` (rows,) of the sides (k,), -0.5 to 0.5, and ``across`` (k, taps)
     pixels out of them, and which rows (k, rows) lie inside the picture."""
     base = (sides.start + 0.5 * sides.vector)[:, None] + along * sides.vector[:, None]
@@ -152,9 +149,28 @@ def _profiles(
     last = at.shape[2] - 1
     x, y = at.real[..., ::last], at.imag[..., ::last]
     inside = (x >= 0.0) & (x <= width - 1) & (y >= 0.0) & (y <= height - 1)
-    pixels = at.astype(np.complex64).view(np.float32).reshape(-1, at.shape[2], 2)
-    levels = cv2.remap(image, pixels, _NO_MAP, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return np.asarray(levels, dtype=np.uint8).reshape(at.shape), inside[..., 0] & inside[..., 1]
+    return _bilinear(image, at), inside[..., 0] & inside[..., 1]
+
+
+def _bilinear(image: NDArray[np.uint8], at: Points) -> Array:
+    """Grey levels at points x + iy, pixels; beyond the picture those of its border.
+
+    Not cv2.remap: it takes coordinates in steps of 1/32 pixel. The detector's corners are whole pixels, so that many
+    points lie just where one step ends, and the last bits of the arithmetic (another SIMD level) would decide.
+    """
+    height, width = image.shape
+    x = np.minimum(np.maximum(at.real, 0.0), width - 1.0)
+    y = np.minimum(np.maximum(at.imag, 0.0), height - 1.0)
+    column = np.minimum(x.astype(np.intp), width - 2)
+    row = np.minimum(y.astype(np.intp), height - 2)
+    x -= column
+    y -= row
+    flat = image.reshape(-1)
+    corner = row * width + column
+    upper = flat.take(corner) * (1.0 - x) + flat.take(corner + 1) * x
+    corner += width
+    lower = flat.take(corner) * (1.0 - x) + flat.take(corner + 1) * x
+    return upper + (lower - upper) * y
 
 
 def _reach(sides: _Sides, cells: int, most_px: float) -> Array:
@@ -168,7 +184,7 @@ def _centroid_pass(
     sides = _Sides(quads.start.ravel(), quads.vector.ravel(), quads.normal.ravel(), quads.extent.ravel())
     reach = _reach(sides, cells, settings.reach_px)[:, None]
     levels, inside = _profiles(image, camera, sides, settings.along, settings.taps * reach)
-    rise = np.subtract(levels[..., 1:], levels[..., :-1], dtype=float)
+    rise = levels[..., 1:] - levels[..., :-1]
     sums = np.maximum(rise, 0.0, out=rise).reshape(-1, rise.shape[-1]) @ settings.centroid
     total = sums[:, 0].reshape(inside.shape)
     offset = sums[:, 1].reshape(inside.shape) / np.maximum(total, 1e-6) * reach
@@ -200,7 +216,7 @@ def _strip_shift(
     s = (outer + inner)[:, None] * _STRIP_ACROSS - inner[:, None]
     levels, inside = _profiles(image, camera, sides, _STRIP_ALONG, s)
     weight = inside / np.maximum(np.add.reduce(inside, axis=1), 1)[:, None]
-    profile = (weight[:, None, :] @ levels.astype(float))[:, 0]
+    profile = (weight[:, None, :] @ levels)[:, 0]
 
     # Distances of the samples from both edges, in pixels where e = 0.
     from_edges = np.stack([s, s - border_px[:, None]], axis=1)

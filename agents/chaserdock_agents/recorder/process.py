@@ -17,15 +17,16 @@ from chaserdock_protocol.log import LogError, LogWriter
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Farewell,
+    JoinReply,
     MissionEnd,
     Presence,
     RecorderAck,
     SolverStatus,
     Tick,
 )
-from chaserdock_protocol.presence import JoinRefused, PresenceTeller, health_of, join, new_instance
+from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
-from chaserdock_protocol.transport import Node, Raw, TransportError
+from chaserdock_protocol.transport import Node, Raw
 
 LOG_NAME = "mission.mcap"
 _DRAIN_S = 10.0
@@ -34,37 +35,29 @@ _HEALTH_TICKS = 15
 
 def main(options: ProcessOptions) -> int:
     """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
-    node: Node | None = None
+    return take_part("recorder", "recorder", options, lambda *member: record(options.out, *member))
+
+
+def record(folder: Path, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+    """Records until the mission is over and all that was published is in the file; the process' status."""
+    writer = open_log(folder)
     try:
-        node = Node("recorder", "recorder", options.link)
-        stop, instance = Stop(options.watch_parent), new_instance()
-        mission = join(node, instance, stop, options.patience_s)
-        if mission is None:
-            return 1
-        writer = open_log(options.out)
-        try:
-            writer.describe(mission.scenario_json, {"run_id": mission.run_id, "mode": mission.mode})
-            recorder = Recorder(node, writer)
-            recorder.open(instance)
-            while not recorder.finished() and not (stop() and recorder.idle()):
-                recorder.take_one(0.1)
-        finally:
-            writer.close()
-        if recorder.ended_s is None:
-            say("recorder", f"stopped before the mission's end; {writer.path} holds what came until then")
-            return 1
-        missing = recorder.missing()
-        for key, number in missing.items():
-            say("recorder", f"{number} messages of {key} never came")
-        # In real time pictures are dropped rather than waited for; anything else must be here.
-        excused = {k for k in missing if mission.mode == "realtime" and k.endswith("/image")}
-        return 1 if missing.keys() - excused else 0
-    except (TransportError, JoinRefused, LogError) as error:
-        say("recorder", str(error))
-        return 2
+        writer.describe(mission.scenario_json, {"run_id": mission.run_id, "mode": mission.mode})
+        recorder = Recorder(node, writer)
+        recorder.open(instance)
+        while not recorder.finished() and not (stop() and recorder.idle()):
+            recorder.take_one(0.1)
     finally:
-        if node is not None:
-            node.close()
+        writer.close()
+    if recorder.ended_s is None:
+        say("recorder", f"stopped before the mission's end; {writer.path} holds what came until then")
+        return 1
+    missing = recorder.missing()
+    for key, number in missing.items():
+        say("recorder", f"{number} messages of {key} never came")
+    # In real time pictures are dropped rather than waited for; anything else must be here.
+    excused = {k for k in missing if mission.mode == "realtime" and k.endswith("/image")}
+    return 1 if missing.keys() - excused else 0
 
 
 def open_log(folder: Path) -> LogWriter:

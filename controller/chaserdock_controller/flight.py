@@ -21,6 +21,7 @@ from chaserdock_protocol.messages import (
     TargetEstimate,
     WrenchCommand,
 )
+from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
 from . import reference

@@ -154,12 +154,13 @@ class CameraSection(Section):
 class EstimatorSection(Section):
     """How sightings become the target's odometry; the numbers are ``mekf``'s.
 
-    ``camera_bias_*``: one sigma of each camera's own calibration error, which is estimated (0: cameras are perfect).
+    ``camera_bias_*``: one sigma of each camera's own calibration error, which is then estimated. 0: the cameras are as
+    calibrated, which is so in the world's pictures.
     """
 
     name: Literal["mekf", "paper"] = "mekf"
-    camera_bias_position_m: NotNegative = 0.004
-    camera_bias_attitude_deg: NotNegative = 0.4
+    camera_bias_position_m: NotNegative = 0.0
+    camera_bias_attitude_deg: NotNegative = 0.0
 
 
 class PerceptionSection(Section):

@@ -85,14 +85,18 @@ def zenoh_config(link: Link) -> zenoh.Config:
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": True,
     }
+    # Processes start in any order: keep trying to connect, unless the file says otherwise.
+    patient = {
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    }
+    values |= {name: value for name, value in patient.items() if config.get_json(name) in ("null", None)}
     if link.config is None:
         values |= {
             "mode": link.mode,
             "listen/endpoints": list(link.listen) if link.mode != "client" else [],
             "connect/endpoints": list(link.connect),
-            "connect/timeout_ms": -1,
-            "connect/exit_on_failure": False,
-            "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
             "transport/link/tx/lease": link.lease_ms,
         }
     try:
@@ -325,6 +329,8 @@ class Node:
 
 def _open_error(error: Exception, link: Link) -> str:
     text = " ".join(str(error).split())
+    if link.config is not None:
+        return f"cannot open the Zenoh session of {link.config}: {text}"
     listen, connect = ", ".join(link.listen) or "-", ", ".join(link.connect) or "-"
     if "in use" in text.lower():
         return (

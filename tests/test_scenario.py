@@ -228,6 +228,7 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("success.docked", [2], "success.docked", "there is no chaser 2"),
     ("success.docked", [-1], "success.docked.0", "greater than or equal to 0"),
     ("controller.horizon_s", 0.04, "controller", "shorter than one step"),
+    ("controller.dt_s", 0.001, "controller", "3000 stages; at most 500"),
     ("controller.dt_s", 0.0, "controller.dt_s", "greater than 0"),
     ("controller.falloff", 1.5, "controller.falloff", "less than or equal to 1"),
     ("controller.weight_force", 0.0, "controller.weight_force", "greater than 0"),

@@ -169,6 +169,10 @@ class PerceptionSection(Section):
     name: Literal["default", "paper"] = "default"
 
 
+MAX_STAGES = 500
+"""Most prediction steps of a plan; more could not be solved in time, and messages bound their size."""
+
+
 class Controller(Section):
     """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md)."""
 
@@ -190,6 +194,8 @@ class Controller(Section):
     def _stages(self) -> Controller:
         if round(self.horizon_s / self.dt_s) < 1:
             raise ValueError(f"horizon_s ({self.horizon_s}) is shorter than one step dt_s ({self.dt_s})")
+        if self.horizon_s / self.dt_s > MAX_STAGES:
+            raise ValueError(f"horizon_s / dt_s is {self.horizon_s / self.dt_s:.0f} stages; at most {MAX_STAGES}")
         return self
 
 

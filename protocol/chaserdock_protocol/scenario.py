@@ -195,7 +195,9 @@ class Controller(Section):
         if round(self.horizon_s / self.dt_s) < 1:
             raise ValueError(f"horizon_s ({self.horizon_s}) is shorter than one step dt_s ({self.dt_s})")
         if self.horizon_s / self.dt_s > MAX_STAGES:
-            raise ValueError(f"horizon_s / dt_s is {self.horizon_s / self.dt_s:.0f} stages; at most {MAX_STAGES}")
+            raise ValueError(
+                f"horizon_s / dt_s is {self.horizon_s / self.dt_s:.0f} stages; at most {MAX_STAGES}"
+            )
         return self
 
 

@@ -239,13 +239,24 @@ def test_frozen_controller_in_real_time(tmp_path: Path) -> None:
     finally:
         mission.kill()
         mission.wait()
-    flown = [r.message for r in read_log(out / "mission.mcap", ["chaser/0/actuators"])]
+    records = list(read_log(out / "mission.mcap", ["chaser/0/actuators"]))
+    flown = [r.message for r in records]
     braking = [m.tick for m in flown if m.source == "brake"]
     assert 5 < len(braking) < 60
     assert max(m.tick for m in flown if m.source == "command") > max(braking) + 15
     result = summary(out)
     assert any("no command, braking" in e["what"] for e in result["events"])
-    assert any("command refused" in e["what"] for e in result["events"])
+    # Nothing stale was flown: by the time a command was passed on, no odometry had been sent that outlived it by more
+    # than what may just be on its way. (Whether the thawed controller sends stale commands at all is a matter of luck;
+    # that they are refused, tests/test_pilot.py holds.)
+    known = [
+        (r.sent_ns, r.message.sim_time_ns)
+        for r in read_log(out / "mission.mcap", ["world/chaser/0/odometry"])
+    ]
+    for record in records:
+        if record.message.source == "command":
+            newest_ns = max(sim_ns for sent_ns, sim_ns in known if sent_ns <= record.sent_ns)
+            assert newest_ns - record.message.sim_time_ns < 0.5e9 + 0.5e9
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM])

@@ -147,7 +147,8 @@ def run_mission(
     stop = _Stop()
     fleet = Fleet()
     try:
-        start_all(fleet, scenario, path, folder, mode, overrides, ["-e", endpoint, "--namespace", namespace])
+        network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(lease_ms)]
+        start_all(fleet, scenario, path, folder, mode, overrides, network)
         failure = watch(fleet, hub, scenario, Progress(scenario, mode, quiet), stop)
     finally:
         fleet.end()
@@ -167,7 +168,6 @@ def start_all(
 ) -> None:
     """Starts recorder, world, controller and chasers; in which order does not matter."""
     words = folder / "processes"
-    network = [*network, "--lease-ms", "2000" if mode == "realtime" else "600000"]
     patient = ["--patience", str(_PATIENCE_S)]
     sets = [item for override in overrides for item in ("--set", override)]
     fleet.start(

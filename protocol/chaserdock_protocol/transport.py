@@ -115,9 +115,8 @@ def _sent_ns(sample: zenoh.Sample) -> int:
 
 @dataclass
 class Counts:
-    """What a node has seen and refused, by topic."""
+    """What a node has refused and missed, by topic."""
 
-    received: Counter[str] = field(default_factory=Counter)
     rejected: Counter[str] = field(default_factory=Counter)
     lost: Counter[str] = field(default_factory=Counter)
     stale: int = 0
@@ -251,7 +250,6 @@ class Node:
         except Rejected as refusal:
             self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
             return None
-        self.counts.received[raw.key] += 1
         last = self._last_seq.get(raw.key)
         if last is not None and message.seq > last + 1:
             self.counts.lost[raw.key] += message.seq - last - 1

@@ -101,12 +101,7 @@ Contacts = set[tuple[str, str]]
 
 
 def pass_lockstep(
-    tick: int,
-    begun_s: float,
-    answers: Answers,
-    stop: Stop,
-    timing: Timing,
-    fly_to_step: Callable[[int], Contacts],
+    tick: int, answers: Answers, stop: Stop, timing: Timing, fly_to_step: Callable[[int], Contacts]
 ) -> Contacts:
     """Flies a tick whose end waits for all answers; the pairs of bodies that touched."""
     end = timing.step_of_tick(tick + 1)
@@ -118,12 +113,7 @@ def pass_lockstep(
 
 
 def pass_realtime(
-    tick: int,
-    begun_s: float,
-    answers: Answers,
-    stop: Stop,
-    timing: Timing,
-    fly_to_step: Callable[[int], Contacts],
+    tick: int, begun_s: float, answers: Answers, timing: Timing, fly_to_step: Callable[[int], Contacts]
 ) -> Contacts:
     """Flies a tick at the pace of the wall clock, in slices, so that a command acts when it comes, not before."""
     contacts: Contacts = set()
@@ -146,7 +136,11 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     )
     answers.settle()
     reason = "flown to its end" if started else "stopped before the first tick"
-    begun_s, tick, step_s = time.monotonic(), 0, 1.0 / timing.physics_hz
+    begun_s, tick = time.monotonic(), 0
+
+    def fly_to_step(step: int) -> Contacts:
+        return fly_to(step, physics, actuators, 1.0 / timing.physics_hz)
+
     contacts: Contacts = set()
     while started:
         states = {name: physics.state(name) for name in physics.bodies}
@@ -159,10 +153,10 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
         for i in answers.chasers if pictures else ():
             number = tick // timing.ticks_per_picture
             node.publish(topics.IMAGE, cameras.picture(i, number, tick, timing.tick_time_ns(tick), states), i)
-        pass_tick = pass_lockstep if options.mode == "lockstep" else pass_realtime
-        contacts = pass_tick(
-            tick, begun_s, answers, stop, timing, lambda step: fly_to(step, physics, actuators, step_s)
-        )
+        if options.mode == "lockstep":
+            contacts = pass_lockstep(tick, answers, stop, timing, fly_to_step)
+        else:
+            contacts = pass_realtime(tick, begun_s, answers, timing, fly_to_step)
         if stop() or not answers.chasers:
             reason = "stopped" if stop() else "no chaser is left"
             break

@@ -110,7 +110,7 @@ class Recorder:
 
     def _note(self, key: str, message: object) -> None:
         match message:
-            case Presence(process=process):
+            case Presence():
                 self.teller.take(message)
             case Tick() as tick:
                 self.teller.settled.set()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_protocol.messages import ActuatorCommand
-from chaserdock_protocol.scenario import Body
+from chaserdock_protocol.scenario_bodies import Body
 from chaserdock_world.actuators import IdealActuators, fly_to
 from chaserdock_world.physics import Physics
 from hypothesis import given, settings

@@ -13,7 +13,7 @@ from chaserdock_agents.chaser.pilot import brake, passed_on, refusal
 from chaserdock_controller.prediction import integrate
 from chaserdock_protocol import rotations
 from chaserdock_protocol.messages import Odometry, WrenchCommand
-from chaserdock_protocol.scenario import Body
+from chaserdock_protocol.scenario_bodies import Body
 from flight_cases import odometry, start
 
 BODY = Body()

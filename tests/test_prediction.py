@@ -7,7 +7,7 @@ import pytest
 from chaserdock_controller.prediction import CommandHistory, integrate, predict_state
 from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
-from chaserdock_protocol.scenario import Body
+from chaserdock_protocol.scenario_bodies import Body
 from flight_cases import odometry, quick, start
 from hypothesis import given
 from hypothesis import strategies as st

@@ -15,11 +15,11 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.scenario import (
     Scenario,
     ScenarioError,
-    cuboid_inertia,
     load_scenario,
     parse_scenario,
     scenario_from_json,
 )
+from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from chaserdock_protocol.targets import target_model
 from hypothesis import given, settings
 from hypothesis import strategies as st

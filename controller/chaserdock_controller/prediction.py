@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.rotations import Array
-from chaserdock_protocol.scenario import Body
+from chaserdock_protocol.scenario_bodies import Body
 
 _STEP_S = 0.02
 

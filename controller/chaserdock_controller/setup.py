@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from chaserdock_protocol.scenario import Scenario, cuboid_inertia
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from chaserdock_protocol.targets import target_model
 
 from .fusion import make_estimator

@@ -7,7 +7,7 @@ import numpy as np
 from . import rotations
 from .messages import Odometry
 from .rotations import Array
-from .scenario import Body
+from .scenario_bodies import Body
 
 BRAKE_TIME_S = 3.0
 """Time constant with which velocity and rate decay while the limits allow."""

@@ -11,44 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from . import rotations
 from .camera import Camera
 from .clock import Timing
+from .scenario_bodies import Body, Target
+from .scenario_camera import CameraSection
+from .scenario_fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
 from .scenario_text import ScenarioError, explain, override
-from .targets import target_model
-
-
-def _finite(value: float) -> float:
-    if not math.isfinite(value):
-        raise ValueError("must be a finite number")
-    return value
-
-
-def _unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
-    length = math.hypot(*q)
-    if abs(length - 1.0) > 1e-3:
-        raise ValueError(
-            f"must be a quaternion (w, x, y, z) of unit length; this one has length {length:.6g}"
-        )
-    w, x, y, z = rotations.normalize(q).tolist()
-    return (w, x, y, z)
-
-
-Number = Annotated[float, AfterValidator(_finite)]
-Positive = Annotated[float, AfterValidator(_finite), Field(gt=0)]
-NotNegative = Annotated[float, AfterValidator(_finite), Field(ge=0)]
-Vector = tuple[Number, Number, Number]
-PositiveVector = tuple[Positive, Positive, Positive]
-UnitQuaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_unit)]
-Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
-
-
-class Section(BaseModel):
-    """A table of the scenario file; unknown keys are errors."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
 
 class Time(Section):
@@ -66,89 +37,6 @@ class Time(Section):
         if self.rate_hz % self.picture_hz:
             raise ValueError(f"rate_hz must be a multiple of picture_hz ({self.rate_hz}, {self.picture_hz})")
         return self
-
-
-class Target(Section):
-    """The target's model (geometry and markers), initial state, and how it moves.
-
-    ``constant_rates`` and ``static`` prescribe the motion, as the paper does; ``torque_free`` is a rigid
-    body's (then ``inertia_kg_m2``, principal, and ``mass_kg`` count).
-    """
-
-    model: Name = "paper"
-    motion: Literal["constant_rates", "static", "torque_free"] = "constant_rates"
-    position_m: Vector = (0.0, 0.0, 0.0)
-    q_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
-    velocity_m_s: Vector = (0.015, 0.0075, 0.03)
-    omega_rad_s: Vector = (0.015, 0.045, 0.03)
-    mass_kg: Positive = 1.25
-    inertia_kg_m2: PositiveVector | None = None
-
-    @model_validator(mode="after")
-    def _known(self) -> Target:
-        target_model(self.model)
-        if self.inertia_kg_m2 is not None:
-            _check_inertia(self.inertia_kg_m2)
-        return self
-
-
-def _check_inertia(i: tuple[float, float, float]) -> None:
-    if 2 * max(i) > sum(i) * (1 + 1e-9):
-        raise ValueError(
-            f"inertia_kg_m2 {i}: no moment may exceed the sum of the other two (no body is like that)"
-        )
-
-
-def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Principal moments (kg m^2) of a homogeneous cuboid about its axes."""
-    x, y, z = (s * s for s in size_m)
-    return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
-
-
-class Body(Section):
-    """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's."""
-
-    mass_kg: Positive = 30.0
-    size_m: PositiveVector = (0.25, 0.25, 0.05)
-    inertia_kg_m2: PositiveVector | None = None
-    force_max_N: Positive = 2.0
-    torque_max_N_m: Positive = 0.05
-    probe_reach_m: Positive = 0.35
-    actuation: Literal["ideal"] = "ideal"
-
-    @model_validator(mode="after")
-    def _possible(self) -> Body:
-        if self.inertia_kg_m2 is not None:
-            _check_inertia(self.inertia_kg_m2)
-        return self
-
-    @property
-    def inertia(self) -> tuple[float, float, float]:
-        return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.size_m)
-
-
-class Effects(Section):
-    """What the camera does to the exact picture: a gain of 1 and 0 elsewhere switch an effect off.
-
-    Noise in grey levels (``read_noise``) and squared grey levels per grey level (``shot_noise``).
-    """
-
-    gain: Positive = 1.0
-    point_spread_px: NotNegative = 0.6
-    read_noise: NotNegative = 1.5
-    shot_noise: NotNegative = 0.025
-    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 85
-
-
-class CameraSection(Section):
-    """The chasers' camera, looking along the body's +X, its top towards +Z; ``sun_direction`` (WRF): to the sun."""
-
-    width_px: Annotated[int, Field(ge=64, le=4096)] = 1280
-    height_px: Annotated[int, Field(ge=64, le=4096)] = 720
-    hfov_deg: Annotated[float, AfterValidator(_finite), Field(gt=5, lt=150)] = 60.0
-    position_m: Vector = (0.07, 0.0, 0.075)
-    sun_direction: Vector = (-0.4, -0.5, 0.77)
-    effects: Effects = Effects()
 
 
 class EstimatorSection(Section):
@@ -179,7 +67,7 @@ class Controller(Section):
     solver: Literal["rti", "ipopt"] = "rti"
     horizon_s: Positive = 3.0
     dt_s: Positive = 0.1
-    falloff: Annotated[float, AfterValidator(_finite), Field(ge=0, le=1)] = 0.0
+    falloff: Annotated[float, AfterValidator(finite), Field(ge=0, le=1)] = 0.0
     weight_position: NotNegative = 65.0
     weight_orientation: NotNegative = 35.0
     weight_force: Positive = 3.5

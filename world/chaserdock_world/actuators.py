@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.rotations import Array
-from chaserdock_protocol.scenario import Body
+from chaserdock_protocol.scenario_bodies import Body
 
 from .physics import Physics
 

@@ -12,7 +12,8 @@ import numpy as np
 import pybullet
 from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
-from chaserdock_protocol.scenario import Scenario, cuboid_inertia
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from chaserdock_protocol.targets import TargetModel, target_model
 from pybullet_utils.bullet_client import BulletClient
 

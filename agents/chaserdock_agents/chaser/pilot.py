@@ -5,7 +5,7 @@ from __future__ import annotations
 from chaserdock_protocol.braking import brake_wrench
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
-from chaserdock_protocol.scenario import Body
+from chaserdock_protocol.scenario_bodies import Body
 
 
 def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int) -> str | None:

@@ -1,0 +1,1 @@
+"""The verbs of the ``chaserdock`` program, a module a group; ``cli`` puts them together."""

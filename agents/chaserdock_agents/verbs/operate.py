@@ -1,0 +1,41 @@
+"""Verbs of an operator: commands to a running mission."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Annotated
+
+import typer
+
+from .options import ConfigOpt, ConnectOpt, NamespaceOpt, NetModeOpt, link_of
+
+
+class Command(StrEnum):
+    """What an operator may ask for."""
+
+    approach = "approach"
+    hold = "hold"
+    retreat = "retreat"
+    abort = "abort"
+    goto = "goto"
+
+
+def command(
+    what: Annotated[Command, typer.Argument(help="what the chaser is to do")],
+    number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
+    offset: Annotated[
+        tuple[float, float, float] | None, typer.Option(help="goto: where, in the target's frame, metres")
+    ] = None,
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    net_mode: NetModeOpt = "peer",
+    config: ConfigOpt = None,
+    timeout: Annotated[float, typer.Option(help="seconds to wait for the answer")] = 5.0,
+) -> None:
+    """Tell a chaser of a running mission what to do; status 1 when refused, 2 when nobody answers."""
+    from chaserdock_agents.operator import send_command
+
+    link = link_of(namespace, connect, None, net_mode, config, 60_000)
+    reply = send_command(link, what.value, number, offset, timeout)
+    print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
+    raise typer.Exit(0 if reply.accepted else 1)

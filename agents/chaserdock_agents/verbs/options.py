@@ -1,0 +1,72 @@
+"""What several verbs share: options, the network link they describe, and how they fail.
+
+Heavy imports wait until a verb needs them, so that ``--help`` is quick.
+"""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+class Mode(StrEnum):
+    """How simulated time runs."""
+
+    lockstep = "lockstep"
+    realtime = "realtime"
+
+
+ScenarioArg = Annotated[str, typer.Argument(help="scenario file, or the name of one that is shipped")]
+SetOpt = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a scenario value")
+]
+SeedOpt = Annotated[int | None, typer.Option(help="seed of everything random")]
+ModeOpt = Annotated[Mode, typer.Option(help="lockstep waits for every answer; realtime for nobody")]
+NamespaceOpt = Annotated[str, typer.Option(help="keeps runs apart")]
+ConnectOpt = Annotated[
+    list[str] | None, typer.Option("--connect", "-e", metavar="ENDPOINT", help="such as tcp/host:7447")
+]
+ListenOpt = Annotated[list[str] | None, typer.Option("--listen", "-l", metavar="ENDPOINT")]
+NetModeOpt = Annotated[str, typer.Option("--net-mode", "-m", help="peer or client")]
+ConfigOpt = Annotated[
+    Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
+]
+LeaseOpt = Annotated[int, typer.Option("--lease-ms", help="after that long a silent process counts as lost")]
+WatchOpt = Annotated[bool, typer.Option("--watch-parent", hidden=True)]
+OutOpt = Annotated[Path | None, typer.Option("--out", help="folder for log and summary; runs/… by default")]
+
+
+def fail(text: str) -> typer.Exit:
+    """One line on standard error, status 2."""
+    for line in text.splitlines():
+        print(f"chaserdock: {line}", file=sys.stderr)
+    return typer.Exit(2)
+
+
+def link_of(
+    namespace: str,
+    connect: list[str] | None,
+    listen: list[str] | None,
+    mode: str,
+    config: Path | None,
+    lease_ms: int,
+):
+    """The link that the network options describe."""
+    from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
+
+    if mode not in ("peer", "client", "router"):
+        raise fail(f"--net-mode {mode}: must be peer or client")
+    if config is not None and not config.is_file():
+        raise fail(f"--config {config}: no such file")
+    return Link(
+        namespace=namespace,
+        connect=tuple(connect if connect is not None else [DEFAULT_ENDPOINT]),
+        listen=tuple(listen if listen is not None else ["tcp/127.0.0.1:0"]),
+        mode="client" if mode == "client" else "peer",
+        config=config,
+        lease_ms=lease_ms,
+    )

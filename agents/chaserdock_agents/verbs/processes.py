@@ -1,0 +1,166 @@
+"""Verbs that fly: a whole mission, or one process of it."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from chaserdock_agents.scenarios import find_scenario
+
+from .options import (
+    ConfigOpt,
+    ConnectOpt,
+    LeaseOpt,
+    ListenOpt,
+    Mode,
+    ModeOpt,
+    NamespaceOpt,
+    NetModeOpt,
+    OutOpt,
+    ScenarioArg,
+    SeedOpt,
+    SetOpt,
+    WatchOpt,
+    fail,
+    link_of,
+)
+
+
+def start_process(name: str, options) -> None:
+    """Runs a process by its entry point (group ``chaserdock.processes``) and exits with its status."""
+    found = [e for e in entry_points(group="chaserdock.processes") if e.name == name]
+    if not found:
+        raise fail(f"no process {name!r} is installed")
+    try:
+        process = found[0].load()
+    except ImportError as error:
+        if "pybullet" in str(error):
+            raise fail(
+                f"the world needs PyBullet, whose wheels end at Python 3.11; this is Python {sys.version_info.major}."
+                f"{sys.version_info.minor}. With uv: uv run --python 3.11 chaserdock world …"
+            ) from None
+        raise
+    sys.exit(process(options))
+
+
+def _found(scenario: str) -> Path:
+    path = find_scenario(scenario)
+    if path is None:
+        raise fail(f"{scenario}: no such scenario file, and none of that name is shipped")
+    return path
+
+
+def run(
+    scenario: ScenarioArg,
+    out: OutOpt = None,
+    mode: ModeOpt = Mode.lockstep,
+    seed: SeedOpt = None,
+    overrides: SetOpt = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="no progress")] = False,
+) -> None:
+    """Fly a scenario on this machine: start every process, record, judge."""
+    from chaserdock_agents.launcher import run_mission
+
+    path = _found(scenario)
+    folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+    raise typer.Exit(run_mission(path, folder, mode.value, seed, tuple(overrides or ()), quiet))
+
+
+def world(
+    scenario: ScenarioArg,
+    mode: ModeOpt = Mode.lockstep,
+    seed: SeedOpt = None,
+    overrides: SetOpt = None,
+    recorder: Annotated[bool, typer.Option(help="wait for a recorder before the first tick")] = True,
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    listen: ListenOpt = None,
+    net_mode: NetModeOpt = "peer",
+    config: ConfigOpt = None,
+    lease_ms: LeaseOpt = 60_000,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """The simulated world: physics, cameras, time. Listens on tcp/127.0.0.1:7447 unless told otherwise."""
+    from chaserdock_protocol.runtime import ProcessOptions
+    from chaserdock_protocol.transport import DEFAULT_ENDPOINT
+
+    if listen is None and connect is None and net_mode == "peer":
+        listen = [DEFAULT_ENDPOINT]
+    options = ProcessOptions(
+        link=link_of(namespace, connect or [], listen, net_mode, config, lease_ms),
+        scenario=_found(scenario),
+        overrides=tuple(overrides or ()),
+        seed=seed,
+        mode=mode.value,
+        recorder_expected=recorder,
+        watch_parent=watch_parent,
+    )
+    start_process("world", options)
+
+
+def chaser(
+    number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    listen: ListenOpt = None,
+    net_mode: NetModeOpt = "peer",
+    config: ConfigOpt = None,
+    lease_ms: LeaseOpt = 60_000,
+    patience: Annotated[
+        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
+    ] = None,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """One chaser: sees the target, drives its actuators."""
+    from chaserdock_protocol.runtime import ProcessOptions
+
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
+    start_process(
+        "chaser", ProcessOptions(link=link, chaser=number, patience_s=patience, watch_parent=watch_parent)
+    )
+
+
+def controller(
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    listen: ListenOpt = None,
+    net_mode: NetModeOpt = "peer",
+    config: ConfigOpt = None,
+    lease_ms: LeaseOpt = 60_000,
+    patience: Annotated[
+        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
+    ] = None,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """The central controller: fuses what all chasers see, plans for all of them."""
+    from chaserdock_protocol.runtime import ProcessOptions
+
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
+    start_process("controller", ProcessOptions(link=link, patience_s=patience, watch_parent=watch_parent))
+
+
+def record(
+    out: OutOpt = None,
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    listen: ListenOpt = None,
+    net_mode: NetModeOpt = "peer",
+    config: ConfigOpt = None,
+    lease_ms: LeaseOpt = 60_000,
+    patience: Annotated[
+        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
+    ] = None,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """The recorder: every message into OUT/mission.mcap."""
+    from chaserdock_protocol.runtime import ProcessOptions
+
+    folder = out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
+    options = ProcessOptions(link=link, out=folder, patience_s=patience, watch_parent=watch_parent)
+    start_process("record", options)

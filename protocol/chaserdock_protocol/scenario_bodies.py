@@ -1,0 +1,69 @@
+"""The scenario's sections of bodies: the target and the chasers' body."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import model_validator
+
+from .scenario_fields import Name, Positive, PositiveVector, Section, UnitQuaternion, Vector
+from .targets import target_model
+
+
+class Target(Section):
+    """The target's model (geometry and markers), initial state, and how it moves.
+
+    ``constant_rates`` and ``static`` prescribe the motion, as the paper does; ``torque_free`` is a rigid
+    body's (then ``inertia_kg_m2``, principal, and ``mass_kg`` count).
+    """
+
+    model: Name = "paper"
+    motion: Literal["constant_rates", "static", "torque_free"] = "constant_rates"
+    position_m: Vector = (0.0, 0.0, 0.0)
+    q_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
+    velocity_m_s: Vector = (0.015, 0.0075, 0.03)
+    omega_rad_s: Vector = (0.015, 0.045, 0.03)
+    mass_kg: Positive = 1.25
+    inertia_kg_m2: PositiveVector | None = None
+
+    @model_validator(mode="after")
+    def _known(self) -> Target:
+        target_model(self.model)
+        if self.inertia_kg_m2 is not None:
+            _check_inertia(self.inertia_kg_m2)
+        return self
+
+
+def _check_inertia(i: tuple[float, float, float]) -> None:
+    if 2 * max(i) > sum(i) * (1 + 1e-9):
+        raise ValueError(
+            f"inertia_kg_m2 {i}: no moment may exceed the sum of the other two (no body is like that)"
+        )
+
+
+def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Principal moments (kg m^2) of a homogeneous cuboid about its axes."""
+    x, y, z = (s * s for s in size_m)
+    return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
+
+
+class Body(Section):
+    """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's."""
+
+    mass_kg: Positive = 30.0
+    size_m: PositiveVector = (0.25, 0.25, 0.05)
+    inertia_kg_m2: PositiveVector | None = None
+    force_max_N: Positive = 2.0
+    torque_max_N_m: Positive = 0.05
+    probe_reach_m: Positive = 0.35
+    actuation: Literal["ideal"] = "ideal"
+
+    @model_validator(mode="after")
+    def _possible(self) -> Body:
+        if self.inertia_kg_m2 is not None:
+            _check_inertia(self.inertia_kg_m2)
+        return self
+
+    @property
+    def inertia(self) -> tuple[float, float, float]:
+        return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.size_m)

@@ -389,3 +389,15 @@ def test_bad_overrides_are_one_line(file: Path, override: str, where: str) -> No
 
 def test_an_empty_array_has_no_items_to_set(file: Path) -> None:
     assert "timeline" in file_complaint(file, "timeline=[]", "timeline.0.at_s=1")
+
+
+def test_one_element_of_a_default_can_be_set(tmp_path: Path) -> None:
+    file = tmp_path / "s.toml"
+    file.write_text(GOOD)
+    before = load_scenario(file).camera.position_m
+    after = load_scenario(file, ("camera.position_m.1=0.5",)).camera.position_m
+    assert after == (before[0], 0.5, before[2])
+    with pytest.raises(ScenarioError, match="from 0 to 2"):
+        load_scenario(file, ("camera.position_m.3=0.5",))
+    with pytest.raises(ScenarioError, match="lens"):
+        load_scenario(file, ("camera.lens.0=0.5",))

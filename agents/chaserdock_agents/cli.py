@@ -11,6 +11,7 @@ import sys
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 
+from .verbs.campaign import campaign
 from .verbs.flights import snapshot, summary
 from .verbs.operate import command
 from .verbs.options import fail
@@ -22,7 +23,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for verb in (run, world, chaser, controller, record, command, summary, snapshot):
+for verb in (run, world, chaser, controller, record, command, summary, snapshot, campaign):
     app.command()(verb)
 
 

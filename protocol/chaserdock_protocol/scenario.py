@@ -254,5 +254,5 @@ def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     for text in overrides:
-        override(values, text)
+        override(values, text, lambda: parse_scenario(values, str(path)).model_dump(mode="json"))
     return parse_scenario(values, str(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Callable
 from typing import Any
 
 from pydantic import ValidationError
@@ -34,8 +35,12 @@ def explain(error: ValidationError) -> list[str]:
     return lines
 
 
-def override(values: dict[str, Any], text: str) -> None:
-    """Sets ``key.path=value`` in nested tables and arrays, the value in TOML's notation; raises ScenarioError."""
+def override(values: dict[str, Any], text: str, resolved: Callable[[], dict[str, Any]]) -> None:
+    """Sets ``key.path=value`` in nested tables and arrays, the value in TOML's notation; raises ScenarioError.
+
+    ``resolved`` gives the same tables with all defaults: one element of an array that is not in ``values`` can only be
+    set together with its neighbours.
+    """
     path, equals, value = text.partition("=")
     if not equals or not path.strip():
         raise ScenarioError(f"--set {text}: must be key.path=value")
@@ -45,7 +50,9 @@ def override(values: dict[str, Any], text: str) -> None:
         parsed = value.strip()
     place: Any = values
     keys = path.strip().split(".")
-    for key in keys[:-1]:
+    for depth, key in enumerate(keys[:-1]):
+        if isinstance(place, dict) and key not in place and _is_index(keys[depth + 1]):
+            place[key] = _default(resolved(), keys[: depth + 1])
         place = _item(place, key, text) if isinstance(place, list) else place.setdefault(key, {})
         if not isinstance(place, dict | list):
             raise ScenarioError(f"--set {text}: {key} is a value, not a table")
@@ -56,7 +63,17 @@ def override(values: dict[str, Any], text: str) -> None:
         place[keys[-1]] = parsed
 
 
+def _is_index(key: str) -> bool:
+    return key.isascii() and key.isdigit()
+
+
+def _default(values: Any, keys: list[str]) -> Any:
+    for key in keys:
+        values = values.get(key, {}) if isinstance(values, dict) else {}
+    return values
+
+
 def _item(place: list[Any], key: str, text: str) -> Any:
-    if not (key.isascii() and key.isdigit()) or int(key) >= len(place):
+    if not _is_index(key) or int(key) >= len(place):
         raise ScenarioError(f"--set {text}: {key} must be a number from 0 to {len(place) - 1}")
     return place[int(key)]

@@ -1,0 +1,1 @@
+"""Many seeded runs of one scenario: planned, flown, gathered in a table, reported."""

@@ -329,9 +329,8 @@ def test_killed_resumed_and_on_a_cluster_the_table_is_the_same(tmp_path: Path) -
     from distributed import LocalCluster
 
     os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
-    with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="") as cluster:
-        status, said = program(
-            "campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address
-        )
+    cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
+    with cluster:
+        status, said = program("campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address)
     assert status == 0, said
     assert json.dumps(table(there)) == json.dumps(table(here))

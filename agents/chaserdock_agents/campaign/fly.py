@@ -142,7 +142,7 @@ def fly_on_cluster(
     except ImportError:
         raise CampaignError('--cluster needs Dask: pip install "chaserdock[cluster]"') from None
     try:
-        client = Client(address, timeout=10)
+        client = Client(address, timeout=5)
     except (OSError, ValueError, TimeoutError) as error:
         raise CampaignError(f"--cluster {address}: no Dask scheduler answers: {error}") from None
     with client:

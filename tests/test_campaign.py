@@ -331,6 +331,8 @@ def test_killed_resumed_and_on_a_cluster_the_table_is_the_same(tmp_path: Path) -
     os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
     cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
     with cluster:
-        status, said = program("campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address)
+        status, said = program(
+            "campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address
+        )
     assert status == 0, said
     assert json.dumps(table(there)) == json.dumps(table(here))

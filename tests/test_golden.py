@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.eye import look, prediction_from
 from chaserdock_agents.chaser.pilot import passed_on, refusal
-from chaserdock_agents.perception import Perception
+from chaserdock_agents.perception import make_perception
 from chaserdock_controller.flight import Flight, Inputs
 from chaserdock_protocol.log import Record, read_log, read_scenario
 from chaserdock_protocol.messages import (
@@ -24,7 +24,6 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
-from chaserdock_protocol.targets import target_model
 from chaserdock_world.cameras import Cameras
 from chaserdock_world.physics import BodyState
 
@@ -64,9 +63,7 @@ def test_world_takes_the_same_pictures(scenario: Scenario, records: dict[type, l
 
 
 def test_chaser_sees_the_same(scenario: Scenario, records: dict[type, list[Record]]) -> None:
-    perception = Perception(
-        scenario.camera_model(), target_model(scenario.target.model), scenario.perception.name
-    )
+    perception = make_perception(scenario)
     then = {(r.message.chaser, r.message.tick): r.message for r in records[Sighting]}
     last: dict[int, Sighting] = {}
     for record in records[Image]:

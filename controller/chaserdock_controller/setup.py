@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol import plugins
+from chaserdock_protocol.scenario import ESTIMATORS, Scenario
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from chaserdock_protocol.targets import target_model
 
@@ -38,9 +39,12 @@ def nmpc_parameters(scenario: Scenario) -> NmpcParameters:
 
 
 def estimator_of(scenario: Scenario) -> Estimator:
-    """The estimator that the scenario names."""
+    """The estimator that the scenario names: one of ours, or an installed ``chaserdock.estimators`` entry point, a
+    function of the scenario. Raises PluginError when there is no such thing here."""
     if scenario.estimator.name == "paper":
         return make_estimator("paper")
+    if scenario.estimator.name != "mekf":
+        return plugins.load("estimator", scenario.estimator.name, ESTIMATORS)(scenario)
     target, e = scenario.target, scenario.estimator
     size_m = target_model(target.model).size_m
     ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, size_m)

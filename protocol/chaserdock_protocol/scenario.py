@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from . import rotations
+from . import plugins, rotations
 from .camera import Camera
 from .clock import Timing
 from .scenario_bodies import Body, Target
@@ -46,7 +46,7 @@ class EstimatorSection(Section):
     calibrated, which is so in the world's pictures.
     """
 
-    name: Literal["mekf", "paper"] = "mekf"
+    name: Name = "mekf"
     camera_bias_position_m: NotNegative = 0.0
     camera_bias_attitude_deg: NotNegative = 0.0
 
@@ -54,8 +54,13 @@ class EstimatorSection(Section):
 class PerceptionSection(Section):
     """How a picture becomes a pose."""
 
-    name: Literal["default", "paper"] = "default"
+    name: Name = "default"
 
+
+PERCEPTIONS = ("default", "paper")
+ESTIMATORS = ("mekf", "paper")
+SOLVERS = ("rti", "ipopt")
+"""Chaserdock's own parts, by the name that a scenario chooses them with; others may be installed (see ``plugins``)."""
 
 MAX_STAGES = 500
 """Most prediction steps of a plan; more could not be solved in time, and messages bound their size."""
@@ -64,7 +69,7 @@ MAX_STAGES = 500
 class Controller(Section):
     """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md)."""
 
-    solver: Literal["rti", "ipopt"] = "rti"
+    solver: Name = "rti"
     horizon_s: Positive = 3.0
     dt_s: Positive = 0.1
     falloff: Annotated[float, AfterValidator(finite), Field(ge=0, le=1)] = 0.0
@@ -243,8 +248,24 @@ def scenario_from_json(text: str, source: str) -> Scenario:
     return _checked(Scenario.model_validate_json, text, source)
 
 
+def _require_parts(scenario: Scenario, source: str) -> None:
+    parts: tuple[tuple[plugins.Kind, str, str, tuple[str, ...]], ...] = (
+        ("perception", "perception.name", scenario.perception.name, PERCEPTIONS),
+        ("estimator", "estimator.name", scenario.estimator.name, ESTIMATORS),
+        ("solver", "controller.solver", scenario.controller.solver, SOLVERS),
+    )
+    for kind, path, name, own in parts:
+        try:
+            plugins.require(kind, name, own)
+        except plugins.PluginError as error:
+            raise ScenarioError(f"{source}: {path}: {error}") from None
+
+
 def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
-    """Scenario file with ``key.path=value`` overrides (values in TOML's notation); raises ScenarioError."""
+    """Scenario file with ``key.path=value`` overrides (values in TOML's notation); raises ScenarioError.
+
+    The parts that it names have to be installed here. A scenario from the world or a log may name what is not.
+    """
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -255,4 +276,6 @@ def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     for text in overrides:
         override(values, text, lambda: parse_scenario(values, str(path)).model_dump(mode="json"))
-    return parse_scenario(values, str(path))
+    scenario = parse_scenario(values, str(path))
+    _require_parts(scenario, str(path))
+    return scenario

@@ -10,7 +10,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Image, PoseSolution, Sighting
 from numpy.typing import NDArray
 
-from chaserdock_agents.perception import Perception
+from chaserdock_agents.perception import Sees
 
 Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Where the target may be: position (3,) in IRF and rotation (4,) TRF to IRF."""
@@ -59,7 +59,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
     return None
 
 
-def look(perception: Perception, image: Image, predicted: Prediction | None) -> Sighting:
+def look(perception: Sees, image: Image, predicted: Prediction | None) -> Sighting:
     """What is seen of the target in a picture; ``wall_estimate_s`` is left for the caller."""
     header: dict[str, Any] = {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
     try:

@@ -23,10 +23,9 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
-from chaserdock_protocol.targets import target_model
 from chaserdock_protocol.transport import Node
 
-from chaserdock_agents.perception import Perception
+from chaserdock_agents.perception import make_perception
 
 from .eye import look, prediction_from
 from .pilot import brake, passed_on, refusal
@@ -66,11 +65,7 @@ class Chaser:
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
         self._forgotten = self._refusing = False
-        self._perception = Perception(
-            self.scenario.camera_model(),
-            target_model(self.scenario.target.model),
-            self.scenario.perception.name,
-        )
+        self._perception = make_perception(self.scenario)
 
     def open(self, instance: str, realtime: bool) -> None:
         """Opens the topics, then tells its presence."""

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from chaserdock_protocol import plugins
+from chaserdock_protocol.scenario import SOLVERS
+
 from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver
 
 __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver", "make_solver"]
 
-BACK_ENDS = ("rti", "ipopt")
+BACK_ENDS = SOLVERS
 
 
 def make_solver(name: str, params: NmpcParameters, n: int) -> NmpcSolver:
-    """The back end ``name`` for up to ``n`` chasers. Raises ValueError for an unknown name or n < 1."""
+    """The back end ``name`` for up to ``n`` chasers: one of ours, or an installed ``chaserdock.solvers`` entry point, a
+    function of (params, n). Raises PluginError when there is no such thing here, ValueError for n < 1."""
     # Imported here so that the one does not cost the start-up time of the other.
     if name == "rti":
         from chaserdock_controller.nmpc.rti import RtiSolver
@@ -20,4 +24,4 @@ def make_solver(name: str, params: NmpcParameters, n: int) -> NmpcSolver:
         from chaserdock_controller.nmpc.ipopt import IpoptSolver
 
         return IpoptSolver(params, n)
-    raise ValueError(f"unknown NMPC back end {name!r}; known: {', '.join(BACK_ENDS)}")
+    return plugins.load("solver", name, BACK_ENDS)(params, n)

@@ -209,9 +209,10 @@ def watch(fleet: Fleet, hub: Node, scenario: Scenario, progress: Progress, stop:
     fleet.wait(_END_S)
     if stop.asked:
         return "stopped by the operator"
-    if not ended.complete:
-        return ended.reason
     bad = [c for c in fleet.children if c.process.poll() != 0]
+    if not ended.complete:
+        # The world ends with status 1 for having been left; whoever left it knows more.
+        return "; ".join([ended.reason, *(f"{c.name}: {c.last_words()}" for c in bad if c.name != "world")])
     return bad[0].last_words() if bad else None
 
 

@@ -28,6 +28,7 @@ from .plots import (
     STYLE,
     Nothing,
     colour,
+    dashes,
     legend_above,
     limit_line,
     new_figure,
@@ -131,10 +132,10 @@ def docking(flight: Flight, _: Traces) -> Figure:
         n = min(len(own.time_s), len(target.time_s))
         distance = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)
         nearest = min(nearest, float(distance.min()))
-        top.plot(own.time_s[:n], distance, color=colour(i), label=f"chaser {i}")
+        top.plot(own.time_s[:n], distance, color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
         if n > 2:
             speed = -np.gradient(distance, own.time_s[:n])
-            bottom.plot(own.time_s[:n], speed * 1e3, color=colour(i))
+            bottom.plot(own.time_s[:n], speed * 1e3, color=colour(i), linestyle=dashes(i))
     limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
     # The two may be close: this one is named below its line.
     top.axhspan(0.0, s.limits.min_distance_target_m, color=LIMIT, alpha=0.10, linewidth=0)
@@ -172,7 +173,7 @@ def separation(flight: Flight, _: Traces) -> Figure:
         a, b = flight.truth[f"chaser/{i}"], flight.truth[f"chaser/{j}"]
         n = min(len(a.time_s), len(b.time_s))
         distance = np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
-        axes.plot(a.time_s[:n], distance, color=colour(k), label=f"{i} and {j}")
+        axes.plot(a.time_s[:n], distance, color=colour(k), linestyle=dashes(k), label=f"{i} and {j}")
     least = flight.scenario.limits.min_distance_chasers_m
     limit_line(axes, least, f"least allowed {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
@@ -283,7 +284,7 @@ KINDS: tuple[Kind, ...] = (
         "consistency",
         "Consistency of the target estimate",
         "Normalized estimation error squared over the six pose errors; 95 % of the values of a consistent filter lie in "
-        "the band. It says how honest the covariance is.",
+        "the band. Above it a filter trusts itself too much, below it too little.",
         consistency,
     ),
     Kind(

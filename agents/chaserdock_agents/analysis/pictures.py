@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from chaserdock_protocol.log import read_log
 from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.topics import IMAGE, SIGHTING
@@ -64,8 +63,3 @@ def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tu
         if width > best[1]:
             best = (columns, width)
     return best
-
-
-def empty_like(width_px: int, height_px: int) -> np.ndarray[Any, np.dtype[np.uint8]]:
-    """A dark place (height, width, 3) for a picture that there is none of."""
-    return np.full((height_px, width_px, 3), 24, dtype=np.uint8)

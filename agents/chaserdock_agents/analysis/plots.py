@@ -69,6 +69,11 @@ def colour(number: int) -> str:
     return SERIES[number % len(SERIES)]
 
 
+def dashes(number: int) -> Any:
+    """The line style of chaser or pair ``number`` where lines may lie upon one another: the lower one shows through."""
+    return ("-", (0, (5, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))[number % 4]
+
+
 def new_figure(rows: int, columns: int = 1, height: float = 2.3, **options: Any) -> tuple[Figure, list[Axes]]:
     """A figure of the page's width with its axes, row by row; ``height`` of one row in inches."""
     figure = Figure(figsize=(9.6, 0.35 + height * rows))

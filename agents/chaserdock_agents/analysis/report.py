@@ -106,7 +106,7 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _shown(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
-    return _DASH if value is None else f"{value * factor:.{digits}g} {unit}".rstrip()
+    return _DASH if value is None else f"{value * factor:#.{digits}g} {unit}".rstrip()
 
 
 def _rms(mean_square: float | None, unit: str, factor: float) -> str:
@@ -172,7 +172,8 @@ def _chasers(flight: Flight, result: dict[str, Any]) -> str:
     return (
         "<h2>Chasers</h2>"
         + table(head, rows)
-        + f'<p class="faint">Chaser against its reference pose on the true target. Steady: {s.settling_s:g} s to {until:g} s.</p>'
+        + '<p class="faint">Chaser against its reference pose on the true target. '
+        + f"Steady: {s.settling_s:g} s to {until:g} s.</p>"
     )
 
 
@@ -202,9 +203,10 @@ def _numbers(flight: Flight, result: dict[str, Any]) -> str:
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
     return (
-        f"<h2>Target estimate</h2>{table(('', 'RMS', 'largest error'), estimate)}"
-        f'<p class="faint">Fused estimate against the truth, after {flight.scenario.settling_s:g} s, at the time of exposure.</p>'
-        f"<h2>Safety and timing</h2>{table(('', ''), safety)}"
+        f'<div class="pair"><section><h2>Target estimate</h2>{table(("", "RMS", "largest error"), estimate)}'
+        f'<p class="faint">Fused estimate against the truth, after {flight.scenario.settling_s:g} s, '
+        "at the time of exposure.</p></section>"
+        f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
     )
 
 
@@ -225,12 +227,15 @@ def _replay(data: dict[str, Any]) -> str:
     )
     return f"""<h2 id="replay-section">Replay</h2>
 <div class="player">
-<div class="stage"><canvas id="replay" tabindex="0" role="img" aria-label="target and chasers in three dimensions"></canvas>{views}</div>
+<div class="stage"><canvas id="replay" tabindex="0" role="img" aria-label="target and chasers in three dimensions">
+</canvas>{views}</div>
 <div class="controls"><button id="replay-play" type="button">Play</button>
-<input id="replay-time" type="range" min="0" max="{end}" step="0.05" value="0" aria-label="time"><span id="replay-clock"></span>
+<input id="replay-time" type="range" min="0" max="{end}" step="0.05" value="0" aria-label="time">
+<span id="replay-clock"></span>
 <label>speed <select id="replay-speed">{speeds}</select></label>
 <label><input id="replay-ride" type="checkbox"> ride on the target</label></div>
-<div class="wide"><table><thead><tr><th></th><th>phase</th><th>to the target</th><th>position error</th><th>picture</th></tr></thead>
+<div class="wide"><table>
+<thead><tr><th></th><th>phase</th><th>to the target</th><th>position error</th><th>picture</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
 <p class="faint">Drag to turn, wheel to zoom; arrow keys, +, − and space do the same. Ground truth. A camera's outline is
 bright while its picture is used; chaser colours are the figures'.</p>

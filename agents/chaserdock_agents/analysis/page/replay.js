@@ -133,7 +133,7 @@
     faces.sort((a, b) => b.depth - a.depth);
     function shade(grey, lit, tint) {
       const g = grey * lit;
-      return tint ? `rgb(${tint.map((v) => Math.round(v * (0.35 + 0.75 * lit * grey / 128) * 0.8)).join()})` : `rgb(${g},${g},${g})`;
+      return tint ? `rgb(${tint.map((v) => Math.round(Math.min(255, v * (0.3 + 0.75 * lit * grey / 110) + 18))).join()})` : `rgb(${g},${g},${g})`;
     }
     for (const f of faces) {
       polygon(f.corners.map(see), shade(f.face.g, f.lit, f.tint));
@@ -151,9 +151,11 @@
       far.forEach((corner) => line([origin, corner], colour, 0.8));
       line([...far, far[0]], colour, 0.8);
       context.globalAlpha = 1;
-      context.fillStyle = colour; context.font = "600 12px system-ui, sans-serif";
+      context.fillStyle = css("--ink"); context.font = "600 12px system-ui, sans-serif";
       const label = see(sum(poses[k].p, [0, 0, 0]));
-      context.fillText(String(c.id), label[0] + 14, label[1] - 12);
+      context.strokeStyle = css("--panel"); context.lineWidth = 3;
+      context.strokeText(String(c.id), label[0] + 26, label[1] - 22);
+      context.fillText(String(c.id), label[0] + 26, label[1] - 22);
     });
 
     clock.textContent = time.toFixed(1) + " s";

@@ -16,6 +16,7 @@ from .verbs.flights import snapshot, summary
 from .verbs.operate import command
 from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
+from .verbs.publish import figures, report, video
 
 app = typer.Typer(
     name="chaserdock",
@@ -23,7 +24,20 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for verb in (run, world, chaser, controller, record, command, summary, snapshot, campaign):
+for verb in (
+    run,
+    world,
+    chaser,
+    controller,
+    record,
+    command,
+    summary,
+    snapshot,
+    campaign,
+    figures,
+    report,
+    video,
+):
     app.command()(verb)
 
 

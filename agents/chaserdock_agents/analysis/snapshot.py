@@ -39,7 +39,7 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
         (images if isinstance(message, Image) else sightings)[message.chaser] = message
     if not images:
         raise LogError(f"{log}: holds no picture up to {at_s:g} s")
-    views = [_view(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
+    views = [view(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
     columns = math.ceil(math.sqrt(len(views)))
     blank = np.zeros_like(views[0])
     views += [blank] * (-len(views) % columns)
@@ -47,7 +47,8 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
     return np.vstack(rows)
 
 
-def _view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int) -> NDArray[np.uint8]:
+def view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int) -> NDArray[np.uint8]:
+    """BGR picture ``width_px`` wide with the sighting's markers and pose drawn; raises LogError for a bad picture."""
     try:
         grey = decode_picture(image)
     except BadPicture as error:

@@ -11,6 +11,7 @@ import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
+from numpy.typing import NDArray
 
 from .flight import Flight, Track, load_flight
 
@@ -46,19 +47,24 @@ def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
     return time_s[:n], position, rotations.angle_between(attitudes[:n], own.q_wxyz[:n])
 
 
+def known_estimates(flight: Flight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of the estimate (K,) at which the target was known, and the rows of its truth at the same times."""
+    truth = flight.truth.get("target")
+    index = {} if truth is None else {round(t * 1e9): k for k, t in enumerate(truth.time_s)}
+    rows = [
+        (k, index[key])
+        for k, status in enumerate(flight.estimate_status)
+        if status in ("tracking", "predicting") and (key := round(flight.estimate.time_s[k] * 1e9)) in index
+    ]
+    both = np.array(rows, dtype=np.intp).reshape(-1, 2)
+    return both[:, 0], both[:, 1]
+
+
 def estimate_errors(flight: Flight) -> dict[str, Array]:
     """Errors of the fused estimate where there is one: ``time_s``, ``position_m``, ``orientation_rad``,
     ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and attitude), each (K,)."""
-    known = np.array([s in ("tracking", "predicting") for s in flight.estimate_status], dtype=bool)
-    truth = flight.truth["target"]
-    index = {round(t * 1e9): k for k, t in enumerate(truth.time_s)}
-    rows = [
-        (k, index[key])
-        for k in np.flatnonzero(known)
-        if (key := round(flight.estimate.time_s[k] * 1e9)) in index
-    ]
-    a = np.array([r[0] for r in rows], dtype=int)
-    b = np.array([r[1] for r in rows], dtype=int)
+    a, b = known_estimates(flight)
+    truth = flight.truth.get("target", flight.estimate)  # without a truth there are no rows
     e = flight.estimate
     position = truth.position_m[b] - e.position_m[a]
     angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
@@ -144,7 +150,7 @@ def summary_of(flight: Flight) -> dict[str, Any]:
     chasers, names = {}, [f"chaser/{i}" for i in range(len(s.chasers))]
     until = s.steady_until_s or s.duration_s
     for i, name in enumerate(names):
-        if name not in flight.truth:
+        if name not in flight.truth or "target" not in flight.truth:
             continue
         time_s, position, angle = tracking_errors(flight, i)
         steady = (time_s >= s.settling_s) & (time_s < until)

@@ -1,0 +1,129 @@
+"""How our figures look, and how they become files or a piece of a page.
+
+One style for all: colours that the colour-blind tell apart (Okabe and Ito, 2008) and that stand on white paper and on a
+dark page alike; text as text. In a page the colours become CSS variables, so that a figure follows the page's theme.
+"""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+INK, FAINT, GRID = "#1b1e23", "#5c6370", "#d9dce1"
+SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a6a00", "#6b4fa0")
+AXES_XYZ = ("#d55e00", "#009e73", "#0072b2")
+LIMIT = "#b3261e"
+FORMATS = ("svg", "png", "pdf")
+
+STYLE: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.edgecolor": FAINT,
+    "axes.labelcolor": INK,
+    "axes.titlecolor": INK,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": GRID,
+    "grid.linewidth": 0.6,
+    "text.color": INK,
+    "xtick.color": FAINT,
+    "ytick.color": FAINT,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "lines.linewidth": 1.1,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "figure.constrained_layout.use": True,
+    "svg.fonttype": "none",
+    "savefig.dpi": 150,
+    "path.simplify_threshold": 0.3,
+}
+
+_VARIABLES = {
+    INK: "ink",
+    FAINT: "faint",
+    GRID: "grid",
+    LIMIT: "limit",
+    **{c: f"series-{k}" for k, c in enumerate(SERIES)},
+}
+
+
+class Nothing(Exception):
+    """A figure cannot be drawn; the text says what the log lacks."""
+
+
+def colour(number: int) -> str:
+    """The colour of chaser ``number`` in every figure."""
+    return SERIES[number % len(SERIES)]
+
+
+def dashes(number: int) -> Any:
+    """The line style of chaser or pair ``number`` where lines may lie upon one another: the lower one shows through."""
+    return ("-", (0, (5, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))[number % 4]
+
+
+def new_figure(rows: int, columns: int = 1, height: float = 2.3, **options: Any) -> tuple[Figure, list[Axes]]:
+    """A figure of the page's width with its axes, row by row; ``height`` of one row in inches."""
+    figure = Figure(figsize=(9.6, 0.35 + height * rows))
+    axes: Any = figure.subplots(rows, columns, squeeze=False, **options)
+    return figure, list(axes.ravel())
+
+
+def limit_line(axes: Axes, value: float, label: str) -> None:
+    """A dashed limit across the axes, named at its right end."""
+    axes.axhline(value, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
+    axes.annotate(
+        label,
+        (1.0, value),
+        xycoords=("axes fraction", "data"),
+        xytext=(-2, 2),
+        textcoords="offset points",
+        ha="right",
+        color=LIMIT,
+        fontsize=8,
+    )
+
+
+def legend_above(axes: Axes, columns: int = 8) -> None:
+    """The legend in one row over the axes' right end, off the data."""
+    axes.legend(
+        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, handlelength=1.4
+    )
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Writes a figure in the format that the path's ending names; equal figures give equal SVG files."""
+    with matplotlib.rc_context(STYLE | {"svg.hashsalt": path.stem}):
+        figure.savefig(path, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None)
+
+
+def to_inline_svg(figure: Figure, name: str, title: str) -> str:
+    """An ``svg`` element for a page: ids unique to ``name``, colours by CSS variables, nothing that points elsewhere."""
+    out = io.StringIO()
+    with matplotlib.rc_context(STYLE | {"svg.hashsalt": name}):
+        figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
+    text = out.getvalue()
+    text = text[text.index("<svg") :]
+    text = re.sub(r"<metadata>.*?</metadata>", "", text, count=1, flags=re.DOTALL)
+    text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text, count=2)
+    text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
+    text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
+    # In a page, ids of all figures share one name space, and SVG needs no xlink prefix.
+    text = re.sub(r'\bid="', f'id="{name}-', text)
+    text = text.replace("url(#", f"url(#{name}-").replace('xlink:href="#', f'href="#{name}-')
+    for hexadecimal, variable in _VARIABLES.items():
+        text = text.replace(hexadecimal, f"var(--{variable})")
+    text = re.sub(r"font(-family)?: ([^;\"]*)'DejaVu Sans'[^;\"]*", r"font\1: \2var(--figure-font)", text)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{title}" ', 1)

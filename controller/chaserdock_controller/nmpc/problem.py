@@ -13,15 +13,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from chaserdock_controller.nmpc.slack import SLACK_L2
 from chaserdock_controller.nmpc.types import INTEGRATORS, NmpcParameters
-
-# L1 and L2 weights of the slacks of the distance constraints. The L1 weight must exceed the constraint's
-# multiplier for the penalty to be exact: at 1e3 the terminal weight pressed chasers to 0.32 m of 0.35 m.
-SLACK_L1 = 1e5
-SLACK_L2 = 1e5
-# Multipliers grow with the distance to the reference; the L1 weight stays this many times above
-# the terminal cost's slope.
-SLACK_L1_OVER_SLOPE = 10.0
 
 
 def multiply(a: Any, b: Any) -> Any:
@@ -178,9 +171,3 @@ def build_nlp(n: int, params: NmpcParameters) -> Nlp:
         n_slack=len(distances),
         n_equal=n_equal,
     )
-
-
-def slack_l1_weight(params: NmpcParameters, distance_m: float) -> float:
-    """L1 weight of the slacks of a chaser ``distance_m`` from its reference (of the farthest, if one for all)."""
-    slope = 2.0 * (params.weight_final_position + params.weight_position) * distance_m
-    return max(SLACK_L1, SLACK_L1_OVER_SLOPE * slope)

@@ -6,18 +6,29 @@ from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
 
 __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver", "make_solver"]
 
-BACK_ENDS = ("rti", "ipopt")
+BACK_ENDS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 
 
-def make_solver(name: str, params: NmpcParameters, n: int) -> NmpcSolver:
-    """The back end ``name`` for up to ``n`` chasers. Raises ValueError for an unknown name or n < 1."""
+def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int | None = None) -> NmpcSolver:
+    """The back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, as the back end counts.
+
+    Raises ValueError for an unknown name, n < 1, or a back end whose package or compiler is not installed.
+    """
     # Imported here so that the one does not cost the start-up time of the other.
     if name == "rti":
         from chaserdock_controller.nmpc.rti import RtiSolver
 
-        return RtiSolver(params, n)
-    if name == "ipopt":
-        from chaserdock_controller.nmpc.ipopt import IpoptSolver
+        return RtiSolver(params, n, max_iterations)
+    if name in ("ipopt", "fatrop"):
+        from chaserdock_controller.nmpc.nlp import NlpSolver
 
-        return IpoptSolver(params, n)
+        return NlpSolver(name, params, n, max_iterations)
+    if name == "alpaqa":
+        from chaserdock_controller.nmpc.alm import AlpaqaSolver
+
+        return AlpaqaSolver(params, n, max_iterations)
+    if name == "open":
+        from chaserdock_controller.nmpc.open_engine import OpenSolver
+
+        return OpenSolver(params, n, max_iterations)
     raise ValueError(f"unknown NMPC back end {name!r}; known: {', '.join(BACK_ENDS)}")

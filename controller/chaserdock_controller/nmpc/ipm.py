@@ -70,7 +70,7 @@ def _is_free(dx, w, stage, row_a, row_c, n_rows):
     for i in range(len(w)):
         if not abs(w[i]) <= 1.0 + FREE_TOLERANCE:
             return False
-    for j in range(n_rows):
+    for j in range(n_rows):  # noqa: SIM110 (Numba knows no generators)
         if not _along(dx, stage, row_a, j) - row_c[j] >= -FREE_TOLERANCE:
             return False
     return True

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcParameters
-from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, linearize, step
+from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, roll, roll_linearized
 from chaserdock_controller.nmpc.problem import derivative, dynamics
 from chaserdock_controller.reference import (
     feed_forward,
@@ -39,10 +39,17 @@ def params(integrator: str = "rk4", dt_s: float = 0.1) -> NmpcParameters:
 
 
 def numba_step(x: Array, u: Array, h: float, integrator: str) -> Array:
-    out = np.empty(13)
+    states = np.tile(x, (1, 2, 1))
+    roll(states, u[None, None], h, RK_NODES[integrator], RK_WEIGHTS[integrator], MASS_KG, MATRIX, INVERSE)
+    return states[0, 1]
+
+
+def numba_jacobians(x: Array, u: Array, h: float, integrator: str) -> tuple[Array, Array, Array]:
+    """x_next (13,), A (12, 12), B (12, 6)."""
+    states, mats = np.tile(x, (1, 2, 1)), np.empty((1, 1, 12, 12))
     nodes, weights = RK_NODES[integrator], RK_WEIGHTS[integrator]
-    step(x, u, h, nodes, weights, MASS_KG, MATRIX, INVERSE, out, np.empty(24))
-    return out
+    roll_linearized(states, u[None, None], np.ones((1, 6)), h, nodes, weights, MASS_KG, MATRIX, INVERSE, mats)
+    return states[0, 1], full_a(mats[0, 0, :, :6], h), mats[0, 0, :, 6:]
 
 
 def random_point(seed: int, rate: float = 1.0) -> tuple[Array, Array]:
@@ -99,25 +106,9 @@ def test_jacobians_equal_casadis_in_the_tangent_space(integrator: str, seed: int
     lift[:6, :6], lift[6:10, 6:9], lift[10:, 9:] = np.eye(6), tangent(x[6:10]), np.eye(3)
     lower = np.zeros((12, 13))
     lower[:6, :6], lower[6:9, 6:10], lower[9:, 10:] = np.eye(6), 4.0 * tangent(x_next[6:10]).T, np.eye(3)
-    out, c_mat, b_mat = np.empty(13), np.empty((12, 6)), np.empty((12, 6))
-    nodes, weights = RK_NODES[integrator], RK_WEIGHTS[integrator]
-    linearize(
-        x,
-        u,
-        0.1,
-        nodes,
-        weights,
-        MASS_KG,
-        MATRIX,
-        INVERSE,
-        out,
-        c_mat,
-        b_mat,
-        np.empty(54),
-        np.empty((27, 9)),
-    )
+    out, a_mat, b_mat = numba_jacobians(x, u, 0.1, integrator)
     np.testing.assert_allclose(out, x_next, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(full_a(c_mat, 0.1), lower @ np.array(jac_x(x, u)) @ lift, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(a_mat, lower @ np.array(jac_x(x, u)) @ lift, rtol=0, atol=1e-12)
     np.testing.assert_allclose(b_mat, lower @ np.array(jac_u(x, u)), rtol=0, atol=1e-12)
 
 
@@ -125,24 +116,8 @@ def test_jacobians_equal_casadis_in_the_tangent_space(integrator: str, seed: int
 @given(st.integers(0, 10_000), st.sampled_from(["euler", "rk4"]))
 def test_jacobians_equal_finite_differences(seed: int, integrator: str) -> None:
     x, u = random_point(seed)
-    out, c_mat, b_mat = np.empty(13), np.empty((12, 6)), np.empty((12, 6))
-    nodes, weights = RK_NODES[integrator], RK_WEIGHTS[integrator]
-    linearize(
-        x,
-        u,
-        0.1,
-        nodes,
-        weights,
-        MASS_KG,
-        MATRIX,
-        INVERSE,
-        out,
-        c_mat,
-        b_mat,
-        np.empty(54),
-        np.empty((27, 9)),
-    )
-    a_mat, e = full_a(c_mat, 0.1), 1e-6
+    _, a_mat, b_mat = numba_jacobians(x, u, 0.1, integrator)
+    e = 1e-6
     for j in range(12):
         plus = numba_step(perturb(x, e * np.eye(12)[j]), u, 0.1, integrator)
         minus = numba_step(perturb(x, -e * np.eye(12)[j]), u, 0.1, integrator)

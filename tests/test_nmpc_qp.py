@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -13,11 +12,10 @@ from chaserdock_controller.nmpc import (
     kernels,
     make_solver,
     planes,
-    riccati,
 )
 from chaserdock_controller.nmpc.cost import plan_cost, quadratic_model
-from chaserdock_controller.nmpc.ipm import CONVERGED, MU_STOP, solve_qp
-from chaserdock_controller.nmpc.problem import SLACK_L1, SLACK_L2
+from chaserdock_controller.nmpc.ipm import CONVERGED, FREE, MAX_ITERATIONS, MU_STOP, solve_qp
+from chaserdock_controller.nmpc.slack import SLACK_L1, SLACK_L2
 from chaserdock_protocol import rotations
 from nmpc_cases import (
     INVERSE,
@@ -41,14 +39,17 @@ def qp_data(problem: NmpcInput, u: Array) -> tuple[list[list[Any]], list[list[An
     n, d = len(problem.states), PARAMS.stages
     weights_p, weights_q = PARAMS.stage_weights()
     weights_u = np.array([3.5] * 3 + [40.0] * 3)
-    x, c, b = np.empty((n, d + 1, 13)), np.empty((n, d, 12, 6)), np.empty((n, d, 12, 6))
+    x, mats = np.empty((n, d + 1, 13)), np.empty((n, d, 12, 12))
     x[:, 0] = problem.states
-    kernels.roll_linearized(x, u, problem.input_max, 0.1, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE, c, b)
-    row_a, row_c = np.zeros((n, d + 1, n + 1, 3)), np.zeros((n, d + 1, n + 1))
-    n_rows = np.zeros((n, d + 1), dtype=np.int64)
+    kernels.roll_linearized(x, u, problem.input_max, 0.1, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE, mats)
+    width = d * (n + 2)
+    stage, n_rows = np.zeros((n, width), dtype=np.int64), np.zeros(n, dtype=np.int64)
+    row_a, row_c = np.zeros((n, width, 3)), np.zeros((n, width))
+    corridors = np.zeros((n, d + 1, 5)) if problem.corridors is None else problem.corridors
     planes.build_rows(
-        x, problem.references, problem.target_positions, problem.min_distance_target_m,
-        np.full((n, n), problem.min_distance_chasers_m), 25.0, np.full((n, d + 1), 10.0), row_a, row_c, n_rows,
+        x, problem.references, problem.target_positions, np.tile(problem.min_distance_target_m[:, None], d + 1),
+        np.full((n, n), problem.min_distance_chasers_m), 25.0, corridors, np.full((n, d + 1), 10.0),
+        stage, row_a, row_c, n_rows,
     )  # fmt: skip
     data, rows = [], []
     for i in range(n):
@@ -58,23 +59,23 @@ def qp_data(problem: NmpcInput, u: Array) -> tuple[list[list[Any]], list[list[An
             x[i], u[i], problem.references[i], problem.u_ref[i], problem.input_max[i],
             weights_p, weights_q, weights_u, q_pos, q_att, qx, r_diag, r, w_bar,
         )  # fmt: skip
-        data.append([c[i], b[i], 0.1, q_pos, q_att, qx, r_diag, r, w_bar])
-        rows.append([row_a[i], row_c[i], n_rows[i]])
+        data.append([mats[i], 0.1, q_pos, q_att, qx, r_diag, r, w_bar])
+        rows.append([stage[i], row_a[i], row_c[i], n_rows[i]])
     return data, rows, x
 
 
 def condensed(data: list[Any]) -> tuple[Array, Array, Array]:
     """Dense gradient, Hessian (6 D) and the maps (D+1, 12, 6 D) from inputs to states, by brute force."""
-    c, b, h, q_pos, q_att, qx, r_diag, r, _ = data
-    d = len(c)
+    mats, h, q_pos, q_att, qx, r_diag, r, _ = data
+    d = len(mats)
     maps = np.zeros((d + 1, 12, 6 * d))
     for k in range(d):
         a = np.zeros((12, 12))
         a[:6, :6] = np.eye(6)
         a[:3, 3:6] = h * np.eye(3)
-        a[:, 6:] = c[k]
+        a[:, 6:] = mats[k][:, :6]
         maps[k + 1] = a @ maps[k]
-        maps[k + 1][:, 6 * k : 6 * k + 6] += b[k]
+        maps[k + 1][:, 6 * k : 6 * k + 6] += mats[k][:, 6:]
     hessian, gradient = np.diag(r_diag.ravel()), r.ravel().copy()
     for k in range(d + 1):
         q = np.zeros((12, 12))
@@ -89,16 +90,22 @@ def random_inputs(seed: int, n: int, share: float) -> Array:
     return share * PARAMS.input_limits() * rng.uniform(-1, 1, size=(n, PARAMS.stages, 6))
 
 
+def run_qp(one: list[Any], rows: list[Any]) -> tuple[int, int, float, Array, Array, Array]:
+    """`solve_qp`: code, iterations, complementarity, dx, dw, multipliers."""
+    d = len(one[0])
+    dx, dw, mul = np.zeros((d + 1, 12)), np.zeros((d, 6)), np.zeros(2 * len(rows[0]) + 12 * d)
+    code, iterations, _, mu = solve_qp(*one, *rows, SLACK_L1, SLACK_L2, MAX_ITERATIONS, dx, dw, mul)
+    return code, iterations, mu, dx, dw, mul
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_riccati_minimizes_the_quadratic_model(seed: int) -> None:
     problem_at, states = tumbling(1)
-    states[:, :3] += 0.1
-    data, _, _ = qp_data(problem_at(states, 0.0), random_inputs(seed, 1, 0.5))
-    c, b, h, q_pos, q_att, qx, r_diag, r, _ = data[0]
-    gain, chol = np.empty((30, 6, 12)), np.zeros((30, 6, 6))
-    dx, dw = np.zeros((31, 12)), np.zeros((30, 6))
-    assert riccati.factor(c, b, h, q_pos, q_att, r_diag, gain, chol)
-    riccati.solve(c, b, h, gain, chol, qx, r, dx, dw)
+    states[:, :3] += 0.01
+    data, rows, _ = qp_data(problem_at(states, 0.0), random_inputs(seed, 1, 0.3))
+    code, _, _, dx, dw, mul = run_qp(data[0], rows[0])
+    assert code == FREE
+    assert not mul.any()
     gradient, hessian, maps = condensed(data[0])
     expected = -np.linalg.solve(hessian, gradient)
     np.testing.assert_allclose(dw.ravel(), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
@@ -138,30 +145,30 @@ def test_interior_point_meets_the_kkt_conditions(seed: int) -> None:
     problem = fixed_problem(states, np.array([[0.8, 0.5, 0], [-0.8, 0.5, 0.0]]), rotations.exp([0, 0, 0.7]))
     data, rows, _ = qp_data(problem, random_inputs(seed, 2, 0.3))
     active = 0
-    for one, (row_a, row_c, n_rows) in zip(data, rows, strict=True):
-        dx, dw = np.zeros((31, 12)), np.zeros((30, 6))
-        # The Python source of the kernel, so that the test does not wait for a second compilation.
-        run: Callable[..., Any] = solve_qp.py_func
-        code, iterations, _, mu, lam, box = run(*one, row_a, row_c, n_rows, SLACK_L1, SLACK_L2, dx, dw)
+    for one, row in zip(data, rows, strict=True):
+        stage, row_a, row_c, n_rows = row
+        code, iterations, mu, _, dw, mul = run_qp(one, row)
         assert code == CONVERGED
         assert 0 < iterations < 30
         gradient, hessian, maps = condensed(one)
-        w = one[-1] + dw
+        w = (one[-1] + dw).ravel()
         assert np.all(np.abs(w) < 1.0)
-        stationarity = gradient + hessian @ dw.ravel() - (box[:, :, 0] - box[:, :, 1]).ravel()
-        for k in range(1, 31):
-            for m in range(n_rows[k]):
-                normal = maps[k][:3].T @ row_a[k, m]
-                stationarity -= lam[k, m] * normal
-                gap = normal @ dw.ravel() - row_c[k, m]
-                slack = max(-gap, 0.0)
-                assert 0.0 < lam[k, m] < SLACK_L1 + SLACK_L2 * slack + 1.0
-                assert lam[k, m] * (gap + slack) < 60 * MU_STOP * len(w)
-                active += lam[k, m] > 1.0
-        assert np.max(np.abs(stationarity)) < 1e-5 * np.max(np.abs(gradient))
-        assert np.all(box > 0.0)
+        lam, low = mul[:n_rows], mul[2 * n_rows : 2 * n_rows + len(w)]
+        high = mul[2 * n_rows + len(w) : 2 * n_rows + 2 * len(w)]
+        stationarity = gradient + hessian @ dw.ravel() - low + high
+        for j in range(n_rows):
+            normal = maps[stage[j]][:3].T @ row_a[j]
+            stationarity -= lam[j] * normal
+            gap = normal @ dw.ravel() - row_c[j]
+            slack = max(-gap, 0.0)
+            assert 0.0 < lam[j] < SLACK_L1 + SLACK_L2 * slack + 1.0
+            assert lam[j] * (gap + slack) < 60 * MU_STOP * 30
+            active += lam[j] > 1.0
+        assert np.max(np.abs(stationarity)) < 1e-6 * np.max(np.abs(gradient))
+        assert np.all(low > 0.0)
+        assert np.all(high > 0.0)
         assert mu <= MU_STOP
-        assert np.max(np.minimum(box[:, :, 0] * (1 + w), 1e9)) < 400 * MU_STOP
+        assert np.max(low * (1 + w)) < 400 * MU_STOP
     assert active > 0
 
 

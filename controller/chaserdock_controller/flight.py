@@ -25,6 +25,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
 from . import reference
+from .facing import facing_attitudes
 from .fusion import geometry
 from .fusion.types import Measurement
 from .fusion.types import TargetEstimate as Fused
@@ -34,6 +35,7 @@ from .prediction import CommandHistory, predict_state
 from .setup import estimator_of, nmpc_parameters
 
 _ODOMETRY_KEPT_NS = 2_000_000_000
+_GREATEST_MARGIN_M = 0.1
 
 
 COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
@@ -83,7 +85,8 @@ class Flight:
         self._camera = scenario.camera_model()
         self._estimator = estimator_of(scenario)
         self._parameters = nmpc_parameters(scenario)
-        self._solver = make_solver(scenario.controller.solver, self._parameters, len(scenario.chasers))
+        c = scenario.controller
+        self._solver = make_solver(c.solver, self._parameters, len(scenario.chasers), c.max_iterations)
         self._odometry: dict[tuple[int, int], Odometry] = {}
         self._history = CommandHistory()
         self._last_solve_ns: int | None = None
@@ -101,7 +104,9 @@ class Flight:
             self.guidance.found(now_s)
         elif fused.status == "lost":
             self.guidance.lost(now_s)
-        for command in (*self.guidance.due_commands(now_s), *inputs.commands):
+        commands = (*self.guidance.due_commands(now_s), *inputs.commands)
+        self.guidance.expect(commands)
+        for command in commands:
             answer = self.guidance.command(command, now_s)
             out.replies.append(
                 CommandReply(
@@ -203,14 +208,18 @@ class Flight:
         states, references, u_ref = [], [], []
         for i in ids:
             offset = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s)
-            q_off = s.chasers[i].q_wxyz
+            q_off = self._attitudes(i, offset[0])
             states.append(predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser))
             references.append(reference.reference_trajectory(*moving, offset[0], q_off, times_s))
             if s.controller.feed_forward:
                 held = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s[:-1] + p.dt_s / 2)
                 u_ref.append(
                     reference.feed_forward(
-                        ahead.omega_rad_s, *held, q_off, s.chaser.mass_kg, np.diag(s.chaser.inertia)
+                        ahead.omega_rad_s,
+                        *held,
+                        self._attitudes(i, held[0]),
+                        s.chaser.mass_kg,
+                        np.diag(s.chaser.inertia),
                     )
                 )
             else:
@@ -221,10 +230,22 @@ class Flight:
             references=np.array(references),
             u_ref=np.array(u_ref),
             target_positions=positions,
-            min_distance_target_m=np.full(n, s.limits.min_distance_target_m),
+            min_distance_target_m=np.full(n, s.limits.min_distance_target_m + self._margin_m(ahead)),
             min_distance_chasers_m=s.limits.min_distance_chasers_m,
             input_max=np.tile(p.input_limits(), (n, 1)),
         )
+
+    def _attitudes(self, i: int, offsets: Array) -> Array:
+        """Attitude of a chaser's reference, body to TRF, at offsets (K, 3): (K, 4), or (4,) where it never turns."""
+        c = self.scenario.chasers[i]
+        if not self.scenario.approach.face_target:
+            return np.array(c.q_wxyz)
+        return facing_attitudes(c.position_m, c.q_wxyz, offsets)
+
+    def _margin_m(self, ahead: Fused) -> float:
+        """What the uncertainty of the target's position adds to the distance from it."""
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(ahead.covariance[:3, :3])[-1]))
+        return min(self.scenario.limits.estimate_margin_sigmas * sigma_m, _GREATEST_MARGIN_M)
 
     def _describe(self, ids: tuple[int, ...], inputs: Inputs, fused: Fused, out: Outputs) -> None:
         """Where every chaser is to be now, and its phase by how near it is to that."""
@@ -232,7 +253,7 @@ class Flight:
         for i in ids:
             offset = self.guidance.chasers[i].move.at(np.array([now_s]))[0][0]
             position = fused.position_m + rotations.rotate(fused.q_wxyz, offset)
-            attitude = rotations.multiply(fused.q_wxyz, self.scenario.chasers[i].q_wxyz)
+            attitude = rotations.multiply(fused.q_wxyz, self._attitudes(i, offset[None]).reshape(4))
             odometry = inputs.odometry[i]
             error_m = float(np.linalg.norm(position - odometry.position_m))
             error_rad = float(rotations.angle_between(attitude, odometry.q_wxyz))

@@ -8,12 +8,13 @@ the docking tolerances for long enough), ``retreat`` and ``abort`` (back to the 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import Scenario
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .moves import Move, move_to, stay, stop
 
@@ -48,6 +49,7 @@ class Guidance:
         self._scenario = scenario
         self.events: list[tuple[int, str, str]] = []
         self.chasers = [ChaserGuidance("acquire", 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
+        self._leaving: dict[int, Array] = {}
         self._due = sorted(scenario.timeline, key=lambda entry: entry.at_s)
 
     def found(self, now_s: float) -> None:
@@ -70,6 +72,14 @@ class Guidance:
             for chaser in entry.chasers:
                 out.append(OperatorCommand(command=entry.command, chaser=chaser, offset_m=entry.offset_m))
         return out
+
+    def expect(self, commands: Sequence[OperatorCommand]) -> None:
+        """What one tick asks for together: a chaser may be sent to where another is being sent away from."""
+        self._leaving = {
+            c.chaser: np.asarray(c.offset_m)
+            for c in commands
+            if c.command == "goto" and c.offset_m is not None and not self._why_not_there(c.offset_m)
+        }
 
     def command(self, command: OperatorCommand, now_s: float) -> Answer:
         """Does what an operator or the time line asks for, or says why not."""
@@ -113,14 +123,19 @@ class Guidance:
     def _why_not_goto(self, i: int, command: OperatorCommand, offset: Array) -> str:
         if command.offset_m is None:
             return "goto needs an offset"
-        distance = float(np.linalg.norm(offset))
+        if reason := self._why_not_there(offset):
+            return reason
+        for j, other in enumerate(self.chasers):
+            apart = float(np.linalg.norm(self._leaving.get(j, other.move.goal_m) - offset))
+            if j != i and apart < self._scenario.limits.min_distance_chasers_m:
+                return f"the offset is {apart:.3g} m from where chaser {j} is to be"
+        return ""
+
+    def _why_not_there(self, offset_m: ArrayLike) -> str:
+        distance = float(np.linalg.norm(offset_m))
         nearest = self._scenario.limits.min_distance_target_m
         if not nearest < distance <= self._scenario.limits.max_reference_distance_m:
             return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
-        for j, other in enumerate(self.chasers):
-            apart = float(np.linalg.norm(other.move.goal_m - offset))
-            if j != i and apart < self._scenario.limits.min_distance_chasers_m:
-                return f"the offset is {apart:.3g} m from where chaser {j} is to be"
         return ""
 
     def dock_offset(self, i: int) -> Array:

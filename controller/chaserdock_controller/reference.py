@@ -41,8 +41,8 @@ def reference_trajectory(
 ) -> Array:
     """Reference poses (K, 7): p (WRF, m), q_wxyz (chaser body to world) at ``times_s`` (K,).
 
-    Target arguments as in `predict_target`; offset_position_m (K, 3) or (3,) in TRF, q_off_wxyz (4,) chaser body to
-    TRF. p_ref = p_tar + q_tar p_off q_tar*, q_ref = q_tar q_off (paper, section 4.1).
+    Target arguments as in `predict_target`; offset_position_m (K, 3) or (3,) in TRF, q_off_wxyz (4,) or (K, 4) chaser
+    body to TRF. p_ref = p_tar + q_tar p_off q_tar*, q_ref = q_tar q_off (paper, section 4.1).
     """
     positions, attitudes = predict_target(position_m, velocity_m_s, q_wxyz, omega_rad_s, times_s)
     offsets = np.broadcast_to(np.asarray(offset_position_m, dtype=float), positions.shape)
@@ -90,7 +90,8 @@ def feed_forward(
     """Force and torque (K, 6), N and N m in chaser body axes, that following the reference takes.
 
     omega (3,) of the target in TRF, constant; offset position, velocity and acceleration (K, 3) in TRF, one row per
-    instant (for an input held over a stage, give the stage's middle); q_off_wxyz (4,) chaser body to TRF.
+    instant (for an input held over a stage, give the stage's middle); q_off_wxyz (4,) or (K, 4) chaser body to TRF,
+    whose own turning is taken as slow: it adds no torque.
     Acceleration in a rotating frame, a = p'' + 2 omega x p' + omega x (omega x p) (Goldstein, "Classical
     Mechanics", eq. 4.91), turned into body axes; torque omega_b x I omega_b for the constant body rate. The
     target's position, velocity and attitude do not enter: in body axes the wrench is the same anywhere.
@@ -107,6 +108,6 @@ def feed_forward(
     acceleration = a + 2.0 * cross(omega, v) + cross(omega, cross(omega, p))
     q_off = normalize(q_off_wxyz)
     omega_body = rotate_inverse(q_off, omega)
-    torque = cross(omega_body, np.asarray(inertia_kg_m2, dtype=float) @ omega_body)
+    torque = cross(omega_body, omega_body @ np.asarray(inertia_kg_m2, dtype=float))
     force = mass_kg * rotate_inverse(q_off, acceleration)
     return np.concatenate([force, np.broadcast_to(torque, force.shape)], axis=1)

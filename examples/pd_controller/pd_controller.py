@@ -8,7 +8,7 @@ KP, KD = 0.16, 0.72  # 1/s^2 and 1/s: 0.4 rad/s, damped 0.9
 
 
 class Pd:
-    def __init__(self, params, n):
+    def __init__(self, params, n, max_iterations=None):
         self.params = params
 
     def reset(self):

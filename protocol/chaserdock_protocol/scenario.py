@@ -59,7 +59,7 @@ class PerceptionSection(Section):
 
 PERCEPTIONS = ("default", "paper")
 ESTIMATORS = ("mekf", "paper")
-SOLVERS = ("rti", "ipopt")
+SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Chaserdock's own parts, by the name that a scenario chooses them with; others may be installed (see ``plugins``)."""
 
 MAX_STAGES = 500
@@ -67,9 +67,13 @@ MAX_STAGES = 500
 
 
 class Controller(Section):
-    """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md)."""
+    """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md).
+
+    ``max_iterations`` bounds a solve, in iterations as the solver counts them, so that it flies the same anywhere.
+    """
 
     solver: Name = "rti"
+    max_iterations: Annotated[int, Field(ge=0)] | None = None
     horizon_s: Positive = 3.0
     dt_s: Positive = 0.1
     falloff: Annotated[float, AfterValidator(finite), Field(ge=0, le=1)] = 0.0
@@ -95,21 +99,31 @@ class Controller(Section):
 
 
 class Limits(Section):
-    """Distances that the controller keeps, centre to centre."""
+    """Distances that the controller keeps, centre to centre.
+
+    ``estimate_margin_sigmas``: how many standard deviations of the target's estimated position are added to the
+    distance from it, at most 0.1 m. 0: the estimate is taken as it is.
+    """
 
     min_distance_target_m: NotNegative = 0.35
+    estimate_margin_sigmas: NotNegative = 0.0
     min_distance_chasers_m: NotNegative = 0.35
     max_reference_distance_m: Positive = 25.0
 
 
 class Approach(Section):
-    """How an approach is flown, and when a chaser counts as docked."""
+    """How an approach is flown, and when a chaser counts as docked.
+
+    ``face_target``: the reference attitude turns with the offset, so that a chaser sent elsewhere goes on facing the
+    target; otherwise it keeps its attitude in TRF.
+    """
 
     dock_distance_m: Positive = 0.40
     max_speed_m_s: Positive = 0.03
     docked_position_m: Positive = 0.01
     docked_angle_deg: Positive = 1.0
     docked_time_s: Positive = 5.0
+    face_target: bool = False
 
 
 class Chaser(Section):

@@ -12,16 +12,28 @@ __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver",
 BACK_ENDS = SOLVERS
 
 
-def make_solver(name: str, params: NmpcParameters, n: int) -> NmpcSolver:
-    """The back end ``name`` for up to ``n`` chasers: one of ours, or an installed ``chaserdock.solvers`` entry point, a
-    function of (params, n). Raises PluginError when there is no such thing here, ValueError for n < 1."""
+def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int | None = None) -> NmpcSolver:
+    """The back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, as the back end counts.
+
+    One of ours, or an installed ``chaserdock.solvers`` entry point: a function of (params, n, max_iterations). Raises
+    PluginError when there is no such thing here, ValueError for n < 1, or a back end whose package or compiler is not
+    installed.
+    """
     # Imported here so that the one does not cost the start-up time of the other.
     if name == "rti":
         from chaserdock_controller.nmpc.rti import RtiSolver
 
-        return RtiSolver(params, n)
-    if name == "ipopt":
-        from chaserdock_controller.nmpc.ipopt import IpoptSolver
+        return RtiSolver(params, n, max_iterations)
+    if name in ("ipopt", "fatrop"):
+        from chaserdock_controller.nmpc.nlp import NlpSolver
 
-        return IpoptSolver(params, n)
-    return plugins.load("solver", name, BACK_ENDS)(params, n)
+        return NlpSolver(name, params, n, max_iterations)
+    if name == "alpaqa":
+        from chaserdock_controller.nmpc.alm import AlpaqaSolver
+
+        return AlpaqaSolver(params, n, max_iterations)
+    if name == "open":
+        from chaserdock_controller.nmpc.open_engine import OpenSolver
+
+        return OpenSolver(params, n, max_iterations)
+    return plugins.load("solver", name, BACK_ENDS)(params, n, max_iterations)

@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from chaserdock_controller.nmpc.compiled import kernel
 from chaserdock_controller.nmpc.types import Array, NmpcInput, NmpcParameters
 
 # Measured quaternions are normalized; one this far off is a mistake, not a rounding error.
@@ -21,7 +21,7 @@ def _array(name: str, value: object, shape: tuple[int, ...]) -> Array:
     return array
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _normalize_rows(array, first, stop):
     """Normalizes the quaternions in columns first..first+3 of ``array`` (K, stop) in place.
 
@@ -44,7 +44,7 @@ def _normalize_rows(array, first, stop):
     return bad
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def _smallest(array):
     """The least value of a flat array; NaN if any value is not finite."""
     least = np.inf
@@ -64,10 +64,12 @@ def _poses(name: str, array: Array, first: int) -> None:
 
 
 def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
-    """A copy of ``problem`` with contiguous arrays, unit quaternions and (N, N) chaser distances.
+    """A copy of ``problem`` with contiguous arrays, unit quaternions and everything optional written out:
+    (N, D+1) target distances, (N, N) chaser distances, corridors.
 
     Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
-    length, a negative distance or limit, an asymmetric distance matrix, or more than ``n_max`` chasers.
+    length, a negative distance or limit, an asymmetric distance matrix, a corridor that is no cone, or more than
+    ``n_max`` chasers.
     """
     states = np.asarray(problem.states, dtype=np.float64)
     if states.ndim != 2 or not 1 <= len(states) <= n_max:
@@ -83,7 +85,12 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
     between = _array("min_distance_chasers_m", between, (n, n))
     if n > 1 and (between != between.T).any():
         raise ValueError("min_distance_chasers_m must be symmetric")
-    to_target = _array("min_distance_target_m", problem.min_distance_target_m, (n,))
+    to_target = np.asarray(problem.min_distance_target_m, dtype=np.float64)
+    if to_target.ndim == 1:
+        to_target = np.repeat(to_target[:, None], d + 1, axis=1)
+    to_target = _array("min_distance_target_m", to_target, (n, d + 1))
+    corridors = np.zeros((n, d + 1, 5)) if problem.corridors is None else problem.corridors
+    corridors = _array("corridors", corridors, (n, d + 1, 5))
     input_max = _array("input_max", problem.input_max, (n, 6))
     u_ref = _array("u_ref", problem.u_ref, (n, d, 6))
     targets = _array("target_positions", problem.target_positions, (d + 1, 3))
@@ -93,12 +100,15 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         ("input_max", input_max, False),
         ("u_ref", u_ref, True),
         ("target_positions", targets, True),
+        ("corridors", corridors, True),
     ):
         least = _smallest(value.ravel())
         if math.isnan(least):
             raise ValueError(f"{name} holds a value that is not finite")
         if least < 0.0 and not may_be_negative:
             raise ValueError(f"{name} must not be negative")
+    if problem.corridors is not None:
+        _check_corridors(corridors)
     return NmpcInput(
         states=states,
         references=references,
@@ -107,7 +117,18 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         min_distance_target_m=to_target,
         min_distance_chasers_m=between,
         input_max=input_max,
+        corridors=corridors,
     )
+
+
+def _check_corridors(corridors: Array) -> None:
+    length = np.linalg.norm(corridors[..., :3], axis=-1)
+    used = length > 0.0
+    if (np.abs(length[used] - 1.0) > 1e-6).any():
+        raise ValueError("corridors must have axes of unit length, or zero for no corridor")
+    angle = corridors[..., 3][used]
+    if not ((angle > 0.0) & (angle < math.pi / 2)).all():
+        raise ValueError("corridors must have half angles above 0 and below pi / 2")
 
 
 def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:

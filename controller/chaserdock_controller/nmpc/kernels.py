@@ -2,250 +2,232 @@
 
 Jacobians are taken in the 12-dimensional tangent space [dp, dv, dtheta, domega] with
 q_true = q (x) exp(dtheta): A is 12 x 12 and B 12 x 6. The first six columns of A are those of a double
-integrator (identity and dt), so only its last six, called C here, are computed and stored.
+integrator (identity and dt), so only its last six, called C, are computed. They are stored beside B as M = [C B],
+12 x 12: loops over rows of twelve are what LLVM turns into vector instructions.
+
+Loops rather than written-out terms, throughout: Numba's compilation takes about 1.5 ms for each elementary
+operation in the source, whatever the processor makes of it, and is most of a cold start.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from chaserdock_controller.nmpc.compiled import kernel, part
 
 # Explicit Runge-Kutta tableaux with one sub-diagonal, which is all that euler and rk4 need.
 RK_NODES = {"euler": np.array([0.0]), "rk4": np.array([0.0, 0.5, 0.5, 1.0])}
 RK_WEIGHTS = {"euler": np.array([1.0]), "rk4": np.array([1.0, 2.0, 2.0, 1.0]) / 6.0}
 
+# Scratch of a step: y (7) and its rates (10), rotation (9), I omega (3), the torque left (3), one spare.
+_STEP_WORK = 33
 
-@njit(cache=True, error_model="numpy")
-def body_rates(q, w, u, mass, inertia, inverse, a, kq, kw):
-    """Writes the acceleration a (3, WRF), kq = q' (4) and kw = omega' (3)."""
-    t0 = 2.0 * (q[2] * u[2] - q[3] * u[1])
-    t1 = 2.0 * (q[3] * u[0] - q[1] * u[2])
-    t2 = 2.0 * (q[1] * u[1] - q[2] * u[0])
-    a[0] = (u[0] + q[0] * t0 + q[2] * t2 - q[3] * t1) / mass
-    a[1] = (u[1] + q[0] * t1 + q[3] * t0 - q[1] * t2) / mass
-    a[2] = (u[2] + q[0] * t2 + q[1] * t1 - q[2] * t0) / mass
-    kq[0] = 0.5 * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2])
-    kq[1] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
-    kq[2] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
-    kq[3] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
-    l0 = inertia[0, 0] * w[0] + inertia[0, 1] * w[1] + inertia[0, 2] * w[2]
-    l1 = inertia[1, 0] * w[0] + inertia[1, 1] * w[1] + inertia[1, 2] * w[2]
-    l2 = inertia[2, 0] * w[0] + inertia[2, 1] * w[1] + inertia[2, 2] * w[2]
-    n0 = u[3] - (w[1] * l2 - w[2] * l1)
-    n1 = u[4] - (w[2] * l0 - w[0] * l2)
-    n2 = u[5] - (w[0] * l1 - w[1] * l0)
+
+@part
+def _rates(y, u, mass, inertia, inverse, k, work):
+    """k (10) = [q', omega', acceleration (WRF)] at y (7) = [q, omega]; work (15) gets R (9), I omega (3)."""
+    w0, x0, y0, z0 = y[0], y[1], y[2], y[3]
+    work[0] = 1.0 - 2.0 * (y0 * y0 + z0 * z0)
+    work[4] = 1.0 - 2.0 * (x0 * x0 + z0 * z0)
+    work[8] = 1.0 - 2.0 * (x0 * x0 + y0 * y0)
+    work[1] = 2.0 * (x0 * y0 - w0 * z0)
+    work[3] = 2.0 * (x0 * y0 + w0 * z0)
+    work[2] = 2.0 * (x0 * z0 + w0 * y0)
+    work[6] = 2.0 * (x0 * z0 - w0 * y0)
+    work[5] = 2.0 * (y0 * z0 - w0 * x0)
+    work[7] = 2.0 * (y0 * z0 + w0 * x0)
+    k[0] = 0.0
     for i in range(3):
-        kw[i] = inverse[i, 0] * n0 + inverse[i, 1] * n1 + inverse[i, 2] * n2
+        a, b = (i + 1) % 3, (i + 2) % 3
+        k[0] -= 0.5 * y[1 + i] * y[4 + i]
+        k[1 + i] = 0.5 * (w0 * y[4 + i] + y[1 + a] * y[4 + b] - y[1 + b] * y[4 + a])
+        work[9 + i] = 0.0
+        k[7 + i] = 0.0
+        for j in range(3):
+            work[9 + i] += inertia[i, j] * y[4 + j]
+            k[7 + i] += work[3 * i + j] * u[j] / mass
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        work[12 + i] = u[3 + i] - (y[4 + a] * work[9 + b] - y[4 + b] * work[9 + a])
+    for i in range(3):
+        k[4 + i] = 0.0
+        for j in range(3):
+            k[4 + i] += inverse[i, j] * work[12 + j]
 
 
-@njit(cache=True, error_model="numpy")
-def step(x, u, h, nodes, weights, mass, inertia, inverse, out, work):
-    """One step x (13), u (6) -> out (13); the quaternion is normalized. work (24,)."""
-    q, w, kq, kw, a = work[0:4], work[4:7], work[7:11], work[11:14], work[14:17]
-    kq[:] = 0.0
-    kw[:] = 0.0
-    a[:] = 0.0
-    for i in range(13):
-        out[i] = x[i]
-    for s in range(len(nodes)):
-        c = h * nodes[s]
-        b = h * weights[s]
-        for i in range(4):
-            q[i] = x[6 + i] + c * kq[i]
-        for i in range(3):
-            w[i] = x[10 + i] + c * kw[i]
-            out[i] += b * (x[3 + i] + c * a[i])
-        body_rates(q, w, u, mass, inertia, inverse, a, kq, kw)
-        for i in range(3):
-            out[3 + i] += b * a[i]
-            out[10 + i] += b * kw[i]
-        for i in range(4):
-            out[6 + i] += b * kq[i]
-    norm = np.sqrt(out[6] * out[6] + out[7] * out[7] + out[8] * out[8] + out[9] * out[9])
-    for i in range(4):
-        out[6 + i] /= norm
+@part
+def _runge_kutta_stage(x, u, b, c, mass, inertia, inverse, out, work):
+    """One stage: rates at x + c k, added with weight b to out (13). work (33): y (7), k (10), scratch."""
+    y, k = work[0:7], work[7:17]
+    for i in range(7):
+        y[i] = x[6 + i] + c * k[i]
+    for i in range(3):
+        out[i] += b * (x[3 + i] + c * k[7 + i])
+    _rates(y, u, mass, inertia, inverse, k, work[17:33])
+    for i in range(3):
+        out[3 + i] += b * k[7 + i]
+    for i in range(7):
+        out[6 + i] += b * k[i]
+
+
+@part
+def _normalize(out):
+    norm = 0.0
+    for i in range(6, 10):
+        norm += out[i] * out[i]
+    norm = np.sqrt(norm)
+    for i in range(6, 10):
+        out[i] /= norm
     return norm
 
 
-@njit(cache=True, error_model="numpy")
-def linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, c_mat, b_mat, work, sens):
-    """One step as in `step`, with its Jacobians C (12, 6) and B (12, 6).
+@part
+def _step(x, u, h, nodes, weights, mass, inertia, inverse, out, work):
+    """One step x (13), u (6) -> out (13); the quaternion is normalized. work (_STEP_WORK,)."""
+    for i in range(13):
+        out[i] = x[i]
+    for i in range(17):
+        work[i] = 0.0
+    for s in range(len(nodes)):
+        _runge_kutta_stage(x, u, h * weights[s], h * nodes[s], mass, inertia, inverse, out, work)
+    _normalize(out)
 
-    work (54,) and sens (27, 9) are scratch. sens holds the sensitivities to [dtheta, domega, torque] of, in
-    rows: q' (4), omega' (3) and acceleration (3) at the last stage; the sums for p (3), v (3), q (4) and
-    omega (3); q at the start (4).
+
+@part
+def _rate_jacobian(y, u, mass, inertia, inverse, work, g):
+    """g (10, 7) = d[q', omega', acceleration] / d[q, omega]. work (15) as `_rates` left it.
+
+    q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = q F q* / m, whose derivative is
+    2/m [ s x F | (v . F) 1 + v F' - 2 F v' + s [F]x' ] for q = (s, v) (the terms of v v' - |v|^2 + s v x).
     """
-    q, w, kq, kw, a = work[0:4], work[4:7], work[7:11], work[11:14], work[14:17]
-    m, jac, rot = work[24:36].reshape((3, 4)), work[36:45].reshape((3, 3)), work[45:54].reshape((3, 3))
-    dkq, dkw, da = sens[0:4], sens[4:7], sens[7:10]
-    dp, dv, sum_q, sum_w, dq0 = sens[10:13], sens[13:16], sens[16:20], sens[20:23], sens[23:27]
-    sens[:] = 0.0
-    work[:] = 0.0
-    c_mat[:] = 0.0
-    b_mat[:] = 0.0
+    s = y[0]
+    dot = 0.0
+    for i in range(3):
+        dot += y[1 + i] * u[i]
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        # q'
+        g[0, 1 + i] = -0.5 * y[4 + i]
+        g[1 + i, 0] = 0.5 * y[4 + i]
+        g[1 + i, 1 + a] = 0.5 * y[4 + b]
+        g[1 + i, 1 + b] = -0.5 * y[4 + a]
+        g[0, 4 + i] = -0.5 * y[1 + i]
+        g[1 + i, 4 + i] = 0.5 * s
+        g[1 + i, 4 + a] = -0.5 * y[1 + b]
+        g[1 + i, 4 + b] = 0.5 * y[1 + a]
+        # acceleration
+        f = 2.0 / mass
+        g[7 + i, 0] = f * (y[1 + a] * u[b] - y[1 + b] * u[a])
+        for j in range(3):
+            g[7 + i, 1 + j] = f * (y[1 + i] * u[j] - 2.0 * u[i] * y[1 + j])
+        g[7 + i, 1 + i] += f * dot
+        g[7 + i, 1 + a] += f * s * u[b]
+        g[7 + i, 1 + b] -= f * s * u[a]
+    for j in range(3):
+        # column j of [I omega]x - [omega]x I, then I^-1 in front
+        a, b = (j + 1) % 3, (j + 2) % 3
+        for i in range(3):
+            m, n = (i + 1) % 3, (i + 2) % 3
+            work[12 + i] = y[4 + n] * inertia[m, j] - y[4 + m] * inertia[n, j]
+        work[12 + a] += work[9 + b]
+        work[12 + b] -= work[9 + a]
+        for i in range(3):
+            g[4 + i, 4 + j] = 0.0
+            for m in range(3):
+                g[4 + i, 4 + j] += inverse[i, m] * work[12 + m]
+
+
+@part
+def _linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, m_mat, work, g, sens):
+    """One step as in `_step`, with its Jacobians M = [C B] (12, 12). g (10, 7): zeros where nothing is written.
+
+    sens (28, 12), sensitivities to [dtheta, domega, force, torque]: those of [q, omega] at the step's start (7),
+    at the stage (7), of the rates (10), and their sum for q (4); the other sums lie in m_mat.
+    """
+    start, here, rate, q_sum = sens[0:7], sens[7:14], sens[14:24], sens[24:28]
+    for i in range(28):
+        for j in range(12):
+            sens[i, j] = 0.0
+    for i in range(12):
+        for j in range(12):
+            m_mat[i, j] = 0.0
     for i in range(13):
         out[i] = x[i]
-    per_mass = 1.0 / mass
-    # dq = q (x) (0, dtheta / 2)
-    w0, x0, y0, z0 = 0.5 * x[6], 0.5 * x[7], 0.5 * x[8], 0.5 * x[9]
-    sum_q[0, 0], sum_q[0, 1], sum_q[0, 2] = -x0, -y0, -z0
-    sum_q[1, 0], sum_q[1, 1], sum_q[1, 2] = w0, -z0, y0
-    sum_q[2, 0], sum_q[2, 1], sum_q[2, 2] = z0, w0, -x0
-    sum_q[3, 0], sum_q[3, 1], sum_q[3, 2] = -y0, x0, w0
-    for i in range(4):
-        for j in range(3):
-            dq0[i, j] = sum_q[i, j]
+    for i in range(17):
+        work[i] = 0.0
+    # dq = 1/2 q (x) (0, dtheta)
     for i in range(3):
-        sum_w[i, 3 + i] = 1.0
-    for s in range(len(nodes)):
-        c = h * nodes[s]
-        b = h * weights[s]
-        for i in range(4):
-            q[i] = x[6 + i] + c * kq[i]
-        for i in range(3):
-            w[i] = x[10 + i] + c * kw[i]
-            out[i] += b * (x[3 + i] + c * a[i])
-            for j in range(3):
-                b_mat[i, j] += b * c * rot[i, j]
-        body_rates(q, w, u, mass, inertia, inverse, a, kq, kw)
-        # d(acceleration)/dq, and the rotation over the mass, which is d(acceleration)/dF
-        f0, f1, f2, qw, qx, qy, qz = u[0], u[1], u[2], q[0], q[1], q[2], q[3]
-        dot = qx * f0 + qy * f1 + qz * f2
-        m[0, 0] = 2.0 * (qy * f2 - qz * f1)
-        m[1, 0] = 2.0 * (qz * f0 - qx * f2)
-        m[2, 0] = 2.0 * (qx * f1 - qy * f0)
-        m[0, 1] = 2.0 * (dot - qx * f0)
-        m[0, 2] = 2.0 * (qw * f2 + qx * f1 - 2.0 * f0 * qy)
-        m[0, 3] = 2.0 * (-qw * f1 + qx * f2 - 2.0 * f0 * qz)
-        m[1, 1] = 2.0 * (-qw * f2 + qy * f0 - 2.0 * f1 * qx)
-        m[1, 2] = 2.0 * (dot - qy * f1)
-        m[1, 3] = 2.0 * (qw * f0 + qy * f2 - 2.0 * f1 * qz)
-        m[2, 1] = 2.0 * (qw * f1 + qz * f0 - 2.0 * f2 * qx)
-        m[2, 2] = 2.0 * (-qw * f0 + qz * f1 - 2.0 * f2 * qy)
-        m[2, 3] = 2.0 * (dot - qz * f2)
-        rot[0, 0] = 1.0 - 2.0 * (qy * qy + qz * qz)
-        rot[0, 1] = 2.0 * (qx * qy - qw * qz)
-        rot[0, 2] = 2.0 * (qx * qz + qw * qy)
-        rot[1, 0] = 2.0 * (qx * qy + qw * qz)
-        rot[1, 1] = 1.0 - 2.0 * (qx * qx + qz * qz)
-        rot[1, 2] = 2.0 * (qy * qz - qw * qx)
-        rot[2, 0] = 2.0 * (qx * qz - qw * qy)
-        rot[2, 1] = 2.0 * (qy * qz + qw * qx)
-        rot[2, 2] = 1.0 - 2.0 * (qx * qx + qy * qy)
-        for i in range(3):
-            for j in range(4):
-                m[i, j] *= per_mass
-            for j in range(3):
-                rot[i, j] *= per_mass
-        # d omega' / d omega = I^-1 ([I w]x - [w]x I)
-        l0 = inertia[0, 0] * w[0] + inertia[0, 1] * w[1] + inertia[0, 2] * w[2]
-        l1 = inertia[1, 0] * w[0] + inertia[1, 1] * w[1] + inertia[1, 2] * w[2]
-        l2 = inertia[2, 0] * w[0] + inertia[2, 1] * w[1] + inertia[2, 2] * w[2]
-        for j in range(3):
-            g0 = -(w[1] * inertia[2, j] - w[2] * inertia[1, j])
-            g1 = -(w[2] * inertia[0, j] - w[0] * inertia[2, j])
-            g2 = -(w[0] * inertia[1, j] - w[1] * inertia[0, j])
-            if j == 0:
-                g1 += l2
-                g2 -= l1
-            elif j == 1:
-                g0 -= l2
-                g2 += l0
-            else:
-                g0 += l1
-                g1 -= l0
-            for i in range(3):
-                jac[i, j] = inverse[i, 0] * g0 + inverse[i, 1] * g1 + inverse[i, 2] * g2
-        bc = b * c
-        for j in range(9):
-            d0, d1 = dq0[0, j] + c * dkq[0, j], dq0[1, j] + c * dkq[1, j]
-            d2, d3 = dq0[2, j] + c * dkq[2, j], dq0[3, j] + c * dkq[3, j]
-            e0, e1, e2 = c * dkw[0, j], c * dkw[1, j], c * dkw[2, j]
-            if j == 3:
-                e0 += 1.0
-            elif j == 4:
-                e1 += 1.0
-            elif j == 5:
-                e2 += 1.0
-            g0 = 0.5 * (-d1 * w[0] - d2 * w[1] - d3 * w[2] - qx * e0 - qy * e1 - qz * e2)
-            g1 = 0.5 * (d0 * w[0] + d2 * w[2] - d3 * w[1] + qw * e0 + qy * e2 - qz * e1)
-            g2 = 0.5 * (d0 * w[1] + d3 * w[0] - d1 * w[2] + qw * e1 + qz * e0 - qx * e2)
-            g3 = 0.5 * (d0 * w[2] + d1 * w[1] - d2 * w[0] + qw * e2 + qx * e1 - qy * e0)
-            dkq[0, j], dkq[1, j], dkq[2, j], dkq[3, j] = g0, g1, g2, g3
-            sum_q[0, j] += b * g0
-            sum_q[1, j] += b * g1
-            sum_q[2, j] += b * g2
-            sum_q[3, j] += b * g3
-            for i in range(3):
-                t = jac[i, 0] * e0 + jac[i, 1] * e1 + jac[i, 2] * e2
-                if j >= 6:
-                    t += inverse[i, j - 6]
-                dkw[i, j] = t
-                sum_w[i, j] += b * t
-                t = m[i, 0] * d0 + m[i, 1] * d1 + m[i, 2] * d2 + m[i, 3] * d3
-                dp[i, j] += bc * da[i, j]
-                da[i, j] = t
-                dv[i, j] += b * t
-        for i in range(3):
-            out[3 + i] += b * a[i]
-            out[10 + i] += b * kw[i]
-            for j in range(3):
-                b_mat[3 + i, j] += b * rot[i, j]
-        for i in range(4):
-            out[6 + i] += b * kq[i]
-    norm = np.sqrt(out[6] * out[6] + out[7] * out[7] + out[8] * out[8] + out[9] * out[9])
+        a, b = (i + 1) % 3, (i + 2) % 3
+        start[0, i] = -0.5 * x[7 + i]
+        start[1 + i, i] = 0.5 * x[6]
+        start[1 + i, a] = -0.5 * x[7 + b]
+        start[1 + i, b] = 0.5 * x[7 + a]
+        start[4 + i, 3 + i] = 1.0
+        m_mat[9 + i, 3 + i] = 1.0
     for i in range(4):
-        out[6 + i] /= norm
-    # dtheta_next = 2 vec(q_next* (x) dq) / |q|: the projection on the tangent space, normalization included
-    scale = 2.0 / norm
-    qw, qx, qy, qz = scale * out[6], scale * out[7], scale * out[8], scale * out[9]
-    for j in range(9):
-        d0, d1, d2, d3 = sum_q[0, j], sum_q[1, j], sum_q[2, j], sum_q[3, j]
-        t0 = qw * d1 - qx * d0 - (qy * d3 - qz * d2)
-        t1 = qw * d2 - qy * d0 - (qz * d1 - qx * d3)
-        t2 = qw * d3 - qz * d0 - (qx * d2 - qy * d1)
+        for j in range(3):
+            q_sum[i, j] = start[i, j]
+    for s in range(len(nodes)):
+        c, b = h * nodes[s], h * weights[s]
+        for i in range(7):
+            for j in range(12):
+                here[i, j] = start[i, j] + c * rate[i, j]
         for i in range(3):
-            t = t0 if i == 0 else (t1 if i == 1 else t2)
-            if j < 6:
-                c_mat[i, j], c_mat[3 + i, j], c_mat[6 + i, j], c_mat[9 + i, j] = (
-                    dp[i, j],
-                    dv[i, j],
-                    t,
-                    sum_w[i, j],
-                )
-            else:
-                b_mat[i, j - 3], b_mat[3 + i, j - 3], b_mat[6 + i, j - 3], b_mat[9 + i, j - 3] = (
-                    dp[i, j],
-                    dv[i, j],
-                    t,
-                    sum_w[i, j],
-                )
-    return norm
+            for j in range(12):
+                m_mat[i, j] += b * c * rate[7 + i, j]
+        _runge_kutta_stage(x, u, b, c, mass, inertia, inverse, out, work)
+        _rate_jacobian(work[0:7], u, mass, inertia, inverse, work[17:33], g)
+        for i in range(10):
+            for j in range(12):
+                rate[i, j] = 0.0
+            for m in range(4 if 4 <= i < 7 else 0, 7 if i < 7 else 4):
+                f = g[i, m]
+                for j in range(12):
+                    rate[i, j] += f * here[m, j]
+        for i in range(3):
+            for j in range(3):
+                rate[7 + i, 6 + j] += work[17 + 3 * i + j] / mass
+                rate[4 + i, 9 + j] += inverse[i, j]
+        for i in range(3):
+            for j in range(12):
+                m_mat[3 + i, j] += b * rate[7 + i, j]
+                m_mat[9 + i, j] += b * rate[4 + i, j]
+        for i in range(4):
+            for j in range(12):
+                q_sum[i, j] += b * rate[i, j]
+    # dtheta_next = 2 vec(q_next* (x) dq) / |q|: the projection on the tangent space, normalization included
+    scale = 2.0 / _normalize(out)
+    for i in range(3):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        for j in range(12):
+            t = out[6] * q_sum[1 + i, j] - out[7 + i] * q_sum[0, j]
+            m_mat[6 + i, j] = scale * (t - (out[7 + a] * q_sum[1 + b, j] - out[7 + b] * q_sum[1 + a, j]))
 
 
-@njit(cache=True, error_model="numpy")
-def roll_linearized(x, u, limits, h, nodes, weights, mass, inertia, inverse, c_mats, b_mats):
-    """Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13); c_mats, b_mats (N, D, 12, 6) along the way.
+@kernel
+def roll_linearized(x, u, limits, h, nodes, weights, mass, inertia, inverse, mats):
+    """Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13); mats (N, D, 12, 12) = [C B] along the way.
 
     B is that of the scaled inputs u / limits (N, 6): its columns are multiplied by the limits.
     """
-    work = np.empty(54)
-    sens = np.empty((27, 9))
+    work = np.empty(_STEP_WORK)
+    g = np.zeros((10, 7))
+    sens = np.empty((28, 12))
     for i in range(u.shape[0]):
         for k in range(u.shape[1]):
-            linearize(
-                x[i, k], u[i, k], h, nodes, weights, mass, inertia, inverse, x[i, k + 1],
-                c_mats[i, k], b_mats[i, k], work, sens,
+            m = mats[i, k]
+            _linearize(
+                x[i, k], u[i, k], h, nodes, weights, mass, inertia, inverse, x[i, k + 1], m, work, g, sens
             )  # fmt: skip
             for row in range(12):
                 for c in range(6):
-                    b_mats[i, k, row, c] *= limits[i, c]
+                    m[row, 6 + c] *= limits[i, c]
 
 
-@njit(cache=True, error_model="numpy")
+@kernel
 def roll(x, u, h, nodes, weights, mass, inertia, inverse):
     """Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13)."""
-    work = np.empty(24)
+    work = np.empty(_STEP_WORK)
     for i in range(u.shape[0]):
         for k in range(u.shape[1]):
-            step(x[i, k], u[i, k], h, nodes, weights, mass, inertia, inverse, x[i, k + 1], work)
+            _step(x[i, k], u[i, k], h, nodes, weights, mass, inertia, inverse, x[i, k + 1], work)

@@ -2,13 +2,15 @@
 
 A chaser-target constraint becomes the plane tangent to the keep-out ball; a chaser-chaser constraint a
 separating plane at the midpoint, half the distance to each side; the outer bound a plane tangent to the
-ball about the reference. Row m of stage k reads a' dp_k >= c with dp_k the change of the rolled position.
+ball about the reference; an approach corridor the plane tangent to its cone where the chaser is nearest. A row of
+stage k reads a' dp_k >= c with dp_k the change of the rolled position.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from chaserdock_controller.nmpc.compiled import kernel, part
 
 # Linearization gave away 2 mm of a distance; the plan keeps this much more.
 MARGIN_M = 5e-3
@@ -22,7 +24,7 @@ INSIDE = 0.8
 REACH_SAFETY = 1.5
 
 
-@njit(cache=True, error_model="numpy")
+@part
 def _normalize(v):
     norm = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     if norm < 1e-9:
@@ -32,18 +34,30 @@ def _normalize(v):
     return norm
 
 
-@njit(cache=True, error_model="numpy")
-def _tilt(n):
+@part
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@part
+def _between(a, b, out):
+    """out (3) = a - b, of which the first three."""
+    for i in range(3):
+        out[i] = a[i] - b[i]
+
+
+@part
+def _tilt(n, t):
     """Turns the unit normal ``n`` sideways by TILT. Odd in n: both chasers of a pair tilt the same plane.
 
-    The side is n x e, e the axis that n has least of.
+    The side is n x e, e the axis that n has least of. t (3) is scratch.
     """
-    t = np.zeros(3)
     least = 0
     for i in range(1, 3):
         if abs(n[i]) < abs(n[least]):
             least = i
     j, k = (least + 1) % 3, (least + 2) % 3
+    t[least] = 0.0
     t[j] = n[k]
     t[k] = -n[j]
     _normalize(t)
@@ -52,127 +66,141 @@ def _tilt(n):
     _normalize(n)
 
 
-@njit(cache=True, error_model="numpy")
-def _push(row_a, row_c, n_rows, k, n, sign, room, reach):
-    """Adds the row sign n' dp >= -room unless no admissible input can use up the room."""
-    if room > reach:
-        return
-    m = n_rows[k]
+@part
+def _push(stage, row_a, row_c, n_rows, i, k, n, sign, room, reach):
+    """Adds the row sign n' dp_k >= -room of chaser i unless no admissible input can use up the room."""
+    if room <= reach[i, k]:
+        m = n_rows[i]
+        for c in range(3):
+            row_a[i, m, c] = sign * n[c]
+        row_c[i, m] = -room
+        stage[i, m] = k
+        n_rows[i] = m + 1
+
+
+@part
+def _begin(here, there, ref, ref_there, last):
+    """The side at stage 0: where the one is from the other, else where it is to be."""
+    _between(here, there, last)
+    if _normalize(last) == 0.0:
+        _between(ref, ref_there, last)
+        if _normalize(last) == 0.0:
+            last[0] = 1.0
+
+
+@part
+def _side(n, want, d, held, last):
+    """n becomes the normal at a stage; last is that of the stage before, and is updated.
+
+    Returns (held, gap, cosine of the heading, length of ``want``): the way ``want`` is normalized. ``held``: the
+    rollout goes through, and keeps the normal of the side that it came from.
+    """
+    gap = _normalize(n)
+    ahead = _dot(n, last)
+    if held or gap < INSIDE * d or ahead < 0.0:
+        held = True
+        gap *= ahead
+        for c in range(3):
+            n[c] = last[c]
+    for c in range(3):
+        last[c] = n[c]
+    length = _normalize(want)
+    return held, gap, -_dot(want, n), length
+
+
+@part
+def corridor_room(r, corridor, n):
+    """Distance from the surface of the corridor's cone, m, positive inside; n (3) gets the normal inwards.
+
+    r (3): position from the target; corridor (5): axis (unit), half angle, distance of the apex from the target.
+    """
+    s, c = np.sin(corridor[3]), np.cos(corridor[3])
+    along = _dot(r, corridor)
     for i in range(3):
-        row_a[k, m, i] = sign * n[i]
-    row_c[k, m] = -room
-    n_rows[k] = m + 1
+        n[i] = along * corridor[i] - r[i]
+    aside = _normalize(n)
+    if aside == 0.0:
+        c, s = 0.0, 1.0
+    for i in range(3):
+        n[i] = s * corridor[i] + c * n[i]
+    return s * (along - corridor[4]) - c * aside
 
 
-@njit(cache=True, error_model="numpy")
-def build_rows(x, references, targets, to_target, between, outer, reach, row_a, row_c, n_rows):
+@kernel
+def build_rows(
+    x, references, targets, to_target, between, outer, corridors, reach, stage, row_a, row_c, n_rows
+):
     """Writes rows for all chasers.
 
-    x (N, D+1, 13) rollouts; references (N, D+1, 7); targets (D+1, 3); to_target (N,), between (N, N), outer: m;
-    reach (N, D+1): how far admissible inputs can move a chaser from its rollout, m.
-    Out: row_a (N, D+1, N+1, 3), row_c (N, D+1, N+1), n_rows (N, D+1); none at stage 0.
+    x (N, D+1, 13) rollouts; references (N, D+1, 7); targets (D+1, 3); to_target (N, D+1), between (N, N), outer: m;
+    corridors (N, D+1, 5) as in `NmpcInput`; reach (N, D+1): how far admissible inputs can move a chaser from its
+    rollout, m. Out: stage (N, M), row_a (N, M, 3), row_c (N, M), n_rows (N,); M at least D (N + 2). None at stage 0.
     """
     n_chasers, nodes = x.shape[0], x.shape[1]
     n_rows[:] = 0
     n = np.empty(3)
-    use = np.empty(3)
     last = np.empty(3)
     want = np.empty(3)
     for i in range(n_chasers):
         for k in range(1, nodes):
-            for c in range(3):
-                n[c] = references[i, k, c] - x[i, k, c]
+            _between(references[i, k], x[i, k], n)
             gap = _normalize(n)
-            _push(row_a[i], row_c[i], n_rows[i], k, n, 1.0, outer - gap, reach[i, k])
-        d = to_target[i]
-        if d > 0.0:
-            for c in range(3):
-                last[c] = x[i, 0, c] - targets[0, c]
-            if _normalize(last) == 0.0:
-                for c in range(3):
-                    last[c] = references[i, 0, c] - targets[0, c]
-                if _normalize(last) == 0.0:
-                    last[0] = 1.0
-            held = False
-            for k in range(1, nodes):
-                for c in range(3):
-                    n[c] = x[i, k, c] - targets[k, c]
-                    want[c] = references[i, k, c] - x[i, k, c]
-                gap = _normalize(n)
-                ahead = n[0] * last[0] + n[1] * last[1] + n[2] * last[2]
-                if held or gap < INSIDE * d or ahead < 0.0:
-                    held = True
-                    gap *= ahead
-                    for c in range(3):
-                        n[c] = last[c]
-                for c in range(3):
-                    last[c] = n[c]
-                    use[c] = n[c]
-                away = 0.0
-                for c in range(3):
-                    away += (references[i, k, c] - targets[k, c]) ** 2
-                length = _normalize(want)
-                heading = -(want[0] * n[0] + want[1] * n[1] + want[2] * n[2])
+            _push(stage, row_a, row_c, n_rows, i, k, n, 1.0, outer - gap, reach)
+            if _dot(corridors[i, k], corridors[i, k]) > 0.0:
+                _between(x[i, k], targets[k], want)
+                room = corridor_room(want, corridors[i, k], n)
+                _push(stage, row_a, row_c, n_rows, i, k, n, 1.0, room, reach)
+        _begin(x[i, 0], targets[0], references[i, 0], targets[0], last)
+        held = False
+        for k in range(1, nodes):
+            d = to_target[i, k]
+            if d > 0.0:
+                _between(references[i, k], targets[k], want)
+                away = _dot(want, want)
+                _between(x[i, k], targets[k], n)
+                _between(references[i, k], x[i, k], want)
+                held, gap, heading, length = _side(n, want, d, held, last)
                 if heading > COS_HEAD_ON and length > gap and away >= d * d:
-                    _tilt(use)
-                room = -(d + MARGIN_M)
-                for c in range(3):
-                    room += use[c] * (x[i, k, c] - targets[k, c])
-                _push(row_a[i], row_c[i], n_rows[i], k, use, 1.0, room, reach[i, k])
+                    _tilt(n, want)
+                _between(x[i, k], targets[k], want)
+                _push(stage, row_a, row_c, n_rows, i, k, n, 1.0, _dot(n, want) - d - MARGIN_M, reach)
         for j in range(i + 1, n_chasers):
             d = between[i, j]
-            if d <= 0.0:
-                continue
-            for c in range(3):
-                last[c] = x[i, 0, c] - x[j, 0, c]
-            if _normalize(last) == 0.0:
-                for c in range(3):
-                    last[c] = references[i, 0, c] - references[j, 0, c]
-                if _normalize(last) == 0.0:
-                    last[0] = 1.0
-            held = False
-            for k in range(1, nodes):
-                for c in range(3):
-                    n[c] = x[i, k, c] - x[j, k, c]
-                    want[c] = references[i, k, c] - references[j, k, c]
-                gap = _normalize(n)
-                if held or gap < INSIDE * d or n[0] * last[0] + n[1] * last[1] + n[2] * last[2] < 0.0:
-                    held = True
-                    for c in range(3):
-                        n[c] = last[c]
-                for c in range(3):
-                    last[c] = n[c]
-                    use[c] = n[c]
-                apart = _normalize(want)
-                if apart >= d and -(want[0] * n[0] + want[1] * n[1] + want[2] * n[2]) > COS_HEAD_ON:
-                    _tilt(use)
-                room = 0.0
-                for c in range(3):
-                    room += 0.5 * use[c] * (x[i, k, c] - x[j, k, c])
-                room -= 0.5 * (d + MARGIN_M)
-                _push(row_a[i], row_c[i], n_rows[i], k, use, 1.0, room, reach[i, k])
-                _push(row_a[j], row_c[j], n_rows[j], k, use, -1.0, room, reach[j, k])
+            if d > 0.0:
+                _begin(x[i, 0], x[j, 0], references[i, 0], references[j, 0], last)
+                held = False
+                for k in range(1, nodes):
+                    _between(x[i, k], x[j, k], n)
+                    _between(references[i, k], references[j, k], want)
+                    held, _, heading, length = _side(n, want, d, held, last)
+                    if heading > COS_HEAD_ON and length >= d:
+                        _tilt(n, want)
+                    _between(x[i, k], x[j, k], want)
+                    room = 0.5 * (_dot(n, want) - d - MARGIN_M)
+                    _push(stage, row_a, row_c, n_rows, i, k, n, 1.0, room, reach)
+                    _push(stage, row_a, row_c, n_rows, j, k, n, -1.0, room, reach)
 
 
-@njit(cache=True, error_model="numpy")
-def plan_violation(x, references, targets, to_target, between, outer, worst):
+@kernel
+def plan_violation(x, references, targets, to_target, between, outer, corridors, worst):
     """Writes the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if none.
 
     Arguments as in `build_rows`; all stages 0..D count, without margin.
     """
     n_chasers = x.shape[0]
     worst[:] = 0.0
+    r = np.empty(3)
+    n = np.empty(3)
     for k in range(x.shape[1]):
         for i in range(n_chasers):
-            s = t = 0.0
-            for c in range(3):
-                s += (x[i, k, c] - targets[k, c]) ** 2
-                t += (x[i, k, c] - references[i, k, c]) ** 2
-            worst[i] = max(worst[i], to_target[i] - np.sqrt(s), np.sqrt(t) - outer)
+            _between(x[i, k], references[i, k], r)
+            worst[i] = max(worst[i], _normalize(r) - outer)
+            _between(x[i, k], targets[k], r)
+            if _dot(corridors[i, k], corridors[i, k]) > 0.0:
+                worst[i] = max(worst[i], -corridor_room(r, corridors[i, k], n))
+            worst[i] = max(worst[i], to_target[i, k] - _normalize(r))
             for j in range(i + 1, n_chasers):
-                s = 0.0
-                for c in range(3):
-                    s += (x[i, k, c] - x[j, k, c]) ** 2
-                depth = between[i, j] - np.sqrt(s)
+                _between(x[i, k], x[j, k], r)
+                depth = between[i, j] - _normalize(r)
                 worst[i] = max(worst[i], depth)
                 worst[j] = max(worst[j], depth)

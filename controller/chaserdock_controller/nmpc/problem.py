@@ -13,15 +13,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from chaserdock_controller.nmpc.slack import SLACK_L2
 from chaserdock_controller.nmpc.types import INTEGRATORS, NmpcParameters
-
-# L1 and L2 weights of the slacks of the distance constraints. The L1 weight must exceed the constraint's
-# multiplier for the penalty to be exact: at 1e3 the terminal weight pressed chasers to 0.32 m of 0.35 m.
-SLACK_L1 = 1e5
-SLACK_L2 = 1e5
-# Multipliers grow with the distance to the reference; the L1 weight stays this many times above
-# the terminal cost's slope.
-SLACK_L1_OVER_SLOPE = 10.0
 
 
 def multiply(a: Any, b: Any) -> Any:
@@ -89,98 +82,122 @@ def pose_cost(x: Any, reference: Any, weight_position: float, weight_orientation
 
 @dataclass(frozen=True)
 class Nlp:
-    """The nonlinear programme of ``n`` chasers and where its parts lie.
+    """The nonlinear programme of ``n`` chasers over ``stages`` and where its parts lie, stage by stage.
 
-    ``problem``: CasADi dictionary x, p, f, g. x = per chaser, per stage: u_0, x_1, u_1 ... x_D; then the
-    slacks. p = per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D); then target positions (3 (D+1)),
-    target distances (n), chaser distances (upper triangle, row by row), L1 weight (1).
-    g: ``n_equal`` dynamics defects, to be zero, then the distances with slack, to be >= 0.
-    ``chaser_size`` is the number of variables per chaser; ``n_slack`` the number of slacks.
+    ``problem``: CasADi dictionary x, p, f, g. Multiple shooting: x = for k = 0..D: states of all chasers (13 each),
+    inputs of all (6 each; not at D), slacks of the stage's distances (not at 0). g = for k = 0..D: the defects to
+    stage k + 1 (not at D), the distances of the stage with slack; at 0 in their place x - x_0. Single shooting: x is
+    the inputs, stage by stage, chaser by chaser, and g the distances without slack.
+    p = per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D), target distances (D+1), corridors (5 (D+1)); then
+    target positions (3 (D+1)), chaser distances (upper triangle, row by row), L1 weight (1).
+    ``rows``: distances a stage: per chaser target, outer bound, corridor; then the pairs. ``stage_sizes``: (states,
+    inputs and slacks, constraints besides the defects) of stages 0..D.
     """
 
     n: int
+    stages: int
     problem: dict[str, Any]
-    chaser_size: int
-    n_slack: int
-    n_equal: int
+    rows: int
+    stage_sizes: tuple[tuple[int, int, int], ...]
 
 
-def _distance(a: Any, b: Any) -> Any:
+def _norm(a: Any) -> Any:
     # The tiny term keeps the gradient finite where two points coincide; it changes 0.35 m by 1e-12 m.
-    return ca.sqrt(ca.sumsqr(a - b) + 1e-12)
+    return ca.sqrt(ca.sumsqr(a) + 1e-12)
 
 
-def build_nlp(n: int, params: NmpcParameters) -> Nlp:
-    """Eq. 3 and 4 for ``n`` chasers by multiple shooting. Raises ValueError for n < 1.
+def _corridor(r: Any, corridor: Any) -> Any:
+    """Distance from the surface of the corridor's cone, positive inside (`planes.corridor_room`)."""
+    axis, half_angle, apex = corridor[0:3], corridor[3], corridor[4]
+    along = ca.dot(axis, r)
+    return ca.sin(half_angle) * (along - apex) - ca.cos(half_angle) * _norm(r - along * axis)
 
-    The input box (4a) is left to the variable bounds, the distances (4b to 4d) carry a slack each, at stages
-    1..D (stage 0 cannot be changed).
+
+def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple") -> Nlp:
+    """Eq. 3 and 4 for ``n`` chasers. Raises ValueError for n < 1.
+
+    The input box (4a) is left to the variable bounds. The distances (4b to 4d) stand at stages 1..D (stage 0 cannot
+    be changed) and carry a slack each in multiple shooting (``shooting`` "multiple"); in "single" shooting, for
+    augmented-Lagrangian methods, which have their own penalty, they stand as they are.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1, not {n}")
     d, step = params.stages, dynamics(params)
+    multiple = shooting == "multiple"
     position_weight, orientation_weight = params.stage_weights()
     input_weight = ca.DM([params.weight_force] * 3 + [params.weight_torque] * 3)
-
-    targets = ca.SX.sym("p_tar", 3, d + 1)
-    target_distance = ca.SX.sym("d_target", n)
     pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
+    rows = 3 * n + len(pairs)
+
+    x0 = [ca.SX.sym(f"x0_{i}", 13) for i in range(n)]
+    references = [ca.SX.sym(f"ref_{i}", 7, d + 1) for i in range(n)]
+    u_ref = [ca.SX.sym(f"u_ref_{i}", 6, d) for i in range(n)]
+    to_target = [ca.SX.sym(f"d_target_{i}", d + 1) for i in range(n)]
+    corridors = [ca.SX.sym(f"corridor_{i}", 5, d + 1) for i in range(n)]
+    targets = ca.SX.sym("p_tar", 3, d + 1)
     pair_distance = ca.SX.sym("d_pair", len(pairs))
     slack_l1 = ca.SX.sym("w1")
 
-    variables: list[Any] = []
-    parameters: list[Any] = []
-    defects: list[Any] = []
-    distances: list[Any] = []
-    trajectories: list[list[Any]] = []
-    references: list[Any] = []
-    cost: Any = 0
-    for i in range(n):
-        x0 = ca.SX.sym(f"x0_{i}", 13)
-        reference = ca.SX.sym(f"ref_{i}", 7, d + 1)
-        u_ref = ca.SX.sym(f"u_ref_{i}", 6, d)
-        parameters += [x0, ca.vec(reference), ca.vec(u_ref)]
-        references.append(reference)
-        x, states = x0, [x0]
-        cost += pose_cost(x, reference[:, 0], position_weight[0], orientation_weight[0])
-        for k in range(d):
-            u = ca.SX.sym(f"u_{i}_{k}", 6)
-            x_next = ca.SX.sym(f"x_{i}_{k + 1}", 13)
-            variables += [u, x_next]
-            defects.append(step(x, u) - x_next)
-            cost += ca.dot(input_weight, (u_ref[:, k] - u) ** 2)
-            x = x_next
-            states.append(x)
-            cost += pose_cost(x, reference[:, k + 1], position_weight[k + 1], orientation_weight[k + 1])
-        trajectories.append(states)
-
-    for k in range(1, d + 1):
+    def distances(k: int, x: list[Any]) -> Any:
+        out = []
         for i in range(n):
-            p = trajectories[i][k][0:3]
-            distances.append(_distance(p, targets[:, k]) - target_distance[i])
-            distances.append(params.max_reference_distance_m - _distance(p, references[i][0:3, k]))
+            r = x[i][0:3] - targets[:, k]
+            out.append(_norm(r) - to_target[i][k])
+            out.append(params.max_reference_distance_m - _norm(x[i][0:3] - references[i][0:3, k]))
+            out.append(_corridor(r, corridors[i][:, k]))
         for row, (i, j) in enumerate(pairs):
-            gap = _distance(trajectories[i][k][0:3], trajectories[j][k][0:3])
-            distances.append(gap - pair_distance[row])
-    slack = ca.SX.sym("s", len(distances))
-    cost += slack_l1 * ca.sum1(slack) + 0.5 * SLACK_L2 * ca.sumsqr(slack)
+            out.append(_norm(x[i][0:3] - x[j][0:3]) - pair_distance[row])
+        return ca.vertcat(*out)
 
-    n_equal = 13 * d * n
+    variables: list[Any] = []
+    constraints: list[Any] = []
+    sizes: list[tuple[int, int, int]] = []
+    cost: Any = 0
+    x = [ca.SX.sym(f"x_{i}_0", 13) for i in range(n)] if multiple else x0
+    for k in range(d + 1):
+        here = x
+        if multiple:
+            variables += here
+        for i in range(n):
+            cost += pose_cost(here[i], references[i][:, k], position_weight[k], orientation_weight[k])
+        if k < d:
+            inputs = [ca.SX.sym(f"u_{i}_{k}", 6) for i in range(n)]
+            variables += inputs
+            for i in range(n):
+                cost += ca.dot(input_weight, (u_ref[i][:, k] - inputs[i]) ** 2)
+            x = [step(a, u) for a, u in zip(here, inputs, strict=True)]
+            if multiple:
+                reached, x = x, [ca.SX.sym(f"x_{i}_{k + 1}", 13) for i in range(n)]
+                # fatrop asks for the next state first, with a plus sign.
+                constraints += [b - a for a, b in zip(reached, x, strict=True)]
+                if k == 0:
+                    constraints += [a - b for a, b in zip(here, x0, strict=True)]
+        if k > 0:
+            room = distances(k, here)
+            if multiple:
+                s = ca.SX.sym(f"s_{k}", rows)
+                variables.append(s)
+                cost += slack_l1 * ca.sum1(s) + 0.5 * SLACK_L2 * ca.sumsqr(s)
+                room += s
+            constraints.append(room)
+        inputs_here = 6 * n if k < d else 0
+        if multiple:
+            sizes.append((13 * n, inputs_here + rows, rows) if k > 0 else (13 * n, inputs_here, 13 * n))
+        else:
+            sizes.append((0, inputs_here, rows if k > 0 else 0))
+
+    parameters: list[Any] = []
+    for i in range(n):
+        parameters += [x0[i], ca.vec(references[i]), ca.vec(u_ref[i]), to_target[i], ca.vec(corridors[i])]
     return Nlp(
         n=n,
+        stages=d,
         problem={
-            "x": ca.vertcat(*variables, slack),
-            "p": ca.vertcat(*parameters, ca.vec(targets), target_distance, pair_distance, slack_l1),
+            "x": ca.vertcat(*variables),
+            "p": ca.vertcat(*parameters, ca.vec(targets), pair_distance, slack_l1),
             "f": cost,
-            "g": ca.vertcat(*defects, ca.vertcat(*distances) + slack),
+            "g": ca.vertcat(*constraints),
         },
-        chaser_size=19 * d,
-        n_slack=len(distances),
-        n_equal=n_equal,
+        rows=rows,
+        stage_sizes=tuple(sizes),
     )
-
-
-def slack_l1_weight(params: NmpcParameters, distance_m: float) -> float:
-    """L1 weight of the slacks of a chaser ``distance_m`` from its reference (of the farthest, if one for all)."""
-    slope = 2.0 * (params.weight_final_position + params.weight_position) * distance_m
-    return max(SLACK_L1, SLACK_L1_OVER_SLOPE * slope)

@@ -3,112 +3,109 @@
     minimize  sum_k 1/2 dx_k' Q_k dx_k + qx_k' dx_k + 1/2 dw_k' R_k dw_k + r_k' dw_k
     subject to dx_{k+1} = A_k dx_k + B_k dw_k, dx_0 = 0,  k = 0..D-1
 
-A_k = [[I, hI], [0, I], [0, 0], [0, 0] | C_k] with C_k (12, 6); Q_k holds a 3 x 3 block for position and
-one for attitude; R_k is diagonal. Standard discrete-time recursion, e.g. Rawlings, Mayne and Diehl, "Model
-Predictive Control", 2nd ed., section 8.8.3.
+A_k = [[I, hI], [0, I], [0, 0], [0, 0] | C_k]; M_k = [C_k B_k] (12, 12) is what is stored. Q_k holds a 3 x 3 block
+for position and one for attitude; R_k is diagonal. Standard discrete-time recursion, e.g. Rawlings, Mayne and
+Diehl, "Model Predictive Control", 2nd ed., section 8.8.3.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from chaserdock_controller.nmpc.compiled import part
 
 
-@njit(cache=True, error_model="numpy")
-def _times_six(left, transposed, right, shift, out, first):
-    """out[first + i, j] = sum_m left[i, m] right[m, shift + j], six columns at a time, in registers.
-
-    ``transposed``: left[m, i] instead. Written out because six accumulators vectorize and an inner loop
-    over six memory cells does not.
-    """
-    rows = left.shape[1] if transposed else left.shape[0]
-    for i in range(rows):
-        a0 = a1 = a2 = a3 = a4 = a5 = 0.0
+@part
+def _product(left, right, out):
+    """out = left right, 12 x 12."""
+    for i in range(12):
+        for j in range(12):
+            out[i, j] = 0.0
         for m in range(12):
-            f = left[m, i] if transposed else left[i, m]
-            a0 += f * right[m, shift]
-            a1 += f * right[m, shift + 1]
-            a2 += f * right[m, shift + 2]
-            a3 += f * right[m, shift + 3]
-            a4 += f * right[m, shift + 4]
-            a5 += f * right[m, shift + 5]
-        out[first + i, shift] = a0
-        out[first + i, shift + 1] = a1
-        out[first + i, shift + 2] = a2
-        out[first + i, shift + 3] = a3
-        out[first + i, shift + 4] = a4
-        out[first + i, shift + 5] = a5
+            f = left[i, m]
+            for j in range(12):
+                out[i, j] += f * right[m, j]
 
 
-@njit(cache=True, error_model="numpy")
-def factor(c_mats, b_mats, h, q_pos, q_att, r_diag, gain, chol):
+@part
+def _gram(left, right, out):
+    """out = left' right, 12 x 12."""
+    for i in range(12):
+        for j in range(12):
+            out[i, j] = 0.0
+    for m in range(12):
+        for i in range(12):
+            f = left[m, i]
+            for j in range(12):
+                out[i, j] += f * right[m, j]
+
+
+@part
+def _cholesky(matrix, first, diagonal, low):
+    """low (6, 6) with low low' = matrix[first:, first:] + diag(diagonal); False where that is not positive."""
+    for j in range(6):
+        for i in range(j, 6):
+            t = matrix[first + i, first + j]
+            if i == j:
+                t += diagonal[j]
+            for m in range(j):
+                t -= low[i, m] * low[j, m]
+            if i == j:
+                if not t > 0.0:
+                    return False
+                low[j, j] = np.sqrt(t)
+            else:
+                low[i, j] = t / low[j, j]
+    return True
+
+
+@part
+def factor(mats, h, q_pos, q_att, r_diag, gain, chol):
     """Backward sweep over the matrices: gain (D, 6, 12) = -Rt^-1 B'PA, chol (D, 6, 6) lower with Rt = LL'.
 
     Returns False where Rt is not positive definite.
     """
-    stages = len(c_mats)
+    stages = len(mats)
     p = np.zeros((12, 12))
-    w = np.empty((12, 6))  # P C
-    v = np.empty((12, 6))  # P B
-    st = np.empty((12, 6))  # A'PB
+    w = np.empty((12, 12))  # P M
+    gram = np.empty((12, 12))  # M'PM
     y = np.empty((6, 12))  # L^-1 B'PA
-    low = np.empty((6, 6))
-    corner = np.empty((6, 6))  # C'PC
     for i in range(3):
         for j in range(3):
             p[i, j] = q_pos[stages, i, j]
             p[6 + i, 6 + j] = q_att[stages, i, j]
     for k in range(stages - 1, -1, -1):
-        c, b = c_mats[k], b_mats[k]
-        _times_six(p, False, c, 0, w, 0)
-        _times_six(p, False, b, 0, v, 0)
-        _times_six(b, True, v, 0, low, 0)
-        _times_six(c, True, v, 0, st, 6)
-        _times_six(c, True, w, 0, corner, 0)
-        for i in range(3):
-            for j in range(6):
-                st[i, j] = v[i, j]
-                st[3 + i, j] = h * v[i, j] + v[3 + i, j]
-        for j in range(6):  # Cholesky of Rt = R + B'PB
-            s = low[j, j] + r_diag[k, j]
-            for m in range(j):
-                s -= low[j, m] * low[j, m]
-            if not s > 0.0:
-                return False
-            s = np.sqrt(s)
-            low[j, j] = s
-            for i in range(j + 1, 6):
-                t = low[i, j]
-                for m in range(j):
-                    t -= low[i, m] * low[j, m]
-                low[i, j] = t / s
-        d0, d1, d2 = 1.0 / low[0, 0], 1.0 / low[1, 1], 1.0 / low[2, 2]
-        d3, d4, d5 = 1.0 / low[3, 3], 1.0 / low[4, 4], 1.0 / low[5, 5]
-        for n in range(12):
-            y0 = st[n, 0] * d0
-            y1 = (st[n, 1] - low[1, 0] * y0) * d1
-            y2 = (st[n, 2] - low[2, 0] * y0 - low[2, 1] * y1) * d2
-            y3 = (st[n, 3] - low[3, 0] * y0 - low[3, 1] * y1 - low[3, 2] * y2) * d3
-            y4 = (st[n, 4] - low[4, 0] * y0 - low[4, 1] * y1 - low[4, 2] * y2 - low[4, 3] * y3) * d4
-            y5 = st[n, 5] - low[5, 0] * y0 - low[5, 1] * y1 - low[5, 2] * y2 - low[5, 3] * y3
-            y5 = (y5 - low[5, 4] * y4) * d5
-            y[0, n], y[1, n], y[2, n], y[3, n], y[4, n], y[5, n] = y0, y1, y2, y3, y4, y5
-            z5 = y5 * d5
-            z4 = (y4 - low[5, 4] * z5) * d4
-            z3 = (y3 - low[4, 3] * z4 - low[5, 3] * z5) * d3
-            z2 = (y2 - low[3, 2] * z3 - low[4, 2] * z4 - low[5, 2] * z5) * d2
-            z1 = (y1 - low[2, 1] * z2 - low[3, 1] * z3 - low[4, 1] * z4 - low[5, 1] * z5) * d1
-            z0 = y0 - low[1, 0] * z1 - low[2, 0] * z2 - low[3, 0] * z3 - low[4, 0] * z4
-            z0 = (z0 - low[5, 0] * z5) * d0
-            gain[k, 0, n], gain[k, 1, n], gain[k, 2, n] = -z0, -z1, -z2
-            gain[k, 3, n], gain[k, 4, n], gain[k, 5, n] = -z3, -z4, -z5
+        low, g = chol[k], gain[k]
+        _product(p, mats[k], w)
+        _gram(mats[k], w, gram)
+        if not _cholesky(gram, 6, r_diag[k], low):
+            return False
         for i in range(6):
-            for j in range(i + 1):
-                chol[k, i, j] = low[i, j]
+            for n in range(3):
+                y[i, n] = w[n, 6 + i]
+                y[i, 3 + n] = h * w[n, 6 + i] + w[3 + n, 6 + i]
+            for n in range(6):
+                y[i, 6 + n] = gram[6 + i, n]
+        for i in range(6):
+            for m in range(i):
+                for n in range(12):
+                    y[i, n] -= low[i, m] * y[m, n]
+            f = 1.0 / low[i, i]
+            for n in range(12):
+                y[i, n] *= f
+        for i in range(5, -1, -1):
+            f = 1.0 / low[i, i]
+            for n in range(12):
+                g[i, n] = -y[i, n]
+            for m in range(i + 1, 6):
+                for n in range(12):
+                    g[i, n] -= low[m, i] * g[m, n]
+            for n in range(12):
+                g[i, n] *= f
         # P <- Q + A'PA - y'y: A'PA by its blocks, lower triangle, from the bottom up
         for i in range(6):
             for j in range(6):
-                p[6 + i, 6 + j] = corner[i, j]
+                p[6 + i, 6 + j] = gram[i, j]
             for j in range(3):
                 p[6 + i, j] = w[j, i]
                 p[6 + i, 3 + j] = h * w[j, i] + w[3 + j, i]
@@ -118,13 +115,13 @@ def factor(c_mats, b_mats, h, q_pos, q_att, r_diag, gain, chol):
         for i in range(3):
             for j in range(3):
                 p[3 + i, j] += h * p[i, j]
-        for i in range(12):
-            e0, e1, e2, e3, e4, e5 = y[0, i], y[1, i], y[2, i], y[3, i], y[4, i], y[5, i]
-            for j in range(i + 1):
-                s = e0 * y[0, j] + e1 * y[1, j] + e2 * y[2, j] + e3 * y[3, j] + e4 * y[4, j] + e5 * y[5, j]
-                p[i, j] -= s
+        for m in range(6):
+            for i in range(12):
+                f = y[m, i]
+                for j in range(12):
+                    p[i, j] -= f * y[m, j]
         for i in range(3):
-            for j in range(i + 1):
+            for j in range(3):
                 p[i, j] += q_pos[k, i, j]
                 p[6 + i, 6 + j] += q_att[k, i, j]
         for i in range(12):
@@ -133,39 +130,58 @@ def factor(c_mats, b_mats, h, q_pos, q_att, r_diag, gain, chol):
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def transpose_apply(c, h, y, out):
-    """out (12) = A' y (12)."""
+@part
+def _adjoint(m_mat, h, y, out):
+    """out (18) = [A B]' y (12)."""
     for i in range(3):
         out[i] = y[i]
         out[3 + i] = h * y[i] + y[3 + i]
+    for i in range(12):
         out[6 + i] = 0.0
-        out[9 + i] = 0.0
     for m in range(12):
         f = y[m]
-        for i in range(6):
-            out[6 + i] += f * c[m, i]
+        for i in range(12):
+            out[6 + i] += f * m_mat[m, i]
 
 
-@njit(cache=True, error_model="numpy")
-def solve(c_mats, b_mats, h, gain, chol, qx, r, dx, dw):
-    """With `factor`'s result: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx (D+1, 12), r (D, 6)."""
-    stages = len(c_mats)
-    p = np.empty(12)
-    t = np.empty(12)
+@part
+def advance(mats, h, dx, dw):
+    """dx (D+1, 12) by dw (D, 6), from zero: dx_{k+1} = A_k dx_k + B_k dw_k."""
+    for n in range(12):
+        dx[0, n] = 0.0
+    for k in range(len(mats)):
+        forward(mats[k], h, dx[k], dw[k], dx[k + 1])
+
+
+@part
+def forward(m_mat, h, dx, dw, out):
+    """out (12) = A dx + B dw."""
     for i in range(12):
-        p[i] = qx[stages, i]
+        s = 0.0
+        for j in range(6):
+            s += m_mat[i, j] * dx[6 + j] + m_mat[i, 6 + j] * dw[j]
+        out[i] = s
+    for i in range(3):
+        out[i] += dx[i] + h * dx[3 + i]
+        out[3 + i] += dx[3 + i]
+
+
+@part
+def solve(mats, h, gain, chol, qx, r, dx, dw):
+    """With `factor`'s result: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx (D+1, 12), r (D, 6)."""
+    stages = len(mats)
+    p = np.empty(12)
+    t = np.empty(18)
+    for n in range(12):
+        p[n] = qx[stages, n]
+        dx[0, n] = 0.0
     for k in range(stages - 1, -1, -1):
-        b, low, g, f = b_mats[k], chol[k], gain[k], dw[k]
-        for i in range(6):
-            f[i] = r[k, i]
-        for m in range(12):
-            for i in range(6):
-                f[i] += b[m, i] * p[m]
-        transpose_apply(c_mats[k], h, p, t)
+        low, g, f = chol[k], gain[k], dw[k]
+        _adjoint(mats[k], h, p, t)
         for n in range(12):
             p[n] = t[n] + qx[k, n]
         for i in range(6):
+            f[i] = r[k, i] + t[12 + i]
             for n in range(12):
                 p[n] += g[i, n] * f[i]
         for i in range(6):
@@ -176,48 +192,33 @@ def solve(c_mats, b_mats, h, gain, chol, qx, r, dx, dw):
             for m in range(i + 1, 6):
                 f[i] -= low[m, i] * f[m]
             f[i] /= low[i, i]
-        for i in range(6):
-            f[i] = -f[i]
-    for n in range(12):
-        dx[0, n] = 0.0
     for k in range(stages):
         for i in range(6):
-            s = dw[k, i]
+            s = -dw[k, i]
             for n in range(12):
                 s += gain[k, i, n] * dx[k, n]
             dw[k, i] = s
-        advance(c_mats[k], b_mats[k], h, dx[k], dw[k], dx[k + 1])
+        forward(mats[k], h, dx[k], dw[k], dx[k + 1])
 
 
-@njit(cache=True, error_model="numpy")
-def advance(c, b, h, dx, dw, out):
-    """out (12) = A dx + B dw."""
-    for i in range(3):
-        out[i] = dx[i] + h * dx[3 + i]
-        out[3 + i] = dx[3 + i]
-        out[6 + i] = 0.0
-        out[9 + i] = 0.0
-    for i in range(12):
-        s = out[i]
-        for j in range(6):
-            s += c[i, j] * dx[6 + j] + b[i, j] * dw[j]
-        out[i] = s
+@part
+def reduced_gradient(mats, h, qx, r, out):
+    """Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r.
 
-
-@njit(cache=True, error_model="numpy")
-def reduced_gradient(c_mats, b_mats, h, qx, r, out):
-    """Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r."""
-    stages = len(c_mats)
+    Returns its greatest absolute value; NaN if any value is.
+    """
+    stages = len(mats)
     p = np.empty(12)
-    t = np.empty(12)
-    for i in range(12):
-        p[i] = qx[stages, i]
+    t = np.empty(18)
+    greatest = 0.0
+    for n in range(12):
+        p[n] = qx[stages, n]
     for k in range(stages - 1, -1, -1):
-        for i in range(6):
-            s = r[k, i]
-            for m in range(12):
-                s += b_mats[k, m, i] * p[m]
-            out[k, i] = s
-        transpose_apply(c_mats[k], h, p, t)
+        _adjoint(mats[k], h, p, t)
         for n in range(12):
             p[n] = t[n] + qx[k, n]
+        for i in range(6):
+            out[k, i] = r[k, i] + t[12 + i]
+            if not abs(out[k, i]) <= greatest and greatest == greatest:
+                greatest = abs(out[k, i])
+    return greatest

@@ -99,8 +99,13 @@ class NmpcInput:
     states (N, 13): p (WRF, m), v (WRF, m/s), q_wxyz (body to world), omega (body, rad/s).
     references (N, D+1, 7): p (WRF, m), q_wxyz; stage 0 is now.
     u_ref (N, D, 6): force (N) and torque (N m), body axes, from which the input cost is counted.
-    target_positions (D+1, 3): WRF, m. min_distance_target_m (N,); min_distance_chasers_m: one float or a
-    symmetric (N, N), diagonal ignored; 0 switches a constraint off. input_max (N, 6): N and N m, body axes.
+    target_positions (D+1, 3): WRF, m. min_distance_target_m (N,) or, for each stage, (N, D+1);
+    min_distance_chasers_m: one float or a symmetric (N, N), diagonal ignored; 0 switches a constraint off.
+    input_max (N, 6): N and N m, body axes; may change from tick to tick.
+    corridors (N, D+1, 5) or None: an approach corridor of a chaser at a stage: a cone about an axis through the
+    target, [axis (3; WRF, unit, from the target outwards; zero: no corridor), half angle (rad, above 0 and below
+    pi/2), distance of the apex from the target's centre along the axis (m; may be negative)]. It comes beside the
+    keep-out ball, whose distance a docking chaser is given smaller, or 0.
     """
 
     states: Array
@@ -110,6 +115,7 @@ class NmpcInput:
     min_distance_target_m: Array
     min_distance_chasers_m: Array | float
     input_max: Array
+    corridors: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,262 @@
+"""How fast each NMPC back end solves, and how well it flies: ``python benchmarks/nmpc.py [--quick] [--json FILE]``.
+
+The hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m, on a ring about a target; half of the chasers
+start swapped with a neighbour, head-on. Closed loop, perfect state, 10 commands a second, each solve timed by the wall
+clock and by the thread's processor time (which a busy machine disturbs less). One thread. ``--quick``: fewer chasers
+and ticks. ``--solver`` (repeatable) chooses back ends. A back end that cannot be had is named with its reason; one
+that would take longer than ``--cell-s`` for a number of chasers is flown for as many ticks as fit, and says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import platform
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, replace
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from chaserdock_controller.nmpc import (
+    BACK_ENDS,
+    NmpcInput,
+    NmpcParameters,
+    NmpcSolver,
+    kernels,
+    make_solver,
+)
+from chaserdock_controller.reference import (
+    feed_forward,
+    predict_target,
+    reference_state,
+    reference_trajectory,
+)
+from chaserdock_protocol import rotations
+from chaserdock_protocol.scenario_bodies import cuboid_inertia
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TICK_S = 0.1
+D_MIN_M = 0.35
+SIZE_M = (0.25, 0.25, 0.05)
+
+
+def parameters(mass_kg: float, force_N: float, torque_N_m: float) -> NmpcParameters:
+    x, y, z = cuboid_inertia(mass_kg, SIZE_M)
+    inertia = ((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z))
+    return NmpcParameters(mass_kg, inertia, force_N, torque_N_m)
+
+
+HARD = parameters(10.0, 3.0, 0.3)
+PAPER = parameters(30.0, 2.0, 0.05)
+
+
+def advance(states: Array, inputs: Array, params: NmpcParameters, duration_s: float) -> Array:
+    """The true motion under held inputs (N, 6): a finer integration than the plan's."""
+    inertia = np.array(params.inertia_kg_m2)
+    x = np.empty((len(states), 5, 13))
+    x[:, 0] = states
+    held = np.repeat(inputs[:, None], 4, axis=1)
+    nodes, weights = kernels.RK_NODES["rk4"], kernels.RK_WEIGHTS["rk4"]
+    kernels.roll(x, held, duration_s / 4, nodes, weights, params.mass_kg, inertia, np.linalg.inv(inertia))
+    return x[:, -1].copy()
+
+
+def hard_case(n: int) -> tuple[Array, NmpcInput]:
+    """States at rest and the problem (its states to be replaced tick by tick)."""
+    radius_m = max(1.0, 0.8 * n / (2.0 * np.pi))
+    angle = 2.0 * np.pi * np.arange(n) / max(n, 2)
+    places = radius_m * np.stack([-np.cos(angle), -np.sin(angle), np.zeros(n)], axis=1)
+    goals = places.copy()
+    for i in range(0, n - 1, 4):
+        goals[[i, i + 1]] = goals[[i + 1, i]]
+    if n == 1:
+        goals[0] = [0.8, 0.3, 0.1]  # past the target
+    states = np.zeros((n, 13))
+    states[:, :3], states[:, 6] = places, 1.0
+    pose = np.concatenate([goals, np.tile([1.0, 0, 0, 0], (n, 1))], axis=1)
+    d = HARD.stages
+    return states, NmpcInput(
+        states=states,
+        references=np.repeat(pose[:, None], d + 1, axis=1),
+        u_ref=np.zeros((n, d, 6)),
+        target_positions=np.zeros((d + 1, 3)),
+        min_distance_target_m=np.full(n, D_MIN_M),
+        min_distance_chasers_m=D_MIN_M,
+        input_max=np.tile(HARD.input_limits(), (n, 1)),
+    )
+
+
+@dataclass
+class Flown:
+    wall_s: Array
+    cpu_s: Array
+    cost: float
+    margin_m: float
+    failures: int
+
+
+def fly_hard(solver: NmpcSolver, n: int, ticks: int, cell_s: float) -> Flown:
+    """Closed loop on the hard case; ends early after ``cell_s`` of wall clock."""
+    states, problem = hard_case(n)
+    solver.reset()
+    wall, cpu, cost, margin_m, failures = [], [], 0.0, np.inf, 0
+    begun = time.perf_counter()
+    for k in range(ticks):
+        now = replace(problem, states=states)
+        t, c = time.perf_counter(), time.thread_time()
+        plan = solver.solve(now, TICK_S if k else 0.0)
+        wall.append(time.perf_counter() - t)
+        cpu.append(time.thread_time() - c)
+        failures += plan.status.count("failed")
+        goal = problem.references[:, 0]
+        error = [
+            rotations.multiply(x[6:10], rotations.conjugate(g[3:]))[1:]
+            for x, g in zip(states, goal, strict=True)
+        ]
+        cost += TICK_S * (65.0 * np.sum((states[:, :3] - goal[:, :3]) ** 2) + 35.0 * np.sum(np.square(error)))
+        cost += TICK_S * np.sum(np.array([3.5] * 3 + [40.0] * 3) * plan.inputs[:, 0] ** 2)
+        states = advance(states, plan.inputs[:, 0], HARD, TICK_S)
+        gaps = np.linalg.norm(states[:, None, :3] - states[None, :, :3], axis=-1) + 9.0 * np.eye(n)
+        nearest = min(float(gaps.min()), float(np.linalg.norm(states[:, :3], axis=-1).min()))
+        margin_m = min(margin_m, nearest - D_MIN_M)
+        if time.perf_counter() - begun > cell_s:
+            break
+    return Flown(np.array(wall), np.array(cpu), float(cost), float(margin_m), failures)
+
+
+def tracking(stronger: float, time_s: float) -> tuple[float, float]:
+    """Steady RMS of position, m, and orientation, degrees, at the paper's tumble with feed-forward (`rti`).
+
+    Perfect state, 15 commands a second; actuators ``stronger`` times the modelled. The second half counts.
+    """
+    v, w = np.array([1.5e-2, 0.75e-2, 3e-2]), np.array([1.5e-2, 4.5e-2, 3e-2])
+    offset, q_off, tick_s, d = np.array([-1.0, 0, 0]), np.array([1.0, 0, 0, 0]), 1.0 / 15.0, PAPER.stages
+    times = PAPER.dt_s * np.arange(d + 1)
+    wrench = feed_forward(w, np.tile(offset, (d, 1)), np.zeros((d, 3)), np.zeros((d, 3)), q_off, PAPER.mass_kg,
+                          PAPER.inertia_kg_m2)  # fmt: skip
+    states = reference_state(np.zeros(3), v, [1.0, 0, 0, 0], w, offset, np.zeros(3), q_off)[None]
+    solver = make_solver("rti", PAPER, 1)
+    errors = []
+    ticks = round(time_s / tick_s)
+    for k in range(ticks + 1):
+        p, q = (a[0] for a in predict_target(np.zeros(3), v, [1.0, 0, 0, 0], w, [k * tick_s]))
+        reference = reference_trajectory(p, v, q, w, offset, q_off, times)
+        angle = rotations.angle_between(states[0, 6:10], reference[0, 3:])
+        errors.append((np.linalg.norm(states[0, :3] - reference[0, :3]), angle))
+        problem = NmpcInput(
+            states=states,
+            references=reference[None],
+            u_ref=wrench[None],
+            target_positions=predict_target(p, v, q, w, times)[0],
+            min_distance_target_m=np.array([D_MIN_M]),
+            min_distance_chasers_m=D_MIN_M,
+            input_max=PAPER.input_limits()[None],
+        )
+        plan = solver.solve(problem, tick_s if k else 0.0)
+        states = advance(states, stronger * plan.inputs[:, 0], PAPER, tick_s)
+    position_m, angle_rad = np.sqrt(np.mean(np.square(errors[ticks // 2 :]), axis=0))
+    return float(position_m), float(np.degrees(angle_rad))
+
+
+def start(solver: str) -> float:
+    """Seconds from the start of a fresh Python to the end of a first solve of four chasers."""
+    code = (
+        "import sys; sys.path.insert(0, 'benchmarks'); import nmpc; s, p = nmpc.hard_case(4); "
+        f"nmpc.make_solver({solver!r}, nmpc.HARD, 4).solve(p, 0.0)"
+    )
+    begun = time.perf_counter()
+    subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).resolve().parents[1], check=True)
+    return time.perf_counter() - begun
+
+
+def measure(names: list[str], sizes: list[int], ticks: int, cell_s: float) -> dict[str, float]:
+    out: dict[str, float] = {}
+    print(
+        f"{'':8}{'N':>3} {'ticks':>5}  wall ms median/p95/max   cpu ms median/p95/max   margin mm  failed  cost"
+    )
+    for name in names:
+        for n in sizes:
+            try:
+                solver = make_solver(name, HARD, n)
+            except ValueError as error:
+                print(f"{name:8} not measured: {error}")
+                break
+            flown = fly_hard(solver, n, ticks, cell_s)
+            key = f"{name}_n{n}"
+            cells = []
+            for kind, times in (("wall", flown.wall_s), ("cpu", flown.cpu_s)):
+                for label, value in zip(
+                    ("median", "p95", "max"), (*np.percentile(times, [50, 95]), times.max()), strict=True
+                ):
+                    out[f"{key}_solve_{kind}_{label}_s"] = float(value)
+                    cells.append(f"{1e3 * value:8.2f}")
+            whole = len(flown.wall_s) == ticks
+            out[f"{key}_ticks"] = len(flown.wall_s)
+            out[f"{key}_margin_m"] = flown.margin_m
+            out[f"{key}_failures"] = flown.failures
+            if whole:
+                out[f"{key}_closed_loop_cost"] = flown.cost
+            print(
+                f"{name:8}{n:3d} {len(flown.wall_s):5d} {' '.join(cells)} {1e3 * flown.margin_m:9.1f} "
+                f"{flown.failures:6d}  {f'{flown.cost:.3f}' if whole else 'cut short'}",
+                flush=True,
+            )
+            if not whole:
+                break
+    for key in [k for k in out if k.endswith("_closed_loop_cost") and not k.startswith("ipopt")]:
+        best = out.get("ipopt" + key[key.index("_n") :])
+        if best is not None:
+            out[key.replace("cost", "cost_over_ipopt")] = out[key] / best
+    return out
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--solver", action="append", choices=BACK_ENDS)
+    parser.add_argument("--cell-s", type=float, default=120.0)
+    options = parser.parse_args()
+    sizes, ticks = ([1, 2, 4], 30) if options.quick else ([1, 2, 4, 8, 16], 150)
+    names = options.solver or ([n for n in BACK_ENDS if n != "open"] if options.quick else list(BACK_ENDS))
+    result = measure(names, sizes, ticks, 10.0 if options.quick else options.cell_s)
+    if importlib.util.find_spec("acados_template") is None:
+        print("acados   not measured: acados_template is not installed")
+    else:
+        print("acados   not measured: this benchmark does not drive it yet")
+    if "rti" in names:
+        time_s = 20.0 if options.quick else 60.0
+        for label, stronger in (("", 1.0), ("_actuators_5_percent_stronger", 1.05)):
+            position_m, angle_deg = tracking(stronger, time_s)
+            result[f"tracking{label}_position_rms_m"] = position_m
+            result[f"tracking{label}_orientation_rms_deg"] = angle_deg
+        result["rti_start_to_first_solve_cached_s"] = start("rti")
+    for name, value in result.items():
+        if "over_ipopt" in name or "tracking" in name or "start" in name:
+            print(f"{name}  {value:.5g}")
+    if options.json is not None:
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"],
+            cwd=Path(__file__).parent,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        about: dict[str, Any] = {
+            "command": " ".join(sys.argv),
+            "commit": commit.stdout.strip(),
+            "machine": f"{platform.machine()} {platform.platform()}",
+            "date": f"{datetime.now():%Y-%m-%d}",
+        }
+        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

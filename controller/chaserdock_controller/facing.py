@@ -1,0 +1,29 @@
+"""The attitude of a reference that turns with its offset, so that a chaser sent elsewhere goes on facing the target."""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_protocol.rotations import multiply, normalize
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def facing_attitudes(nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike) -> Array:
+    """Attitudes (K, 4), chaser body to TRF, at offsets (K, 3) in TRF.
+
+    The nominal attitude (4,), which belongs to the nominal offset (3,), is turned by the shortest rotation that takes
+    the nominal direction into the offset's, q = normalize([1 + a . b, a x b]) for unit vectors a, b. An offset
+    opposite to the nominal one leaves the axis open; then it is the one at right angles to the nominal direction
+    that is nearest to z (to x, where that is z). At the target's centre the attitude is the nominal one.
+    """
+    offsets = np.atleast_2d(np.asarray(offsets_m, dtype=float))
+    a = np.asarray(nominal_m, dtype=float) / np.linalg.norm(nominal_m)
+    length = np.linalg.norm(offsets, axis=1, keepdims=True)
+    b = np.where(length > 1e-9, offsets / np.maximum(length, 1e-9), a)
+    turn = np.concatenate([1.0 + (b @ a)[:, None], np.cross(np.broadcast_to(a, b.shape), b)], axis=1)
+    axis = np.eye(3)[2 if abs(a[2]) < 0.9 else 0]
+    axis = axis - (axis @ a) * a
+    half_turn = np.concatenate([[0.0], axis / np.linalg.norm(axis)])
+    opposite = np.linalg.norm(turn, axis=1, keepdims=True) < 1e-6
+    return multiply(normalize(np.where(opposite, half_turn, turn)), np.asarray(q_nominal_wxyz, dtype=float))

@@ -1,0 +1,155 @@
+"""One conformance test for every back end, and what they promise about budgets, corridors and changing limits."""
+
+from __future__ import annotations
+
+import importlib.util
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from chaserdock_controller.nmpc import BACK_ENDS, make_solver
+from chaserdock_controller.nmpc.planes import corridor_room
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from nmpc_cases import D_MIN_M, PARAMS, at_rest, far_start, fixed_problem, fly, fresh, swap
+
+# Eight stages: the same mathematics, and what OpEn's compiler has to do stays bearable.
+CONFORM = replace(PARAMS, horizon_s=0.8)
+
+
+def installed(name: str) -> bool:
+    needs = {"alpaqa": "alpaqa", "open": "opengen"}
+    return importlib.util.find_spec(needs.get(name, "casadi")) is not None and (
+        name != "open" or shutil.which("cargo") is not None
+    )
+
+
+def short(problem, d: int = 8):
+    """The first ``d`` stages of a problem."""
+    return replace(
+        problem,
+        references=problem.references[:, : d + 1],
+        u_ref=problem.u_ref[:, :d],
+        target_positions=problem.target_positions[: d + 1],
+        corridors=None if problem.corridors is None else problem.corridors[:, : d + 1],
+    )
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "open" else n for n in BACK_ENDS]
+)
+@pytest.mark.parametrize("case", ["transfer", "keep-out", "corridor"])
+def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
+    """The plan's cost is the converged optimum's, its box holds exactly, its distances to 5 mm."""
+    if not installed(name):
+        with pytest.raises(ValueError, match=rf"'{name}' needs"):
+            make_solver(name, CONFORM, 1)
+        pytest.skip(f"{name} is not installed")
+    problem_at, states = far_start(1)
+    problem = problem_at(states, 0.0)
+    if case != "transfer":
+        moving = at_rest(np.array([-0.45, 0.05, 0.0]))
+        moving[3] = 0.1
+        problem = fixed_problem(moving[None], np.array([[-0.38, 0.0, 0.0]]), d_target=0.4)
+    if case == "corridor":
+        corridors = np.zeros((1, 31, 5))
+        corridors[...] = [-1.0, 0.0, 0.0, np.deg2rad(8.0), 0.0]
+        problem = replace(problem, min_distance_target_m=np.zeros(1), corridors=corridors)
+    problem = short(problem)
+    chosen, best = fresh(name, 1, CONFORM), fresh("ipopt", 1, CONFORM).solve(problem, 0.0)
+    plan = chosen.solve(problem, 0.0)
+    for _ in range(5):
+        plan = chosen.solve(problem, 0.0)
+    assert plan.status == best.status == ("solved",)
+    assert plan.cost[0] == pytest.approx(best.cost[0], rel=0.02)
+    assert plan.max_violation_m[0] < 5e-3
+    assert np.all(np.abs(plan.inputs) <= problem.input_max[:, None, :])
+
+
+@settings(derandomize=True, deadline=None, max_examples=50)
+@given(st.integers(0, 10_000))
+def test_the_corridors_plane_is_its_cones(seed: int) -> None:
+    """Room: positive inside, zero on the surface; the normal is its gradient (finite differences)."""
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    half_angle, apex = rng.uniform(0.1, 1.2), rng.uniform(-0.5, 0.5)
+    corridor = np.array([*axis, half_angle, apex])
+    aside = np.cross(axis, rng.normal(size=3))
+    aside /= np.linalg.norm(aside)
+    along, angle = rng.uniform(0.2, 2.0), rng.uniform(0.02, 1.5)
+    r = apex * axis + along * (np.cos(angle) * axis + np.sin(angle) * aside)
+    normal, scratch = np.empty(3), np.empty(3)
+    room = corridor_room.py_func(r, corridor, normal)
+    assert room == pytest.approx(along * np.sin(half_angle - angle), abs=1e-12)
+    for i in range(3):
+        e = 1e-6 * np.eye(3)[i]
+        slope = corridor_room.py_func(r + e, corridor, scratch) - corridor_room.py_func(
+            r - e, corridor, scratch
+        )
+        assert normal[i] == pytest.approx(slope / 2e-6, abs=1e-7)
+
+
+def test_a_docking_chaser_stays_in_its_corridor_and_the_other_keeps_out() -> None:
+    """Chaser 0 comes in to 0.2 m from beside its axis; chaser 1 has no corridor and is sent as near."""
+    states = np.array([at_rest(np.array([-1.0, 0.25, 0.0])), at_rest(np.array([1.0, 0.2, 0.0]))])
+    goals = np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
+    corridors = np.zeros((2, 31, 5))
+    corridors[0, :] = [-1.0, 0.0, 0.0, np.deg2rad(15.0), 0.05]
+    problem = fixed_problem(states, goals)
+    problem = replace(problem, corridors=corridors, min_distance_target_m=np.array([0.15, D_MIN_M]))
+    flight = fly(fresh("rti", 2), lambda x, _t: replace(problem, states=x), states, 1 / 15, 30.0)
+    room = [corridor_room.py_func(p, corridors[0, 0], np.empty(3)) for p in flight.states[:, 0, :3]]
+    assert min(room) > -1e-3
+    assert np.linalg.norm(flight.states[-1, 0, :3] - goals[0]) < 0.02
+    assert np.min(np.linalg.norm(flight.states[:, 1, :3], axis=-1)) > D_MIN_M - 1e-3
+
+
+@pytest.mark.parametrize("budget", [0, 3, 10])
+def test_a_budget_gives_the_best_plan_so_far(budget: int) -> None:
+    """Never more iterations than allowed; the box holds; never worse than what it came with."""
+    problem_at, states = swap(0.2, 0.4)
+    chosen = make_solver("rti", PARAMS, 2, budget)
+    plan = chosen.solve(problem_at(states, 0.0), 0.0)
+    assert plan.iterations.sum() <= budget
+    assert "iteration_limit" in plan.status or "infeasible_relaxed" in plan.status
+    flight = fly(chosen, problem_at, states, 0.1, 3.0)
+    assert all(p.iterations.sum() <= budget for p in flight.plans)
+    assert flight.between() > D_MIN_M - 1e-3
+
+
+def test_actuator_limits_change_in_flight() -> None:
+    """A thruster weakens to a tenth half way: the box of that tick holds at once, and the chaser still arrives."""
+    problem_at, states = far_start(1)
+
+    def weakening(x, now_s: float):
+        problem = problem_at(x, now_s)
+        weak = problem.input_max * (np.array([0.1, 1, 1, 1, 1, 1]) if now_s >= 4.0 else 1.0)
+        return replace(problem, input_max=weak)
+
+    flight = fly(fresh("rti", 1), weakening, states, 0.1, 40.0)
+    goal = weakening(flight.states[-1], 40.0).references[0, 0, :3]
+    assert np.linalg.norm(flight.states[-1, 0, :3] - goal) < 0.02
+
+
+def test_joining_and_leaving_costs_nothing_of_the_others_plan() -> None:
+    """Far from each other, a chaser's plan is the same whoever else is there."""
+    states = np.array([at_rest(np.array([3.0 * i - 4.0, 2.0, 0.0])) for i in range(3)])
+    goals = states[:, :3] + np.array([0.0, 0.3, 0.1])
+    alone, crowd = make_solver("rti", PARAMS, 3), make_solver("rti", PARAMS, 3)
+    for ids in ([0, 1], [0, 1, 2], [0, 2], [0]):
+        one = alone.solve(fixed_problem(states[:1], goals[:1]), 0.1, [0])
+        many = crowd.solve(fixed_problem(states[ids], goals[ids]), 0.1, ids)
+        np.testing.assert_allclose(many.inputs[0], one.inputs[0], rtol=0, atol=1e-12)
+
+
+def test_unreachable_reference_is_flown_towards() -> None:
+    """Ten kilometres away and turned about: finite, saturated, within the box, and no failure."""
+    states = np.array([at_rest(np.array([-1.0, 0.0, 0.0]))])
+    problem = fixed_problem(states, np.array([[-1e4, 0.0, 0.0]]), np.array([0.0, 0, 0, 1.0]))
+    plan = fresh("rti", 1).solve(problem, 0.0)
+    assert plan.status[0] in ("solved", "infeasible_relaxed", "iteration_limit")
+    assert plan.inputs[0, 0, 0] < -0.9 * PARAMS.force_max_N
+    assert np.all(np.abs(plan.inputs) <= problem.input_max[:, None, :])
+    assert np.isfinite(plan.states).all()

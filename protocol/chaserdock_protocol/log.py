@@ -1,10 +1,10 @@
 """The mission log: MCAP files, every message verbatim, one channel a key and encoding.
 
-``log_time`` is simulated time (the message's ``sim_time_ns``), so that a lock-step flight has its own
-time line whatever the machine's speed; ``publish_time`` is the sender's wall clock. Payloads are the bytes that
-travelled (msgpack), each channel's schema is the JSON Schema of its type; the resolved scenario, the lock file and the
-versions lie inside as attachments and a metadata record. Beside this verbatim layer there may be a second one for
-viewers, under ``/viewer/``, which nothing here reads back.
+``log_time`` is simulated time (the message's ``sim_time_ns``; the time of the one before where it has none), so that
+a lock-step flight has its own time line whatever the machine's speed; ``publish_time`` is the sender's wall clock.
+Payloads are the bytes that travelled (msgpack), each channel's schema is the JSON Schema of its type; the resolved
+scenario, the lock file and the versions lie inside as attachments and a metadata record. Beside this verbatim layer
+there may be a second one for viewers, under ``/viewer/``, which nothing here reads back.
 """
 
 from __future__ import annotations
@@ -164,7 +164,8 @@ class LogWriter:
             with self._writing():
                 channel = self._channels[key, encoding] = self._register(key, encoding)
         try:
-            self.last_time_ns = max(0, _header.decode(payload).sim_time_ns)
+            # Zero: a message without a time of its own (presence), which belongs where it arrived.
+            self.last_time_ns = max(0, _header.decode(payload).sim_time_ns) or self.last_time_ns
         except (msgspec.DecodeError, OverflowError, RecursionError, UnicodeDecodeError):
             self.unreadable += 1
         self._add(channel, self.last_time_ns, payload, sent_ns or self.last_time_ns)

@@ -11,11 +11,12 @@ import sys
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 
+from .verbs import logs
 from .verbs.flights import snapshot, summary
 from .verbs.operate import command
 from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
-from .verbs.replays import replay
+from .verbs.replays import compare, replay
 
 app = typer.Typer(
     name="chaserdock",
@@ -23,8 +24,9 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for verb in (run, world, chaser, controller, record, command, summary, snapshot, replay):
+for verb in (run, world, chaser, controller, record, command, summary, snapshot, replay, compare):
     app.command()(verb)
+app.add_typer(logs.app, name="log")
 
 
 def main() -> None:

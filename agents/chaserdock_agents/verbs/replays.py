@@ -44,3 +44,23 @@ def replay(
             print(line)
         print("equal to the log" if first is None else f"first difference: {first}")
     raise typer.Exit(0 if result.equal else 1)
+
+
+def compare(
+    first: Annotated[Path, typer.Argument(help="a log, or the folder of a run")],
+    second: Annotated[Path, typer.Argument(help="another")],
+    tolerance: ToleranceOpt = 0.0,
+    as_json: JsonOpt = False,
+) -> None:
+    """Put two recorded flights side by side; status 1 unless their digests are equal."""
+    import msgspec
+
+    from chaserdock_agents.replay.compare import compare as run
+    from chaserdock_agents.replay.compare import comparison_lines
+
+    found = run(first, second, tolerance)
+    if as_json:
+        print(json.dumps({"equal": found.equal, **msgspec.to_builtins(found)}, indent=2))
+    else:
+        print("\n".join(comparison_lines(found)))
+    raise typer.Exit(0 if found.equal else 1)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from collections.abc import Iterator
+from importlib.metadata import version
 from pathlib import Path
 
 import msgpack
@@ -11,13 +13,16 @@ import pytest
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.log import (
+    LOCK_ATTACHMENT,
     SCENARIO_ATTACHMENT,
+    VERSIONS_ATTACHMENT,
     LogError,
     LogWriter,
     count_messages,
     read_log,
     read_scenario,
 )
+from harness import ROOT
 from mcap.reader import make_reader
 
 V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
@@ -147,9 +152,15 @@ def test_mcaps_own_reader_and_plain_msgpack_read_it_all(tmp_path: Path) -> None:
         assert channel.metadata["zenoh_encoding"] == m.encoding_of(type(original))
         properties = json.loads(schema.data)["$defs"][type(original).__name__]["properties"]
         assert set(properties) == set(values)
-    assert [(a.name, a.media_type, a.data) for a in attachments] == [
-        (SCENARIO_ATTACHMENT, "application/json", SCENARIO.encode())
-    ]
+    assert (attachments[0].name, attachments[0].data) == (SCENARIO_ATTACHMENT, SCENARIO.encode())
+    assert {a.name: a.media_type for a in attachments} == {
+        SCENARIO_ATTACHMENT: "application/json",
+        VERSIONS_ATTACHMENT: "application/json",
+        LOCK_ATTACHMENT: "application/gzip",
+    }
+    held = {a.name: a.data for a in attachments}
+    assert json.loads(held[VERSIONS_ATTACHMENT])["numpy"] == version("numpy")
+    assert gzip.decompress(held[LOCK_ATTACHMENT]) == (ROOT / "uv.lock").read_bytes()
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_count == len(expected)
@@ -269,7 +280,7 @@ def test_files_that_are_no_log_are_one_clear_line(tmp_path: Path) -> None:
     for reader in (read_scenario, count_messages, lambda p: list(read_log(p))):
         with pytest.raises(LogError, match="cannot be read: No such file or directory"):
             reader(tmp_path / "none.mcap")
-        with pytest.raises(LogError, match="cannot be read: Is a directory"):
+        with pytest.raises(LogError, match=r"holds no log \(mission.mcap"):
             reader(tmp_path)
     other = tmp_path / "other.mcap"
     for content in (b"", b"text, and not a log at all " * 20, bytes(1000)):

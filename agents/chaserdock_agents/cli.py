@@ -12,11 +12,13 @@ import typer
 from chaserdock_protocol.errors import ChaserdockError
 
 from .verbs.campaign import campaign
+from .verbs import logs
 from .verbs.flights import snapshot, summary
 from .verbs.operate import command
 from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
 from .verbs.publish import figures, report, video
+from .verbs.replays import compare, replay
 
 app = typer.Typer(
     name="chaserdock",
@@ -37,8 +39,11 @@ for verb in (
     figures,
     report,
     video,
+    replay,
+    compare,
 ):
     app.command()(verb)
+app.add_typer(logs.app, name="log")
 
 
 def main() -> None:

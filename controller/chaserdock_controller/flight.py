@@ -95,10 +95,8 @@ class Flight:
     def step(self, inputs: Inputs) -> Outputs:
         """Everything that one tick asks of the controller."""
         now_s = inputs.time_ns / 1e9
-        for odometry in inputs.odometry.values():
-            self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
-        fused = self._estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
-        out = Outputs(target=self._target_message(inputs, fused))
+        fused, target = self.fuse(inputs)
+        out = Outputs(target=target)
         self._events(out, inputs, [("info", text) for _, text in self._estimator.drain_events()])
         if fused.status in ("tracking", "predicting"):
             self.guidance.found(now_s)
@@ -119,8 +117,17 @@ class Flight:
                 )
             )
         self._command(inputs, fused, out)
-        self._forget(inputs.time_ns)
+        self._history.forget_before(inputs.time_ns)
         return out
+
+    def fuse(self, inputs: Inputs) -> tuple[Fused, TargetEstimate]:
+        """The estimation of ``step`` alone: the fused state and its message. Once a tick, by ``step`` or instead of it."""
+        for odometry in inputs.odometry.values():
+            self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
+        fused = self._estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
+        for key in [k for k in self._odometry if k[1] < inputs.time_ns - _ODOMETRY_KEPT_NS]:
+            del self._odometry[key]
+        return fused, self._target_message(inputs, fused)
 
     def _measurements(self, sightings: tuple[Sighting, ...]) -> list[Measurement]:
         measurements = []
@@ -310,9 +317,3 @@ class Flight:
                     what=text,
                 )
             )
-
-    def _forget(self, now_ns: int) -> None:
-        old = [key for key in self._odometry if key[1] < now_ns - _ODOMETRY_KEPT_NS]
-        for key in old:
-            del self._odometry[key]
-        self._history.forget_before(now_ns)

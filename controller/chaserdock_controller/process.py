@@ -64,14 +64,14 @@ class Controller:
     def open(self, instance: str) -> None:
         """Opens the topics, then tells its presence."""
         node = self.node
-        for topic in (topics.TARGET, topics.SOLVER, topics.COMMAND):
+        for topic in (topics.TARGET, topics.SOLVER, topics.COMMAND, topics.OPERATED):
             node.advertise(topic)
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
         for topic in (topics.TICK, topics.END, topics.ODOMETRY, topics.SIGHTING):
             node.subscribe(topic)
-        node.answer(topics.OPERATE_KEY, OperatorCommand, self._operate)
+        node.answer(topics.OPERATE_KEY, OperatorCommand, self.operate)
         self.teller = PresenceTeller(node, instance)
 
     def listen(self) -> None:
@@ -111,8 +111,10 @@ class Controller:
         out = self.flight.step(
             Inputs(tick.tick, tick.sim_time_ns, here, tuple(self._sightings), tuple(c for c, _ in asked))
         )
-        for (_, answer), reply in zip(asked, out.replies[len(out.replies) - len(asked) :], strict=True):
+        for (command, answer), reply in zip(asked, out.replies[len(out.replies) - len(asked) :], strict=True):
             answer(reply)
+            known = msgspec.structs.replace(command, tick=tick.tick, sim_time_ns=tick.sim_time_ns)
+            self.node.publish(topics.OPERATED, known)
         self._publish(out, time.perf_counter() - begun_s)
         self._sightings.clear()
         self._seen = {key for key in self._seen if key[0] > tick.tick}
@@ -138,7 +140,7 @@ class Controller:
         if out.solver is not None:
             node.publish(topics.SOLVER, msgspec.structs.replace(out.solver, wall_tick_s=took_s))
 
-    def _operate(self, command: OperatorCommand, reply: Callable[[CommandReply], None]) -> None:
+    def operate(self, command: OperatorCommand, reply: Callable[[CommandReply], None]) -> None:
         """An operator asks; answered when the next tick has been worked out. Runs on Zenoh's thread."""
         with self._lock:
             self._asked.append((command, reply))

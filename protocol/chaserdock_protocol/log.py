@@ -1,41 +1,49 @@
-"""The mission log: an MCAP file, every message verbatim, one channel a key and encoding.
+"""The mission log: MCAP files, every message verbatim, one channel a key and encoding.
 
-``log_time`` is simulated time (the message's ``sim_time_ns``), so that a lock-step flight has its own
-time line whatever the machine's speed; ``publish_time`` is the sender's wall clock. Payloads are the bytes that
-travelled (msgpack), each channel's schema is the JSON Schema of its type; the resolved scenario and the
-versions lie inside as an attachment and a metadata record.
+``log_time`` is simulated time (the message's ``sim_time_ns``; the time of the one before where it has none), so that
+a lock-step flight has its own time line whatever the machine's speed; ``publish_time`` is the sender's wall clock.
+Payloads are the bytes that travelled (msgpack), each channel's schema is the JSON Schema of its type; the resolved
+scenario, the lock file and the versions lie inside as attachments and a metadata record. Beside this verbatim layer
+there may be a second one for viewers, under ``/viewer/``, which nothing here reads back.
 """
 
 from __future__ import annotations
 
 import os
-import struct
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.metadata import version
-from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import msgspec
-import zstandard
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
-from mcap.records import Attachment, Channel, Chunk, Metadata
+from mcap.records import Channel
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import breakup_chunk
-from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+from mcap.writer import CompressionType, Writer
 
-from . import codec, topics
+from . import provenance, topics
 from .codec import Rejected
-from .errors import ChaserdockError
+from .log_scan import (
+    METADATA,
+    VIEWER_PREFIX,
+    FileState,
+    LogError,
+    LogSource,
+    files_of,
+    head_of,
+    seal,
+    stored_messages,
+)
 from .messages import encoding_of, schema_of
 from .topics import Topic
+from .upgrades import decode_logged
 
 SCENARIO_ATTACHMENT = "scenario.json"
-METADATA = "chaserdock"
+LOCK_ATTACHMENT = "uv.lock.gz"
+VERSIONS_ATTACHMENT = "versions.json"
 _PACKAGES = (
     "chaserdock",
     "casadi",
@@ -47,9 +55,7 @@ _PACKAGES = (
     "opencv-python-headless",
 )
 
-
-class LogError(ChaserdockError):
-    """A log that cannot be used; the text is one clear line."""
+__all__ = ["LogError", "LogSource", "LogWriter", "Record", "count_messages", "read_log", "read_scenario"]
 
 
 @dataclass(frozen=True)
@@ -67,71 +73,143 @@ class _Header(msgspec.Struct):
     sim_time_ns: int = 0
 
 
-_RECORD_HEAD = struct.Struct("<BQ")
-# What the parsers of a damaged record raise.
-_DAMAGE = (McapError, ValueError, KeyError, struct.error, zstandard.ZstdError)
-
 _header = msgspec.msgpack.Decoder(_Header)
+
+
+class _Sink:
+    """The file under the MCAP writer, which hands over whole records: one that does not fit is taken back."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file = file
+        self.size = 0
+
+    def write(self, data: bytes) -> None:
+        done = 0
+        try:
+            while done < len(data):
+                done += self._file.write(memoryview(data)[done:])
+        except OSError:
+            # Best effort: a cut record is found and left out by every reader, too.
+            os.ftruncate(self._file.fileno(), self.size)
+            raise
+        self.size += len(data)
+
+    def tell(self) -> int:
+        return self.size
+
+    def flush(self) -> None:
+        """Nothing is held back."""
 
 
 class LogWriter:
     """Writes a log; flushed to the file at least once a second of ``now_s``, so a kill costs at most the last second.
 
-    Raises LogError when the file cannot be created or written.
+    Raises LogError when the file cannot be created or written; what was written until then stays readable.
     """
 
     def __init__(self, path: Path, now_s: Callable[[], float] = time.monotonic) -> None:
         self.path = path
         self.messages = 0
         self.unreadable = 0
+        self.last_time_ns = 0
         self._now_s = now_s
+        self._broken = False
         self._channels: dict[tuple[str, str], int] = {}
         self._sequence: dict[int, int] = {}
         self._schemas: dict[str, int] = {}
-        self._last_time_ns = 0
         try:
-            self._file = path.open("xb")
+            self._file = path.open("xb", buffering=0)
         except FileExistsError:
             raise LogError(f"{path}: already exists; a log is never overwritten") from None
         except OSError as error:
             raise LogError(f"{path}: cannot be created: {error.strerror or error}") from None
+        self._sink: Any = _Sink(self._file)
         # Small chunks: what a reader holds in memory, and what an unclean end may cost inside the flush period.
-        self._writer = Writer(self._file, chunk_size=1 << 20, compression=CompressionType.ZSTD)
-        self._writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')}")
+        self._writer = Writer(
+            self._sink, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True
+        )
+        with self._writing():
+            self._writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')}")
         self._flushed_s = now_s()
 
+    @property
+    def size_bytes(self) -> int:
+        """Bytes in the file so far; the chunk in progress is not among them."""
+        return self._sink.size
+
     def describe(self, scenario_json: str, run: dict[str, str]) -> None:
-        """Puts the resolved scenario, the run's data and the package versions into the log."""
+        """Puts the resolved scenario, the run's data, the lock file and the package versions into the log."""
         now = time.time_ns()
-        self._writer.add_attachment(now, now, SCENARIO_ATTACHMENT, "application/json", scenario_json.encode())
+        attached = [
+            (SCENARIO_ATTACHMENT, "application/json", scenario_json.encode()),
+            (VERSIONS_ATTACHMENT, "application/json", provenance.versions_json()),
+            (LOCK_ATTACHMENT, "application/gzip", provenance.lock_file_gz()),
+        ]
         versions = {f"version.{name}": version(name) for name in _PACKAGES}
-        self._writer.add_metadata(METADATA, {**run, **versions})
+        with self._writing():
+            for name, kind, data in attached:
+                if data is not None:
+                    self._writer.add_attachment(now, now, name, kind, data)
+            self._writer.add_metadata(METADATA, seal({**run, **versions}))
+
+    def note(self, name: str, data: dict[str, str]) -> None:
+        """Adds a metadata record of another name."""
+        with self._writing():
+            self._writer.add_metadata(name, seal(data))
 
     def write(self, key: str, encoding: str, payload: bytes, sent_ns: int) -> None:
         """Appends one message, whatever it holds."""
         channel = self._channels.get((key, encoding))
         if channel is None:
-            channel = self._channels[key, encoding] = self._register(key, encoding)
-            self._sequence[channel] = 0
+            with self._writing():
+                channel = self._channels[key, encoding] = self._register(key, encoding)
         try:
-            self._last_time_ns = max(0, _header.decode(payload).sim_time_ns)
+            # Zero: a message without a time of its own (presence), which belongs where it arrived.
+            self.last_time_ns = max(0, _header.decode(payload).sim_time_ns) or self.last_time_ns
         except (msgspec.DecodeError, OverflowError, RecursionError, UnicodeDecodeError):
             self.unreadable += 1
+        self._add(channel, self.last_time_ns, payload, sent_ns or self.last_time_ns)
+        self.messages += 1
+        if self._now_s() - self._flushed_s >= 0.5:
+            self.flush()
+
+    def write_view(self, topic: str, schema: tuple[str, str, bytes], payload: bytes, time_ns: int) -> None:
+        """Appends a message of the viewer layer, whose ``topic`` begins with ``/viewer/``.
+
+        ``schema``: its name, its encoding (also the message's, such as ``protobuf``) and its data.
+        """
+        if not topic.startswith(VIEWER_PREFIX):
+            raise ValueError(f"{topic} is none of the viewer layer's")
+        name, encoding, data = schema
+        channel = self._channels.get((topic, name))
+        if channel is None:
+            with self._writing():
+                if name not in self._schemas:
+                    self._schemas[name] = self._writer.register_schema(name, encoding, data)
+                channel = self._writer.register_channel(topic, encoding, self._schemas[name])
+            self._channels[topic, name] = channel
+        self._add(channel, time_ns, payload, time_ns)
+
+    def _add(self, channel: int, time_ns: int, payload: bytes, sent_ns: int) -> None:
+        number = self._sequence.get(channel, 0)
+        with self._writing():
+            self._writer.add_message(channel, time_ns, payload, sent_ns, number)
+        self._sequence[channel] = number + 1
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        if self._broken:
+            raise LogError(f"{self.path}: could not be written before, and is not continued")
         try:
-            self._writer.add_message(
-                channel, self._last_time_ns, payload, sent_ns or self._last_time_ns, self._sequence[channel]
-            )
-            self._sequence[channel] += 1
-            self.messages += 1
-            if self._now_s() - self._flushed_s >= 0.5:
-                self.flush()
+            yield
         except OSError as error:
+            self._broken = True
             raise LogError(f"{self.path}: cannot be written: {error.strerror or error}") from None
 
     def flush(self) -> None:
         """Hands everything written so far to the operating system."""
-        self._writer.flush()
-        self._file.flush()
+        with self._writing():
+            self._writer.flush()
         self._flushed_s = self._now_s()
 
     def _register(self, key: str, encoding: str) -> int:
@@ -147,92 +225,75 @@ class LogWriter:
         )
 
     def close(self) -> None:
-        """Writes index and footer and closes the file."""
-        self._writer.finish()
-        self._file.close()
+        """Writes index and footer, where the file can still be written, and closes it; raises LogError."""
+        try:
+            if not self._broken:
+                with self._writing():
+                    self._writer.finish()
+        finally:
+            self._file.close()
 
 
-def _records(path: Path) -> Iterator[tuple[int, ReadDataStream]]:
-    """Opcode and content of every record up to the summary.
-
-    A log whose writer was killed ends with its last whole record: what was flushed before is good. Raises
-    LogError for a file that cannot be read, is no log, or is damaged.
-    """
-    try:
-        with path.open("rb") as file:
-            if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
-                raise LogError(f"{path}: no MCAP log")
-            left = os.fstat(file.fileno()).st_size - file.tell()
-            while left >= _RECORD_HEAD.size:
-                opcode, length = _RECORD_HEAD.unpack(file.read(_RECORD_HEAD.size))
-                left -= _RECORD_HEAD.size + length
-                if left < 0 or opcode == Opcode.DATA_END:
-                    return
-                yield opcode, ReadDataStream(BytesIO(file.read(length)))
-    except OSError as error:
-        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
-
-
-def _raw_messages(path: Path, keys: Iterable[str] | None) -> Iterator[tuple[Channel, McapMessage]]:
+def _raw_messages(
+    source: LogSource, keys: Iterable[str] | None, state: FileState | None = None
+) -> Iterator[tuple[Channel, McapMessage]]:
     wanted = None if keys is None else set(keys)
-    channels: dict[int, Channel] = {}
-    for opcode, content in _records(path):
-        if opcode != Opcode.CHUNK:
-            continue
-        try:
-            inside = breakup_chunk(Chunk.read(content), validate_crc=True)
-        except _DAMAGE as error:
-            raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
-        channels |= {record.id: record for record in inside if isinstance(record, Channel)}
-        for record in inside:
-            if isinstance(record, McapMessage):
-                channel = channels[record.channel_id]
-                if wanted is None or channel.topic in wanted:
-                    yield channel, record
+    for path in files_of(source):
+        for channel, message in stored_messages(path, state):
+            key = channel.topic
+            if not key.startswith(VIEWER_PREFIX) and (wanted is None or key in wanted):
+                yield channel, message
 
 
-def read_log(path: Path, keys: Iterable[str] | None = None) -> Iterator[Record]:
-    """Messages of a log in file order, opened and checked; those that do not pass are left out.
+def read_log(
+    source: LogSource, keys: Iterable[str] | None = None, rejected: Counter[str] | None = None
+) -> Iterator[Record]:
+    """Messages of a log in file order, opened and checked, older versions upgraded.
 
-    Raises LogError when the file cannot be read, is no log, or where it is damaged; a log cut off is read up to there.
+    Those that do not pass are left out, and counted in ``rejected`` as ``key: reason``. Raises LogError when a file
+    cannot be read, is no log, or where it is damaged; a log cut off is read up to there.
     """
-    for channel, message in _raw_messages(path, keys):
+    for channel, message in _raw_messages(source, keys):
         found = topics.topic_of_key(channel.topic)
-        if found is None:
-            continue
         try:
-            opened = codec.decode(found[0].kind, message.data, channel.metadata.get("zenoh_encoding"))
-        except Rejected:
+            if found is None:
+                raise Rejected("key", "none of ours")
+            encoding = channel.metadata.get("zenoh_encoding", "")
+            opened = decode_logged(found[0].kind, message.data, encoding)
+        except Rejected as refusal:
+            if rejected is not None:
+                rejected[f"{channel.topic}: {refusal.reason}"] += 1
             continue
         yield Record(channel.topic, found[0], found[1], opened, message.publish_time)
 
 
-def count_messages(path: Path) -> dict[str, int]:
+def count_messages(source: LogSource) -> dict[str, int]:
     """Messages by key, whatever they hold."""
     counts: dict[str, int] = {}
-    for channel, _ in _raw_messages(path, None):
+    for channel, _ in _raw_messages(source, None):
         counts[channel.topic] = counts.get(channel.topic, 0) + 1
     return dict(sorted(counts.items()))
 
 
-def read_scenario(path: Path) -> tuple[str, dict[str, str]]:
-    """The resolved scenario (JSON) and the run's data and versions; raises LogError if the log lacks them."""
-    scenario: str | None = None
-    data: dict[str, str] = {}
-    try:
-        for opcode, content in _records(path):
-            if opcode == Opcode.ATTACHMENT:
-                attachment = Attachment.read(content)
-                if attachment.name == SCENARIO_ATTACHMENT:
-                    scenario = attachment.data.decode()
-            elif opcode == Opcode.METADATA:
-                metadata = Metadata.read(content)
-                if metadata.name == METADATA:
-                    data = metadata.metadata
-            if scenario is not None and data:
-                break
-    except _DAMAGE as error:
-        raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
-    if scenario is None:
+def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
+    """The resolved scenario (JSON) and the run's data and versions; raises LogError if the log lacks them.
+
+    All files of a rotated log must be parts of one run.
+    """
+    files = files_of(source)
+    first, scenario = _scenario_of(files[0])
+    for path in files[1:]:
+        data = _scenario_of(path)[0]
+        if data.get("run_id") != first.get("run_id"):
+            raise LogError(f"{path}: of another run than {files[0]}")
+    return scenario, first
+
+
+def _scenario_of(path: Path) -> tuple[dict[str, str], str]:
+    data, attachments = head_of(path)
+    if SCENARIO_ATTACHMENT not in attachments:
         raise LogError(f"{path}: holds no scenario; was it recorded by chaserdock?")
-    return scenario, data
+    try:
+        return data, attachments[SCENARIO_ATTACHMENT].decode()
+    except UnicodeDecodeError:
+        raise LogError(f"{path}: its {SCENARIO_ATTACHMENT} is no UTF-8 text") from None

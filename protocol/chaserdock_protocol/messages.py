@@ -238,7 +238,10 @@ class RecorderAck(Message, frozen=True, kw_only=True):
 
 
 class OperatorCommand(Message, frozen=True, kw_only=True):
-    """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone."""
+    """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone.
+
+    The controller publishes it again, with the tick it was obeyed or refused at: the log must hold all inputs.
+    """
 
     command: Literal["approach", "hold", "retreat", "abort", "goto"]
     chaser: ChaserId

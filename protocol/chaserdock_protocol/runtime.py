@@ -24,6 +24,18 @@ SINGLE_THREADED = {
 
 
 @dataclass(frozen=True)
+class Rotation:
+    """When a recorder begins a new file: after so many bytes, after so many seconds of simulated time."""
+
+    size_bytes: int | None = None
+    seconds: float | None = None
+
+    @property
+    def wanted(self) -> bool:
+        return self.size_bytes is not None or self.seconds is not None
+
+
+@dataclass(frozen=True)
 class ProcessOptions:
     """How a process was started. Which fields count depends on the process."""
 
@@ -34,6 +46,8 @@ class ProcessOptions:
     seed: int | None = None
     mode: Mode = "lockstep"
     out: Path = Path("runs")
+    rotation: Rotation = Rotation()
+    viewer_layer: bool = True
     recorder_expected: bool = True
     watch_parent: bool = False
     patience_s: float | None = None

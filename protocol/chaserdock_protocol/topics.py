@@ -73,6 +73,7 @@ PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"
 TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "state")
 SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
 COMMAND = _topic("controller/command", m.CommandReply, "controller", set(), "event", "event")
+OPERATED = _topic("controller/operated", m.OperatorCommand, "controller", set(), "event", "event")
 ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
 EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
 HEALTH = _topic("{process}/health", m.Health, "any", set(), "second", "event")
@@ -94,6 +95,7 @@ TOPICS: tuple[Topic, ...] = (
     TARGET,
     SOLVER,
     COMMAND,
+    OPERATED,
     ACK,
     EVENT,
     HEALTH,

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import queue
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.log import LogError, LogWriter
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Farewell,
@@ -26,31 +25,35 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
+from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Node, Raw
 
-LOG_NAME = "mission.mcap"
+from .recording import Recording
+from .viewer import SHOWN
+
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
 
 
 def main(options: ProcessOptions) -> int:
     """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
-    return take_part("recorder", "recorder", options, lambda *member: record(options.out, *member))
+    return take_part("recorder", "recorder", options, lambda *member: record(options, *member))
 
 
-def record(folder: Path, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
     """Records until the mission is over and all that was published is in the file; the process' status."""
-    writer = open_log(folder)
+    source = "the world's scenario"
+    scenario = scenario_from_json(mission.scenario_json, source) if options.viewer_layer else None
+    recording = Recording(options.out, mission, options.rotation, scenario)
     try:
-        writer.describe(mission.scenario_json, {"run_id": mission.run_id, "mode": mission.mode})
-        recorder = Recorder(node, writer)
+        recorder = Recorder(node, recording)
         recorder.open(instance)
         while not recorder.finished() and not (stop() and recorder.idle()):
             recorder.take_one(0.1)
     finally:
-        writer.close()
+        recording.close()
     if recorder.ended_s is None:
-        say("recorder", f"stopped before the mission's end; {writer.path} holds what came until then")
+        say("recorder", f"stopped before the mission's end; {recording.path} holds what came until then")
         return 1
     missing = recorder.missing()
     for key, number in missing.items():
@@ -60,21 +63,12 @@ def record(folder: Path, node: Node, mission: JoinReply, instance: str, stop: St
     return 1 if missing.keys() - excused else 0
 
 
-def open_log(folder: Path) -> LogWriter:
-    """The run's log in ``folder``, which is made; raises LogError."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from None
-    return LogWriter(folder / LOG_NAME)
-
-
 @dataclass
 class Recorder:
     """What has been recorded, and what the ends of the others say there should be."""
 
     node: Node
-    writer: LogWriter
+    recording: Recording
     ended_s: float | None = None
     _waiting: queue.SimpleQueue[Raw] = field(default_factory=queue.SimpleQueue)
     _received: dict[str, int] = field(default_factory=dict)
@@ -98,15 +92,13 @@ class Recorder:
             raw = self._waiting.get(timeout=timeout_s)
         except queue.Empty:
             return
-        self.writer.write(raw.key, raw.encoding, raw.payload, raw.sent_ns)
+        found, message = topics.topic_of_key(raw.key), None
+        if found is not None and (found[0] in _READ or found[0] in SHOWN):
+            with suppress(Rejected):
+                message = codec.decode(found[0].kind, raw.payload, raw.encoding)
+        self.recording.write(raw, message)
         self._received[raw.key] = self._received.get(raw.key, 0) + 1
-        found = topics.topic_of_key(raw.key)
-        if found is None or found[0] not in _READ:
-            return
-        try:
-            self._note(raw.key, codec.decode(found[0].kind, raw.payload, raw.encoding))
-        except Rejected:
-            return
+        self._note(raw.key, message)
 
     def _note(self, key: str, message: object) -> None:
         match message:

@@ -155,12 +155,27 @@ def record(
     patience: Annotated[
         float | None, typer.Option(help="seconds to wait for a world; for ever by default")
     ] = None,
+    rotate_size_mb: Annotated[
+        float | None,
+        typer.Option(min=1, help="begin a new file (mission-0000.mcap …) after so many megabytes"),
+    ] = None,
+    rotate_s: Annotated[
+        float | None, typer.Option(min=1, help="begin a new file after so many simulated seconds")
+    ] = None,
+    viewer: Annotated[bool, typer.Option(help="write the layer that rerun and Foxglove show, too")] = True,
     watch_parent: WatchOpt = False,
 ) -> None:
     """The recorder: every message into OUT/mission.mcap."""
-    from chaserdock_protocol.runtime import ProcessOptions
+    from chaserdock_protocol.runtime import ProcessOptions, Rotation
 
     folder = out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
     link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
-    options = ProcessOptions(link=link, out=folder, patience_s=patience, watch_parent=watch_parent)
+    options = ProcessOptions(
+        link=link,
+        out=folder,
+        rotation=Rotation(None if rotate_size_mb is None else round(rotate_size_mb * 1e6), rotate_s),
+        viewer_layer=viewer,
+        patience_s=patience,
+        watch_parent=watch_parent,
+    )
     start_process("record", options)

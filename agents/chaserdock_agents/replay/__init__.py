@@ -1,0 +1,1 @@
+"""Recorded inputs through today's code, and two sets of messages compared field by field."""

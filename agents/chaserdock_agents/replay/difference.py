@@ -1,0 +1,194 @@
+"""Messages compared field by field: where two runs, or a log and today's code, differ first and most."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from typing import Any
+
+import msgspec
+from chaserdock_protocol.messages import Message
+
+Side = int
+"""0: the recorded, or first; 1: today's, or second."""
+
+
+class FieldDifference(msgspec.Struct):
+    """One field's differences. ``largest`` is the greatest absolute difference of numbers; None where it has no size."""
+
+    name: str
+    unequal: int = 0
+    first_tick: int = 0
+    first_time_s: float = 0.0
+    first: tuple[Any, Any] = (None, None)
+    largest: float | None = None
+    largest_time_s: float | None = None
+
+
+class TopicDifference(msgspec.Struct):
+    """One key: messages compared, those that differ, those that only one side has, and the fields that differ.
+
+    ``alone_time_s`` is the simulated time of the first message that only one side has, seconds.
+    """
+
+    key: str
+    compared: int = 0
+    unequal: int = 0
+    alone: list[int] = msgspec.field(default_factory=lambda: [0, 0])
+    alone_time_s: float | None = None
+    fields: dict[str, FieldDifference] = {}
+
+    @property
+    def equal(self) -> bool:
+        return not self.unequal and not any(self.alone)
+
+    @property
+    def first_time_s(self) -> float | None:
+        """Simulated time of the first difference of any kind, None if there is none."""
+        times = [f.first_time_s for f in self.fields.values()]
+        return min([*times, *([self.alone_time_s] if self.alone_time_s is not None else [])], default=None)
+
+
+def field_differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any, Any, float | None]]:
+    """Fields that differ: name (items of lists share one), both values, and their distance if they are numbers.
+
+    ``seq`` is the transport's, ``wall_`` fields are the clock's: neither is compared.
+    """
+    if isinstance(a, msgspec.Struct) and type(a) is type(b):
+        for field in a.__struct_fields__:
+            if field != "seq" and not field.startswith("wall_"):
+                x, y = getattr(a, field), getattr(b, field)
+                if x != y:
+                    yield from field_differences(x, y, f"{name}.{field}" if name else field)
+    elif isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
+        if a and isinstance(a[0], msgspec.Struct):
+            for k, (x, y) in enumerate(zip(a, b, strict=True)):
+                if x != y:
+                    yield from field_differences(x, y, f"{name}[{k}]")
+        elif all(_is_number(x) for x in (*a, *b)):
+            pairs: Any = zip(a, b, strict=True)
+            distances = [abs(x - y) for x, y in pairs]
+            k = distances.index(max(distances))
+            yield name, a[k], b[k], distances[k]
+        else:
+            yield name, a, b, None
+    elif _is_number(a) and _is_number(b):
+        yield name, a, b, abs(a - b)
+    else:
+        yield name, a, b, None
+
+
+def _is_number(x: Any) -> bool:
+    return isinstance(x, int | float) and not isinstance(x, bool)
+
+
+# More waiting messages than this, and those that fell this many ticks behind both sides have no partner.
+_MANY_WAITING, _BEHIND_TICKS = 20_000, 300
+
+
+class Comparison:
+    """Pairs the messages of two sides (by key, tick, and their order within it) and notes how they differ.
+
+    Numbers that are at most ``tolerance`` apart count as equal. Memory does not grow with the flights' length.
+    """
+
+    def __init__(self, tolerance: float = 0.0) -> None:
+        self._tolerance = tolerance
+        self._topics: dict[str, TopicDifference] = {}
+        self._waiting: tuple[dict[tuple[str, int], list[Message]], ...] = (
+            defaultdict(list),
+            defaultdict(list),
+        )
+        self._last_tick = [-1, -1]
+        self._number = 0
+
+    def add(self, side: Side, key: str, message: Message) -> None:
+        """Takes one message of a side."""
+        self._last_tick[side] = max(self._last_tick[side], message.tick)
+        other = self._waiting[1 - side].get((key, message.tick))
+        if not other:
+            self._waiting[side][key, message.tick].append(message)
+            self._number += 1
+            if self._number > _MANY_WAITING:
+                self._give_up(min(self._last_tick) - _BEHIND_TICKS)
+            return
+        partner = other.pop(0)
+        if not other:
+            del self._waiting[1 - side][key, message.tick]
+        self._number -= 1
+        self._compare(key, *((message, partner) if side == 0 else (partner, message)))
+
+    def _topic(self, key: str) -> TopicDifference:
+        if key not in self._topics:
+            self._topics[key] = TopicDifference(key=key, fields={})
+        return self._topics[key]
+
+    def _compare(self, key: str, a: Message, b: Message) -> None:
+        topic = self._topic(key)
+        topic.compared += 1
+        unequal = False
+        for name, x, y, apart in field_differences(a, b):
+            if apart is not None and apart <= self._tolerance:
+                continue
+            unequal = True
+            time_s = a.sim_time_ns / 1e9
+            field = topic.fields.get(name)
+            if field is None:
+                field = topic.fields[name] = FieldDifference(
+                    name=name, first_tick=a.tick, first_time_s=time_s, first=(x, y)
+                )
+            field.unequal += 1
+            if apart is not None and apart > (field.largest or 0.0):
+                field.largest, field.largest_time_s = apart, time_s
+        topic.unequal += unequal
+
+    def _give_up(self, before_tick: float) -> None:
+        for side, waiting in enumerate(self._waiting):
+            for key, tick in [k for k in waiting if k[1] < before_tick]:
+                for message in waiting.pop((key, tick)):
+                    self._number -= 1
+                    topic = self._topic(key)
+                    topic.alone[side] += 1
+                    time_s = message.sim_time_ns / 1e9
+                    if topic.alone_time_s is None or time_s < topic.alone_time_s:
+                        topic.alone_time_s = time_s
+
+    def finish(self) -> list[TopicDifference]:
+        """What differs, by key; keys that are equal are there, too."""
+        self._give_up(float("inf"))
+        return [self._topics[key] for key in sorted(self._topics)]
+
+
+def first_difference(topics: list[TopicDifference]) -> str | None:
+    """Topic, field and time of the first difference of all, in words."""
+    unequal = [t for t in topics if not t.equal]
+    if not unequal:
+        return None
+    first = min(unequal, key=lambda t: (t.first_time_s or 0.0, t.key))
+    fields = sorted(first.fields.values(), key=lambda f: (f.first_time_s, f.name))
+    if fields and fields[0].first_time_s == first.first_time_s:
+        return f"{first.key}: {fields[0].name} at {first.first_time_s:.3f} s (tick {fields[0].first_tick})"
+    return f"{first.key}: a message at {first.first_time_s or 0.0:.3f} s that only one side has"
+
+
+def difference_lines(topics: list[TopicDifference], sides: tuple[str, str]) -> Iterator[str]:
+    """The differences, one topic after the other, for people. Equal topics are one line together."""
+    equal = [t for t in topics if t.equal]
+    yield f"equal: {len(equal)} topics, {sum(t.compared for t in equal)} messages"
+    for t in topics:
+        if t.equal:
+            continue
+        yield f"{t.key}: {t.unequal} of {t.compared} messages differ"
+        for side, number in zip(sides, t.alone, strict=True):
+            if number:
+                yield f"  {number} only {side}; the first that only one has is at {t.alone_time_s:.3f} s"
+        for f in sorted(t.fields.values(), key=lambda f: (f.first_time_s, f.name)):
+            values = ", ".join(f"{side} {_shown(x)}" for side, x in zip(sides, f.first, strict=True))
+            yield f"  {f.name}: {f.unequal} times, first at {f.first_time_s:.3f} s (tick {f.first_tick}): {values}"
+            if f.largest is not None:
+                yield f"    largest difference {f.largest:.3g} at {f.largest_time_s:.3f} s"
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."

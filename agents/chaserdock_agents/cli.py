@@ -12,6 +12,7 @@ import typer
 from chaserdock_protocol.errors import ChaserdockError
 
 from .verbs.flights import snapshot, summary
+from .verbs.network import judge, keys, router, status
 from .verbs.operate import command
 from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
@@ -22,8 +23,9 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for verb in (run, world, chaser, controller, record, command, summary, snapshot):
+for verb in (run, world, chaser, controller, record, router, status, judge, command, summary, snapshot):
     app.command()(verb)
+app.add_typer(keys, name="keys")
 
 
 def main() -> None:

@@ -28,6 +28,8 @@ from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.transport import Node, Raw
 
+from chaserdock_agents.runs import run_name
+
 LOG_NAME = "mission.mcap"
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
@@ -35,12 +37,14 @@ _HEALTH_TICKS = 15
 
 def main(options: ProcessOptions) -> int:
     """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
-    return take_part("recorder", "recorder", options, lambda *member: record(options.out, *member))
+    return take_part(
+        "recorder", "recorder", options, lambda *member: record(options.out, options.by_run, *member)
+    )
 
 
-def record(folder: Path, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+def record(out: Path, by_run: bool, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
     """Records until the mission is over and all that was published is in the file; the process' status."""
-    writer = open_log(folder)
+    writer = open_log(out / run_name(mission) if by_run else out)
     try:
         writer.describe(mission.scenario_json, {"run_id": mission.run_id, "mode": mission.mode})
         recorder = Recorder(node, writer)

@@ -30,7 +30,7 @@ USER chaserdock
 RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
       --set camera.width_px=640 --set camera.height_px=480 \
       --set success.steady_position_rms_m=0.2 --set success.steady_orientation_rms_deg=10.0 \
-    && rm -rf /tmp/warm && chmod -R a+rwX /var/cache/chaserdock
+    && rm -rf /tmp/warm && chmod -R a+rwX /var/cache/chaserdock/*
 WORKDIR /tmp
 ENTRYPOINT ["python", "-m", "chaserdock_agents.member"]
 HEALTHCHECK --interval=10s --timeout=5s --start-period=20s --retries=3 \

@@ -30,7 +30,9 @@ def sockets(table: str) -> list[tuple[int, int, str]]:
 
 def linked(port: int) -> bool:
     """Whether this container has an open connection to a router's port, or listens on it."""
-    rows = [row for f in ("/proc/net/tcp", "/proc/net/tcp6") if os.path.exists(f) for row in sockets(_text(f))]
+    rows = [
+        row for f in ("/proc/net/tcp", "/proc/net/tcp6") if os.path.exists(f) for row in sockets(_text(f))
+    ]
     return any(
         (remote == port and state == _ESTABLISHED) or (local == port and state == _LISTEN)
         for local, remote, state in rows

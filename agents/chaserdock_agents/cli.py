@@ -14,6 +14,7 @@ from chaserdock_protocol.errors import ChaserdockError
 from .verbs.campaign import campaign
 from .verbs import logs
 from .verbs.flights import snapshot, summary
+from .verbs.network import judge, keys, router, status
 from .verbs.operate import command
 from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
@@ -41,9 +42,13 @@ for verb in (
     video,
     replay,
     compare,
+    router,
+    status,
+    judge,
 ):
     app.command()(verb)
 app.add_typer(logs.app, name="log")
+app.add_typer(keys, name="keys")
 
 
 def main() -> None:

@@ -231,7 +231,8 @@ def judge(fleet: Fleet, folder: Path, failure: str | None) -> int:
     if failure is not None:
         summary["failures"] = [failure, *summary["failures"]]
         summary["success"] = False
-    summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
+    if fleet.children:  # processes elsewhere have not been measured
+        summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     print(text_of(summary))
     print(f"log, summary and the processes' words: {folder}")

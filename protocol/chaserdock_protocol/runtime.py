@@ -37,7 +37,11 @@ class Rotation:
 
 @dataclass(frozen=True)
 class ProcessOptions:
-    """How a process was started. Which fields count depends on the process."""
+    """How a process was started. Which fields count depends on the process.
+
+    ``rejoin_s``: wall seconds that a world in lock-step waits when it has lost everybody; ``by_run``: a recorder
+    makes a folder for each run in ``out``; ``until``: a router ends once that process has come and gone.
+    """
 
     link: Link = field(default_factory=Link)
     chaser: int | None = None
@@ -51,6 +55,9 @@ class ProcessOptions:
     recorder_expected: bool = True
     watch_parent: bool = False
     patience_s: float | None = None
+    rejoin_s: float = 0.0
+    by_run: bool = False
+    until: str | None = None
 
 
 class Stop:

@@ -41,8 +41,20 @@ class TransportError(ChaserdockError):
 
 
 @dataclass(frozen=True)
+class Tls:
+    """PEM files for mutual TLS: the mission's authority, this process' certificate, its private key."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
 class Link:
-    """How a process reaches the others. ``lease_ms``: after that long a silent peer counts as lost."""
+    """How a process reaches the others. ``lease_ms``: after that long a silent peer counts as lost.
+
+    ``access_control`` is what a router enforces (see ``rights``).
+    """
 
     namespace: str = DEFAULT_NAMESPACE
     connect: tuple[str, ...] = ()
@@ -50,6 +62,8 @@ class Link:
     mode: Literal["peer", "client", "router"] = "peer"
     config: Path | None = None
     lease_ms: int = 60_000
+    tls: Tls | None = None
+    access_control: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +113,10 @@ def zenoh_config(link: Link) -> zenoh.Config:
             "connect/endpoints": list(link.connect),
             "transport/link/tx/lease": link.lease_ms,
         }
+    if link.tls is not None:
+        values |= _tls_values(link.tls)
+    if link.access_control is not None:
+        values["access_control"] = link.access_control
     try:
         config.insert_json5("namespace", json.dumps(link.namespace))
         for name, value in values.items():
@@ -106,6 +124,21 @@ def zenoh_config(link: Link) -> zenoh.Config:
     except zenoh.ZError as error:
         raise TransportError(f"Zenoh option: {error}") from None
     return config
+
+
+def _tls_values(tls: Tls) -> dict[str, Any]:
+    """Nothing but TLS, both sides with a certificate of the mission."""
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(tls.ca),
+            "enable_mtls": True,
+            "listen_private_key": str(tls.key),
+            "listen_certificate": str(tls.certificate),
+            "connect_private_key": str(tls.key),
+            "connect_certificate": str(tls.certificate),
+        },
+    }
 
 
 def _sent_ns(sample: zenoh.Sample) -> int:

@@ -41,12 +41,13 @@ class Answers:
         self._timing = timing
         self._actuators = actuators
         self._step_now = step_now
-        self._recorder_expected = recorder_expected
+        self._recorder_expected = self._recorder_wanted = recorder_expected
         self._recorded_tick = -1
         self._tick = -1
         self._revision = 0
         self._answered: set[int] = set()
         self._warned_s = time.monotonic()
+        self._alone_s: float | None = None
 
     def missing_at_start(self) -> list[str]:
         """Processes that are not joined up yet."""
@@ -58,14 +59,19 @@ class Answers:
         """Opens a tick: tells everyone who is expected to answer it."""
         self._take_leave()
         linked = self._membership.linked(self._teller.heard())
-        self.chasers = tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in linked)
+        self.chasers = self._chasers_among(linked)
         self.controller = "controller" in linked
+        # One that was lost and is back: the flight is again held to what it has recorded.
+        self._recorder_expected |= self._recorder_wanted and "recorder" in linked
         self._tick, self._pictures, self._revision = tick, pictures, 0
         self._answered.clear()
         self._tell()
         if tick > 0 and tick % self._timing.rate_hz == 0:
             health = health_of(self._node, tick, self._timing.tick_time_ns(tick))
             self._node.publish(topics.HEALTH, health, "world")
+
+    def _chasers_among(self, linked: set[str]) -> tuple[int, ...]:
+        return tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in linked)
 
     def _tell(self) -> None:
         message = Tick(
@@ -151,6 +157,33 @@ class Answers:
                 self._warned_s = time.monotonic()
                 say("world", f"waiting for {waiting_for()}")
         return True
+
+    def abandoned(self, rejoin_s: float, stopped: Callable[[], bool]) -> bool:
+        """Whether no chaser is left, and none comes back within ``rejoin_s`` of wall time.
+
+        Everybody is lost at once when the router starts again, or the world is cut off. In lock-step simulated time
+        then stands still until all are back, or the wait is over; in real time it goes on.
+        """
+        now_s = time.monotonic()
+        if self.chasers or rejoin_s <= 0.0:
+            self._alone_s = None
+            return not self.chasers
+        if self._alone_s is None:
+            self._alone_s = now_s
+            self.warn("all chasers lost", f"waiting for them for {rejoin_s:g} s")
+        if self._membership.realtime:
+            return now_s - self._alone_s > rejoin_s
+        self._recorder_expected = self._recorder_wanted
+        self.wait(
+            lambda: not self.missing_at_start() or time.monotonic() - now_s > rejoin_s,
+            stopped,
+            lambda: ", ".join(self.missing_at_start()),
+        )
+        still_away = self.missing_at_start()
+        self._recorder_expected &= "recorder" not in still_away
+        self.warn("waited for the lost", f"still away: {', '.join(still_away) or 'none'}")
+        self._alone_s = None
+        return not self._chasers_among(self._membership.linked(self._teller.heard()))
 
     def listen_until(self, wall_s: float) -> None:
         """Listens until a time of the monotonic wall clock."""

@@ -157,7 +157,7 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
             contacts = pass_lockstep(tick, answers, stop, timing, fly_to_step)
         else:
             contacts = pass_realtime(tick, begun_s, answers, timing, fly_to_step)
-        if stop() or not answers.chasers:
+        if stop() or answers.abandoned(options.rejoin_s, stop):
             reason = "stopped" if stop() else "no chaser is left"
             break
         tick += 1

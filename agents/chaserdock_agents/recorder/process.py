@@ -28,6 +28,8 @@ from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Node, Raw
 
+from chaserdock_agents.runs import run_name
+
 from .recording import Recording
 from .viewer import SHOWN
 
@@ -44,7 +46,8 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
     """Records until the mission is over and all that was published is in the file; the process' status."""
     source = "the world's scenario"
     scenario = scenario_from_json(mission.scenario_json, source) if options.viewer_layer else None
-    recording = Recording(options.out, mission, options.rotation, scenario)
+    out = options.out / run_name(mission) if options.by_run else options.out
+    recording = Recording(out, mission, options.rotation, scenario)
     try:
         recorder = Recorder(node, recording)
         recorder.open(instance)

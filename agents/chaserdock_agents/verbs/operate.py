@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from .options import ConfigOpt, ConnectOpt, NamespaceOpt, NetModeOpt, link_of
+from .options import ConfigOpt, ConnectOpt, KeysOpt, NamespaceOpt, NetModeOpt, link_of
 
 
 class Command(StrEnum):
@@ -30,12 +30,13 @@ def command(
     connect: ConnectOpt = None,
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
+    keys: KeysOpt = None,
     timeout: Annotated[float, typer.Option(help="seconds to wait for the answer")] = 5.0,
 ) -> None:
     """Tell a chaser of a running mission what to do; status 1 when refused, 2 when nobody answers."""
     from chaserdock_agents.operator import send_command
 
-    link = link_of(namespace, connect, None, net_mode, config, 60_000)
+    link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
     reply = send_command(link, what.value, number, offset, timeout)
     print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
     raise typer.Exit(0 if reply.accepted else 1)

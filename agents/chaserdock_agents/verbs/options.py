@@ -5,6 +5,7 @@ Heavy imports wait until a verb needs them, so that ``--help`` is quick.
 
 from __future__ import annotations
 
+import os
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -35,6 +36,15 @@ NetModeOpt = Annotated[str, typer.Option("--net-mode", "-m", help="peer or clien
 ConfigOpt = Annotated[
     Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
 ]
+KeysOpt = Annotated[
+    Path | None,
+    typer.Option(
+        "--keys",
+        envvar="CHASERDOCK_KEYS",
+        metavar="DIR",
+        help="keys of the mission or of this process (see `keys init`): TLS to a router, as its client",
+    ),
+]
 LeaseOpt = Annotated[int, typer.Option("--lease-ms", help="after that long a silent process counts as lost")]
 WatchOpt = Annotated[bool, typer.Option("--watch-parent", hidden=True)]
 OutOpt = Annotated[Path | None, typer.Option("--out", help="folder for log and summary; runs/… by default")]
@@ -54,14 +64,24 @@ def link_of(
     mode: str,
     config: Path | None,
     lease_ms: int,
+    keys: Path | None = None,
+    process: str = "operator",
 ):
-    """The link that the network options describe."""
+    """The link that the network options describe; with ``keys``, that of ``process`` to a router over TLS."""
     from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
 
     if mode not in ("peer", "client", "router"):
         raise fail(f"--net-mode {mode}: must be peer or client")
     if config is not None and not config.is_file():
         raise fail(f"--config {config}: no such file")
+    if keys is not None:
+        endpoints = tuple(connect or [DEFAULT_ENDPOINT.replace("tcp/", "tls/")])
+        if plain := [e for e in endpoints if not e.startswith("tls/")]:
+            raise fail(
+                f"--connect {plain[0]}: with --keys it must be tls/HOST:PORT, that of the mission's router"
+            )
+        tls = tls_of(keys, process)
+        return Link(namespace, endpoints, (), "client", config, lease_ms, tls)
     return Link(
         namespace=namespace,
         connect=tuple(connect if connect is not None else [DEFAULT_ENDPOINT]),
@@ -70,3 +90,19 @@ def link_of(
         config=config,
         lease_ms=lease_ms,
     )
+
+
+def tls_of(keys: Path, process: str):
+    """The TLS files of a process, in the mission's folder ``keys`` or in the process' own."""
+    from chaserdock_protocol.rights import common_name
+    from chaserdock_protocol.transport import Tls
+
+    name = common_name(process)
+    folder = keys / name if (keys / name).is_dir() else keys
+    for file in ("ca.pem", "cert.pem", "key.pem"):
+        if not os.access(folder / file, os.R_OK):
+            raise fail(
+                f"--keys {keys}: {folder / file} is not there or may not be read; "
+                f"make a mission's keys with `chaserdock keys init {keys}`, and give {name} its folder"
+            )
+    return Tls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")

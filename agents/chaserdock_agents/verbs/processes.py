@@ -15,6 +15,7 @@ from chaserdock_agents.scenarios import find_scenario
 from .options import (
     ConfigOpt,
     ConnectOpt,
+    KeysOpt,
     LeaseOpt,
     ListenOpt,
     Mode,
@@ -82,22 +83,27 @@ def world(
     listen: ListenOpt = None,
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
+    keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
+    rejoin: Annotated[
+        float, typer.Option("--rejoin-s", help="lock-step: seconds to wait when everybody is lost")
+    ] = 0.0,
     watch_parent: WatchOpt = False,
 ) -> None:
     """The simulated world: physics, cameras, time. Listens on tcp/127.0.0.1:7447 unless told otherwise."""
     from chaserdock_protocol.runtime import ProcessOptions
     from chaserdock_protocol.transport import DEFAULT_ENDPOINT
 
-    if listen is None and connect is None and net_mode == "peer":
+    if listen is None and connect is None and net_mode == "peer" and keys is None:
         listen = [DEFAULT_ENDPOINT]
     options = ProcessOptions(
-        link=link_of(namespace, connect or [], listen, net_mode, config, lease_ms),
+        link=link_of(namespace, connect or [], listen, net_mode, config, lease_ms, keys, "world"),
         scenario=_found(scenario),
         overrides=tuple(overrides or ()),
         seed=seed,
         mode=mode.value,
         recorder_expected=recorder,
+        rejoin_s=rejoin,
         watch_parent=watch_parent,
     )
     start_process("world", options)
@@ -110,6 +116,7 @@ def chaser(
     listen: ListenOpt = None,
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
+    keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
     patience: Annotated[
         float | None, typer.Option(help="seconds to wait for a world; for ever by default")
@@ -119,7 +126,7 @@ def chaser(
     """One chaser: sees the target, drives its actuators."""
     from chaserdock_protocol.runtime import ProcessOptions
 
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, f"chaser/{number}")
     start_process(
         "chaser", ProcessOptions(link=link, chaser=number, patience_s=patience, watch_parent=watch_parent)
     )
@@ -131,6 +138,7 @@ def controller(
     listen: ListenOpt = None,
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
+    keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
     patience: Annotated[
         float | None, typer.Option(help="seconds to wait for a world; for ever by default")
@@ -140,17 +148,19 @@ def controller(
     """The central controller: fuses what all chasers see, plans for all of them."""
     from chaserdock_protocol.runtime import ProcessOptions
 
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, "controller")
     start_process("controller", ProcessOptions(link=link, patience_s=patience, watch_parent=watch_parent))
 
 
 def record(
     out: OutOpt = None,
+    by_run: Annotated[bool, typer.Option(help="make a folder for this run in OUT")] = False,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
     net_mode: NetModeOpt = "peer",
     config: ConfigOpt = None,
+    keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
     patience: Annotated[
         float | None, typer.Option(help="seconds to wait for a world; for ever by default")
@@ -168,11 +178,14 @@ def record(
     """The recorder: every message into OUT/mission.mcap."""
     from chaserdock_protocol.runtime import ProcessOptions, Rotation
 
-    folder = out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms)
+    folder = (
+        (out or Path("runs")) if by_run else out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
+    )
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, "recorder")
     options = ProcessOptions(
         link=link,
         out=folder,
+        by_run=by_run,
         rotation=Rotation(None if rotate_size_mb is None else round(rotate_size_mb * 1e6), rotate_s),
         viewer_layer=viewer,
         patience_s=patience,

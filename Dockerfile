@@ -1,0 +1,37 @@
+# chaserdock in a container: one image for all processes of a mission. See compose.yaml and docs/deployment.md.
+FROM python:3.11-slim AS wheel
+COPY docker/build-requirements.txt /src/docker/
+RUN pip install --no-cache-dir --require-hashes -r /src/docker/build-requirements.txt
+COPY pyproject.toml README.md LICENSE /src/
+COPY scenarios /src/scenarios
+COPY protocol /src/protocol
+COPY world /src/world
+COPY agents /src/agents
+COPY controller /src/controller
+RUN pip wheel --no-deps --no-build-isolation --wheel-dir /wheels /src
+
+FROM python:3.11-slim
+ENV PYTHONUNBUFFERED=1 HOME=/tmp \
+    NUMBA_CACHE_DIR=/var/cache/chaserdock \
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+# What changes rarely comes first. Volumes take over the owner and mode of the folder that they are mounted on.
+RUN useradd --uid 10001 --no-create-home --home-dir /tmp chaserdock \
+    && mkdir -p /keys /runs /scenarios /var/cache/chaserdock \
+    && for name in router world controller recorder operator analysis \
+         $(seq -f chaser-%g 0 15); do mkdir /keys/$name; done \
+    && chmod -R 1777 /keys /var/cache/chaserdock
+COPY requirements.txt /opt/chaserdock/
+RUN pip install --no-cache-dir --require-hashes -r /opt/chaserdock/requirements.txt
+COPY --from=wheel /wheels /opt/chaserdock/wheels
+RUN pip install --no-cache-dir --no-index --no-deps /opt/chaserdock/wheels/*.whl
+COPY docker/as-owner /usr/local/bin/
+USER chaserdock
+# Compiles the solver for this kind of CPU (another kind compiles again, at its start), and shows that the image flies.
+RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
+      --set camera.width_px=640 --set camera.height_px=480 \
+      --set success.steady_position_rms_m=0.2 --set success.steady_orientation_rms_deg=10.0 \
+    && rm -rf /tmp/warm && chmod -R a+rwX /var/cache/chaserdock/*
+WORKDIR /tmp
+ENTRYPOINT ["python", "-m", "chaserdock_agents.member"]
+HEALTHCHECK --interval=10s --timeout=5s --start-period=20s --retries=3 \
+    CMD ["python", "-m", "chaserdock_agents.member", "--health"]

@@ -1,0 +1,91 @@
+"""Watches a mission that others fly (containers, hosts), waits for its log and judges it, as ``run`` does for its own."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.messages import MissionEnd
+from chaserdock_protocol.presence import join, new_instance
+from chaserdock_protocol.runtime import Stop
+from chaserdock_protocol.scenario import scenario_from_json
+from chaserdock_protocol.transport import Link, Node
+
+from .launcher import Fleet, judge
+from .progress import Progress
+from chaserdock_protocol.log_scan import LOG_NAME
+from .runs import run_name
+
+LOG_CLOSED_S = 60.0
+"""After the end the recorder has that long (wall time) to have everything and close its log."""
+_MCAP_END = b"\x89MCAP0\r\n"
+
+
+class JudgeError(ChaserdockError):
+    """There is nothing to judge."""
+
+
+def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s: float, quiet: bool) -> int:
+    """Watches the mission on ``link`` to its end and judges the log in ``out/SCENARIO-RUN``; the mission's status.
+
+    ``world_away_s``: a world that has been gone (wall time) for so long counts as lost. Raises JoinRefused when no
+    mission is there within ``patience_s``, JudgeError when it left no log.
+    """
+    node = Node("operator", "operator", link)
+    try:
+        stop = Stop(watch_parent=False)
+        mission = join(node, new_instance(), stop, patience_s)
+        if mission is None:
+            return 1
+        folder = out / run_name(mission)
+        scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
+        progress = Progress(scenario, mission.mode, quiet)
+        failure = _watch(node, progress, stop, world_away_s)
+        progress.close()
+        if stop():
+            return 1
+    finally:
+        node.close()
+    log = folder / LOG_NAME
+    if not log.exists():
+        raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
+    if not _wait_for_end(log):
+        failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
+    return judge(Fleet(), folder, failure)
+
+
+def _watch(node: Node, progress: Progress, stop: Stop, world_away_s: float) -> str | None:
+    """Shows the flight until it has ended; why it failed, or None."""
+    seen = {"world": time.monotonic()}
+
+    def changed(process: str, alive: bool) -> None:
+        if process == "world":
+            seen["world"] = float("inf") if alive else time.monotonic()
+
+    node.subscribe(topics.END)
+    progress.subscribe(node)
+    node.watch_liveliness(changed)
+    node.announce()
+    while not stop():
+        received = node.receive(0.1)
+        if received is not None:
+            progress.take(received.message)
+            if isinstance(received.message, MissionEnd):
+                return None if received.message.complete else received.message.reason
+        if time.monotonic() - seen["world"] > world_away_s:
+            return f"the world has been gone for {world_away_s:g} s"
+    return None
+
+
+def _wait_for_end(log: Path) -> bool:
+    """Waits until a log has its footer (a recorder's last act); False when it does not come."""
+    deadline = time.monotonic() + LOG_CLOSED_S
+    while time.monotonic() < deadline:
+        with log.open("rb") as file:
+            file.seek(max(0, log.stat().st_size - len(_MCAP_END)))
+            if log.stat().st_size > 2 * len(_MCAP_END) and file.read() == _MCAP_END:
+                return True
+        time.sleep(0.1)
+    return False

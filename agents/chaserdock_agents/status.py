@@ -1,0 +1,144 @@
+"""``chaserdock status``: who is there on a mission's network, at which tick, in which phase."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.messages import Event, MissionEnd, Presence, Reference, TargetEstimate, Tick
+from chaserdock_protocol.transport import Link, Node
+from rich.table import Table
+
+
+class StatusError(ChaserdockError):
+    """Nobody is there to tell about."""
+
+
+@dataclass
+class Status:
+    """What was heard while looking on; processes by name."""
+
+    alive: set[str] = field(default_factory=set)
+    presence: dict[str, Presence] = field(default_factory=dict)
+    ticks: list[Tick] = field(default_factory=list)
+    heard_s: list[float] = field(default_factory=list)
+    phases: dict[int, Reference] = field(default_factory=dict)
+    target: TargetEstimate | None = None
+    ended: MissionEnd | None = None
+    events: list[Event] = field(default_factory=list)
+
+    def take(self, message: object, now_s: float) -> None:
+        """Notes a message that came at ``now_s`` (monotonic)."""
+        match message:
+            case Presence():
+                self.presence[message.process] = message
+            case Tick():
+                self.ticks.append(message)
+                self.heard_s.append(now_s)
+            case Reference():
+                self.phases[message.chaser] = message
+            case TargetEstimate():
+                self.target = message
+            case MissionEnd():
+                self.ended = message
+            case Event():
+                self.events.append(message)
+
+    @property
+    def speed(self) -> float | None:
+        """Simulated over wall time, from the first tick heard to the last; None without two."""
+        if len(self.ticks) < 2 or self.heard_s[-1] <= self.heard_s[0]:
+            return None
+        simulated_s = (self.ticks[-1].sim_time_ns - self.ticks[0].sim_time_ns) / 1e9
+        return simulated_s / (self.heard_s[-1] - self.heard_s[0])
+
+    def as_dict(self) -> dict[str, object]:
+        """For programs; ``processes`` says of each whether it is expected to answer the tick that is open."""
+        tick = self.ticks[-1] if self.ticks else None
+        return {
+            "tick": tick.tick if tick else None,
+            "sim_time_s": tick.sim_time_ns / 1e9 if tick else None,
+            "speed": self.speed,
+            "ended": self.ended.reason if self.ended else None,
+            "target": self.target.status if self.target else None,
+            "processes": {
+                name: {
+                    "instance": self.presence[name].instance if name in self.presence else None,
+                    "heard": sorted(self.presence[name].heard) if name in self.presence else None,
+                    "expected": expected(name, tick),
+                }
+                for name in sorted(self.alive)
+            },
+            "phases": {str(i): r.phase for i, r in sorted(self.phases.items())},
+        }
+
+
+def expected(name: str, tick: Tick | None) -> bool | None:
+    """Whether the world expects this process' answer to a tick; None for those it never does, or when none flies."""
+    if tick is None:
+        return None
+    if name == "controller":
+        return tick.controller
+    head, _, number = name.partition("/")
+    return int(number) in tick.chasers if head == "chaser" else None
+
+
+def look_on(link: Link, seconds: float) -> Status:
+    """Looks on for so long (wall time), as an operator who is not seen. Raises StatusError when nobody is there."""
+    status = Status()
+    node = Node("operator", "operator", link)
+    try:
+
+        def changed(process: str, alive: bool) -> None:
+            (status.alive.add if alive else status.alive.discard)(process)
+
+        for topic in (
+            topics.TICK,
+            topics.REFERENCE,
+            topics.TARGET,
+            topics.END,
+            topics.PRESENCE,
+            topics.EVENT,
+        ):
+            node.subscribe(topic)
+        node.watch_liveliness(changed)
+        deadline = time.monotonic() + seconds
+        while time.monotonic() < deadline:
+            received = node.receive(0.05)
+            if received is not None:
+                status.take(received.message, time.monotonic())
+    finally:
+        node.close()
+    if not status.alive:
+        raise StatusError(
+            f"nobody is there within {seconds:g} s (namespace {link.namespace}, "
+            f"connect {', '.join(link.connect)}); is a mission running there?"
+        )
+    return status
+
+
+def table_of(status: Status) -> Table:
+    """The status as a person reads it."""
+    tick = status.ticks[-1] if status.ticks else None
+    speed = f", {status.speed:.2f} x real time" if status.speed is not None else ""
+    head = f"{tick.sim_time_ns / 1e9:.2f} s, tick {tick.tick}{speed}" if tick else "no tick is flown"
+    if status.target is not None:
+        head += f"; target: {status.target.status}"
+    if status.ended is not None:
+        head += f"; ended: {status.ended.reason}"
+    table = Table(title=head)
+    for column in ("process", "instance", "in the tick", "phase", "has heard"):
+        table.add_column(column)
+    for name in sorted(status.alive):
+        presence, takes_part = status.presence.get(name), expected(name, tick)
+        phase = status.phases.get(int(name.partition("/")[2])) if name.startswith("chaser/") else None
+        table.add_row(
+            name,
+            presence.instance if presence else "-",
+            {True: "yes", False: "no", None: "-"}[takes_part],
+            f"{phase.phase} for {phase.phase_time_s:.1f} s" if phase else "-",
+            ", ".join(sorted(presence.heard)) if presence else "-",
+        )
+    return table

@@ -1,0 +1,233 @@
+"""Faults on containers: ``python benchmarks/containers.py [--quick] [--json FILE] [--only FAULT]``.
+
+Builds the image, then flies a mission by compose.yaml once for each fault, with rights on, each in a project of its own,
+and tells how long (wall time) until every process was expected again in a tick, how much simulated time the world flew
+without one, and whether the mission was a success. The faults: ``crash`` of a chaser (its process killed, Docker starts it
+again), ``kill`` of a chaser (``docker kill``: Docker does not start that again, so ``docker start`` follows after 2 s),
+``pause`` of a chaser for 5 s, ``disconnect`` of a chaser from the network for 5 s, ``router`` restarted,
+``controller`` crashed. ``--quick``: 40 s of two chasers.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+import uuid
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from chaserdock_protocol.log import read_log
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
+LOOSE = "success.steady_position_rms_m=0.5 success.steady_orientation_rms_deg=20.0"
+FLYING_TICKS = 60
+_MISSION_S = 900.0
+
+
+def compose_command() -> list[str]:
+    """The Compose that is here: version 2 as Docker's plugin, or docker-compose. Raises SystemExit without any."""
+    for command in (["docker", "compose"], ["docker-compose"]):
+        try:
+            if subprocess.run([*command, "version"], capture_output=True, check=False).returncode == 0:
+                return command
+        except FileNotFoundError:
+            continue
+    raise SystemExit("neither `docker compose` nor `docker-compose` is here")
+
+
+class Project:
+    """A mission in containers, under a project name of its own."""
+
+    def __init__(self, scenario: str, overrides: str, folder: Path = ROOT) -> None:
+        self.name = f"chaserdock-{uuid.uuid4().hex[:8]}"
+        self.folder = folder
+        self._environment = {**os.environ, "SCENARIO": scenario, "SET": overrides}
+        self._command = [*compose_command(), "-p", self.name]
+        self._before = set(folder.glob("runs/*/mission.mcap"))
+
+    def compose(self, *arguments: str, timeout_s: float = _MISSION_S) -> subprocess.CompletedProcess[str]:
+        """Runs Compose in the project; what it said is in the result."""
+        return subprocess.run(
+            [*self._command, *arguments],
+            cwd=self.folder,
+            env=self._environment,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=timeout_s,
+        )
+
+    def container(self, service: str) -> str:
+        """The id of a service's container."""
+        found = self.compose("ps", "-q", service).stdout.split()
+        if not found:
+            raise SystemExit(f"{self.name}: no container of {service}")
+        return found[0]
+
+    def network(self) -> str:
+        return f"{self.name}_default"
+
+    def log(self, timeout_s: float = 300.0) -> Path:
+        """The mission's log, once it is there: that which holds this project's containers' run."""
+        deadline = time.monotonic() + timeout_s
+        while time.monotonic() < deadline:
+            new = set(self.folder.glob("runs/*/mission.mcap")) - self._before
+            if new:
+                return new.pop()
+            time.sleep(0.2)
+        raise SystemExit(f"{self.name}: no log after {timeout_s:g} s:\n{self.compose('logs').stdout[-3000:]}")
+
+    def wait_for_tick(self, log: Path, tick: int, timeout_s: float = 300.0) -> None:
+        """Waits until a tick has been recorded."""
+        deadline = time.monotonic() + timeout_s
+        while not any(r.message.tick >= tick for r in read_log(log, ["world/tick"])):
+            if time.monotonic() > deadline:
+                raise SystemExit(f"{self.name}: tick {tick} was not recorded within {timeout_s:g} s")
+            time.sleep(0.5)
+
+    def wait(self) -> int:
+        """Waits for the mission's end; its status."""
+        done = docker("wait", self.container("mission"), timeout_s=_MISSION_S)
+        return int(done.stdout.strip())
+
+    def down(self) -> None:
+        self.compose("down", "--volumes", "--timeout", "5")
+
+
+def docker(*arguments: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
+    """Runs docker; raises CalledProcessError when it fails."""
+    return subprocess.run(
+        ["docker", *arguments], capture_output=True, text=True, check=True, timeout=timeout_s
+    )
+
+
+def crash(container: str) -> None:
+    """kill -9 of the chaserdock process; the container's main process ends with it, and Docker starts it again."""
+    code = (
+        "import os,glob\n"
+        "for f in glob.glob('/proc/[0-9]*/cmdline'):\n"
+        "    words = open(f, 'rb').read().split(b'\\0')\n"
+        "    if b'chaserdock_agents' in words: os.kill(int(f.split('/')[2]), 9)\n"
+    )
+    docker("exec", container, "python", "-c", code)
+
+
+def fault_of(name: str) -> tuple[str, Callable[[Project, str], None]]:
+    """The service that a fault hits, and what it does to that container."""
+
+    def kill(project: Project, container: str) -> None:
+        docker("kill", container)
+        time.sleep(2.0)
+        docker("start", container)
+
+    def pause(project: Project, container: str) -> None:
+        docker("pause", container)
+        time.sleep(5.0)
+        docker("unpause", container)
+
+    def disconnect(project: Project, container: str) -> None:
+        docker("network", "disconnect", project.network(), container)
+        time.sleep(5.0)
+        docker("network", "connect", project.network(), container)
+
+    faults: dict[str, tuple[str, Callable[[Project, str], None]]] = {
+        "none": ("chaser-1", lambda project, container: None),
+        "crash": ("chaser-1", lambda project, container: crash(container)),
+        "kill": ("chaser-1", kill),
+        "pause": ("chaser-1", pause),
+        "disconnect": ("chaser-1", disconnect),
+        "router": ("router", lambda project, container: docker("restart", "-t", "2", container) and None),
+        "controller": ("controller", lambda project, container: crash(container)),
+    }
+    return faults[name]
+
+
+FAULTS = ("none", "crash", "kill", "pause", "disconnect", "router", "controller")
+
+
+def fly(fault: str, scenario: str, overrides: str) -> dict[str, float]:
+    """One flight with a fault in it: its figures."""
+    project = Project(scenario, overrides)
+    service, strike = fault_of(fault)
+    try:
+        begun_s = time.monotonic()
+        up = project.compose("up", "-d", "--no-build")
+        if up.returncode != 0:
+            raise SystemExit(f"docker compose up failed:\n{up.stdout}{up.stderr}")
+        log = project.log()
+        project.wait_for_tick(log, FLYING_TICKS)
+        struck_ns = time.time_ns()
+        strike(project, project.container(service))
+        status = project.wait()
+        took_s = time.monotonic() - begun_s
+        words = project.compose("logs", "--no-color").stdout
+    finally:
+        project.down()
+    if not log.exists():
+        raise SystemExit(f"{fault}: no log\n{words[-3000:]}")
+    print(f"-- {fault}: status {status}, {log.parent.name}", flush=True)
+    return figures(log, struck_ns, status, took_s)
+
+
+def figures(log: Path, struck_ns: int, status: int, took_s: float) -> dict[str, float]:
+    """From the ticks in a log: who was expected, when and for how long not."""
+    ticks = [(r.sent_ns, r.message) for r in read_log(log, ["world/tick"])]
+    everyone = max(len(t.chasers) for _, t in ticks)
+    after = [(ns, t) for ns, t in ticks if ns > struck_ns]
+    short = [(ns, t) for ns, t in after if len(t.chasers) < everyone or not t.controller]
+    gap_ns = [b[0] - a[0] for a, b in itertools.pairwise(ticks)]
+    rate_s = ticks[1][1].sim_time_ns / 1e9 if len(ticks) > 1 else 0.0
+    last_short = max((ns for ns, _ in short), default=None)
+    back = [ns for ns, _ in after if last_short is not None and ns > last_short]
+    whole = len(ticks[-1][1].chasers) == everyone and ticks[-1][1].controller
+    summary = json.loads((log.parent / "summary.json").read_text())
+    return {
+        "success": float(status == 0),
+        "all_back": float(whole),
+        "recovery_wall_s": (back[0] - struck_ns) / 1e9 if back else 0.0,
+        "incomplete_sim_s": len({t.tick for _, t in short}) * rate_s,
+        "longest_pause_wall_s": max(gap_ns) / 1e9,
+        "collisions": float(summary["collisions"]),
+        "mission_wall_s": took_s,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--only", choices=FAULTS, action="append")
+    options = parser.parse_args()
+    (ROOT / "runs").mkdir(exist_ok=True)
+    built = subprocess.run([*compose_command(), "build", "router"], cwd=ROOT, check=False)
+    if built.returncode != 0:
+        raise SystemExit("the image cannot be built")
+    scenario = "two-chaser-tracking" if options.quick else "four-chaser-docking"
+    overrides = f"duration_s=40.0 {SMALL} {LOOSE}" if options.quick else LOOSE
+    result: dict[str, Any] = {}
+    for fault in options.only or FAULTS:
+        for name, value in fly(fault, scenario, overrides).items():
+            result[f"{fault}_{name}"] = value
+            print(f"{fault}_{name:24} {value:.5g}", flush=True)
+    if options.json is not None:
+        commit = subprocess.run(
+            ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+        )
+        about = {
+            "command": " ".join(sys.argv),
+            "commit": commit.stdout.strip(),
+            "machine": f"{platform.machine()} {platform.platform()}",
+        }
+        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

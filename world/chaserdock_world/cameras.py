@@ -10,6 +10,7 @@ from chaserdock_protocol.targets import target_model
 from .effects import CameraEffects, Effects
 from .physics import TARGET, BodyState
 from .render import Obstacle, Renderer, chaser_boxes
+from .sky import Light
 
 
 class Cameras:
@@ -22,7 +23,7 @@ class Cameras:
         strengths = Effects(e.gain, e.point_spread_px, e.read_noise, e.shot_noise)
         self._effects = CameraEffects(self._camera.width_px, self._camera.height_px, strengths, scenario.seed)
         self._jpeg_quality = e.jpeg_quality
-        self._sun = scenario.camera.sun_direction
+        self._light = Light(scenario.camera.sun_direction)
         body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         # A chaser's own body lies behind its lens; its probe does not.
         self._own, self._others = (probe,), (body, probe)
@@ -40,7 +41,7 @@ class Cameras:
         position, attitude = self._camera.irf_pose_in_world(states[own].position_m, states[own].q_wxyz)
         target = states[TARGET]
         exact = self._renderer.render(
-            position, attitude, target.position_m, target.q_wxyz, obstacles, self._sun
+            position, attitude, target.position_m, target.q_wxyz, obstacles, self._light
         )
         taken = self._effects.apply(exact, chaser, number)
         if self._jpeg_quality:

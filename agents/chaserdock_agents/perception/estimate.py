@@ -71,15 +71,26 @@ class Perception:
             sighting = self._estimate_in(image, region)
             if sighting.solutions:
                 return sighting
-        return self._estimate_in(image, None)
+        sighting = self._estimate_in(image, None)
+        return sighting if sighting.solutions else self._estimate_in(image, None, thorough=True)
 
-    def _estimate_in(self, image: NDArray[np.uint8], region: detect.Region | None) -> Sighting:
-        found = detect.detect(image, self._dictionary, region)
+    def _estimate_in(
+        self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
+    ) -> Sighting:
+        found = detect.detect(image, self._dictionary, region, thorough)
         rows = np.array([self._rows.get(int(i), -1) for i in found.ids], dtype=np.intp)
         px = self.camera.undistort(found.corners_px[rows >= 0])
         rows = rows[rows >= 0]
         cells = self._dictionary.markerSize + 2
-        refined = corners.refine(image, self.camera, px, cells, self._table.margin_share[rows])
+        margin = self._table.margin_share[rows]
+        refined = corners.refine(image, self.camera, px, cells, margin)
+        if not refined.good.all():
+            # The detector may have taken the outer edge of the white border for the marker's.
+            lost = ~refined.good
+            inner = corners.inside_border(px[lost], margin[lost])
+            refined = refined.with_others(
+                lost, corners.refine(image, self.camera, inner, cells, margin[lost])
+            )
         rows, px = rows[refined.good], refined.corners_px[refined.good]
         sigma = refined.relative_sigma[refined.good]
         solutions, used = pnp.solve(self.camera, self._table, rows, px, sigma)

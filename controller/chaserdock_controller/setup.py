@@ -6,7 +6,6 @@ import math
 
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
-from chaserdock_protocol.targets import target_model
 
 from .fusion import make_estimator
 from .fusion.parameters import MekfParameters
@@ -42,7 +41,7 @@ def estimator_of(scenario: Scenario) -> Estimator:
     if scenario.estimator.name == "paper":
         return make_estimator("paper")
     target, e = scenario.target, scenario.estimator
-    size_m = target_model(target.model).size_m
+    size_m = scenario.target_model().size_m
     ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, size_m)
     return make_estimator(
         "mekf",

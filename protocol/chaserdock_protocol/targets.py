@@ -138,6 +138,11 @@ def _servicer() -> TargetModel:
 _MODELS: dict[str, Callable[[], TargetModel]] = {"paper": _paper, "servicer": _servicer}
 
 
+def target_names() -> tuple[str, ...]:
+    """The names of the targets that are known."""
+    return tuple(sorted(_MODELS))
+
+
 def target_model(name: str) -> TargetModel:
     """The target of that name. Raises ValueError, naming the known ones, for an unknown name."""
     if name not in _MODELS:

@@ -23,7 +23,6 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
-from chaserdock_protocol.targets import target_model
 from chaserdock_protocol.transport import Node
 
 from chaserdock_agents.perception import Perception
@@ -68,7 +67,7 @@ class Chaser:
         self._forgotten = self._refusing = False
         self._perception = Perception(
             self.scenario.camera_model(),
-            target_model(self.scenario.target.model),
+            self.scenario.target_model(),
             self.scenario.perception.name,
         )
 

@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from chaserdock_agents.perception import corners, detect, paper, pnp
 from chaserdock_agents.perception.pnp import PoseSolution
 
+_ENOUGH = 6
+"""So many markers make a pose to which further ones add little."""
+
 Method = Literal["default", "paper"]
 
 
@@ -48,6 +51,8 @@ class Perception:
         self.method: Method = method
         self._dictionary = detect.dictionary_of(model.dictionary)
         self._table = pnp.MarkerTable.of(model)
+        # Targets with many markers a face can spare the small ones that half a picture does not show.
+        self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
         self._rows = {int(i): row for row, i in enumerate(self._table.ids)}
 
     def estimate(
@@ -72,12 +77,15 @@ class Perception:
             if sighting.solutions:
                 return sighting
         sighting = self._estimate_in(image, None)
-        return sighting if sighting.solutions else self._estimate_in(image, None, thorough=True)
+        if sighting.solutions:
+            return sighting
+        again = self._estimate_in(image, None, thorough=True)
+        return again if again.solutions else sighting
 
     def _estimate_in(
         self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
     ) -> Sighting:
-        found = detect.detect(image, self._dictionary, region, thorough)
+        found = detect.detect(image, self._dictionary, region, thorough, self._enough)
         rows = np.array([self._rows.get(int(i), -1) for i in found.ids], dtype=np.intp)
         px = self.camera.undistort(found.corners_px[rows >= 0])
         rows = rows[rows >= 0]

@@ -8,6 +8,7 @@ from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.targets import target_model
 from chaserdock_world.effects import CameraEffects, Effects
 from chaserdock_world.render import Renderer
+from chaserdock_world.sky import Light
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -31,7 +32,8 @@ class Scene:
         self.perception = Perception(self.camera, self.model, method)
 
     def picture(self, position, q, number=0, light=(-0.3, -0.5, -0.8)):
-        return self.effects.apply(self.renderer.render(EYE, AHEAD, position, q, (), light), 0, number)
+        exact = self.renderer.render(EYE, AHEAD, position, q, (), Light(tuple(light)))
+        return self.effects.apply(exact, 0, number)
 
     def random_views(self, count, near_m, far_m, seed):
         generator = np.random.default_rng(seed)

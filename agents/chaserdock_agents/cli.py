@@ -11,8 +11,8 @@ import sys
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 
-from .verbs.campaign import campaign
 from .verbs import logs
+from .verbs.campaign import campaign
 from .verbs.flights import snapshot, summary
 from .verbs.network import judge, keys, router, status
 from .verbs.operate import command

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.log_scan import LOG_NAME
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.presence import join, new_instance
 from chaserdock_protocol.runtime import Stop
@@ -15,7 +16,6 @@ from chaserdock_protocol.transport import Link, Node
 
 from .launcher import Fleet, judge
 from .progress import Progress
-from chaserdock_protocol.log_scan import LOG_NAME
 from .runs import run_name
 
 LOG_CLOSED_S = 60.0

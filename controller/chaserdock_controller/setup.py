@@ -7,7 +7,6 @@ import math
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import ESTIMATORS, Scenario
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
-from chaserdock_protocol.targets import target_model
 
 from .fusion import make_estimator
 from .fusion.parameters import MekfParameters
@@ -46,7 +45,7 @@ def estimator_of(scenario: Scenario) -> Estimator:
     if scenario.estimator.name != "mekf":
         return plugins.load("estimator", scenario.estimator.name, ESTIMATORS)(scenario)
     target, e = scenario.target, scenario.estimator
-    size_m = target_model(target.model).size_m
+    size_m = scenario.target_model().size_m
     ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, size_m)
     return make_estimator(
         "mekf",

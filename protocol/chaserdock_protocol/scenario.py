@@ -6,7 +6,6 @@ Names are snake_case with their unit at the end; frames as everywhere: WRF world
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +18,10 @@ from .clock import Timing
 from .scenario_bodies import Body, Target
 from .scenario_camera import CameraSection
 from .scenario_fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
+from .scenario_files import read_toml, resolve_files
+from .scenario_odometry import OdometrySection
 from .scenario_text import ScenarioError, explain, override
+from .targets import TargetModel
 
 
 class Time(Section):
@@ -186,6 +188,7 @@ class Scenario(Section):
     target: Target = Target()
     chaser: Body = Body()
     camera: CameraSection = CameraSection()
+    odometry: OdometrySection = OdometrySection()
     perception: PerceptionSection = PerceptionSection()
     estimator: EstimatorSection = EstimatorSection()
     controller: Controller = Controller()
@@ -198,6 +201,12 @@ class Scenario(Section):
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
         _check_apart(self)
+        if (
+            self.target.geometry is not None
+            and self.target.geometry.mesh
+            and self.camera.renderer != "pybullet"
+        ):
+            raise ValueError('target.geometry.mesh: is drawn by camera.renderer = "pybullet" alone')
         named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
         last = len(self.chasers) - 1
         for where, chasers in (*named, ("success.docked", self.success.docked)):
@@ -215,9 +224,12 @@ class Scenario(Section):
         )
 
     def camera_model(self) -> Camera:
-        """The chasers' camera, as perception, rendering and fusion use it."""
-        c = self.camera
-        return Camera.from_hfov(c.width_px, c.height_px, math.radians(c.hfov_deg), c.position_m)
+        """The chasers' camera, as perception and fusion know it."""
+        return self.camera.model()
+
+    def target_model(self) -> TargetModel:
+        """Geometry and markers of the target."""
+        return self.target.shape()
 
     @property
     def ticks(self) -> int:
@@ -278,18 +290,14 @@ def _require_parts(scenario: Scenario, source: str) -> None:
 def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
     """Scenario file with ``key.path=value`` overrides (values in TOML's notation); raises ScenarioError.
 
-    The parts that it names have to be installed here. A scenario from the world or a log may name what is not.
+    Files it names lie relative to it; those that an override names, to the working directory. The parts that it names
+    have to be installed here; a scenario from the world or a log may name what is not.
     """
-    try:
-        values = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{path}: not UTF-8 text: {error}") from None
-    except tomllib.TOMLDecodeError as error:
-        raise ScenarioError(f"{path}: not TOML: {error}") from None
+    values = read_toml(path)
+    resolve_files(values, path.parent)
     for text in overrides:
         override(values, text, lambda: parse_scenario(values, str(path)).model_dump(mode="json"))
+    resolve_files(values, Path())
     scenario = parse_scenario(values, str(path))
     _require_parts(scenario, str(path))
     return scenario

@@ -7,17 +7,21 @@ from typing import Literal
 from pydantic import model_validator
 
 from .scenario_fields import Name, Positive, PositiveVector, Section, UnitQuaternion, Vector
-from .targets import target_model
+from .scenario_target import Geometry
+from .targets import TargetModel, target_model, target_names
 
 
 class Target(Section):
     """The target's model (geometry and markers), initial state, and how it moves.
+
+    ``model`` is a known name or, in a file, the path of a target file; with ``geometry`` it is just a name.
 
     ``constant_rates`` and ``static`` prescribe the motion, as the paper does; ``torque_free`` is a rigid
     body's (then ``inertia_kg_m2``, principal, and ``mass_kg`` count).
     """
 
     model: Name = "paper"
+    geometry: Geometry | None = None
     motion: Literal["constant_rates", "static", "torque_free"] = "constant_rates"
     position_m: Vector = (0.0, 0.0, 0.0)
     q_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
@@ -28,10 +32,17 @@ class Target(Section):
 
     @model_validator(mode="after")
     def _known(self) -> Target:
-        target_model(self.model)
+        if self.geometry is None:
+            target_model(self.model)
+        elif self.model in target_names():
+            raise ValueError(f"model: {self.model!r} is a known target; give this geometry a name of its own")
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
         return self
+
+    def shape(self) -> TargetModel:
+        """Geometry and markers."""
+        return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
 
 
 def _check_inertia(i: tuple[float, float, float]) -> None:

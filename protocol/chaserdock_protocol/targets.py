@@ -65,6 +65,8 @@ class TargetModel:
     """A target: ``boxes`` in TRF, ``markers`` of the OpenCV ``dictionary``, overall ``size_m``.
 
     ``white_margin_m``: width of the white border printed round every marker, under its neighbours.
+    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws in the place of the boxes, times
+    ``mesh_scale``; empty for none. What is collided with are the boxes.
     """
 
     name: str
@@ -73,6 +75,8 @@ class TargetModel:
     dictionary: str
     size_m: Vector3
     white_margin_m: float
+    mesh: str = ""
+    mesh_scale: float = 1.0
 
     def marker(self, marker_id: int) -> Marker | None:
         """The marker of that id, or None when this target has none."""
@@ -132,6 +136,11 @@ def _servicer() -> TargetModel:
 
 
 _MODELS: dict[str, Callable[[], TargetModel]] = {"paper": _paper, "servicer": _servicer}
+
+
+def target_names() -> tuple[str, ...]:
+    """The names of the targets that are known."""
+    return tuple(sorted(_MODELS))
 
 
 def target_model(name: str) -> TargetModel:

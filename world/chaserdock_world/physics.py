@@ -14,7 +14,7 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
-from chaserdock_protocol.targets import TargetModel, target_model
+from chaserdock_protocol.targets import TargetModel
 from pybullet_utils.bullet_client import BulletClient
 
 from .gyroscopic import midpoint_torque
@@ -77,14 +77,14 @@ class Physics:
         self._bullet.resetBaseVelocity(body, state.velocity_m_s.tolist(), omega_world.tolist())
 
     def _add_target(self, scenario: Scenario) -> int:
-        target, model = scenario.target, target_model(scenario.target.model)
+        target, model = scenario.target, scenario.target_model()
         mass = 0.0 if self._prescribed else target.mass_kg
         inertia = self._target_inertia(scenario)
         return self._add(self._box_shape(model), mass, inertia, prescribed_state(scenario, 0.0))
 
     @staticmethod
     def _target_inertia(scenario: Scenario) -> tuple[float, float, float]:
-        target, model = scenario.target, target_model(scenario.target.model)
+        target, model = scenario.target, scenario.target_model()
         return target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, model.size_m)
 
     def _box_shape(self, model: TargetModel) -> int:

@@ -22,6 +22,7 @@ from chaserdock_protocol.transport import Node, TransportError
 from .actuators import IdealActuators, fly_to
 from .answers import Answers
 from .cameras import Cameras
+from .imperfect import Navigation
 from .membership import Membership
 from .physics import Physics
 from .publish import publish_odometry, publish_truth
@@ -128,6 +129,7 @@ def pass_realtime(
 def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> int:
     """Gathers the processes, flies all ticks, ends the mission; the process' status."""
     cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
+    navigation = Navigation(scenario)
     actuators = {f"chaser/{i}": IdealActuators(scenario.chaser) for i in range(len(scenario.chasers))}
     answers = gather(scenario, options, node, actuators, physics)
     say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
@@ -145,7 +147,7 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     while started:
         states = {name: physics.state(name) for name in physics.bodies}
         publish_truth(node, states, tick, timing, actuators, contacts)
-        publish_odometry(node, states, tick, timing)
+        publish_odometry(node, states, tick, timing, navigation)
         if tick == scenario.ticks:
             break
         pictures = timing.has_pictures(tick)

@@ -11,17 +11,21 @@ from chaserdock_protocol.messages import BodyTruth, Odometry, WorldTruth
 from chaserdock_protocol.transport import Node
 
 from .actuators import IdealActuators
+from .imperfect import Navigation
 from .physics import BodyState
 
 
-def publish_odometry(node: Node, states: dict[str, BodyState], tick: int, timing: Timing) -> None:
-    """Every chaser's own state, as its navigation knows it (assumed known, as in the paper)."""
+def publish_odometry(
+    node: Node, states: dict[str, BodyState], tick: int, timing: Timing, navigation: Navigation
+) -> None:
+    """Every chaser's own state, as its navigation knows it."""
     for name, state in states.items():
         if not name.startswith("chaser/"):
             continue
         chaser = int(name.partition("/")[2])
+        known = navigation.sensed(chaser, tick, state)
         message = Odometry(
-            tick=tick, sim_time_ns=timing.tick_time_ns(tick), chaser=chaser, **_state_fields(state)
+            tick=tick, sim_time_ns=timing.tick_time_ns(tick), chaser=chaser, **_state_fields(known)
         )
         node.publish(topics.ODOMETRY, message, chaser)
 

@@ -19,21 +19,18 @@ from chaserdock_protocol.targets import Box, TargetModel, face_rotation
 from numpy.typing import ArrayLike, NDArray
 
 from chaserdock_world import textures
+from chaserdock_world.lens import Lens
 from chaserdock_world.occlusion import PlacedBox, paint_order
+from chaserdock_world.sky import Earth, Light, Sky
 
 NEAR_M = 0.01
 """Nothing nearer to the camera's plane than this is drawn."""
 
-AMBIENT = 0.35
-"""Share of the light that comes from everywhere; the rest is the sun's, by Lambert's cosine law."""
-
-SPACE_LEVEL = 4
-_STARS = 400
-# Grey level of reflectance 1 in full sun: below 255, so that noise does not clip on white.
-_WHITE_LEVEL = 235.0
 # Samples a pixel along each axis: the most that keep the samples of the painted patch below the limit.
 # (Textures are area averages, so even one sample a pixel puts corners to within 0.03 px.)
 _SAMPLES = ((4, 500_000), (2, 1_000_000))
+
+DAYLIGHT = Light()
 
 Obstacle = tuple[Sequence[Box], ArrayLike, ArrayLike]
 """Boxes in the axes of a body, its position (3,) in WRF and its attitude (4,), body -> WRF."""
@@ -79,7 +76,7 @@ class Renderer:
     the camera's distortion cannot be inverted everywhere in the picture.
     """
 
-    def __init__(self, camera: Camera, model: TargetModel):
+    def __init__(self, camera: Camera, model: TargetModel, earth: Earth | None = None):
         self.camera = camera
         self.model = model
         # By box, face and the halvings of its resolution across and up; coarser ones are made when needed.
@@ -88,12 +85,10 @@ class Renderer:
             for index in range(len(model.boxes))
             for face in range(6)
         }
-        self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
         # The canvas is the ideal picture; with lens distortion it reaches beyond the frame.
-        self._origin = np.zeros(2)
-        self._size = (camera.width_px, camera.height_px)
-        if camera.distortion:
-            self._prepare_distortion()
+        self._lens = Lens(camera)
+        self._origin, self._size = self._lens.origin_px, self._lens.size_px
+        self._sky = Sky(camera, self._origin, self._size, earth)
         # Planes n x + d >= 0 (n_x, n_y, n_z, d) within which a point is in front and on the canvas, with a
         # pixel to spare; and, of the canvas' borders, unit normals into it.
         left, top = (self._origin - 1.0 - (camera.cx_px, camera.cy_px)).tolist()
@@ -109,10 +104,6 @@ class Renderer:
         )
         borders = self._planes[1:, :3] - [0.0, 0.0, 0.5]
         self._borders = (borders / np.linalg.norm(borders, axis=1, keepdims=True)).tolist()
-        generator = np.random.Generator(np.random.PCG64(20230619))
-        stars = generator.standard_normal((_STARS, 3))
-        self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)
-        self._star_levels = (30.0 + 150.0 * generator.random(_STARS) ** 3).astype(np.uint8)
 
     def render(
         self,
@@ -121,21 +112,16 @@ class Renderer:
         target_p_w_m: ArrayLike,
         target_q_w_trf_wxyz: ArrayLike,
         obstacles: Sequence[Obstacle] = (),
-        light_direction_w: ArrayLike = (-0.4, -0.5, 0.77),
+        light: Light = DAYLIGHT,
     ) -> NDArray[np.uint8]:
         """Picture (h, w), uint8, of the target and the ``obstacles``, lens distortion included.
 
         ``camera_position_w_m`` (3,), ``camera_q_w_irf_wxyz`` (4,): see `Camera.irf_pose_in_world`.
-        ``light_direction_w`` (3,), any length: from the scene to the sun. No shadows are cast.
-        Raises ValueError for a zero light direction.
+        ``light``: a face turned from the sun lies in its own (attached) shadow; no shadows are cast.
         """
         q_w_irf = np.asarray(camera_q_w_irf_wxyz, dtype=float)
         position = np.asarray(camera_position_w_m, dtype=float)
-        light = np.asarray(light_direction_w, dtype=float)
-        length = float(np.linalg.norm(light))
-        if not (np.isfinite(length) and length > 0.0):
-            raise ValueError("the light needs a direction other than zero")
-        to_sun = rotations.rotate_inverse(q_w_irf, light / length)
+        to_sun = rotations.rotate_inverse(q_w_irf, light.direction_w)
 
         placed: list[PlacedBox] = []
         faces: list[list[_Face]] = []
@@ -150,57 +136,18 @@ class Renderer:
                 if not self._may_be_seen(centre.tolist(), shape.radius):
                     continue
                 r_box = r_body @ shape.rotation
-                seen = self._visible_faces(box, index, body == 0, centre, r_box, to_sun)
+                seen = self._visible_faces(box, index, body == 0, centre, r_box, to_sun, light)
                 if seen:
                     outline = np.concatenate([face.outline_px for face in seen])
                     low, high = outline.min(axis=0), outline.max(axis=0)
                     placed.append(PlacedBox(centre, r_box, shape.half, low, high))
                     faces.append(seen)
 
-        canvas = self._background(q_w_irf)
+        canvas = self._sky.background(q_w_irf, light)
         if faces:
             ordered = [face for i in paint_order(placed) for face in faces[i]]
             self._paint(canvas, ordered)
-        if self._maps is None:
-            return canvas
-        return np.asarray(cv2.remap(canvas, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)
-
-    def _prepare_distortion(self) -> None:
-        width, height = self._size
-        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-        # As Camera.undistort, which is slow for a million points.
-        matrix = self.camera.matrix()
-        criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-        found = cv2.undistortPoints(
-            grid.reshape(-1, 1, 2),
-            matrix,
-            np.array(self.camera.distortion),
-            None,
-            None,
-            matrix,
-            criteria=criteria,
-        )
-        ideal = np.asarray(found, dtype=float).reshape(grid.shape)
-        if not np.all(np.abs(self.camera.distort(ideal) - grid) < 1e-3):
-            raise ValueError("the lens distortion cannot be inverted everywhere in the picture")
-        low = np.floor(ideal.min(axis=(0, 1))) - 1.0
-        high = np.ceil(ideal.max(axis=(0, 1))) + 2.0
-        if np.any(high - low > 4.0 * np.array(self._size)):
-            raise ValueError("the lens distortion is too strong to be rendered")
-        self._origin = low
-        self._size = (int(high[0] - low[0]), int(high[1] - low[1]))
-        maps = (ideal - low).astype(np.float32)
-        self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
-
-    def _background(self, q_w_irf: Array) -> NDArray[np.uint8]:
-        width, height = self._size
-        canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
-        directions = self._stars @ rotations.to_matrix(q_w_irf)
-        front = directions[:, 2] > 0.1
-        px = np.rint(self.camera.project_ideal(directions[front]) - self._origin).astype(int)
-        inside = (px[:, 0] >= 0) & (px[:, 0] < width) & (px[:, 1] >= 0) & (px[:, 1] < height)
-        canvas[px[inside, 1], px[inside, 0]] = self._star_levels[front][inside]
-        return canvas
+        return self._lens.distorted(canvas)
 
     def _may_be_seen(self, centre: list[float], radius: float) -> bool:
         """False when a sphere lies behind the near plane or beside the field of view."""
@@ -210,7 +157,7 @@ class Renderer:
         return all(a * x + b * y + c * z >= -radius for a, b, c in self._borders)
 
     def _visible_faces(
-        self, box: Box, index: int, is_target: bool, centre: Array, r_box: Array, to_sun: Array
+        self, box: Box, index: int, is_target: bool, centre: Array, r_box: Array, to_sun: Array, light: Light
     ) -> list[_Face]:
         shape = _shape(box)
         axes = (r_box @ _FACE_AXES).swapaxes(1, 2)  # rows: right, up, normal
@@ -235,7 +182,7 @@ class Renderer:
                     continue
                 px = self.camera.project_ideal(polygon) - self._origin
             width, height, _ = _face_extent(box.size_m, face)
-            level = _WHITE_LEVEL * (AMBIENT + (1.0 - AMBIENT) * max(0.0, cosines[k]))
+            level = light.level(cosines[k], -middles[k], axes[k, 2])
             textured = is_target and self._texture(index, face, 0, 0) is not None
             found.append(
                 _Face(
@@ -293,7 +240,7 @@ class Renderer:
             if face.textured:
                 self._paint_texture(patch, face, to_patch, outline)
             else:
-                value = round(face.level * face.box.shade)
+                value = min(255, round(face.level * face.box.shade))
                 fixed = np.rint(outline * 16.0).astype(np.int32)
                 cv2.fillConvexPoly(patch, fixed, value, cv2.LINE_8, 4)
         cv2.resize(patch, (x1 - x0, y1 - y0), dst=view, interpolation=cv2.INTER_AREA)

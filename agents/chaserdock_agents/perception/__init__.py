@@ -7,7 +7,6 @@ from typing import Protocol
 import numpy as np
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import PERCEPTIONS, Scenario
-from chaserdock_protocol.targets import target_model
 from numpy.typing import ArrayLike, NDArray
 
 from chaserdock_agents.perception.estimate import Method, Perception, PoseSolution, Sighting
@@ -24,7 +23,7 @@ class Sees(Protocol):
 def make_perception(scenario: Scenario) -> Sees:
     """The perception that the scenario names: one of ours, or an installed ``chaserdock.perceptions`` entry point, a
     function of (camera: Camera, target: TargetModel). Raises PluginError when there is no such thing here."""
-    camera, target = scenario.camera_model(), target_model(scenario.target.model)
+    camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
         case "default" | "paper" as method:
             return Perception(camera, target, method)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.rotations import Array
@@ -62,6 +63,7 @@ _STRIP_RIDGE = 1e-6 * np.eye(5)
 # sqrt(1 + (this / width)^2), from the errors found in rendered pictures.
 _UNCERTAIN_PX = 2.0
 
+_SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 _NEXT, _BEFORE = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 
 
@@ -74,6 +76,24 @@ class Refined:
     corners_px: Array
     good: NDArray[np.bool_]
     relative_sigma: Array
+
+    def with_others(self, which: NDArray[np.bool_], others: Refined) -> Refined:
+        """These, with ``others`` in the place of the markers ``which`` (n,)."""
+        corners, good, sigma = self.corners_px.copy(), self.good.copy(), self.relative_sigma.copy()
+        corners[which], good[which], sigma[which] = others.corners_px, others.good, others.relative_sigma
+        return Refined(corners, good, sigma)
+
+
+def inside_border(corners_px: Array, margin_share: Array) -> Array:
+    """Corners (n, 4, 2) of the black squares, where ``corners_px`` are the outer ones of their white borders,
+    ``margin_share`` (n,) of the squares' sides wide."""
+    inner = [
+        cv2.perspectiveTransform(
+            _SQUARE[None] / (1.0 + 2.0 * share), cv2.getPerspectiveTransform(_SQUARE, quad.astype(np.float32))
+        )[0]
+        for quad, share in zip(corners_px, margin_share.tolist(), strict=True)
+    ]
+    return np.array(inner, dtype=float).reshape(-1, 4, 2)
 
 
 @dataclass(frozen=True)

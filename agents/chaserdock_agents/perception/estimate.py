@@ -14,6 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 from chaserdock_agents.perception import corners, detect, paper, pnp
 from chaserdock_agents.perception.pnp import PoseSolution
 
+_ENOUGH = 6
+"""So many markers make a pose to which further ones add little."""
+
 Method = Literal["default", "paper"]
 
 
@@ -48,6 +51,8 @@ class Perception:
         self.method: Method = method
         self._dictionary = detect.dictionary_of(model.dictionary)
         self._table = pnp.MarkerTable.of(model)
+        # Targets with many markers a face can spare the small ones that half a picture does not show.
+        self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
         self._rows = {int(i): row for row, i in enumerate(self._table.ids)}
 
     def estimate(
@@ -71,15 +76,29 @@ class Perception:
             sighting = self._estimate_in(image, region)
             if sighting.solutions:
                 return sighting
-        return self._estimate_in(image, None)
+        sighting = self._estimate_in(image, None)
+        if sighting.solutions:
+            return sighting
+        again = self._estimate_in(image, None, thorough=True)
+        return again if again.solutions else sighting
 
-    def _estimate_in(self, image: NDArray[np.uint8], region: detect.Region | None) -> Sighting:
-        found = detect.detect(image, self._dictionary, region)
+    def _estimate_in(
+        self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
+    ) -> Sighting:
+        found = detect.detect(image, self._dictionary, region, thorough, self._enough)
         rows = np.array([self._rows.get(int(i), -1) for i in found.ids], dtype=np.intp)
         px = self.camera.undistort(found.corners_px[rows >= 0])
         rows = rows[rows >= 0]
         cells = self._dictionary.markerSize + 2
-        refined = corners.refine(image, self.camera, px, cells, self._table.margin_share[rows])
+        margin = self._table.margin_share[rows]
+        refined = corners.refine(image, self.camera, px, cells, margin)
+        if not refined.good.all():
+            # The detector may have taken the outer edge of the white border for the marker's.
+            lost = ~refined.good
+            inner = corners.inside_border(px[lost], margin[lost])
+            refined = refined.with_others(
+                lost, corners.refine(image, self.camera, inner, cells, margin[lost])
+            )
         rows, px = rows[refined.good], refined.corners_px[refined.good]
         sigma = refined.relative_sigma[refined.good]
         solutions, used = pnp.solve(self.camera, self._table, rows, px, sigma)

@@ -37,7 +37,7 @@ _CANDIDATE_MARKERS = 6
 # Of a plane's two coarse poses, one this much nearer to the refined pose than the other is that very pose.
 _SAME_POSE_SHARE = 0.25
 # A lone marker is a false id when this many others ought to be as plain to see and none is.
-_MAX_MISSING = 3
+_MAX_MISSING = 2
 _FRAME_MARGIN_PX = 8.0
 
 

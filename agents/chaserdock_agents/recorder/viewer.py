@@ -28,7 +28,6 @@ from chaserdock_protocol.messages import (
     Vector3,
 )
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.targets import target_model
 
 Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
 """``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
@@ -88,7 +87,7 @@ class ViewerLayer:
     def _begin(self, time_ns: int) -> None:
         """What never changes: cameras on the chasers, and the bodies' shapes."""
         stamp = _time(time_ns)
-        shapes = [("target", target_model(self._scenario.target.model).size_m, _TARGET_COLOUR)]
+        shapes = [("target", self._scenario.target_model().size_m, _TARGET_COLOUR)]
         for i in range(len(self._scenario.chasers)):
             self._put("tf", _frame(stamp, f"chaser/{i}", f"chaser/{i}/camera", *self._camera_pose), time_ns)
             shapes.append((f"chaser/{i}", self._scenario.chaser.size_m, _CHASER_COLOUR))

@@ -9,7 +9,7 @@ import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.targets import Box, Marker, TargetModel, face_extent, face_rotation, target_model
+from chaserdock_protocol.targets import Box, Marker, TargetModel, face_extent, face_rotation
 
 Grey = int
 """0 black to 255 white, in full light."""
@@ -94,7 +94,7 @@ def _probe(front_m: float, reach_m: float) -> list[Face]:
 
 def scene_of(scenario: Scenario, view_m: float = 0.22) -> Scene:
     """What a scenario's bodies look like; ``view_m``: how far the outline of a camera's view is drawn."""
-    model = target_model(scenario.target.model)
+    model = scenario.target_model()
     body = scenario.chaser
     front = body.size_m[0] / 2.0
     chaser = box_faces(Box(body.size_m, shade=0.42))

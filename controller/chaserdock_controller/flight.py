@@ -26,7 +26,7 @@ from chaserdock_protocol.scenario import Scenario
 
 from . import reference
 from .fusion import geometry
-from .fusion.types import Measurement
+from .fusion.types import Estimator, Measurement
 from .fusion.types import TargetEstimate as Fused
 from .guidance import Guidance
 from .nmpc import NmpcInput, NmpcPlan, make_solver
@@ -74,14 +74,19 @@ class Outputs:
 
 
 class Flight:
-    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver."""
+    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver.
 
-    def __init__(self, scenario: Scenario, now_s: Callable[[], float]) -> None:
+    ``estimator`` takes the place of the one that the scenario names.
+    """
+
+    def __init__(
+        self, scenario: Scenario, now_s: Callable[[], float], estimator: Estimator | None = None
+    ) -> None:
         self.scenario = scenario
         self.guidance = Guidance(scenario)
         self._now_s = now_s
         self._camera = scenario.camera_model()
-        self._estimator = estimator_of(scenario)
+        self._estimator = estimator or estimator_of(scenario)
         self._parameters = nmpc_parameters(scenario)
         self._solver = make_solver(scenario.controller.solver, self._parameters, len(scenario.chasers))
         self._odometry: dict[tuple[int, int], Odometry] = {}

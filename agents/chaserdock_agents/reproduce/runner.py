@@ -119,8 +119,14 @@ class Runner:
                 raise
         if faults:
             raise ReproduceError("\n".join(faults))
+        return self.results(plan)
+
+    def results(self, plan: Plan) -> Results:
+        """What of ``plan`` is finished, in the plan's order."""
         summaries = {m.name: s for m in plan.missions if (s := self.finished(m)) is not None}
-        return Results(summaries, self._studies())
+        found = self._studies()
+        cases = [c for c in plan.studies if c.name in found and found[c.name].case == c]
+        return Results(summaries, {c.name: found[c.name] for c in cases})
 
     def finished(self, mission: Mission) -> dict[str, Any] | None:
         """The summary of a mission that this code has flown here, or None."""

@@ -112,6 +112,14 @@ _INGREDIENTS: dict[str, tuple[str, ...]] = {
         "controller.weight_final_position=812.5",
         "controller.weight_final_orientation=437.5",
     ),
+    "dt = 1/30 s": ("controller.dt_s=0.0333333333333333",),
+    "dt = 1/30 s, stage weights by 3": (
+        "controller.dt_s=0.0333333333333333",
+        *(
+            f"controller.weight_{name}={weight / 3}"
+            for name, weight in (("position", 65), ("orientation", 35), ("force", 3.5), ("torque", 40))
+        ),
+    ),
     "solved to convergence (ipopt)": ("controller.solver='ipopt'",),
 }
 

@@ -8,6 +8,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 from chaserdock_agents.reproduce.content import sections
 from chaserdock_agents.reproduce.main import fly_plan
@@ -235,7 +236,7 @@ def test_failed_solve_is_a_failed_run() -> None:
     case = StudyCase(name="x", scenario=PATH)
     good = study_result(case, 1.0, 1.0)
     assert errors_of_study(good).failed == 0
-    bad = StudyResult(**{f: getattr(good, f) for f in good.__struct_fields__} | {"failed_solves": 3})
+    bad = msgspec.structs.replace(good, failed_solves=3)
     assert errors_of_study(bad).failed == 1
 
 

@@ -149,9 +149,15 @@ def studies(scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
     length = f"duration_s={duration_s}"
     out: list[StudyCase] = []
 
-    def add(name: str, *overrides: str, floor: bool = False, **delay: float) -> None:
+    def add(name: str, *overrides: str, floor: bool = False, delay_s: float | None = None) -> None:
         out.append(
-            StudyCase(name=name, scenario=scenario, overrides=(*overrides, length), floor=floor, **delay)
+            StudyCase(
+                name=name,
+                scenario=scenario,
+                overrides=(*overrides, length),
+                floor=floor,
+                delay_s=delay_s,
+            )
         )
 
     for start, turned in STARTS.items():

@@ -204,7 +204,7 @@ def test_other_rows_may_be_better_but_not_35_percent_worse() -> None:
         held = requirements(p, complete(p, factor), "receding")
         assert held is not None
         # 1.42 e-2 is the least that the paper has: 1.64 of it is a ratio of 1.155
-        assert next(r.met for r in held if r.what.startswith("dt=1-30: position")) is met
+        assert next(r.met for r in held if r.what.startswith("dt=1/30: position")) is met
 
 
 def test_default_is_held_to_the_floor() -> None:
@@ -230,6 +230,11 @@ def test_steady_state_is_held() -> None:
     for m in p.missions:
         results.missions[m.name]["chasers"]["0"]["steady"]["position_mse_m2"] = 1e-5
     assert [r.met for r in steady_requirements(p, results)] == [True, False]
+
+
+def test_rows_are_called_as_in_the_paper() -> None:
+    assert [row.label for row in ROWS][3:6] == ["dt=1/5", "dt=1/30", "alpha=10 %"]
+    assert ROWS[-1].label == "dt=1/30, alpha=30 %"
 
 
 def test_failed_solve_is_a_failed_run() -> None:
@@ -287,8 +292,8 @@ def test_the_whole_page_of_a_complete_plan() -> None:
     text = markdown("t", parts)
     assert "NOT COMPLETE" not in text
     for row in ROWS:
-        assert f"| {row.name} | {row.position_mse_m2 * 1e2:.4g} | 1.64 | 1.64 |" in text
-    assert "| baseline: position MSE within 15 % | 1.00 of the paper's | yes |" in text
+        assert f"| {row.label} | {row.position_mse_m2 * 1e2:.4g} | 1.64 | 1.64 |" in text
+    assert "| baseline: position MSE within 15 % | 1.000 of the paper's, with pictures | yes |" in text
     checker = _Checker()
     checker.feed(html("t", parts))
     assert checker.open == []
@@ -314,6 +319,7 @@ def test_cut_off_result_counts_as_not_flown(tmp_path: Path) -> None:
     lines = [line_of(study_result(c, 1.0, 1.0)) for c in cases]
     place.write_text(lines[0] + lines[1][:40])
     p = Plan(True, 40.0, (), cases)
+    assert list(runner.results(p).studies) == ["a"]
     assert [c.name for c in runner._open_cases(p)] == ["b", "c"]
     # The same name with other overrides is another case.
     changed = replace(p, studies=(StudyCase(name="a", scenario=PATH, delay_s=0.1),))

@@ -91,7 +91,7 @@ def _start(plan: Plan, results: Results, start: str) -> Section:
         above = seen if seen is not None else perfect
         rows.append(
             (
-                row.name,
+                row.label,
                 cell(perfect, lambda e: position_text(e.position)),
                 cell(seen, lambda e: position_text(e.position)),
                 NONE if above is None or floor is None else f"{above.position / floor:.3f}",
@@ -121,7 +121,7 @@ def _row(plan: Plan, results: Results, start: str, row: Row) -> tuple[str, ...]:
     group = table_group(start, "paper", row.name)
     perfect, seen = study_errors(results, group), flown(plan, results, group)
     return (
-        row.name,
+        row.label,
         position_text(row.position_mse_m2),
         cell(perfect, lambda e: position_text(e.position)),
         cell(seen, lambda e: position_text(e.position)),

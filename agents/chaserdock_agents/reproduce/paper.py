@@ -10,7 +10,7 @@ PAPER_S = 120.0
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the paper's single-chaser table; ``failed`` of its three runs failed."""
+    """A row of the paper's single-chaser table; ``failed`` of its three runs failed. ``name`` can be a folder's."""
 
     name: str
     horizon_s: float
@@ -19,6 +19,12 @@ class Row:
     position_mse_m2: float
     orientation_mse_rad2: float
     failed: int = 0
+
+    @property
+    def label(self) -> str:
+        """The row as people write it: dt=1/30, alpha=30 %."""
+        text = self.name.replace("-alpha", ", alpha").replace("1-", "1/")
+        return f"{text} %" if "alpha" in text else text
 
     @property
     def overrides(self) -> tuple[str, ...]:

@@ -99,6 +99,7 @@ class Runner:
             self.folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise ReproduceError(f"{self.folder}: cannot be made: {error.strerror or error}") from None
+        self._mend()
         todo = [m for m in plan.missions if self.finished(m) is None]
         cases = self._open_cases(plan)
         self._done, self._number = 0, len(todo) + bool(cases)
@@ -122,7 +123,8 @@ class Runner:
         return self.results(plan)
 
     def results(self, plan: Plan) -> Results:
-        """What of ``plan`` is finished, in the plan's order."""
+        """What of ``plan`` is finished, in the plan's order. Nothing may be flying."""
+        self._mend()
         summaries = {m.name: s for m in plan.missions if (s := self.finished(m)) is not None}
         found = self._studies()
         cases = [c for c in plan.studies if c.name in found and found[c.name].case == c]
@@ -184,15 +186,16 @@ class Runner:
         return lines[-1] if lines else f"ended with status {done.returncode} without a word"
 
     def _studies(self) -> dict[str, StudyResult]:
-        """Finished studies by name; a line that was cut off by an interruption counts as not flown."""
+        """Finished studies by name; the last of equal names counts."""
         path = self._results()
-        if not path.exists():
-            return {}
-        whole = [
-            line for line in path.read_text(encoding="utf-8").splitlines(keepends=True) if line[-1] == "\n"
-        ]
-        path.write_text("".join(whole), encoding="utf-8")
-        return {result.case.name: result for result in read_lines(path, StudyResult)}
+        return {r.case.name: r for r in read_lines(path, StudyResult)} if path.exists() else {}
+
+    def _mend(self) -> None:
+        """Drops a line that was cut off when a study was interrupted: that case counts as not flown."""
+        path = self._results()
+        text = path.read_text(encoding="utf-8") if path.exists() else ""
+        if text and not text.endswith("\n"):
+            path.write_text(text[: text.rfind("\n") + 1], encoding="utf-8")
 
     def _results(self) -> Path:
         return self.folder / "studies" / f"{self._code}.jsonl"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from chaserdock_controller.study.perfect import PerfectEstimator
 from chaserdock_controller.study.process import fly_case
 from chaserdock_protocol import rotations
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.study import StudyCase, StudyResult
+from chaserdock_protocol.study import StudyCase, StudyError, StudyResult
 from chaserdock_world.physics import prescribed_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -162,6 +163,24 @@ def test_delay_makes_long_horizons_fail_first() -> None:
     assert worst(10.0, 0.1) < 0.02
     assert worst(3.0, 0.5) < 0.05
     assert worst(10.0, 0.5) > 1.0
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"delay_s": -0.1}, "x: delay_s must be finite, not negative"),
+        ({"delay_s": math.nan}, "x: delay_s must be finite, not negative"),
+        ({"delay_s": 0.1, "delay_measured": True}, "not beside delay_measured"),
+        (
+            {"overrides": ("target.motion='torque_free'",)},
+            "x: target.motion must be constant_rates or static",
+        ),
+        ({"overrides": ("duration_s=3.0",)}, r"x: duration_s \(3\) ends before settling_s \(20\)"),
+    ],
+)
+def test_bad_cases_are_named(changed: dict[str, Any], said: str) -> None:
+    with pytest.raises(StudyError, match=said):
+        fly_case(StudyCase(name="x", scenario=str(SCENARIOS / "paper-single.toml"), **changed))
 
 
 def test_delay_counts_missed_ticks() -> None:

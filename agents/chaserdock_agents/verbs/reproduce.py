@@ -31,7 +31,9 @@ def reproduce(
 
 
 def study(
-    cases: Annotated[Path, typer.Argument(help="cases, one a line, as JSON (docs/reproduction.md)")],
+    cases: Annotated[
+        Path, typer.Argument(help="StudyCases (chaserdock_protocol/study.py), one a line, as JSON")
+    ],
     out: Annotated[Path, typer.Option(help="results are appended here")],
 ) -> None:
     """Fly the controller by itself on perfect knowledge, without pictures: a file of cases."""

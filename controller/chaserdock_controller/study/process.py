@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 from chaserdock_protocol.rotations import rotate
 from chaserdock_protocol.runtime import say
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.study import StudyCase, StudyResult, line_of, read_lines
+from chaserdock_protocol.study import StudyCase, StudyError, StudyResult, line_of, read_lines
 
 from chaserdock_controller.study.floor import gauss_times, least_square_integral
 from chaserdock_controller.study.loop import Trace, fly_offline
@@ -19,20 +20,34 @@ _FLOOR_S = 15.0
 
 
 def main(cases: Path, results: Path) -> int:
-    """Flies every case of ``cases`` and appends to ``results``; 0. Raises StudyError or ScenarioError for bad input."""
+    """Flies every case of ``cases`` and appends to ``results``; 0.
+
+    Raises StudyError or ScenarioError for bad input, before or at the case it is in; what was flown is kept.
+    """
     asked = read_lines(cases, StudyCase)
     for number, case in enumerate(asked, start=1):
         say("study", f"{number} of {len(asked)}: {case.name}")
         result = fly_case(case)
-        with results.open("a", encoding="utf-8") as file:
-            file.write(line_of(result))
+        try:
+            with results.open("a", encoding="utf-8") as file:
+                file.write(line_of(result))
+        except OSError as error:
+            raise StudyError(f"{results}: cannot be written: {error.strerror or error}") from None
     return 0
 
 
 def fly_case(case: StudyCase) -> StudyResult:
-    """One case, flown and measured. Raises ScenarioError or ValueError if it cannot be."""
+    """One case, flown and measured. Raises ScenarioError or StudyError if it cannot be."""
     scenario = load_scenario(Path(case.scenario), case.overrides)
     fixed = case.delay_s
+    if fixed is not None and (case.delay_measured or not 0.0 <= fixed < math.inf):
+        raise StudyError(f"{case.name}: delay_s must be finite, not negative and not beside delay_measured")
+    if scenario.target.motion == "torque_free":
+        raise StudyError(f"{case.name}: target.motion must be constant_rates or static, not torque_free")
+    if scenario.settling_s > scenario.duration_s:
+        raise StudyError(
+            f"{case.name}: duration_s ({scenario.duration_s:g}) ends before settling_s ({scenario.settling_s:g})"
+        )
     delay = (lambda took_s: took_s) if case.delay_measured else None if fixed is None else lambda _: fixed
     trace = fly_offline(scenario, delay)
     position, angle = trace.position_error_m[:, 0] ** 2, trace.orientation_error_rad[:, 0] ** 2

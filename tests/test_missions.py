@@ -178,6 +178,20 @@ def test_tracking_missions(scenario: str, tmp_path: Path) -> None:
     assert estimate["max_orientation_error_rad"] < math.radians(1.0)
 
 
+@pytest.mark.slow
+def test_collision_avoidance(tmp_path: Path) -> None:
+    """Past the target to its other side on what the other chaser sees, never below 0.35 m, there within 60 s."""
+    status, said = run("collision-avoidance", tmp_path / "run")
+    assert status == 0, said
+    result = summary(tmp_path / "run")
+    assert result["chasers"]["0"]["min_distance_target_m"] >= 0.35
+    assert result["chasers"]["0"]["reached_time_s"] <= 70.0
+    flight = load_flight(tmp_path / "run" / "mission.mcap")
+    # At the end chaser 0 looks away from the target: it has seen nothing for a while.
+    assert all(s.status == "nothing" for s in flight.sightings[0][-150:])
+    assert result["target_estimate"]["max_position_error_m"] < 0.01
+
+
 @pytest.fixture(scope="session")
 def main_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The main job, whole."""

@@ -20,6 +20,7 @@ from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
 from .verbs.publish import figures, report, video
 from .verbs.replays import compare, replay
+from .verbs.reproduce import reproduce, study
 
 app = typer.Typer(
     name="chaserdock",
@@ -45,6 +46,8 @@ for verb in (
     router,
     status,
     judge,
+    reproduce,
+    study,
 ):
     app.command()(verb)
 app.add_typer(logs.app, name="log")

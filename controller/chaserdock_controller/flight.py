@@ -27,7 +27,7 @@ from chaserdock_protocol.scenario import Scenario
 from . import reference
 from .facing import facing_attitudes
 from .fusion import geometry
-from .fusion.types import Measurement
+from .fusion.types import Estimator, Measurement
 from .fusion.types import TargetEstimate as Fused
 from .guidance import Guidance
 from .nmpc import NmpcInput, NmpcPlan, make_solver
@@ -76,14 +76,19 @@ class Outputs:
 
 
 class Flight:
-    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver."""
+    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver.
 
-    def __init__(self, scenario: Scenario, now_s: Callable[[], float]) -> None:
+    ``estimator`` takes the place of the one that the scenario names.
+    """
+
+    def __init__(
+        self, scenario: Scenario, now_s: Callable[[], float], estimator: Estimator | None = None
+    ) -> None:
         self.scenario = scenario
         self.guidance = Guidance(scenario)
         self._now_s = now_s
         self._camera = scenario.camera_model()
-        self._estimator = estimator_of(scenario)
+        self._estimator = estimator or estimator_of(scenario)
         self._parameters = nmpc_parameters(scenario)
         c = scenario.controller
         self._solver = make_solver(c.solver, self._parameters, len(scenario.chasers), c.max_iterations)

@@ -164,9 +164,16 @@ class TimelineEntry(Section):
 
 
 class Success(Section):
-    """What makes a run a success, judged on ground truth; what is left out is not asked."""
+    """What makes a run a success, judged on ground truth; what is left out is not asked.
+
+    ``reached``: chasers that at the end are where their last ``goto`` of the time line sent them, to
+    ``reached_position_m``, and have been since ``reached_within_s`` after that command at the latest.
+    """
 
     docked: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    reached: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    reached_position_m: Positive = 0.02
+    reached_within_s: Positive | None = None
     max_collisions: Annotated[int, Field(ge=0)] = 0
     keep_distances: bool = True
     steady_position_rms_m: Positive | None = None
@@ -209,10 +216,19 @@ class Scenario(Section):
             raise ValueError('target.geometry.mesh: is drawn by camera.renderer = "pybullet" alone')
         named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
         last = len(self.chasers) - 1
-        for where, chasers in (*named, ("success.docked", self.success.docked)):
+        judged = (("success.docked", self.success.docked), ("success.reached", self.success.reached))
+        for where, chasers in (*named, *judged):
             if max(chasers, default=0) > last:
                 raise ValueError(f"{where}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
+        for i in self.success.reached:
+            if self.goal_of(i) is None:
+                raise ValueError(f"success.reached: no goto of the timeline names chaser {i}")
         return self
+
+    def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
+        """When (s) and whereto (TRF, m) the last ``goto`` of the time line sends a chaser, if one does."""
+        sent = [(e.at_s, e.offset_m) for e in self.timeline if chaser in e.chasers and e.offset_m is not None]
+        return max(sent, key=lambda entry: entry[0], default=None)
 
     @property
     def timing(self) -> Timing:

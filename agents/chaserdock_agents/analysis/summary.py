@@ -14,6 +14,7 @@ from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
 from .flight import Flight, Track, load_flight
+from .reached import not_reached, reached_time
 
 
 def summarize(log: Path) -> dict[str, Any]:
@@ -164,6 +165,7 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             },
             "docked": docked_s is not None,
             "dock_time_s": docked_s,
+            "reached_time_s": reached_time(flight, i),
             "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
             "impulse_N_s": flight.absolute_impulse_N_s[name],
         }
@@ -253,6 +255,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             out.append(f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m")
         if int(i) in s.success.docked and not c["docked"]:
             out.append(f"chaser {i} is not docked")
+        out += not_reached(s, int(i), c["reached_time_s"])
         _limit(
             out,
             f"chaser {i}: steady position RMS",

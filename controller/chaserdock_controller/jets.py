@@ -38,7 +38,7 @@ class JetDesk:
         return np.minimum(self._nominal, np.abs([*report.force_max_N, *report.torque_max_N_m]))
 
     def coming(self, chaser: int, tick: int) -> Array | None:
-        """Impulse (6,), body axes, that pulses under way give from a tick to its command's effect, if it is told."""
+        """Impulse (6,), body axes, that pulses under way give beside a tick's command, if it is told."""
         report = self._reports.get(chaser)
         if report is None or report.tick != tick:
             return None

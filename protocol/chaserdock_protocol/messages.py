@@ -246,7 +246,7 @@ class JetReport(Message, frozen=True, kw_only=True):
     """What a chaser's jets can do, as it knows them, at the time of the odometry of the same tick.
 
     ``force_max_N`` and ``torque_max_N_m`` are within reach on all body axes at once. ``coming_*`` is the impulse (body
-    axes) that pulses under way will give from ``sim_time_ns`` until the next command takes effect.
+    axes) that it will get from pulses under way, less what of them counts as the next command's.
     """
 
     chaser: ChaserId

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 _TURNS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+_FAST = {"min_on_s": 0.005, "rise_s": 0.001, "fall_s": 0.001}
 _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
@@ -42,7 +43,7 @@ def _slider() -> dict[str, Any]:
     """
     arm_m = 0.125
     jets = [
-        {"position_m": (x * arm_m, y * arm_m, 0.0), "direction": direction, "thrust_N": 2.3}
+        {"position_m": (x * arm_m, y * arm_m, 0.0), "direction": direction, "thrust_N": 2.3, **_FAST}
         for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))
         for direction in ((-x, 0.0, 0.0), (0.0, -y, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
     ]

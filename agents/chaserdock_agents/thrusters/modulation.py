@@ -16,10 +16,6 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_thrusters import Modulation, Thruster, thrusts_max
 from numpy.typing import NDArray
 
-_ROUNDING = 1e-6
-"""Of a resolution step: what lies so close to the next step is that step."""
-
-
 class Modulator:
     """The accounts of one chaser's jets; carrier periods begin where a command can take effect first."""
 
@@ -37,6 +33,11 @@ class Modulator:
         self._accounted_ns = 0
         self._until_ns = 0
         self._next = 0
+        self._paid_N, self._paid_until_ns = np.zeros(len(thrusters)), 0
+
+    def paid_ahead_N_s(self, now_ns: int) -> Array:
+        """(n,): what the pulses under way give instead of thrust that will be asked for only after ``now_ns``."""
+        return self._paid_N * (max(self._paid_until_ns - now_ns, 0) * 1e-9)
 
     def _account(self, until_ns: int) -> None:
         """Books the thrust asked for up to a time; it was asked for only while its command acted."""
@@ -71,6 +72,7 @@ class Modulator:
         self, begin_ns: int, period_ns: int, can_N: Array, able: NDArray[np.bool_]
     ) -> list[JetPulse]:
         period_s = period_ns * 1e-9
+        self._paid_N, self._paid_until_ns = self._asked_N, begin_ns + period_ns
         force_N = np.where(able, can_N, 1.0)
         held_N_s = self._asked_N * period_s
         wanted_N_s = held_N_s + self.owed_N_s
@@ -101,9 +103,10 @@ class Modulator:
         """Pulse widths (n,) for on-times (n,) at full thrust: whole steps, none below the minimum or above the period."""
         resolution_s = self._m.resolution_s
         exact = (wanted_s + self._lag_s) / resolution_s
-        # Nothing makes up for a rounding without carry-over: then to the nearest.
-        steps = np.floor(exact + (_ROUNDING if self._m.carry_over else 0.5))
+        steps = np.floor(exact + 0.5)
         width_s = np.where(wanted_s > 0.0, steps * resolution_s, 0.0)
-        width_s = np.where(width_s < self._shortest_s - 0.5e-9, 0.0, width_s)
+        # Below the minimum, to the nearest, too: jets that were asked for little together then fire together.
+        nearest_s = np.where(wanted_s + self._lag_s >= 0.5 * self._shortest_s, self._shortest_s, 0.0)
+        width_s = np.where(width_s < self._shortest_s, nearest_s, width_s)
         # A gap in which the thrust could not fall is none.
         return np.where(width_s > period_s - np.maximum(self._shortest_gap_s, 0.5e-9), period_s, width_s)

@@ -20,6 +20,8 @@ from .residual import Noise, covariance, observed_impulse
 _LEAST_SCALE = 0.02
 """Of the body's limits: what the controller may ask for even of jets that cannot give every wrench any more."""
 _FORGET_NS = 1_000_000_000
+_LONGEST_NS = 1_000_000_000
+"""No carrier period is longer."""
 
 
 class JetPilot:
@@ -114,7 +116,10 @@ class JetPilot:
         self._scale = scale
         limits = self._box * max(scale, _LEAST_SCALE)
         effective_ns = self._timing.effective_ns(odometry.tick)
-        coming = self._matrix @ self._impulses(odometry.sim_time_ns, effective_ns)
+        self._valves.set_shut(self.isolated, effective_ns)
+        # Pulses that go on after the next command takes effect count beyond what of them belongs to that command.
+        under_way = self._impulses(odometry.sim_time_ns, effective_ns + _LONGEST_NS)
+        coming = self._matrix @ (under_way - self._modulator.paid_ahead_N_s(effective_ns))
         kinds: list[JetState] = ["healthy"] * len(self._full_N)
         for jet, verdict in self._failed.items():
             kinds[jet] = verdict.kind

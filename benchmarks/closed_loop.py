@@ -57,7 +57,11 @@ class Record:
 
 
 def fly(
-    scenario: Scenario, seed: int = 0, noise_m: float = 0.0, noise_rad: float = 0.0, on_tick: Callable | None = None
+    scenario: Scenario,
+    seed: int = 0,
+    noise_m: float = 0.0,
+    noise_rad: float = 0.0,
+    on_tick: Callable | None = None,
 ) -> dict[int, Record]:
     """Flies a scenario to its end; records by chaser. ``noise_*``: one sigma of every sighting, each axis."""
     rng = np.random.default_rng(seed)
@@ -89,7 +93,9 @@ def fly(
                     records[i].events += [(now_ns / 1e9, f"{what}: {detail}") for _, what, detail in told]
                 if timing.has_pictures(tick):
                     noise = rng.normal(size=6) * ([noise_m] * 3 + [noise_rad] * 3)
-                    sightings.append(_sighting(scenario, i, tick, now_ns, state, target, noise, noise_m, noise_rad))
+                    sightings.append(
+                        _sighting(scenario, i, tick, now_ns, state, target, noise, noise_m, noise_rad)
+                    )
             out = flight.step(Inputs(tick, now_ns, odometry, tuple(sightings), jets=reports))
             for i, command in out.wrenches.items():
                 if i in out.references:

@@ -37,7 +37,11 @@ PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.0
 def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **changes: Any) -> Scenario:
     """One chaser a metre from the target, with jets unless said otherwise."""
     chaser = {"body": body, "actuation": "thrusters", **changes.pop("chaser", {})}
-    start = {"start_offset_m": [-0.1, 0.02, 0.0], "start_rotation_rad": [0.05, 0.0, 0.0], **changes.pop("start", {})}
+    start = {
+        "start_offset_m": [-0.1, 0.02, 0.0],
+        "start_rotation_rad": [0.05, 0.0, 0.0],
+        **changes.pop("start", {}),
+    }
     values: dict[str, Any] = {
         "name": "bench",
         "duration_s": duration_s,
@@ -100,7 +104,9 @@ def pulses(quick: bool) -> dict[str, float]:
         given = valves.impulses(edges)
         wanted = np.diff(np.array(asked)[::rate_hz], axis=0)
         least = full * [t.min_on_s for t in b.thrusters]
-        out[f"pulses_{rate_hz}_hz_worst_second_min_pulses"] = float(np.abs((given - wanted) / least)[1:-1].max())
+        out[f"pulses_{rate_hz}_hz_worst_second_min_pulses"] = float(
+            np.abs((given - wanted) / least)[1:-1].max()
+        )
     return out
 
 

@@ -85,9 +85,7 @@ def integrate(state: Array, wrench: Array, body: Body, duration_s: float) -> Arr
 
 
 def _state_of(odometry: Odometry) -> Array:
-    return np.array(
-        [*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s]
-    )
+    return np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
 
 
 def predict_state(odometry: Odometry, history: CommandHistory, until_ns: int, body: Body) -> Array:

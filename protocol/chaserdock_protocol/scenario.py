@@ -245,7 +245,9 @@ def _check_failures(scenario: Scenario) -> None:
                 f"jet_failure.{k}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
             )
         if failure.jet >= jets:
-            raise ValueError(f"jet_failure.{k}.jet: there is no jet {failure.jet}; the body has 0 to {jets - 1}")
+            raise ValueError(
+                f"jet_failure.{k}.jet: there is no jet {failure.jet}; the body has 0 to {jets - 1}"
+            )
         if any((f.chaser, f.jet) == (failure.chaser, failure.jet) for f in scenario.jet_failure[:k]):
             raise ValueError(f"jet_failure.{k}: jet {failure.jet} of chaser {failure.chaser} fails twice")
 

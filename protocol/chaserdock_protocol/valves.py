@@ -159,7 +159,9 @@ class Valves:
         """How long every jet's valves are open between two times, (n,) s."""
         out = np.zeros(len(self._jets))
         jet, begin, end = self._spans()[:3]
-        np.add.at(out, jet.astype(int), np.clip(np.minimum(end, to_ns) - np.maximum(begin, from_ns), 0.0, None))
+        np.add.at(
+            out, jet.astype(int), np.clip(np.minimum(end, to_ns) - np.maximum(begin, from_ns), 0.0, None)
+        )
         return out * 1e-9
 
     def propellant_kg(self, impulses_N_s: Array) -> float:

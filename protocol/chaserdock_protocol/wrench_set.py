@@ -61,9 +61,7 @@ def wrench_set(matrix: Array) -> WrenchSet:
         return WrenchSet(matrix, np.zeros((0, 6)))
     fives = (matrix / scale[:, None]).T[np.array(list(itertools.combinations(range(n), 5)))]
     # The generalized cross product of five vectors: the signed minors.
-    normals = np.stack(
-        [(-1) ** i * np.linalg.det(np.delete(fives, i, axis=2)) for i in range(6)], axis=1
-    )
+    normals = np.stack([(-1) ** i * np.linalg.det(np.delete(fives, i, axis=2)) for i in range(6)], axis=1)
     lengths = np.linalg.norm(normals, axis=1)
     kept = lengths > 1e-9 * lengths.max()
     return WrenchSet(matrix, normals[kept] / lengths[kept, None] / scale)

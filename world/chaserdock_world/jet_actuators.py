@@ -56,7 +56,9 @@ class JetActuators:
         """Mean wrenches (K, 6) of the physics steps from ``step`` on, at least two."""
         row = step - self._ahead_from
         if not 0 <= row < len(self._ahead) - 1:
-            edges_ns = np.array([self._timing.time_ns(step + k) for k in range(_AHEAD_STEPS + 1)], dtype=float)
+            edges_ns = np.array(
+                [self._timing.time_ns(step + k) for k in range(_AHEAD_STEPS + 1)], dtype=float
+            )
             impulses = self._valves.impulses(edges_ns) / np.diff(edges_ns)[:, None] * 1e9
             # So that what does not change is equal, whatever the last bits say.
             self._ahead, self._ahead_from, row = np.round(impulses, 12) @ self._matrix.T, step, 0

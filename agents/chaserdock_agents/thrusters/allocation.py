@@ -22,7 +22,7 @@ from chaserdock_protocol.wrench_set import wrench_matrix
 
 _REGULARIZATION = 1e-2
 """Small enough for the least sum (measured to 1e-12), large enough for well-conditioned steps."""
-_NEARLY_FLAT = 1e-9
+_NEXT_TO_NOTHING = 1e-6
 _EQUALITY = 5  # daqp's codes of kinds of constraints and of success
 _SOLVED = 1
 
@@ -39,17 +39,12 @@ class Allocator:
     """Thruster selection for one layout; ``scale`` (6,) is the unit of each axis in the norm."""
 
     def __init__(self, thrusters: Sequence[Thruster], scale: Array) -> None:
-        n = len(thrusters)
         self.matrix = wrench_matrix(thrusters)
         self._full_N = thrusts_max(thrusters)
         # In parts of the scale and of full thrust all numbers are near one.
-        self._rows = np.ascontiguousarray(self.matrix * self._full_N / scale[:, None])
+        self._rows = self.matrix * self._full_N / scale[:, None]
         self._scale = scale
-        self._hessian = _REGULARIZATION * np.eye(n)
         self._cost = self._full_N / self._full_N.max()
-        self._sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
-        self._lower, self._upper = np.zeros(n + 6), np.zeros(n + 6)
-        self._closest_hessian = self._rows.T @ self._rows + _NEARLY_FLAT * np.eye(n)
 
     def allocate(self, wrench: Array, thrusts_max_N: Array) -> Allocation:
         """Thrusts for a wrench (6,), N and N m, body axes, under limits (n,) N, which may be zero.
@@ -60,20 +55,41 @@ class Allocator:
         limits = thrusts_max_N / self._full_N
         if not (np.isfinite(asked).all() and np.isfinite(limits).all() and (limits >= 0.0).all()):
             raise ValueError("wrench and limits must be finite, limits not negative")
-        n = len(limits)
-        self._upper[:n] = limits
-        self._lower[n:] = self._upper[n:] = asked
-        x, _, flag, _ = daqp.solve(
-            self._hessian, self._cost, self._rows, self._upper, self._lower, self._sense
-        )
+        thrusts = np.zeros(len(limits))
+        able = limits > 0.0
+        if not able.any():
+            return Allocation(thrusts, not asked.any())
+        rows, most = np.ascontiguousarray(self._rows[:, able]), limits[able]
+        x, flag = _cheapest(rows, self._cost[able], asked, most)
         exact = flag == _SOLVED
         if not exact:
-            x, _, flag, _ = daqp.solve(
-                self._closest_hessian, -self._rows.T @ asked, np.zeros((0, n)), limits, np.zeros(n)
-            )
+            x, flag = _closest(rows, asked, most)
             if flag != _SOLVED:
                 raise RuntimeError(f"thruster selection: daqp gave up with flag {flag} on wrench {wrench}")
-        return Allocation(np.clip(x, 0.0, limits) * self._full_N, exact)
+        thrusts[able] = np.clip(x, 0.0, most) * self._full_N[able]
+        return Allocation(thrusts, exact)
+
+
+def _cheapest(rows: Array, cost: Array, asked: Array, most: Array) -> tuple[Array, int]:
+    """min cost . x + small |x|^2 with rows x = asked, 0 <= x <= most; daqp's answer and flag."""
+    n = len(most)
+    upper, lower = np.concatenate([most, asked]), np.concatenate([np.zeros(n), asked])
+    sense = np.array([0] * n + [_EQUALITY] * 6, dtype=np.int32)
+    x, _, flag, _ = daqp.solve(_REGULARIZATION * np.eye(n), cost, rows, upper, lower, sense)
+    return x, flag
+
+
+def _closest(rows: Array, asked: Array, most: Array) -> tuple[Array, int]:
+    """min |slack|^2 + next to nothing |x|^2 with rows x + slack = asked, 0 <= x <= most; daqp's answer and flag."""
+    n = len(most)
+    free = np.full(6, 1e30)
+    upper, lower = np.concatenate([most, free, asked]), np.concatenate([np.zeros(n), -free, asked])
+    sense = np.array([0] * (n + 6) + [_EQUALITY] * 6, dtype=np.int32)
+    hessian = np.diag([_NEXT_TO_NOTHING] * n + [1.0] * 6)
+    x, _, flag, _ = daqp.solve(
+        hessian, np.zeros(n + 6), np.ascontiguousarray(np.hstack([rows, np.eye(6)])), upper, lower, sense
+    )
+    return x[:n], flag
 
 
 def allocator_of(body: Body) -> Allocator:

@@ -91,14 +91,18 @@ class JetWatch:
                     break
                 rows = list(evidence)[-length:]
                 along, squared, energy = (np.sum(x, axis=0) for x in zip(*rows, strict=True))
-                loss = np.where(squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0)
+                loss = np.where(
+                    squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
+                )
                 gain = np.where(suspects, loss * along - loss**2 * squared / 2.0, -math.inf)
                 known = squared[jet] * _LOSS_SIGMA**2 >= 1.0
                 if not known or loss[jet] < _NOTICEABLE or int(np.argmax(gain)) != jet:
                     continue
                 if _stands_out(gain, jet) and _explained(energy, 2.0 * gain[jet], squared[jet], length):
                     gone = loss[jet] > _GONE
-                    return Verdict(int(jet), "stuck_off" if gone else "weak", 0.0 if gone else float(1.0 - loss[jet]))
+                    return Verdict(
+                        int(jet), "stuck_off" if gone else "weak", 0.0 if gone else float(1.0 - loss[jet])
+                    )
         return None
 
 

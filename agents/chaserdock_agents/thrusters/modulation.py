@@ -16,6 +16,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_thrusters import Modulation, Thruster, thrusts_max
 from numpy.typing import NDArray
 
+
 class Modulator:
     """The accounts of one chaser's jets; carrier periods begin where a command can take effect first."""
 
@@ -68,9 +69,7 @@ class Modulator:
     def _begin_ns(self, period: int) -> int:
         return self._timing.time_ns(self._first_step + period * self._period_steps)
 
-    def _period(
-        self, begin_ns: int, period_ns: int, can_N: Array, able: NDArray[np.bool_]
-    ) -> list[JetPulse]:
+    def _period(self, begin_ns: int, period_ns: int, can_N: Array, able: NDArray[np.bool_]) -> list[JetPulse]:
         period_s = period_ns * 1e-9
         self._paid_N, self._paid_until_ns = self._asked_N, begin_ns + period_ns
         force_N = np.where(able, can_N, 1.0)

@@ -155,7 +155,11 @@ class JetPilot:
         """The command with the pulses of the carrier periods that begin while it acts."""
         can_N = self._can_N()
         wrench = np.array([*command.force_N, *command.torque_N_m])
-        thrusts = self._allocator.allocate(wrench, can_N).thrusts_N
+        try:
+            thrusts = self._allocator.allocate(wrench, can_N).thrusts_N
+        except RuntimeError as error:  # no reason to leave the mission: the next command is another problem
+            self.events.append(("error", "no thrusts", str(error)))
+            thrusts = np.zeros(len(can_N))
         begin_ns, isolated = command.effective_time_ns, self.isolated
         end_ns = self._timing.effective_ns(command.tick + 1)
         pulses = self._modulator.pulses(thrusts, can_N, begin_ns, end_ns)

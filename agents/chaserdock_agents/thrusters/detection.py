@@ -22,7 +22,7 @@ _CLEARER = 8.0
 """Least log-likelihood gained over the second-best jet."""
 _ON_WINDOWS = (2, 3, 4, 6, 8)
 """Ticks in a row that a jet may have been stuck on; one alone might be a bump."""
-_OFF_WINDOWS = (3, 4, 6, 9, 15, 30)
+_OFF_WINDOWS = (2, 3, 4, 6, 9, 15, 30)
 """Ticks in which a jet was asked for something, the newest of them, that are looked at together."""
 _GONE = 0.85
 _NOTICEABLE = 0.3

@@ -89,6 +89,7 @@ def test_stuck_on_is_found_within_three_ticks(body: str, jet: int) -> None:
     for _ in range(5):
         jets = case.random()
         assert case.step(jets, jets) is None
+    verdict = None
     for part in (0.4, 1.0, 1.0):  # the first tick in part only
         asked = case.random(0.1)
         given = asked.copy()
@@ -104,6 +105,7 @@ def test_stuck_on_is_found_within_three_ticks(body: str, jet: int) -> None:
 @pytest.mark.parametrize(("left", "kind"), [(0.0, "stuck_off"), (0.5, "weak")])
 def test_a_lost_jet_is_found_after_some_pulses(body: str, jet: int, left: float, kind: str) -> None:
     case = Case(body, jet)
+    verdict = None
     for _ in range(120):
         asked = case.random()
         given = asked.copy()
@@ -129,6 +131,7 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
 def test_noisy_odometry_takes_longer_and_finds_the_same(jet: int) -> None:
     noise = Noise(velocity_m_s=5e-4, omega_rad_s=5e-4)
     case = Case("tetra12", jet, noise, odometry_noise=True)
+    verdict = None
     for _ in range(7):  # half a second, less the latency
         given = np.zeros(12)
         given[jet] = case.full[jet] * TICK_S

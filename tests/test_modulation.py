@@ -52,6 +52,7 @@ class Bench:
 def test_within_any_second_one_minimum_pulse_of_what_was_asked_for(rate_hz: int, seed: int) -> None:
     """Thrusts that stay a second each; a second begins with a carrier period, which no tick splits there."""
     bench, rng = Bench(rate_hz), np.random.default_rng(seed)
+    thrusts = np.zeros(len(bench.full))
     for tick in range(8 * rate_hz):
         if tick % rate_hz == 0:
             thrusts = bench.full * rng.uniform(0.0, 0.95, len(bench.full)) ** 3

@@ -29,7 +29,9 @@ def pairs() -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("name", ["single-thrusters", "jet-failure", "four-chaser-docking-thrusters"])
 def test_shipped_scenarios_fly_with_jets(name: str) -> None:
-    s = load_scenario(find_scenario(name))
+    path = find_scenario(name)
+    assert path is not None
+    s = load_scenario(path)
     assert s.name == name
     assert s.chaser.actuation == "thrusters"
     assert scenario_from_json(s.model_dump_json(), "the same") == s

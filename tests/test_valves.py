@@ -39,7 +39,7 @@ def test_a_pulse_gives_thrust_times_width_and_half_of_fall_less_rise() -> None:
 def test_thrust_rises_and_falls_linearly() -> None:
     valves = Valves([jet(4.0, 8.0)])
     valves.pulse(0, 100 * MS, 120 * MS)
-    edges = np.arange(99, 131) * MS
+    edges = np.arange(99.0, 131.0) * MS
     force_N = valves.impulses(edges)[:, 0] / 1e-3
     np.testing.assert_allclose(force_N[:6], [0.0, 0.25, 0.75, 1.25, 1.75, 2.0], atol=1e-9)
     np.testing.assert_allclose(
@@ -63,7 +63,7 @@ def test_no_splitting_of_time_changes_what_is_given_and_never_more_than_full_thr
     valves.fail(0, failure, 400 * MS, 0.5)
     if shut_ms is not None:
         valves.set_shut([0], shut_ms * MS)
-    edges = np.array([0, *sorted(cuts), 2000]) * MS
+    edges = np.array([0.0, *sorted(cuts), 2000.0]) * MS
     parts = valves.impulses(edges)[:, 0]
     assert parts.sum() == pytest.approx(given_N_s(valves, 0, 2000)[0], abs=1e-12)
     assert np.all(parts >= -1e-12)

@@ -3,5 +3,5 @@
 import sys
 from pathlib import Path
 
-# ``harness`` is a module beside the tests, not a package of ours.
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+# ``harness`` is a module beside the tests, ``closed_loop`` one of the benchmarks: no packages of ours.
+sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1] / "benchmarks")]

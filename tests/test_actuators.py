@@ -71,19 +71,19 @@ def test_a_late_command_acts_at_once_and_is_counted() -> None:
     a.command(command(1, 1.25), 50, 50)  # just in time
     assert a.next_change(50) is None
     assert a.act(50, 1, STEP_S)[0] == 1.25
-    assert a.take()[3] == 1
-    assert a.take()[3] == 0
+    assert a.take(0)[3] == 1
+    assert a.take(0)[3] == 0
 
 
 def test_commands_are_cut_off_at_the_bodys_limits_and_that_is_told() -> None:
     a = IdealActuators(BODY)
     a.command(command(0, BODY.force_max_N, -BODY.torque_max_N_m), 0, 0)
     a.act(0, 1, STEP_S)
-    assert a.take()[2] is False
+    assert a.take(0)[2] is False
     a.command(command(1, -5.0, 1.0), 1, 0)
     np.testing.assert_array_equal(a.act(1, 1, STEP_S), [-2.0, 0.0, 0.0, 0.05, 0.0, 0.0])
-    assert a.take()[2] is True
-    assert a.take()[2] is False
+    assert a.take(0)[2] is True
+    assert a.take(0)[2] is False
 
 
 def test_impulse_is_accounted_for() -> None:
@@ -98,10 +98,10 @@ def test_impulse_is_accounted_for() -> None:
     a.command(both, HZ, 0)
     a.act(0, HZ, STEP_S)
     a.act(HZ, HZ // 2, STEP_S)
-    impulse, absolute, _, _ = a.take()
+    impulse, absolute, *_ = a.take(0)
     np.testing.assert_allclose(impulse, [0.5, -1.0, 0.25, 0.005, 0.0, -0.01], rtol=1e-12)
     assert absolute == pytest.approx(3.5 / 2)
-    assert a.take()[1] == 0.0
+    assert a.take(0)[1] == 0.0
 
 
 def test_stop_ends_everything() -> None:
@@ -109,7 +109,7 @@ def test_stop_ends_everything() -> None:
     a.command(command(0, 1.0), 0, 0)
     a.command(command(1, 2.0), 20, 0)
     a.act(0, 10, STEP_S)
-    a.stop()
+    a.stop(10)
     assert a.next_change(10) is None
     np.testing.assert_array_equal(a.act(20, 10, STEP_S), np.zeros(6))
 
@@ -133,7 +133,7 @@ def test_what_the_body_gets_is_what_was_commanded(commands: list[tuple[int, int]
         for seq in [s for s, (effective, _) in enumerate(commands) if effective == step]:
             force = float(commands[seq][1])
         expected += force * STEP_S
-    impulse, absolute, saturated, _ = a.take()
+    impulse, absolute, saturated, *_ = a.take(0)
     velocity = physics.state("chaser/0").velocity_m_s
     physics.close()
     assert impulse[0] == pytest.approx(expected, abs=1e-12)

@@ -15,12 +15,19 @@ class OperatorError(ChaserdockError):
 
 
 def send_command(
-    link: Link, command: str, chaser: int, offset_m: tuple[float, float, float] | None, timeout_s: float
+    link: Link,
+    command: str,
+    chaser: int,
+    offset_m: tuple[float, float, float] | None,
+    timeout_s: float,
+    jet: int | None = None,
 ) -> CommandReply:
     """Puts a command to the controller; raises OperatorError when nobody answers in time, TransportError."""
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z goes with goto, and goto needs it")
-    request = OperatorCommand(command=command, chaser=chaser, offset_m=offset_m)  # type: ignore[arg-type]
+    if (command in ("isolate", "restore")) != (jet is not None):
+        raise OperatorError("--jet N goes with isolate and restore, and these need it")
+    request = OperatorCommand(command=command, chaser=chaser, offset_m=offset_m, jet=jet)  # type: ignore[arg-type]
     node = Node("operator", "operator", link)
     try:
         begun_s = time.monotonic()

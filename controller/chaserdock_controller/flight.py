@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,6 +12,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     CommandReply,
     Event,
+    JetReport,
     Odometry,
     OperatorCommand,
     Plan,
@@ -30,8 +31,9 @@ from .fusion import geometry
 from .fusion.types import Estimator, Measurement
 from .fusion.types import TargetEstimate as Fused
 from .guidance import Guidance
+from .jets import JET_COMMANDS, JetDesk
 from .nmpc import NmpcInput, NmpcPlan, make_solver
-from .prediction import CommandHistory, predict_state
+from .prediction import CommandHistory, predict_state, predict_state_with_impulse
 from .setup import estimator_of, nmpc_parameters
 
 _ODOMETRY_KEPT_NS = 2_000_000_000
@@ -60,6 +62,7 @@ class Inputs:
     odometry: dict[int, Odometry]
     sightings: tuple[Sighting, ...]
     commands: tuple[OperatorCommand, ...] = ()
+    jets: Mapping[int, JetReport] = field(default_factory=dict)
 
 
 @dataclass
@@ -86,6 +89,7 @@ class Flight:
     ) -> None:
         self.scenario = scenario
         self.guidance = Guidance(scenario)
+        self._jets = JetDesk(scenario)
         self._now_s = now_s
         self._camera = scenario.camera_model()
         self._estimator = estimator or estimator_of(scenario)
@@ -100,6 +104,7 @@ class Flight:
     def step(self, inputs: Inputs) -> Outputs:
         """Everything that one tick asks of the controller."""
         now_s = inputs.time_ns / 1e9
+        self._jets.take(inputs.jets)
         fused, target = self.fuse(inputs)
         out = Outputs(target=target)
         self._events(out, inputs, [("info", text) for _, text in self._estimator.drain_events()])
@@ -110,7 +115,10 @@ class Flight:
         commands = (*self.guidance.due_commands(now_s), *inputs.commands)
         self.guidance.expect(commands)
         for command in commands:
-            answer = self.guidance.command(command, now_s)
+            if command.command in JET_COMMANDS:
+                answer = self._jets.command(command)
+            else:
+                answer = self.guidance.command(command, now_s)
             out.replies.append(
                 CommandReply(
                     tick=inputs.tick,
@@ -187,7 +195,7 @@ class Flight:
                 out.plans[i] = self._plan_message(i, inputs, effective_ns, plan, row)
             else:
                 wrench, mode = brake_wrench(inputs.odometry[i], self.scenario.chaser), "brake"
-            wrench = in_steps(wrench, self._parameters.input_limits())
+            wrench = in_steps(wrench, self._jets.limits(i))
             self._history.add(i, effective_ns, wrench)
             out.wrenches[i] = WrenchCommand(
                 tick=inputs.tick,
@@ -198,6 +206,8 @@ class Flight:
                 mode="nmpc" if mode == "nmpc" else "brake",
                 force_N=vector(wrench[:3]),
                 torque_N_m=vector(wrench[3:]),
+                isolated=self._jets.isolated(i),
+                trusted=self._jets.trusted(i),
             )
         out.solver = SolverStatus(
             tick=inputs.tick,
@@ -221,7 +231,12 @@ class Flight:
         for i in ids:
             offset = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s)
             q_off = self._attitudes(i, offset[0])
-            states.append(predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser))
+            coming = self._jets.coming(i, inputs.tick)
+            if coming is None:
+                state = predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser)
+            else:
+                state = predict_state_with_impulse(inputs.odometry[i], coming, effective_ns, s.chaser)
+            states.append(state)
             references.append(reference.reference_trajectory(*moving, offset[0], q_off, times_s))
             if s.controller.feed_forward:
                 held = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s[:-1] + p.dt_s / 2)
@@ -244,7 +259,7 @@ class Flight:
             target_positions=positions,
             min_distance_target_m=np.full(n, s.limits.min_distance_target_m + self._margin_m(ahead)),
             min_distance_chasers_m=s.limits.min_distance_chasers_m,
-            input_max=np.tile(p.input_limits(), (n, 1)),
+            input_max=np.array([self._jets.limits(i) for i in ids]),
         )
 
     def _attitudes(self, i: int, offsets: Array) -> Array:

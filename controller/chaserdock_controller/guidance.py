@@ -70,7 +70,10 @@ class Guidance:
         while self._due and self._due[0].at_s <= now_s + 1e-9:
             entry = self._due.pop(0)
             for chaser in entry.chasers:
-                out.append(OperatorCommand(command=entry.command, chaser=chaser, offset_m=entry.offset_m))
+                wish = OperatorCommand(
+                    command=entry.command, chaser=chaser, offset_m=entry.offset_m, jet=entry.jet
+                )
+                out.append(wish)
         return out
 
     def expect(self, commands: Sequence[OperatorCommand]) -> None:

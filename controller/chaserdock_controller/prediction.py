@@ -84,9 +84,21 @@ def integrate(state: Array, wrench: Array, body: Body, duration_s: float) -> Arr
     return np.array(x)
 
 
+def _state_of(odometry: Odometry) -> Array:
+    return np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
+
+
 def predict_state(odometry: Odometry, history: CommandHistory, until_ns: int, body: Body) -> Array:
     """State (13,) of a chaser at ``until_ns``, from its odometry and the commands already sent."""
-    x = np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
+    x = _state_of(odometry)
     for begin, end, wrench in history.segments(odometry.chaser, odometry.sim_time_ns, until_ns):
         x = integrate(x, wrench, body, (end - begin) / 1e9)
     return x
+
+
+def predict_state_with_impulse(odometry: Odometry, impulse: Array, until_ns: int, body: Body) -> Array:
+    """State (13,) of a chaser at ``until_ns``, from its odometry and an impulse (6,), N s and N m s, body axes, that
+    it gets until then, taken as evenly spread."""
+    duration_s = (until_ns - odometry.sim_time_ns) / 1e9
+    x = _state_of(odometry)
+    return integrate(x, impulse / duration_s, body, duration_s) if duration_s > 0.0 else x

@@ -11,6 +11,7 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     CommandReply,
+    JetReport,
     JoinReply,
     MissionEnd,
     Odometry,
@@ -56,6 +57,7 @@ class Controller:
     tick: Tick | None = None
     done_tick: int = -1
     _odometry: dict[int, Odometry] = field(default_factory=dict)
+    _jets: dict[int, JetReport] = field(default_factory=dict)
     _seen: set[tuple[int, int]] = field(default_factory=set)
     _sightings: list[Sighting] = field(default_factory=list)
     _asked: list[tuple[OperatorCommand, Callable[[CommandReply], None]]] = field(default_factory=list)
@@ -69,7 +71,7 @@ class Controller:
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
-        for topic in (topics.TICK, topics.END, topics.ODOMETRY, topics.SIGHTING):
+        for topic in (topics.TICK, topics.END, topics.ODOMETRY, topics.SIGHTING, topics.JETS):
             node.subscribe(topic)
         node.answer(topics.OPERATE_KEY, OperatorCommand, self.operate)
         self.teller = PresenceTeller(node, instance)
@@ -88,6 +90,8 @@ class Controller:
             case Sighting() as sighting:
                 self._sightings.append(sighting)
                 self._seen.add((sighting.tick, sighting.chaser))
+            case JetReport() as report:
+                self._jets[report.chaser] = report
             case Presence() as presence:
                 self.teller.take(presence)
             case MissionEnd():
@@ -96,6 +100,10 @@ class Controller:
             self._work_out(self.tick)
 
     def _complete(self, tick: Tick) -> bool:
+        if self.scenario.chaser.actuation == "thrusters" and any(
+            i not in self._jets or self._jets[i].tick != tick.tick for i in tick.chasers
+        ):
+            return False
         return all(
             i in self._odometry
             and self._odometry[i].tick == tick.tick
@@ -108,8 +116,9 @@ class Controller:
         here = {i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers}
         with self._lock:
             asked, self._asked = self._asked, []
+        commands = tuple(c for c, _ in asked)
         out = self.flight.step(
-            Inputs(tick.tick, tick.sim_time_ns, here, tuple(self._sightings), tuple(c for c, _ in asked))
+            Inputs(tick.tick, tick.sim_time_ns, here, tuple(self._sightings), commands, self._jets)
         )
         for (command, answer), reply in zip(asked, out.replies[len(out.replies) - len(asked) :], strict=True):
             answer(reply)

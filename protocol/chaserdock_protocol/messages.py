@@ -24,7 +24,10 @@ Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Count = Annotated[int, Meta(ge=0)]
 ChaserId = Annotated[int, Meta(ge=0, le=255)]
+JetId = Annotated[int, Meta(ge=0, le=254)]
+Jets = Annotated[tuple[JetId, ...], Meta(max_length=255)]
 Text = Annotated[str, Meta(max_length=2000)]
+Level = Literal["info", "warning", "error"]
 Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 
@@ -78,6 +81,8 @@ class BodyTruth(Message, frozen=True, kw_only=True):
 
     ``impulse_N_s`` and ``angular_impulse_N_m_s`` are what its actuators gave it since the last tick, in
     body axes; ``absolute_impulse_N_s`` is the time integral of the sum of the force components' magnitudes.
+    With thrusters: ``jet_impulse_N_s`` that every jet gave, ``jet_open_s`` that its valves were open, and the
+    ``propellant_kg`` that took, since the last tick (the body's mass stays what it is).
     """
 
     body: Text
@@ -88,6 +93,9 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     impulse_N_s: Vector3 = (0.0, 0.0, 0.0)
     angular_impulse_N_m_s: Vector3 = (0.0, 0.0, 0.0)
     absolute_impulse_N_s: float = 0.0
+    jet_impulse_N_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
+    jet_open_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
+    propellant_kg: float = 0.0
 
 
 class WorldTruth(Message, frozen=True, kw_only=True):
@@ -165,6 +173,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
 
     Valid until ``expires_ns``; ``tick`` is that of the odometry it answers. ``mode`` says where it comes from:
     the NMPC's plan, or a safe command (``brake`` stops the chaser, ``coast`` gives nothing).
+    ``isolated``: jets whose shut-off valve an operator wants closed; ``trusted``: jets that an operator vouches for,
+    whatever the chaser has found. ``free``: nothing holds or touches the chaser, so that its motion shows its jets.
     """
 
     chaser: ChaserId
@@ -173,6 +183,9 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     mode: Literal["nmpc", "brake", "coast"]
     force_N: Vector3
     torque_N_m: Vector3
+    isolated: Jets = ()
+    trusted: Jets = ()
+    free: bool = True
 
 
 class Plan(Message, frozen=True, kw_only=True):
@@ -201,10 +214,20 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     wall_tick_s: float = 0.0
 
 
+class JetPulse(Struct, frozen=True, kw_only=True):
+    """A jet's valve is to be open between two times."""
+
+    jet: JetId
+    open_ns: Count
+    close_ns: Count
+
+
 class ActuatorCommand(Message, frozen=True, kw_only=True):
     """What a chaser tells its actuators, body axes, from ``effective_time_ns`` on.
 
     ``source`` is ``command`` when it passes on the controller's, ``brake`` when it had none that it could trust.
+    With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, and ``isolated``
+    the jets whose shut-off valves are closed from ``effective_time_ns`` on; force and torque say what was asked for.
     """
 
     chaser: ChaserId
@@ -212,13 +235,34 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     source: Literal["command", "brake"]
     force_N: Vector3
     torque_N_m: Vector3
+    pulses: Annotated[tuple[JetPulse, ...], Meta(max_length=10_000)] = ()
+    isolated: Jets = ()
+
+
+JetState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
+
+
+class JetReport(Message, frozen=True, kw_only=True):
+    """What a chaser's jets can do, as it knows them, at the time of the odometry of the same tick.
+
+    ``force_max_N`` and ``torque_max_N_m`` are within reach on all body axes at once. ``coming_*`` is the impulse (body
+    axes) that it will get from pulses under way, less what of them counts as the next command's.
+    """
+
+    chaser: ChaserId
+    force_max_N: Vector3
+    torque_max_N_m: Vector3
+    coming_impulse_N_s: Vector3
+    coming_angular_impulse_N_m_s: Vector3
+    jets: Annotated[tuple[JetState, ...], Meta(max_length=255)]
+    isolated: Jets = ()
 
 
 class Event(Message, frozen=True, kw_only=True):
     """Something worth telling, once."""
 
     process: Text
-    level: Literal["info", "warning", "error"]
+    level: Level
     what: Text
     detail: Text = ""
 
@@ -241,11 +285,14 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone.
 
     The controller publishes it again, with the tick it was obeyed or refused at: the log must hold all inputs.
+
+    ``isolate`` closes a jet's shut-off valve, ``restore`` opens it and vouches for the jet; ``jet`` goes with these.
     """
 
-    command: Literal["approach", "hold", "retreat", "abort", "goto"]
+    command: Literal["approach", "hold", "retreat", "abort", "goto", "isolate", "restore"]
     chaser: ChaserId
     offset_m: Vector3 | None = None
+    jet: JetId | None = None
 
 
 class CommandReply(Message, frozen=True, kw_only=True):
@@ -303,6 +350,7 @@ VERSION: dict[type[Struct], int] = {
     Plan: 1,
     SolverStatus: 1,
     ActuatorCommand: 1,
+    JetReport: 1,
     Event: 1,
     Health: 1,
     RecorderAck: 1,

@@ -21,6 +21,7 @@ from .scenario_fields import Name, NotNegative, Positive, Section, UnitQuaternio
 from .scenario_files import read_toml, resolve_files
 from .scenario_odometry import OdometrySection
 from .scenario_text import ScenarioError, explain, override
+from .scenario_thrusters import JetFailure, check_pulses
 from .targets import TargetModel
 
 
@@ -152,14 +153,17 @@ class TimelineEntry(Section):
     """A command at a time of the mission."""
 
     at_s: NotNegative
-    command: Literal["approach", "hold", "retreat", "abort", "goto"]
+    command: Literal["approach", "hold", "retreat", "abort", "goto", "isolate", "restore"]
     chasers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     offset_m: Vector | None = None
+    jet: Annotated[int, Field(ge=0, le=254)] | None = None
 
     @model_validator(mode="after")
     def _goto(self) -> TimelineEntry:
         if (self.command == "goto") != (self.offset_m is not None):
             raise ValueError("offset_m goes with the command goto, and goto needs it")
+        if (self.command in ("isolate", "restore")) != (self.jet is not None):
+            raise ValueError("jet goes with the commands isolate and restore, and these need it")
         return self
 
 
@@ -203,6 +207,7 @@ class Scenario(Section):
     approach: Approach = Approach()
     chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
     timeline: tuple[TimelineEntry, ...] = ()
+    jet_failure: tuple[JetFailure, ...] = ()
     success: Success = Success()
 
     @model_validator(mode="after")
@@ -223,6 +228,9 @@ class Scenario(Section):
         for i in self.success.reached:
             if self.goal_of(i) is None:
                 raise ValueError(f"success.reached: no goto of the timeline names chaser {i}")
+        if self.chaser.actuation == "thrusters":
+            check_pulses(self.chaser.thrusters, self.chaser.modulation, self.time.physics_hz)
+        _check_failures(self)
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
@@ -271,6 +279,24 @@ def _check_apart(scenario: Scenario) -> None:
                     f"chasers.{j} and chasers.{i} start {apart:.3f} m apart, inside one another; "
                     f"their bodies need {width:.3f} m"
                 )
+
+
+def _check_failures(scenario: Scenario) -> None:
+    """Jets fail in this mission only where there are some."""
+    chasers, jets = len(scenario.chasers), len(scenario.chaser.thrusters)
+    if scenario.jet_failure and scenario.chaser.actuation != "thrusters":
+        raise ValueError('jet_failure: jets fail only with chaser.actuation = "thrusters"')
+    for k, failure in enumerate(scenario.jet_failure):
+        if failure.chaser >= chasers:
+            raise ValueError(
+                f"jet_failure.{k}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
+            )
+        if failure.jet >= jets:
+            raise ValueError(
+                f"jet_failure.{k}.jet: there is no jet {failure.jet}; the body has 0 to {jets - 1}"
+            )
+        if any((f.chaser, f.jet) == (failure.chaser, failure.jet) for f in scenario.jet_failure[:k]):
+            raise ValueError(f"jet_failure.{k}: jet {failure.jet} of chaser {failure.chaser} fails twice")
 
 
 def _checked(validate: Callable[[Any], Scenario], values: Any, source: str) -> Scenario:

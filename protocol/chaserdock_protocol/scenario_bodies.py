@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from .scenario_fields import Name, Positive, PositiveVector, Section, UnitQuaternion, Vector
 from .scenario_target import Geometry
+from .scenario_thrusters import MAX_JETS, Modulation, Thruster, check_layout
 from .targets import TargetModel, target_model, target_names
+from .thruster_bodies import BODIES
 
 
 class Target(Section):
@@ -59,20 +61,36 @@ def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[
 
 
 class Body(Section):
-    """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's."""
+    """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's.
 
+    ``body`` names one that is shipped with jets, whose figures are then the defaults. ``actuation``: the commanded
+    wrench itself (``ideal``), or pulses of the jets.
+    """
+
+    body: Literal["slider", "tetra12"] | None = None
     mass_kg: Positive = 30.0
     size_m: PositiveVector = (0.25, 0.25, 0.05)
     inertia_kg_m2: PositiveVector | None = None
     force_max_N: Positive = 2.0
     torque_max_N_m: Positive = 0.05
     probe_reach_m: Positive = 0.35
-    actuation: Literal["ideal"] = "ideal"
+    actuation: Literal["ideal", "thrusters"] = "ideal"
+    thrusters: Annotated[tuple[Thruster, ...], Field(max_length=MAX_JETS)] = ()
+    modulation: Modulation = Modulation()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _shipped(cls, values: Any) -> Any:
+        if isinstance(values, dict) and isinstance(name := values.get("body"), str) and name in BODIES:
+            return BODIES[name] | values
+        return values
 
     @model_validator(mode="after")
     def _possible(self) -> Body:
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
+        if self.actuation == "thrusters":
+            check_layout(self.thrusters, self.force_max_N, self.torque_max_N_m)
         return self
 
     @property

@@ -65,6 +65,7 @@ TRUTH_WORLD = Topic(
 )
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "picture", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
+JETS = _topic("chaser/{chaser}/jets", m.JetReport, "chaser", {"controller"}, "tick", "state")
 WRENCH = _topic(
     "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
 )
@@ -89,6 +90,7 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH_WORLD,
     SIGHTING,
     ACTUATORS,
+    JETS,
     WRENCH,
     REFERENCE,
     PLAN,

@@ -1,12 +1,15 @@
 """What drives a chaser in the world: commands held back until they take effect, bounded by the actuators.
 
-``ideal`` actuation gives the commanded wrench itself, cut off at the body's limits per axis.
+``ideal`` actuation gives the commanded wrench itself, cut off at the body's limits per axis; jets are in
+``jet_actuators``.
 """
 
 from __future__ import annotations
 
 import heapq
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from chaserdock_protocol.messages import ActuatorCommand
@@ -14,6 +17,33 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_bodies import Body
 
 from .physics import Physics
+
+
+class Given(NamedTuple):
+    """What actuators gave since they were last asked: impulse (6,), body axes, and the time integral of the force
+    components' magnitudes; whether a command was more than they can do, how many came late; of jets, see BodyTruth."""
+
+    impulse: Array
+    absolute_impulse_N_s: float
+    saturated: bool
+    late: int
+    jet_impulse_N_s: tuple[float, ...] = ()
+    jet_open_s: tuple[float, ...] = ()
+    propellant_kg: float = 0.0
+
+
+class Actuators(Protocol):
+    """What drives one chaser: see ``IdealActuators`` for the meaning of each member."""
+
+    def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None: ...
+
+    def next_change(self, step: int) -> int | None: ...
+
+    def act(self, step: int, steps: int, step_s: float) -> Array: ...
+
+    def stop(self, step: int) -> None: ...
+
+    def take(self, step: int) -> Given: ...
 
 
 @dataclass
@@ -55,20 +85,20 @@ class IdealActuators:
         self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * steps * step_s
         return self.wrench
 
-    def stop(self) -> None:
-        """The chaser is gone: nothing acts any more."""
+    def stop(self, step: int) -> None:
+        """The chaser is gone at physics step ``step``: nothing acts any more."""
         self._waiting.clear()
         self.wrench = np.zeros(6)
 
-    def take(self) -> tuple[Array, float, bool, int]:
-        """Impulse (6,), absolute impulse, saturated and late commands since the last call."""
-        out = self.impulse, self.absolute_impulse_N_s, self.saturated, self.late
+    def take(self, step: int) -> Given:
+        """What was given since the last call, up to physics step ``step``."""
+        out = Given(self.impulse, self.absolute_impulse_N_s, self.saturated, self.late)
         self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = np.zeros(6), 0.0, False, 0
         return out
 
 
 def fly_to(
-    end_step: int, physics: Physics, actuators: dict[str, IdealActuators], step_s: float
+    end_step: int, physics: Physics, actuators: Mapping[str, Actuators], step_s: float
 ) -> set[tuple[str, str]]:
     """Advances the physics to ``end_step`` under what the actuators give; the pairs of bodies that touched."""
     touched: set[tuple[str, str]] = set()

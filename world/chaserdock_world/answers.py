@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
@@ -12,7 +12,7 @@ from chaserdock_protocol.presence import PresenceTeller, health_of
 from chaserdock_protocol.runtime import say
 from chaserdock_protocol.transport import Node
 
-from .actuators import IdealActuators
+from .actuators import Actuators
 from .membership import Membership
 
 RECORDER_WINDOW_TICKS = 8
@@ -29,7 +29,7 @@ class Answers:
         membership: Membership,
         teller: PresenceTeller,
         timing: Timing,
-        actuators: dict[str, IdealActuators],
+        actuators: Mapping[str, Actuators],
         step_now: Callable[[], int],
         recorder_expected: bool,
     ) -> None:
@@ -125,7 +125,7 @@ class Answers:
                 changed |= self.controller
                 self.controller = False
             elif name in self._actuators:
-                self._actuators[name].stop()
+                self._actuators[name].stop(self._step_now())
                 changed |= any(f"chaser/{i}" == name for i in self.chasers)
                 self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
         return changed and self._tick >= 0

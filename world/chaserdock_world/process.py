@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
@@ -19,10 +19,11 @@ from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
 
-from .actuators import IdealActuators, fly_to
+from .actuators import Actuators, fly_to
 from .answers import Answers
 from .cameras import Cameras
 from .imperfect import Navigation
+from .jet_actuators import actuators_of
 from .membership import Membership
 from .physics import Physics
 from .publish import publish_odometry, publish_truth
@@ -65,7 +66,7 @@ def gather(
     scenario: Scenario,
     options: ProcessOptions,
     node: Node,
-    actuators: dict[str, IdealActuators],
+    actuators: Mapping[str, Actuators],
     physics: Physics,
 ) -> Answers:
     """Opens the world's ears and doors: from here on processes can join."""
@@ -130,7 +131,7 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     """Gathers the processes, flies all ticks, ends the mission; the process' status."""
     cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
     navigation = Navigation(scenario)
-    actuators = {f"chaser/{i}": IdealActuators(scenario.chaser) for i in range(len(scenario.chasers))}
+    actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in range(len(scenario.chasers))}
     answers = gather(scenario, options, node, actuators, physics)
     say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
     started = answers.wait(

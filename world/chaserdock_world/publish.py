@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from chaserdock_protocol import topics
@@ -10,7 +11,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import BodyTruth, Odometry, WorldTruth
 from chaserdock_protocol.transport import Node
 
-from .actuators import IdealActuators
+from .actuators import Actuators
 from .imperfect import Navigation
 from .physics import BodyState
 
@@ -35,7 +36,7 @@ def publish_truth(
     states: dict[str, BodyState],
     tick: int,
     timing: Timing,
-    actuators: dict[str, IdealActuators],
+    actuators: Mapping[str, Actuators],
     contacts: set[tuple[str, str]],
 ) -> None:
     """Ground truth of all bodies, and what happened since the last tick."""
@@ -44,14 +45,17 @@ def publish_truth(
     for name, state in states.items():
         given: dict[str, Any] = {}
         if name in actuators:
-            impulse, absolute, cut, came_late = actuators[name].take()
+            took = actuators[name].take(timing.step_of_tick(tick))
             given = {
-                "impulse_N_s": vector(impulse[:3]),
-                "angular_impulse_N_m_s": vector(impulse[3:]),
-                "absolute_impulse_N_s": absolute,
+                "impulse_N_s": vector(took.impulse[:3]),
+                "angular_impulse_N_m_s": vector(took.impulse[3:]),
+                "absolute_impulse_N_s": took.absolute_impulse_N_s,
+                "jet_impulse_N_s": took.jet_impulse_N_s,
+                "jet_open_s": took.jet_open_s,
+                "propellant_kg": took.propellant_kg,
             }
-            late += came_late
-            if cut:
+            late += took.late
+            if took.saturated:
                 saturated.append(int(name.partition("/")[2]))
         message = BodyTruth(tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **given)
         node.publish(topics.TRUTH_BODY, message, name)

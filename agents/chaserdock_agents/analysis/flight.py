@@ -50,6 +50,8 @@ class Flight:
     run: dict[str, str]
     truth: dict[str, Track]
     absolute_impulse_N_s: dict[str, float]
+    jet_impulse_N_s: dict[str, float]
+    propellant_kg: dict[str, float]
     estimate: Track
     estimate_covariance: Array
     estimate_status: list[str]
@@ -159,6 +161,8 @@ def load_flight(log: Path) -> Flight:
         run=run,
         truth={name: _track(messages) for name, messages in c.bodies.items()},
         absolute_impulse_N_s={n: sum(m.absolute_impulse_N_s for m in ms) for n, ms in c.bodies.items()},
+        jet_impulse_N_s={n: sum(sum(m.jet_impulse_N_s) for m in ms) for n, ms in c.bodies.items()},
+        propellant_kg={n: sum(m.propellant_kg for m in ms) for n, ms in c.bodies.items()},
         estimate=_track(c.targets),
         estimate_covariance=np.array([m.covariance for m in c.targets], dtype=float).reshape(-1, 12, 12),
         estimate_status=[m.status for m in c.targets],

@@ -168,6 +168,8 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             "reached_time_s": reached_time(flight, i),
             "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
             "impulse_N_s": flight.absolute_impulse_N_s[name],
+            "jet_impulse_N_s": flight.jet_impulse_N_s[name],
+            "propellant_kg": flight.propellant_kg[name],
         }
     flown = [n for n in names if n in flight.truth]
     between = [
@@ -316,6 +318,8 @@ def text_of(result: dict[str, Any]) -> str:
                 f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
             )
         line += f"nearest to the target {c['min_distance_target_m']:.3f} m"
+        if c["propellant_kg"] > 0.0:
+            line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
         if c["docked"]:
             line += f"; docked since {c['dock_time_s']:.1f} s"
         lines.append(line)

@@ -13,6 +13,7 @@ from chaserdock_protocol.messages import (
     Event,
     Image,
     JoinReply,
+    Level,
     MissionEnd,
     Odometry,
     Presence,
@@ -26,6 +27,7 @@ from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.transport import Node
 
 from chaserdock_agents.perception import make_perception
+from chaserdock_agents.thrusters.pilot import JetPilot
 
 from .eye import look, prediction_from
 from .pilot import brake, passed_on, refusal
@@ -65,6 +67,9 @@ class Chaser:
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
         self._forgotten = self._refusing = False
+        self._jets = (
+            JetPilot(self.scenario, self.number) if self.scenario.chaser.actuation == "thrusters" else None
+        )
         self._perception = make_perception(self.scenario)
 
     def open(self, instance: str, realtime: bool) -> None:
@@ -73,6 +78,8 @@ class Chaser:
         self.realtime = realtime
         node.advertise(topics.SIGHTING, i)
         node.advertise(topics.ACTUATORS, i)
+        if self._jets is not None:
+            node.advertise(topics.JETS, i)
         node.subscribe(topics.IMAGE, i, latest=realtime)
         node.subscribe(topics.ODOMETRY, i, latest=realtime)
         node.subscribe(topics.WRENCH, i)
@@ -88,6 +95,7 @@ class Chaser:
                 self._look(image)
             case Odometry() as odometry:
                 self.odometry = odometry
+                self._watch_jets(odometry)
                 self._brake_if_alone()
                 self._brake_if_forgotten(odometry)
             case WrenchCommand() as command:
@@ -117,11 +125,21 @@ class Chaser:
             topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number
         )
 
+    def _watch_jets(self, odometry: Odometry) -> None:
+        """Tells the controller what the jets can do, and everyone what has been found of them."""
+        if self._jets is None:
+            return
+        self.node.publish(topics.JETS, self._jets.observe(odometry), self.number)
+        for level, what, detail in self._jets.drain_events():
+            self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)
+
     def _fly(self, command: WrenchCommand) -> None:
         now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0
         why_not = refusal(command, self.number, self.scenario.chaser, self.flown_tick, now_ns)
         if why_not is None:
             self.flown_ns, self._forgotten, self._refusing = command.sim_time_ns, False, False
+            if self._jets is not None:
+                self._jets.heed(command)
             self._send(passed_on(command))
             return
         self.node.counts.stale += 1
@@ -155,21 +173,29 @@ class Chaser:
                 "no command, braking", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns
             )
         # Not noted as this tick's answer: the controller's, should it still come, is better.
-        self.node.publish(topics.ACTUATORS, self._braking(odometry), self.number)
+        self._actuate(self._braking(odometry))
 
     def _braking(self, odometry: Odometry) -> ActuatorCommand:
         return brake(odometry, self.scenario.chaser, self.scenario.timing.effective_ns(odometry.tick))
 
     def _send(self, command: ActuatorCommand) -> None:
         self.flown_tick = command.tick
+        self._actuate(command)
+
+    def _actuate(self, command: ActuatorCommand) -> None:
+        if self._jets is not None:
+            command = self._jets.fly(command)
         self.node.publish(topics.ACTUATORS, command, self.number)
 
     def _warn(self, what: str, detail: str, tick: int, time_ns: int) -> None:
+        self._tell("warning", what, detail, tick, time_ns)
+
+    def _tell(self, level: Level, what: str, detail: str, tick: int, time_ns: int) -> None:
         event = Event(
             tick=tick,
             sim_time_ns=time_ns,
             process=self.name,
-            level="warning",
+            level=level,
             what=what,
             detail=detail,
         )

@@ -18,6 +18,8 @@ class Command(StrEnum):
     retreat = "retreat"
     abort = "abort"
     goto = "goto"
+    isolate = "isolate"
+    restore = "restore"
 
 
 def command(
@@ -25,6 +27,9 @@ def command(
     number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
     offset: Annotated[
         tuple[float, float, float] | None, typer.Option(help="goto: where, in the target's frame, metres")
+    ] = None,
+    jet: Annotated[
+        int | None, typer.Option(min=0, max=254, help="isolate, restore: which jet, from 0")
     ] = None,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
@@ -37,6 +42,6 @@ def command(
     from chaserdock_agents.operator import send_command
 
     link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
-    reply = send_command(link, what.value, number, offset, timeout)
+    reply = send_command(link, what.value, number, offset, timeout, jet)
     print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
     raise typer.Exit(0 if reply.accepted else 1)

@@ -29,6 +29,26 @@ Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 
 
+Phase = Literal[
+    "acquire",
+    "hold",
+    "approach",
+    "docked",
+    "retreat",
+    "goto",
+    "abort",
+    "wait",
+    "align",
+    "final",
+    "contact",
+    "latched",
+    "verified",
+]
+"""What a chaser is doing; from ``wait`` on, where docking ends by capture."""
+Latch = Literal["keep", "arm", "release"]
+"""What a probe's latch is told: as it is, to close at a proper touch (and stay closed), to open (and stay open)."""
+
+
 class Message(Struct, frozen=True, kw_only=True):
     """Fields that every message has."""
 
@@ -73,6 +93,16 @@ class Odometry(Message, frozen=True, kw_only=True):
     omega_rad_s: Vector3
 
 
+class DockingStatus(Message, frozen=True, kw_only=True):
+    """What a chaser's own docking sensor says: ``contact`` of the probe's tip since the last tick, ``armed``: the
+    latch closes at a touch within its tolerances, ``latched``: it has closed."""
+
+    chaser: ChaserId
+    contact: bool
+    armed: bool
+    latched: bool
+
+
 class BodyTruth(Message, frozen=True, kw_only=True):
     """Ground truth of one body (``target`` or ``chaser/0``), for recorder and analysis alone.
 
@@ -90,12 +120,33 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     absolute_impulse_N_s: float = 0.0
 
 
+class ProbeTouch(Struct, frozen=True, kw_only=True):
+    """A probe's tip came to touch the target at ``sim_time_ns``: where and how fast, relative to its port.
+
+    ``latched`` says whether the latch closed, ``refused`` why not.
+    """
+
+    chaser: ChaserId
+    sim_time_ns: Count
+    lateral_m: float
+    angle_rad: float
+    closing_m_s: float
+    lateral_speed_m_s: float
+    latched: bool
+    refused: Text = ""
+
+
 class WorldTruth(Message, frozen=True, kw_only=True):
-    """Contacts between bodies, in this tick and the physics steps since the last, and saturated commands."""
+    """Contacts between bodies, in this tick and the physics steps since the last, and saturated commands.
+
+    A touch of a probe's tip on the target is no contact here but one of ``touches``; ``latched``: who holds on now.
+    """
 
     contacts: tuple[tuple[Text, Text], ...]
     saturated: tuple[ChaserId, ...]
     late_commands: Count = 0
+    touches: tuple[ProbeTouch, ...] = ()
+    latched: tuple[ChaserId, ...] = ()
 
 
 class PoseSolution(Struct, frozen=True, kw_only=True):
@@ -152,7 +203,7 @@ class Reference(Message, frozen=True, kw_only=True):
     """
 
     chaser: ChaserId
-    phase: Literal["acquire", "hold", "approach", "docked", "retreat", "goto", "abort"]
+    phase: Phase
     phase_time_s: float
     position_m: Vector3
     q_wxyz: Quaternion
@@ -164,15 +215,17 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     """What a chaser's actuators are to give, in body axes, from ``effective_time_ns`` on.
 
     Valid until ``expires_ns``; ``tick`` is that of the odometry it answers. ``mode`` says where it comes from:
-    the NMPC's plan, or a safe command (``brake`` stops the chaser, ``coast`` gives nothing).
+    the NMPC's plan, a safe command (``brake`` stops the chaser, ``coast`` gives nothing), or the ``pull`` that
+    verifies a latch.
     """
 
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "brake", "coast"]
+    mode: Literal["nmpc", "brake", "coast", "pull"]
     force_N: Vector3
     torque_N_m: Vector3
+    latch: Latch = "keep"
 
 
 class Plan(Message, frozen=True, kw_only=True):
@@ -212,6 +265,7 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     source: Literal["command", "brake"]
     force_N: Vector3
     torque_N_m: Vector3
+    latch: Latch = "keep"
 
 
 class Event(Message, frozen=True, kw_only=True):
@@ -238,11 +292,16 @@ class RecorderAck(Message, frozen=True, kw_only=True):
 
 
 class OperatorCommand(Message, frozen=True, kw_only=True):
-    """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone."""
+    """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone.
+
+    ``operator`` says who asks, for the log; after ``expires_ns`` the wish is stale and refused.
+    """
 
     command: Literal["approach", "hold", "retreat", "abort", "goto"]
     chaser: ChaserId
     offset_m: Vector3 | None = None
+    operator: Text = ""
+    expires_ns: Count | None = None
 
 
 class CommandReply(Message, frozen=True, kw_only=True):
@@ -252,6 +311,7 @@ class CommandReply(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     accepted: bool
     reason: Text
+    operator: Text = ""
 
 
 class Presence(Message, frozen=True, kw_only=True):
@@ -291,6 +351,7 @@ VERSION: dict[type[Struct], int] = {
     MissionEnd: 1,
     Image: 1,
     Odometry: 1,
+    DockingStatus: 1,
     BodyTruth: 1,
     WorldTruth: 1,
     Sighting: 1,

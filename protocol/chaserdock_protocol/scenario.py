@@ -11,13 +11,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from . import rotations
 from .camera import Camera
 from .clock import Timing
+from .docking import axis_error_deg
 from .scenario_bodies import Body, Target
 from .scenario_camera import CameraSection
+from .scenario_docking import Docking
 from .scenario_fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
 from .scenario_text import ScenarioError, explain, override
 
@@ -146,6 +149,7 @@ class Success(Section):
     """What makes a run a success, judged on ground truth; what is left out is not asked."""
 
     docked: tuple[Annotated[int, Field(ge=0)], ...] = ()
+    latched: tuple[Annotated[int, Field(ge=0)], ...] = ()
     max_collisions: Annotated[int, Field(ge=0)] = 0
     keep_distances: bool = True
     steady_position_rms_m: Positive | None = None
@@ -172,6 +176,7 @@ class Scenario(Section):
     controller: Controller = Controller()
     limits: Limits = Limits()
     approach: Approach = Approach()
+    docking: Docking = Docking()
     chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
     timeline: tuple[TimelineEntry, ...] = ()
     success: Success = Success()
@@ -181,9 +186,12 @@ class Scenario(Section):
         _check_apart(self)
         named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
         last = len(self.chasers) - 1
-        for where, chasers in (*named, ("success.docked", self.success.docked)):
+        named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(self.docking.ports)]
+        success = [("success.docked", self.success.docked), ("success.latched", self.success.latched)]
+        for where, chasers in (*named, *success):
             if max(chasers, default=0) > last:
                 raise ValueError(f"{where}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
+        _check_ports(self)
         return self
 
     @property
@@ -224,6 +232,28 @@ def _check_apart(scenario: Scenario) -> None:
                     f"chasers.{j} and chasers.{i} start {apart:.3f} m apart, inside one another; "
                     f"their bodies need {width:.3f} m"
                 )
+
+
+def _check_ports(scenario: Scenario) -> None:
+    docking = scenario.docking
+    for i in scenario.success.latched:
+        if docking.port_of(i) is None:
+            raise ValueError(f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]")
+    if docking.kind != "capture":
+        return
+    if scenario.target.motion != "torque_free":
+        raise ValueError(
+            f"target.motion: docking by capture needs torque_free, a target that feels it, not {scenario.target.motion}"
+        )
+    if scenario.chaser.probe_reach_m <= scenario.chaser.size_m[0] / 2:
+        raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
+    for k, port in enumerate(docking.ports):
+        off_deg = axis_error_deg(port, np.asarray(scenario.chasers[port.chaser].q_wxyz))
+        if off_deg > 0.1:
+            raise ValueError(
+                f"docking.ports.{k}.axis: chaser {port.chaser} looks along its +X {off_deg:.3g} degrees off the "
+                "axis into the port; turn chasers.q_wxyz or the axis"
+            )
 
 
 def _checked(validate: Callable[[Any], Scenario], values: Any, source: str) -> Scenario:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,6 +85,10 @@ class Estimator(Protocol):
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate: ...
 
     def estimate_at(self, time_ns: int) -> TargetEstimate: ...
+
+    def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None: ...
+
+    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None: ...
 
     def drain_events(self) -> list[tuple[int, str]]: ...
 

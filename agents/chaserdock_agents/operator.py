@@ -15,12 +15,25 @@ class OperatorError(ChaserdockError):
 
 
 def send_command(
-    link: Link, command: str, chaser: int, offset_m: tuple[float, float, float] | None, timeout_s: float
+    link: Link,
+    command: str,
+    chaser: int,
+    offset_m: tuple[float, float, float] | None,
+    timeout_s: float,
+    operator: str = "",
+    before_s: float | None = None,
 ) -> CommandReply:
-    """Puts a command to the controller; raises OperatorError when nobody answers in time, TransportError."""
+    """Puts a command to the controller, in the name of ``operator``, to be refused once simulated time has passed
+    ``before_s``; raises OperatorError when nobody answers in time, TransportError."""
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z goes with goto, and goto needs it")
-    request = OperatorCommand(command=command, chaser=chaser, offset_m=offset_m)  # type: ignore[arg-type]
+    request = OperatorCommand(
+        command=command,  # type: ignore[arg-type]
+        chaser=chaser,
+        offset_m=offset_m,
+        operator=operator,
+        expires_ns=None if before_s is None else round(before_s * 1e9),
+    )
     node = Node("operator", "operator", link)
     try:
         begun_s = time.monotonic()

@@ -6,7 +6,7 @@ TRF's origin need not be the centre of mass: with a captured chaser it no longer
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from chaserdock_protocol.rotations import cross, normalize, rotate, to_matrix
@@ -36,6 +36,10 @@ class TargetPath:
     alpha_rad_s2: Array
     acceleration_m_s2: Array
 
+    def every(self, begin: int) -> TargetPath:
+        """Every second instant, from the one numbered ``begin`` on."""
+        return TargetPath(*(getattr(self, f.name)[begin::2] for f in fields(self)))
+
 
 def joined(target: TargetBody, held: Sequence[tuple[float, Array, Array, Array]]) -> TargetBody:
     """The target with bodies fixed to it: each its mass, principal inertia (3,), centre (3,) and attitude (4,) in TRF.
@@ -57,13 +61,22 @@ def joined(target: TargetBody, held: Sequence[tuple[float, Array, Array, Array]]
 
 
 @njit(cache=True, error_model="numpy")
+def _product(matrix, v):
+    # Numba's own product of arrays asks for SciPy.
+    out = np.empty(3)
+    for i in range(3):
+        out[i] = matrix[i, 0] * v[0] + matrix[i, 1] * v[1] + matrix[i, 2] * v[2]
+    return out
+
+
+@njit(cache=True, error_model="numpy")
 def _slope(q, w, inertia, inverse, dq, dw):
-    momentum = inertia @ w
+    momentum = _product(inertia, w)
     torque = np.empty(3)
     torque[0] = momentum[1] * w[2] - momentum[2] * w[1]
     torque[1] = momentum[2] * w[0] - momentum[0] * w[2]
     torque[2] = momentum[0] * w[1] - momentum[1] * w[0]
-    dw[:] = inverse @ torque
+    dw[:] = _product(inverse, torque)
     dq[0] = 0.5 * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2])
     dq[1] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
     dq[2] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])

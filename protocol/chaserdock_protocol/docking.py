@@ -9,7 +9,7 @@ import numpy as np
 
 from . import rotations
 from .rotations import Array
-from .scenario_docking import PoseLimits, Port
+from .scenario_docking import Port, PoseLimits
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from . import rotations
 from .camera import Camera
 from .clock import Timing
-from .docking import axis_error_deg
+from .docking import axis_error_deg, centre_offset
 from .scenario_bodies import Body, Target
 from .scenario_camera import CameraSection
 from .scenario_docking import Docking
@@ -238,7 +238,9 @@ def _check_ports(scenario: Scenario) -> None:
     docking = scenario.docking
     for i in scenario.success.latched:
         if docking.port_of(i) is None:
-            raise ValueError(f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]")
+            raise ValueError(
+                f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]"
+            )
     if docking.kind != "capture":
         return
     if scenario.target.motion != "torque_free":
@@ -248,6 +250,13 @@ def _check_ports(scenario: Scenario) -> None:
     if scenario.chaser.probe_reach_m <= scenario.chaser.size_m[0] / 2:
         raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
     for k, port in enumerate(docking.ports):
+        entry = centre_offset(port, scenario.chaser.probe_reach_m, docking.entry_m)
+        nearest_m = scenario.limits.min_distance_target_m
+        if math.hypot(*entry) <= nearest_m:
+            raise ValueError(
+                f"docking.ports.{k}: its corridor begins {math.hypot(*entry):.3g} m from the target's centre, inside "
+                f"limits.min_distance_target_m ({nearest_m:g} m); make docking.entry_m longer"
+            )
         off_deg = axis_error_deg(port, np.asarray(scenario.chasers[port.chaser].q_wxyz))
         if off_deg > 0.1:
             raise ValueError(

@@ -44,7 +44,7 @@ class Tolerances(PoseLimits):
 
 
 class Final(PoseLimits):
-    """Limits over the last ``Docking.final_m``."""
+    """Limits over the last ``Docking.final_m``; of the closing speed once the slowing down is over."""
 
     lateral_m: Positive = 0.008
     angle_deg: Positive = 2.0

@@ -43,6 +43,7 @@ class ProbeLatch:
             opens = self.latched and not self.armed
         if opens:
             self.latched = False
+            self._last_touch_step = step  # it still touches
         return opens
 
     def touch(self, step: int, before: PortView) -> bool:

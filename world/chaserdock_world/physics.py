@@ -63,9 +63,7 @@ class Physics:
         self._names = {number: name for name, number in self._bodies.items()}
         hz, docking = scenario.time.physics_hz, scenario.docking
         ports = docking.ports if docking.kind == "capture" else ()
-        self.latches = {
-            f"chaser/{p.chaser}": ProbeLatch(p.chaser, p, docking.tolerances, hz) for p in ports
-        }
+        self.latches = {f"chaser/{p.chaser}": ProbeLatch(p.chaser, p, docking.tolerances, hz) for p in ports}
         self._joints: dict[str, int] = {}
         # Of every free body at the beginning of the last step, as Bullet gives them: pose and rates.
         self._before: dict[int, tuple[Any, Any]] = {}
@@ -139,9 +137,7 @@ class Physics:
         if name == TARGET and self._prescribed:
             return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
         body = self._bodies[name]
-        return _state_of(
-            self._bullet.getBasePositionAndOrientation(body), self._bullet.getBaseVelocity(body)
-        )
+        return _state_of(self._bullet.getBasePositionAndOrientation(body), self._bullet.getBaseVelocity(body))
 
     def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
         """Makes ``steps`` physics steps under constant wrenches; returns the pairs of bodies that touched.
@@ -164,9 +160,7 @@ class Physics:
             for name, latch in self.latches.items():
                 if latch.obey(self.step_count):
                     self._let_go(name)
-            held = {self._bodies[name] for name in self._joints}
-            if held:
-                held.add(self._bodies[TARGET])
+            held = {self._bodies[name] for name in (*self._joints, TARGET)} if self._joints else ()
             # Bullet forgets external forces after every step.
             for body, inertia, force, torque in pushes:
                 pose, rates = pose_of(body, client), rates_of(body, client)
@@ -252,7 +246,9 @@ class Physics:
             childLinkIndex=-1,
             jointType=pybullet.JOINT_FIXED,
             jointAxis=[0, 0, 0],
-            parentFramePosition=rotations.rotate_inverse(target.q_wxyz, tip_world - target.position_m).tolist(),
+            parentFramePosition=rotations.rotate_inverse(
+                target.q_wxyz, tip_world - target.position_m
+            ).tolist(),
             childFramePosition=tip.tolist(),
             parentFrameOrientation=_xyzw(relative),
             childFrameOrientation=[0.0, 0.0, 0.0, 1.0],

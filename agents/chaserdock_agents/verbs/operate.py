@@ -26,6 +26,10 @@ def command(
     offset: Annotated[
         tuple[float, float, float] | None, typer.Option(help="goto: where, in the target's frame, metres")
     ] = None,
+    operator: Annotated[str, typer.Option(help="who asks, for the log")] = "",
+    before: Annotated[
+        float | None, typer.Option(min=0, help="simulated seconds of the mission after which it is too late")
+    ] = None,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     net_mode: NetModeOpt = "peer",
@@ -36,6 +40,6 @@ def command(
     from chaserdock_agents.operator import send_command
 
     link = link_of(namespace, connect, None, net_mode, config, 60_000)
-    reply = send_command(link, what.value, number, offset, timeout)
+    reply = send_command(link, what.value, number, offset, timeout, operator, before)
     print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
     raise typer.Exit(0 if reply.accepted else 1)

@@ -8,43 +8,27 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass, field, replace
 
 from .branch import predict
 from .parameters import MekfParameters
-from .step import Event, FilterState, is_lost, mixture_covariance, process
-from .types import Matrix3, Measurement, TargetEstimate, content_key, is_usable, no_estimate
+from .step import Event, FilterState, is_lost, mixture_covariance, process, shaken
+from .types import Matrix3, Measurement, Shock, TargetEstimate, content_key, is_usable, no_estimate
 
 
 @dataclass
 class _Exposure:
     """The measurements of one exposure time (sorted by chaser) and what they led to.
 
-    ``parameters`` hold up to it from the exposure before; ``shaken``: what was added to the rates' variances after it.
+    ``parameters`` hold up to it from the exposure before; ``shocks`` changed the rates after it.
     """
 
     time_ns: int
     group: list[Measurement]
     parameters: MekfParameters
-    shaken: tuple[float, float] = (0.0, 0.0)
+    shocks: list[Shock] = field(default_factory=list)
     state: FilterState | None = None
     events: tuple[Event, ...] = ()
-
-
-def _shaken(state: FilterState, velocity_variance: float, omega_variance: float) -> FilterState:
-    """The state with these variances added to the rates of every branch."""
-    if velocity_variance == omega_variance == 0.0:
-        return state
-    added = np.array([velocity_variance] * 3 + [omega_variance] * 3)
-    i = np.array([3, 4, 5, 9, 10, 11])
-    branches = []
-    for b in state.branches:
-        covariance = b.covariance.copy()
-        covariance[i, i] += added
-        branches.append(replace(b, covariance=covariance))
-    return replace(state, branches=tuple(branches))
 
 
 class Mekf:
@@ -145,14 +129,13 @@ class Mekf:
             state.rejected,
         )
 
-    def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None:
-        """Something pushed the target: its rates may have changed by these sigmas since the newest exposure."""
+    def disturb(self, shock: Shock) -> None:
+        """Something has pushed the target since the newest exposure."""
         if self._buffer:
             newest = self._buffer[-1]
-            v, w = newest.shaken
-            newest.shaken = (v + velocity_m_s**2, w + omega_rad_s**2)
+            newest.shocks.append(shock)
             if newest.state is not None:
-                newest.state = _shaken(newest.state, velocity_m_s**2, omega_rad_s**2)
+                newest.state = shaken(newest.state, [shock])
 
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
         """From the newest exposure on the target is another rigid body, free of torque: ``inertia`` (TRF, rows, about
@@ -198,7 +181,7 @@ class Mekf:
         state = self._buffer[i - 1].state if i > 0 else self._base
         for exposure in self._buffer[i:]:
             state, exposure.events = process(state, exposure.time_ns, exposure.group, exposure.parameters)
-            exposure.state = state = _shaken(state, *exposure.shaken)
+            exposure.state = state = shaken(state, exposure.shocks)
 
     def _trim(self) -> None:
         horizon = self._buffer[-1].time_ns - self._buffer_ns

@@ -108,7 +108,8 @@ class Conservation:
             wrench = self.flight.actuators["chaser/0"].wrench
             force = rotations.rotate(own.q_wxyz, wrench[:3])
             torque = rotations.rotate(own.q_wxyz, wrench[3:]) + np.cross(own.position_m - centre, force)
-            self._given = [self._given[0] + force * step_s, self._given[1] + torque * step_s]
+            self._given[0] = self._given[0] + np.asarray(force) * step_s
+            self._given[1] = self._given[1] + np.asarray(torque, dtype=float) * step_s
             if self._left_steps is None and physics.latches["chaser/0"].latched:
                 self._left_steps = scenario.time.physics_hz // 2
             elif self._left_steps is not None and self.linear is None:

@@ -88,10 +88,10 @@ class Docking(Section):
     approach_timeout_s: Positive = 60.0
     final_timeout_s: Positive = 30.0
     contact_timeout_s: Positive = 5.0
-    settle_s: Positive = 1.0
+    settle_s: Positive = 2.0
     pull_N: Positive = 0.5
     pull_s: Positive = 1.0
-    verify_position_m: Positive = 0.003
+    verify_position_m: Positive = 0.005
     verify_angle_deg: Positive = 0.5
 
     @model_validator(mode="after")

@@ -139,6 +139,12 @@ class Physics:
         body = self._bodies[name]
         return _state_of(self._bullet.getBasePositionAndOrientation(body), self._bullet.getBaseVelocity(body))
 
+    def place(self, name: str, state: BodyState) -> None:
+        """Puts a body into a state, touching or not: for tests and for what starts in the middle of a mission."""
+        body = self._bodies[name]
+        self._bullet.resetBasePositionAndOrientation(body, state.position_m.tolist(), _xyzw(state.q_wxyz))
+        self._set_velocity(body, state)
+
     def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
         """Makes ``steps`` physics steps under constant wrenches; returns the pairs of bodies that touched.
 
@@ -184,9 +190,7 @@ class Physics:
         return touched
 
     def _move_target(self) -> None:
-        state, body = self.state(TARGET), self._bodies[TARGET]
-        self._bullet.resetBasePositionAndOrientation(body, state.position_m.tolist(), _xyzw(state.q_wxyz))
-        self._set_velocity(body, state)
+        self.place(TARGET, self.state(TARGET))
 
     def contacts(self) -> tuple[tuple[str, str], ...]:
         """Pairs of bodies that touched or overlapped in the last step, sorted; a probe's tip on the target is none."""

@@ -12,6 +12,7 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
+from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
 from .flight import Flight, Track, load_flight
 
 
@@ -161,6 +162,8 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
             "impulse_N_s": flight.absolute_impulse_N_s[name],
         }
+        if (capture := capture_of(flight, i)) is not None:
+            chasers[str(i)]["capture"] = capture
     flown = [n for n in names if n in flight.truth]
     between = [
         float(np.min(_distance(flight.truth[a], flight.truth[b])))
@@ -242,8 +245,8 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         )
     for i, c in result["chasers"].items():
         distance = c["min_distance_target_m"]
-        if s.success.keep_distances and distance < s.limits.min_distance_target_m:
-            limit = s.limits.min_distance_target_m
+        limit = nearest_allowed_m(s, int(i))
+        if s.success.keep_distances and distance < limit:
             out.append(f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m")
         if int(i) in s.success.docked and not c["docked"]:
             out.append(f"chaser {i} is not docked")
@@ -263,6 +266,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             180.0 / math.pi,
             "deg",
         )
+    out += capture_failures(result, s)
     estimate = result["target_estimate"]
     for label, value, limit, unit, factor in (
         ("position", estimate["max_position_error_m"], s.success.max_estimate_position_m, "m", 1.0),
@@ -309,6 +313,8 @@ def text_of(result: dict[str, Any]) -> str:
         line += f"nearest to the target {c['min_distance_target_m']:.3f} m"
         if c["docked"]:
             line += f"; docked since {c['dock_time_s']:.1f} s"
+        if "capture" in c:
+            line += capture_text(c["capture"])
         lines.append(line)
     estimate = result["target_estimate"]
     if estimate["position_rms_m"] is not None:

@@ -149,6 +149,17 @@ class Outcome:
     again: bool | None = None
     phase: str = ""
 
+    def line(self) -> str:
+        """The flight on its own, while the others still fly."""
+        text = f"{self.seed}: {self.cause}"
+        if (t := self.touch) is not None:
+            text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg, {t.closing_m_s * 1e3:.2f} mm/s"
+        if self.linear is not None and self.angular is not None:
+            text += f"; momentum {self.linear:.1e}, {self.angular:.1e}"
+        if self.opened_s is not None:
+            text += f" after {self.opened_s:.1f} s" + ("" if self.again is None else f", again: {self.again}")
+        return text
+
 
 def cause_of(flight: Offline, verified: bool) -> str:
     """In a few words, what the flight's end came of."""
@@ -217,7 +228,6 @@ def abort(seed: int, eye_of: Callable[[Scenario], Eye], again: bool) -> Outcome:
         begun_s = flight.time_s
         flight.step((order("approach"),))
         while flight.time_s < begun_s + LIMIT_S and flight.phase(0) != "verified":
-            # Until it has come to rest the first approach may be refused for its place: it waits for nothing.
             flight.step()
         verified = flight.phase(0) == "verified"
     flight.close()
@@ -280,14 +290,14 @@ def main() -> None:
         outcomes = []
         for seed in seeds[:number]:
             outcomes.append(dock(seed, eye))
-            print(f"{name} {seed}: {outcomes[-1].cause}", file=sys.stderr, flush=True)
+            print(f"{name} {outcomes[-1].line()}", file=sys.stderr, flush=True)
         if outcomes:
             table(name, outcomes)
             result |= figures(name, outcomes)
     outcomes = []
     for seed in seeds[:aborts]:
         outcomes.append(abort(seed, noisy, again=seed % 5 == 0))
-        print(f"abort {seed}: {outcomes[-1].cause}", file=sys.stderr, flush=True)
+        print(f"abort {outcomes[-1].line()}", file=sys.stderr, flush=True)
     if outcomes:
         table("abort", outcomes)
         opened = [o.opened_s for o in outcomes if o.opened_s is not None]

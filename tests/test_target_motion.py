@@ -61,7 +61,7 @@ def branch(s: BodyState) -> Branch:
 
 
 def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
-    """3 s ahead, at three times the paper's rates: within 0.2 mm and 0.02 degrees, where uniform motion is off by more than 1 cm."""
+    """3 s ahead, at three times the paper's rates: 0.2 mm and 0.02 degrees; uniform motion is off by more than 1 cm."""
     begin, body = captured.state(TARGET), composite(captured)
     path = tumble(body, begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s, 0.05, 60)
     estimated = predict(branch(begin), 3_000_000_000, parameters(body))

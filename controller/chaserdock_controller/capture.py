@@ -58,8 +58,8 @@ def dock_of(scenario: Scenario, chaser: int) -> Dock | None:
 
 
 def corridors_apart(a: Dock, b: Dock) -> float:
-    """Least distance (m) between where the centres and probes of two chasers in their corridors may be."""
-    ends = [(d.offset(-d.reach_m), d.offset(d.docking.entry_m)) for d in (a, b)]
+    """Least distance (m) between where the centres of two chasers in their corridors may be."""
+    ends = [(d.offset(0.0), d.offset(d.docking.entry_m)) for d in (a, b)]
     return segments_apart(*ends[0], *ends[1])
 
 

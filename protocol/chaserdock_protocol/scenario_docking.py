@@ -67,8 +67,8 @@ class Docking(Section):
     Distances are between the probe's tip and the port along the port's axis: a corridor begins ``entry_m`` out, its
     last ``final_m`` are flown at ``contact_speed_m_s``, what is before at ``approach_speed_m_s``. The reference goes
     on to ``overdrive_m`` behind the port. ``pull_N`` for ``pull_s``, and as long a push back, must not move a latched
-    chaser by more than ``verify_*``. A corridor that comes within ``clearance_m`` of another's waits, as does one more
-    than ``at_once``.
+    chaser by more than ``verify_*``. A chaser whose way in comes within ``clearance_m`` of another's, centre to
+    centre, waits, as does one more than ``at_once``.
     """
 
     kind: Literal["held", "capture"] = "held"

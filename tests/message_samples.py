@@ -18,6 +18,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.MissionEnd(**HEAD, reason="flown to its end", complete=True),
     m.Image(**HEAD, chaser=2, width_px=4, height_px=2, encoding="mono8", data=bytes(range(8))),
     m.Odometry(**HEAD, chaser=255, position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
+    m.DockingStatus(**HEAD, chaser=1, contact=True, armed=True, latched=False),
     m.BodyTruth(**HEAD, body="chaser/0", position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
     m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
     m.Sighting(

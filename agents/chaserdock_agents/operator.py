@@ -21,13 +21,23 @@ def send_command(
     offset_m: tuple[float, float, float] | None,
     timeout_s: float,
     jet: int | None = None,
+    operator: str = "",
+    before_s: float | None = None,
 ) -> CommandReply:
-    """Puts a command to the controller; raises OperatorError when nobody answers in time, TransportError."""
+    """Puts a command to the controller, in the name of ``operator``, to be refused once simulated time has passed
+    ``before_s``; raises OperatorError when nobody answers in time, TransportError."""
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z goes with goto, and goto needs it")
     if (command in ("isolate", "restore")) != (jet is not None):
         raise OperatorError("--jet N goes with isolate and restore, and these need it")
-    request = OperatorCommand(command=command, chaser=chaser, offset_m=offset_m, jet=jet)  # type: ignore[arg-type]
+    request = OperatorCommand(
+        command=command,  # type: ignore[arg-type]
+        chaser=chaser,
+        offset_m=offset_m,
+        jet=jet,
+        operator=operator,
+        expires_ns=None if before_s is None else round(before_s * 1e9),
+    )
     node = Node("operator", "operator", link)
     try:
         begun_s = time.monotonic()

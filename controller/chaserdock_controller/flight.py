@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from chaserdock_protocol import rotations
@@ -11,6 +12,7 @@ from chaserdock_protocol.braking import brake_wrench
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     CommandReply,
+    DockingStatus,
     Event,
     JetReport,
     Odometry,
@@ -26,6 +28,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
 from . import reference
+from .captures import Captures
 from .facing import facing_attitudes
 from .fusion import geometry
 from .fusion.types import Estimator, Measurement
@@ -36,6 +39,7 @@ from .nmpc import NmpcInput, NmpcPlan, make_solver
 from .prediction import CommandHistory, predict_state, predict_state_with_impulse
 from .setup import estimator_of, nmpc_parameters
 
+Mode = Literal["nmpc", "brake", "coast", "pull"]
 _ODOMETRY_KEPT_NS = 2_000_000_000
 _GREATEST_MARGIN_M = 0.1
 
@@ -63,6 +67,7 @@ class Inputs:
     sightings: tuple[Sighting, ...]
     commands: tuple[OperatorCommand, ...] = ()
     jets: Mapping[int, JetReport] = field(default_factory=dict)
+    docking: Mapping[int, DockingStatus] = field(default_factory=dict)
 
 
 @dataclass
@@ -93,6 +98,7 @@ class Flight:
         self._now_s = now_s
         self._camera = scenario.camera_model()
         self._estimator = estimator or estimator_of(scenario)
+        self._captures = Captures(scenario, self._estimator)
         self._parameters = nmpc_parameters(scenario)
         c = scenario.controller
         self._solver = make_solver(c.solver, self._parameters, len(scenario.chasers), c.max_iterations)
@@ -127,6 +133,7 @@ class Flight:
                     chaser=command.chaser,
                     accepted=answer.accepted,
                     reason=answer.reason,
+                    operator=command.operator,
                 )
             )
         self._command(inputs, fused, out)
@@ -137,7 +144,10 @@ class Flight:
         """The estimation of ``step`` alone: the fused state and its message. Once a tick, by ``step`` or instead of it."""
         for odometry in inputs.odometry.values():
             self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
+        self._captures.feel(inputs.docking, inputs.odometry, self._history, inputs.time_ns)
         fused = self._estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
+        if fused.status in ("tracking", "predicting"):
+            self._captures.join(fused, inputs.odometry)
         for key in [k for k in self._odometry if k[1] < inputs.time_ns - _ODOMETRY_KEPT_NS]:
             del self._odometry[key]
         return fused, self._target_message(inputs, fused)
@@ -170,10 +180,14 @@ class Flight:
         known = fused.status in ("tracking", "predicting")
         plan: NmpcPlan | None = None
         took_s = 0.0
-        if known and ids:
-            ahead = self._estimator.estimate_at(effective_ns)
-            problem = self._problem(ids, inputs, ahead, effective_ns)
-            self._describe(ids, inputs, fused, out)
+        # Who holds on to the target is planned for only where others have to fly around it.
+        held = {i for i in ids if self._is_held(i)}
+        planned = ids if held != set(ids) else ()
+        problem = None
+        if known and planned:
+            problem = self._problem(planned, inputs, self._estimator.estimate_at(effective_ns), effective_ns)
+        self._describe(ids if known else (), inputs, fused, out)
+        if problem is not None:
             begun_s = self._now_s()
             since_ns = 0 if self._last_solve_ns is None else inputs.time_ns - self._last_solve_ns
             try:
@@ -182,38 +196,28 @@ class Flight:
             except (ValueError, ArithmeticError, RuntimeError) as error:
                 self._events(out, inputs, [("error", f"the solver refused: {error}")])
             took_s = self._now_s() - begun_s
-        else:
-            self._describe((), inputs, fused, out)
         for row, i in enumerate(ids):
+            if i in held or self._is_held(i):
+                pull = (-self.guidance.pull_N(i, inputs.time_ns / 1e9), 0.0, 0.0, 0.0, 0.0, 0.0)
+                self._send(i, inputs, effective_ns, "pull" if pull[0] else "coast", np.array(pull), out)
+                continue
             usable = plan is not None and plan.status[row] != "failed"
             if usable != (i not in self._troubled) and known:
                 text = f"chaser {i}: " + ("planned again" if usable else "no plan, braking")
                 self._events(out, inputs, [("info" if usable else "error", text)])
                 (self._troubled.discard if usable else self._troubled.add)(i)
             if plan is not None and usable:
-                wrench, mode = plan.inputs[row, 0], "nmpc"
+                wrench: Array = plan.inputs[row, 0]
+                mode: Mode = "nmpc"
                 out.plans[i] = self._plan_message(i, inputs, effective_ns, plan, row)
             else:
                 wrench, mode = brake_wrench(inputs.odometry[i], self.scenario.chaser), "brake"
-            wrench = in_steps(wrench, self._jets.limits(i))
-            self._history.add(i, effective_ns, wrench)
-            out.wrenches[i] = WrenchCommand(
-                tick=inputs.tick,
-                sim_time_ns=inputs.time_ns,
-                chaser=i,
-                effective_time_ns=effective_ns,
-                expires_ns=inputs.time_ns + round(self.scenario.controller.command_lifetime_s * 1e9),
-                mode="nmpc" if mode == "nmpc" else "brake",
-                force_N=vector(wrench[:3]),
-                torque_N_m=vector(wrench[3:]),
-                isolated=self._jets.isolated(i),
-                trusted=self._jets.trusted(i),
-            )
+            self._send(i, inputs, effective_ns, mode, wrench, out)
         out.solver = SolverStatus(
             tick=inputs.tick,
             sim_time_ns=inputs.time_ns,
             solver=self.scenario.controller.solver,
-            chasers=ids if plan is not None else (),
+            chasers=planned if plan is not None else (),
             status=plan.status if plan is not None else (),
             iterations=tuple(int(n) for n in plan.iterations) if plan is not None else (),
             cost=vector(plan.cost) if plan is not None else (),
@@ -221,12 +225,35 @@ class Flight:
             wall_solve_s=took_s,
         )
 
+    def _is_held(self, i: int) -> bool:
+        """Whether a chaser holds on to the target and is to stay: then its actuators are quiet unless told."""
+        return i in self._captures.latched and self.guidance.chasers[i].phase not in ("retreat", "abort")
+
+    def _send(
+        self, i: int, inputs: Inputs, effective_ns: int, mode: Mode, wrench: Array, out: Outputs
+    ) -> None:
+        wrench = in_steps(wrench, self._jets.limits(i))
+        self._history.add(i, effective_ns, wrench)
+        out.wrenches[i] = WrenchCommand(
+            tick=inputs.tick,
+            sim_time_ns=inputs.time_ns,
+            chaser=i,
+            effective_time_ns=effective_ns,
+            expires_ns=inputs.time_ns + round(self.scenario.controller.command_lifetime_s * 1e9),
+            mode=mode,
+            force_N=vector(wrench[:3]),
+            torque_N_m=vector(wrench[3:]),
+            latch=self.guidance.latch(i),
+            isolated=self._jets.isolated(i),
+            trusted=self._jets.trusted(i),
+            free=self.guidance.is_free(i),
+        )
+
     def _problem(self, ids: tuple[int, ...], inputs: Inputs, ahead: Fused, effective_ns: int) -> NmpcInput:
         """The NMPC's problem at the time when the commands take effect."""
         p, s = self._parameters, self.scenario
         times_s = np.arange(p.stages + 1) * p.dt_s
-        moving = (ahead.position_m, ahead.velocity_m_s, ahead.q_wxyz, ahead.omega_rad_s)
-        positions, _ = reference.predict_target(*moving, times_s)
+        nodes, middles = self._captures.path(ahead, p.dt_s, p.stages)
         states, references, u_ref = [], [], []
         for i in ids:
             offset = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s)
@@ -237,29 +264,35 @@ class Flight:
             else:
                 state = predict_state_with_impulse(inputs.odometry[i], coming, effective_ns, s.chaser)
             states.append(state)
-            references.append(reference.reference_trajectory(*moving, offset[0], q_off, times_s))
+            references.append(reference.references_on(nodes.positions_m, nodes.q_wxyz, offset[0], q_off))
             if s.controller.feed_forward:
                 held = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s[:-1] + p.dt_s / 2)
                 u_ref.append(
                     reference.feed_forward(
-                        ahead.omega_rad_s,
+                        middles.omega_rad_s,
                         *held,
                         self._attitudes(i, held[0]),
                         s.chaser.mass_kg,
                         np.diag(s.chaser.inertia),
+                        middles.alpha_rad_s2,
+                        middles.acceleration_m_s2,
                     )
                 )
             else:
                 u_ref.append(np.zeros((p.stages, 6)))
-        n = len(ids)
+        limits = np.array([self._jets.limits(i) for i in ids])
+        for row, i in enumerate(ids):
+            if self._is_held(i):  # it gives nobody room: no more than what follows the target's motion
+                limits[row] = np.minimum(limits[row], 1.2 * np.abs(u_ref[row]).max(axis=0) + 1e-3)
         return NmpcInput(
             states=np.array(states),
             references=np.array(references),
             u_ref=np.array(u_ref),
-            target_positions=positions,
-            min_distance_target_m=np.full(n, s.limits.min_distance_target_m + self._margin_m(ahead)),
+            target_positions=nodes.positions_m,
+            min_distance_target_m=np.array([self.guidance.min_distance_target_m(i) for i in ids])
+            + self._margin_m(ahead),
             min_distance_chasers_m=s.limits.min_distance_chasers_m,
-            input_max=np.array([self._jets.limits(i) for i in ids]),
+            input_max=limits,
         )
 
     def _attitudes(self, i: int, offsets: Array) -> Array:
@@ -285,6 +318,9 @@ class Flight:
             error_m = float(np.linalg.norm(position - odometry.position_m))
             error_rad = float(rotations.angle_between(attitude, odometry.q_wxyz))
             self.guidance.observe(i, now_s, error_m, error_rad)
+            senses = self._captures.senses(i, fused, odometry, inputs.docking.get(i))
+            if senses is not None:
+                self.guidance.sense(i, now_s, senses)
             phase = self.guidance.chasers[i]
             out.references[i] = Reference(
                 tick=inputs.tick,
@@ -295,7 +331,7 @@ class Flight:
                 position_m=vector(position),
                 q_wxyz=vector(attitude),
                 offset_m=vector(offset),
-                min_distance_target_m=self.scenario.limits.min_distance_target_m,
+                min_distance_target_m=self.guidance.min_distance_target_m(i),
             )
         changes = self.guidance.drain_events()
         self._events(out, inputs, [("info", f"chaser {i}: {what} ({detail})") for i, what, detail in changes])

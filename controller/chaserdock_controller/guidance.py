@@ -2,21 +2,33 @@
 
 Phases: ``acquire`` (the target has not been found), ``hold``, ``approach`` (the offset shrinks along its own line to
 the docking distance, the relative attitude kept, as in the paper, but at a bounded speed), ``docked`` (within
-the docking tolerances for long enough), ``retreat`` and ``abort`` (back to the nominal offset), ``goto``.
+the docking tolerances for long enough), ``retreat`` and ``abort`` (back to the nominal offset), ``goto``. Where docking
+ends by capture, an approach goes through the phases of ``capture`` instead.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.messages import Latch, OperatorCommand
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import ArrayLike, NDArray
 
-from .moves import Move, move_to, stay, stop
+from .capture import (
+    HOLDING_ON,
+    IN_CORRIDOR,
+    Senses,
+    Situation,
+    corridors_apart,
+    dock_of,
+    next_phase,
+    pull_N,
+    why_not_approach,
+)
+from .moves import Motion, glide, move_to, stay, stop
 
 Array = NDArray[np.float64]
 
@@ -26,12 +38,19 @@ _GOTO_SPEED = 2.0
 
 @dataclass(frozen=True)
 class ChaserGuidance:
-    """One chaser: its phase since ``since_s``, the motion of its reference in TRF, how long it has been in place."""
+    """One chaser: its phase since ``since_s``, the motion of its reference in TRF, how long it has been in place.
+
+    By capture: ``then``, what follows when the move is over (``nominal``, ``align`` or nothing, which is to hold);
+    ``attempt``, from 1; ``held``, its pose in TRF when the pull began.
+    """
 
     phase: str
     since_s: float
-    move: Move
+    move: Motion
     inside_since_s: float | None = None
+    then: str = ""
+    attempt: int = 1
+    held: tuple[Array, Array] | None = None
 
 
 @dataclass(frozen=True)
@@ -50,6 +69,9 @@ class Guidance:
         self.events: list[tuple[int, str, str]] = []
         self.chasers = [ChaserGuidance("acquire", 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
         self._leaving: dict[int, Array] = {}
+        self._docks = [dock_of(scenario, i) for i in range(len(scenario.chasers))]
+        self._sensed: dict[int, Senses] = {}
+        self._done: dict[int, tuple[float, OperatorCommand]] = {}
         self._due = sorted(scenario.timeline, key=lambda entry: entry.at_s)
 
     def found(self, now_s: float) -> None:
@@ -61,7 +83,9 @@ class Guidance:
     def lost(self, now_s: float) -> None:
         """The target is not known any more: whoever moved relative to it stops there."""
         for i, c in enumerate(self.chasers):
-            if c.phase in ("approach", "retreat", "goto", "abort"):
+            if self._docks[i] is not None and c.phase in IN_CORRIDOR:
+                self._back_out(i, "retreat", now_s, "the target is lost")
+            elif c.phase in ("approach", "retreat", "goto", "abort"):
                 self._enter(i, "hold", now_s, stop(c.move, now_s))
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
@@ -85,34 +109,128 @@ class Guidance:
         }
 
     def command(self, command: OperatorCommand, now_s: float) -> Answer:
-        """Does what an operator or the time line asks for, or says why not."""
+        """Does what an operator or the time line asks for, or says why not.
+
+        Of different commands to a chaser in one tick the first counts, but an abort always does.
+        """
         i, what = command.chaser, command.command
         if i >= len(self.chasers):
             return Answer(False, f"there is no chaser {i}; this mission has 0 to {len(self.chasers) - 1}")
-        c = self.chasers[i]
-        if c.phase == "acquire":
+        if command.expires_ns is not None and command.expires_ns < round(now_s * 1e9):
+            return Answer(
+                False, f"stale: it was to be done by {command.expires_ns / 1e9:.2f} s, it is {now_s:.2f} s"
+            )
+        if self.chasers[i].phase == "acquire":
             return Answer(False, "the target has not been found yet")
-        if what != "goto" and (what == c.phase or (what == "approach" and c.phase == "docked")):
+        done_s, done = self._done.get(i, (-math.inf, command))
+        differs = (done.command, done.offset_m) != (what, command.offset_m)
+        if done_s == now_s and differs and what != "abort":
+            whose = f" by {done.operator}" if done.operator else ""
+            return Answer(False, f"{done.command}{whose} came first in this tick")
+        answer = self._obey(command, now_s)
+        if answer.accepted:
+            self._done[i] = now_s, command
+        return answer
+
+    def _obey(self, command: OperatorCommand, now_s: float) -> Answer:
+        i, what = command.chaser, command.command
+        c, dock = self.chasers[i], self._docks[i]
+        approaching = ("docked",) if dock is None else ("wait", *IN_CORRIDOR, *HOLDING_ON)
+        if what != "goto" and (what == c.phase or (what == "approach" and c.phase in approaching)):
             return Answer(True, f"already in phase {c.phase}")
+        if dock is not None and what in ("hold", "goto") and c.phase in ("contact", *HOLDING_ON):
+            return Answer(False, f"in phase {c.phase} it can only retreat or abort")
+        if dock is not None and what == "goto" and self.in_corridor(i):
+            return Answer(False, "it is in its corridor: retreat or abort first")
         speed = self._scenario.approach.max_speed_m_s
-        nominal = np.asarray(self._scenario.chasers[i].position_m)
         match what:
             case "hold":
-                self._enter(i, "hold", now_s, stop(c.move, now_s))
-            case "approach":
-                if reason := self._why_not_approach(i, now_s):
+                move = stay(self._sensed[i].offset_m, now_s) if self.in_corridor(i) else stop(c.move, now_s)
+                self._enter(i, "hold", now_s, move)
+            case "approach" if dock is not None:
+                if reason := why_not_approach(dock, c.move.at(np.array([now_s]))[0][0]):
                     return Answer(False, reason)
+                taken = self._corridor_taken(i)
+                if taken:
+                    self._enter(i, "wait", now_s, stop(c.move, now_s), why=taken)
+                else:
+                    self._align(i, now_s, 1)
+            case "approach" if reason := self._why_not_approach(i, now_s):
+                return Answer(False, reason)
+            case "approach":
                 self._enter(i, "approach", now_s, move_to(c.move, self.dock_offset(i), now_s, speed))
-            case "retreat":
-                self._enter(i, "retreat", now_s, move_to(c.move, nominal, now_s, speed))
-            case "abort":
-                self._enter(i, "abort", now_s, move_to(c.move, nominal, now_s, speed * _ABORT_HASTE))
+            case "retreat" | "abort":
+                self._back_out(i, what, now_s)
             case "goto":
+                nominal = self._scenario.chasers[i].position_m
                 offset = np.asarray(command.offset_m if command.offset_m is not None else nominal)
                 if reason := self._why_not_goto(i, command, offset):
                     return Answer(False, reason)
                 self._enter(i, "goto", now_s, move_to(c.move, offset, now_s, speed * _GOTO_SPEED))
         return Answer(True, f"phase {self.chasers[i].phase}")
+
+    def _back_out(self, i: int, phase: str, now_s: float, why: str = "", then: str = "nominal") -> None:
+        """To the nominal offset; out of a corridor first along its axis, from where the chaser is."""
+        c, dock = self.chasers[i], self._docks[i]
+        speed = self._scenario.approach.max_speed_m_s * (_ABORT_HASTE if phase == "abort" else 1.0)
+        if dock is None or not self.in_corridor(i):
+            nominal = self._scenario.chasers[i].position_m
+            self._enter(i, phase, now_s, move_to(c.move, nominal, now_s, speed), why=why)
+            return
+        entry = dock.offset(dock.docking.entry_m)
+        move = move_to(stay(self._sensed[i].offset_m, now_s), entry, now_s, speed)
+        self._enter(i, phase, now_s, move, why=why, then=then)
+
+    def _align(self, i: int, now_s: float, attempt: int) -> None:
+        dock = self._docks[i]
+        assert dock is not None
+        speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED
+        move = move_to(self.chasers[i].move, dock.offset(dock.docking.entry_m), now_s, speed)
+        self._enter(i, "align", now_s, move, attempt=attempt)
+
+    def is_free(self, i: int) -> bool:
+        """Whether nothing holds or touches a chaser, as far as its docking sensor says."""
+        felt = self._sensed.get(i)
+        return felt is None or not (felt.contact or felt.latched)
+
+    def in_corridor(self, i: int) -> bool:
+        """Whether a chaser is in its corridor or at its port, by its phase or by where it is."""
+        c, dock = self.chasers[i], self._docks[i]
+        if dock is None or i not in self._sensed:
+            return False
+        return c.phase in ("approach", "final", "contact", *HOLDING_ON) or dock.inside(
+            self._sensed[i].offset_m
+        )
+
+    def min_distance_target_m(self, i: int) -> float:
+        """How near to the target a chaser may plan to come; 0, any distance, when it holds on to it."""
+        limit, dock = self._scenario.limits.min_distance_target_m, self._docks[i]
+        if dock is None or not self.in_corridor(i):
+            return limit
+        return 0.0 if self.chasers[i].phase in HOLDING_ON else min(limit, dock.keep_out_m())
+
+    def latch(self, i: int) -> Latch:
+        """What a chaser's latch is told: armed from the final approach on, open before and when backing out."""
+        if self._docks[i] is None:
+            return "keep"
+        return "arm" if self.chasers[i].phase in ("final", "contact", *HOLDING_ON) else "release"
+
+    def pull_N(self, i: int, now_s: float) -> float:
+        """Force along -X, CRF, that the test of a latch asks of its chaser now."""
+        c = self.chasers[i]
+        return pull_N(self._scenario.docking, now_s - c.since_s) if c.phase == "latched" else 0.0
+
+    def _corridor_taken(self, i: int) -> str:
+        """Who is in the way of an approach, in words; empty when nobody is."""
+        mine, docking, flying = self._docks[i], self._scenario.docking, 0
+        assert mine is not None
+        for j, other in enumerate(self._docks):
+            if j == i or other is None or not (self.chasers[j].phase == "align" or self.in_corridor(j)):
+                continue
+            flying += self.chasers[j].phase not in HOLDING_ON
+            if corridors_apart(mine, other) < docking.clearance_m:
+                return f"chaser {j} is in the way"
+        return f"{flying} are under way already" if flying >= docking.at_once else ""
 
     def _why_not_approach(self, i: int, now_s: float) -> str:
         position = self.chasers[i].move.at(np.array([now_s]))[0][0]
@@ -150,8 +268,16 @@ class Guidance:
         """Advances a chaser's phase by its estimated errors from the reference pose."""
         c, approach = self.chasers[i], self._scenario.approach
         if c.phase in ("retreat", "abort", "goto") and c.move.over_at(now_s):
-            self._enter(i, "hold", now_s, c.move)
-        elif c.phase in ("approach", "docked") and c.move.over_at(now_s):
+            if c.then == "align":
+                self._align(i, now_s, c.attempt + 1)
+            elif c.then == "nominal":
+                nominal, speed = self._scenario.chasers[i].position_m, approach.max_speed_m_s
+                haste = _ABORT_HASTE if c.phase == "abort" else 1.0
+                move = move_to(c.move, nominal, now_s, speed * haste)
+                self.chasers[i] = replace(c, move=move, then="")
+            else:
+                self._enter(i, "hold", now_s, c.move)
+        elif self._docks[i] is None and c.phase in ("approach", "docked") and c.move.over_at(now_s):
             inside = position_error_m <= approach.docked_position_m and angle_error_rad <= math.radians(
                 approach.docked_angle_deg
             )
@@ -162,13 +288,64 @@ class Guidance:
             elif c.phase == "docked" and since is None:
                 self._enter(i, "approach", now_s, c.move)
 
+    def sense(self, i: int, now_s: float, senses: Senses) -> None:
+        """Advances a chaser's phase by what is known of it at its port; only where it is captured."""
+        self._sensed[i] = senses
+        c, dock = self.chasers[i], self._docks[i]
+        if dock is None:
+            return
+        if c.phase == "wait":
+            if not self._corridor_taken(i):
+                self._align(i, now_s, 1)
+            return
+        docking = dock.docking
+        if c.phase == "align":
+            inside = not senses.view.fault(docking.corridor, docking.corridor.closing_m_s)
+            since = (c.inside_since_s if c.inside_since_s is not None else now_s) if inside else None
+            c = replace(c, inside_since_s=since)
+        elif c.phase == "latched" and c.held is None and now_s - c.since_s >= docking.settle_s:
+            c = replace(c, held=(senses.offset_m, senses.q_wxyz))
+        self.chasers[i] = c
+        gap = dock.place_of(c.move.at(np.array([now_s]))[0][0])[0]
+        inside_s = 0.0 if c.inside_since_s is None else now_s - c.inside_since_s
+        over = c.move.over_at(now_s)
+        follows = next_phase(
+            docking, Situation(c.phase, now_s - c.since_s, over, gap, inside_s, c.held), senses
+        )
+        if follows is None:
+            return
+        phase, why = follows
+        match phase:
+            case "retreat":
+                again = c.attempt < docking.attempts and c.phase not in HOLDING_ON
+                self._back_out(i, phase, now_s, why, "align" if again else "nominal")
+            case "approach":
+                fast = (docking.entry_m - docking.final_m, docking.approach_speed_m_s)
+                slow = (docking.final_m + docking.overdrive_m, docking.contact_speed_m_s)
+                inward = -np.asarray(dock.port.axis)
+                move = glide(dock.offset(docking.entry_m), inward, now_s, fast, slow)
+                self._enter(i, phase, now_s, move, why=why, attempt=c.attempt)
+            case "latched":
+                self._enter(i, phase, now_s, stay(senses.offset_m, now_s), why=why, attempt=c.attempt)
+            case _:
+                self._enter(i, phase, now_s, c.move, why=why, attempt=c.attempt)
+
     def _enter(
-        self, i: int, phase: str, now_s: float, move: Move, inside_since_s: float | None = None
+        self,
+        i: int,
+        phase: str,
+        now_s: float,
+        move: Motion,
+        inside_since_s: float | None = None,
+        why: str = "",
+        then: str = "",
+        attempt: int | None = None,
     ) -> None:
-        before = self.chasers[i].phase
-        self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s)
-        if phase != before:
-            self.events.append((i, phase, f"from {before}"))
+        before = self.chasers[i]
+        number = before.attempt if attempt is None else attempt
+        self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number)
+        if phase != before.phase:
+            self.events.append((i, phase, f"from {before.phase}" + (f": {why}" if why else "")))
 
     def drain_events(self) -> list[tuple[int, str, str]]:
         """Phase changes since the last call."""

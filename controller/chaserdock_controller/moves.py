@@ -9,6 +9,7 @@ Acceleration is continuous throughout, so that the feed-forward is.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -77,7 +78,95 @@ def stay(position_m: ArrayLike, time_s: float) -> Move:
     return Move(time_s, (Part(0.0, coefficients),))
 
 
-def stop(current: Move, now_s: float) -> Move:
+class Motion(Protocol):
+    """What a reference position does: a ``Move`` or a ``Glide``."""
+
+    @property
+    def goal_m(self) -> Array: ...
+
+    def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]: ...
+
+    def over_at(self, time_s: float) -> bool: ...
+
+
+@dataclass(frozen=True)
+class Glide:
+    """A straight way at speeds that change smoothly, from rest to rest.
+
+    ``from_m`` (3,) WRF or TRF, ``along`` (3,) unit; ``speeds_m_s`` (n,) are held for ``holds_s`` (n,), with ramps of
+    ``ramps_s`` (n + 1,) before, between and after them, on which the speed is the cubic with level ends.
+    """
+
+    start_s: float
+    from_m: Array
+    along: Array
+    speeds_m_s: tuple[float, ...]
+    holds_s: tuple[float, ...]
+    ramps_s: tuple[float, ...]
+
+    @property
+    def duration_s(self) -> float:
+        return sum(self.holds_s) + sum(self.ramps_s)
+
+    @property
+    def goal_m(self) -> Array:
+        """Where it ends, (3,)."""
+        return self.at(np.array([self.start_s + self.duration_s]))[0][0]
+
+    def over_at(self, time_s: float) -> bool:
+        """Whether it has ended."""
+        return time_s >= self.start_s + self.duration_s
+
+    def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
+        """Positions, velocities, accelerations (K, 3) at times (K,); at rest before and after."""
+        t = np.asarray(times_s, dtype=float) - self.start_s
+        way, speed, acceleration = np.zeros((3, len(t)))
+        begin, v = 0.0, 0.0
+        for ramp_s, following, hold_s in zip(
+            self.ramps_s, (*self.speeds_m_s, 0.0), (*self.holds_s, 0.0), strict=True
+        ):
+            x, step = np.clip((t - begin) / ramp_s, 0.0, 1.0), following - v
+            way += ramp_s * (v * x + step * (x**3 - x**4 / 2.0))
+            inside = (t >= begin) & (t < begin + ramp_s)
+            speed += np.where(inside, v + step * (3.0 * x**2 - 2.0 * x**3), 0.0)
+            acceleration += np.where(inside, step * 6.0 * (x - x**2) / ramp_s, 0.0)
+            begin, v = begin + ramp_s, following
+            way += v * np.clip(t - begin, 0.0, hold_s)
+            speed += np.where((t >= begin) & (t < begin + hold_s), v, 0.0)
+            begin += hold_s
+        along = self.along
+        return self.from_m + way[:, None] * along, speed[:, None] * along, acceleration[:, None] * along
+
+
+_RAMP_S = 2.0
+
+
+def glide(
+    from_m: ArrayLike, along: ArrayLike, now_s: float, fast: tuple[float, float], slow: tuple[float, float]
+) -> Glide:
+    """From rest at ``from_m`` (3,) along a unit vector (3,): ``fast`` and then ``slow``, each (way m, speed m/s).
+
+    The change from fast to slow has ended where the first way ends; the second holds the stop. A way too short for
+    its ramps is flown at the speed that it allows. Raises ValueError for ways or speeds that are not positive.
+    """
+    if min(*fast, *slow) <= 0.0:
+        raise ValueError(f"ways and speeds must be positive, not {fast} and {slow}")
+    v2 = min(slow[1], slow[0] / _RAMP_S)
+    # Ramps cover their mean speed: v1/2 up, (v1 + v2)/2 down.
+    v1 = min(fast[1], max(v2, fast[0] / _RAMP_S - v2 / 2.0))
+    hold_1 = max(0.0, (fast[0] - _RAMP_S * (v1 + v2 / 2.0)) / v1)
+    hold_2 = max(0.0, (slow[0] - _RAMP_S * v2 / 2.0) / v2)
+    return Glide(
+        now_s,
+        np.asarray(from_m, dtype=float),
+        np.asarray(along, dtype=float),
+        (v1, v2),
+        (hold_1, hold_2),
+        (_RAMP_S,) * 3,
+    )
+
+
+def stop(current: Motion, now_s: float) -> Move:
     """A move that brings ``current`` to rest a little further on its way.
 
     Its velocity is the cubic from that of ``current``, with its acceleration, to zero and zero.
@@ -95,7 +184,7 @@ def _straight(way: Array, duration_s: float) -> Part:
     return Part(duration_s, np.outer(share, way))
 
 
-def move_to(current: Move, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
+def move_to(current: Motion, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
     """A move from wherever ``current`` is at ``now_s`` to rest at ``goal_m`` (3,), not faster than ``max_speed_m_s``.
 
     If stopping takes more than that, it is not faster than ``stop`` (both within half a percent). Raises

@@ -11,6 +11,7 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     CommandReply,
+    DockingStatus,
     JetReport,
     JoinReply,
     MissionEnd,
@@ -58,10 +59,15 @@ class Controller:
     done_tick: int = -1
     _odometry: dict[int, Odometry] = field(default_factory=dict)
     _jets: dict[int, JetReport] = field(default_factory=dict)
+    _docking: dict[int, DockingStatus] = field(default_factory=dict)
     _seen: set[tuple[int, int]] = field(default_factory=set)
     _sightings: list[Sighting] = field(default_factory=list)
     _asked: list[tuple[OperatorCommand, Callable[[CommandReply], None]]] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def __post_init__(self) -> None:
+        s = self.scenario
+        self._ports = [s.docking.port_of(i) for i in range(len(s.chasers))]
 
     def open(self, instance: str) -> None:
         """Opens the topics, then tells its presence."""
@@ -71,7 +77,8 @@ class Controller:
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
-        for topic in (topics.TICK, topics.END, topics.ODOMETRY, topics.SIGHTING, topics.JETS):
+        told = (topics.TICK, topics.END, topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.JETS)
+        for topic in told:
             node.subscribe(topic)
         node.answer(topics.OPERATE_KEY, OperatorCommand, self.operate)
         self.teller = PresenceTeller(node, instance)
@@ -87,6 +94,8 @@ class Controller:
                 self.teller.settled.set()
             case Odometry() as odometry:
                 self._odometry[odometry.chaser] = odometry
+            case DockingStatus() as docking:
+                self._docking[docking.chaser] = docking
             case Sighting() as sighting:
                 self._sightings.append(sighting)
                 self._seen.add((sighting.tick, sighting.chaser))
@@ -108,6 +117,7 @@ class Controller:
             i in self._odometry
             and self._odometry[i].tick == tick.tick
             and (not tick.pictures or (tick.tick, i) in self._seen)
+            and (self._ports[i] is None or (i in self._docking and self._docking[i].tick == tick.tick))
             for i in tick.chasers
         )
 
@@ -116,9 +126,12 @@ class Controller:
         here = {i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers}
         with self._lock:
             asked, self._asked = self._asked, []
+        docking = {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers}
         commands = tuple(c for c, _ in asked)
         out = self.flight.step(
-            Inputs(tick.tick, tick.sim_time_ns, here, tuple(self._sightings), commands, self._jets)
+            Inputs(
+                tick.tick, tick.sim_time_ns, here, tuple(self._sightings), commands, dict(self._jets), docking
+            )
         )
         for (command, answer), reply in zip(asked, out.replies[len(out.replies) - len(asked) :], strict=True):
             answer(reply)

@@ -32,6 +32,26 @@ Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 
 
+Phase = Literal[
+    "acquire",
+    "hold",
+    "approach",
+    "docked",
+    "retreat",
+    "goto",
+    "abort",
+    "wait",
+    "align",
+    "final",
+    "contact",
+    "latched",
+    "verified",
+]
+"""What a chaser is doing; from ``wait`` on, where docking ends by capture."""
+Latch = Literal["keep", "arm", "release"]
+"""What a probe's latch is told: as it is, to close at a proper touch (and stay closed), to open (and stay open)."""
+
+
 class Message(Struct, frozen=True, kw_only=True):
     """Fields that every message has."""
 
@@ -76,6 +96,16 @@ class Odometry(Message, frozen=True, kw_only=True):
     omega_rad_s: Vector3
 
 
+class DockingStatus(Message, frozen=True, kw_only=True):
+    """What a chaser's own docking sensor says: ``contact`` of the probe's tip since the last tick, ``armed``: the
+    latch closes at a touch within its tolerances, ``latched``: it has closed."""
+
+    chaser: ChaserId
+    contact: bool
+    armed: bool
+    latched: bool
+
+
 class BodyTruth(Message, frozen=True, kw_only=True):
     """Ground truth of one body (``target`` or ``chaser/0``), for recorder and analysis alone.
 
@@ -98,12 +128,33 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     propellant_kg: float = 0.0
 
 
+class ProbeTouch(Struct, frozen=True, kw_only=True):
+    """A probe's tip came to touch the target at ``sim_time_ns``: where and how fast, relative to its port.
+
+    ``latched`` says whether the latch closed, ``refused`` why not.
+    """
+
+    chaser: ChaserId
+    sim_time_ns: Count
+    lateral_m: float
+    angle_rad: float
+    closing_m_s: float
+    lateral_speed_m_s: float
+    latched: bool
+    refused: Text = ""
+
+
 class WorldTruth(Message, frozen=True, kw_only=True):
-    """Contacts between bodies, in this tick and the physics steps since the last, and saturated commands."""
+    """Contacts between bodies, in this tick and the physics steps since the last, and saturated commands.
+
+    A touch of a probe's tip on the target is no contact here but one of ``touches``; ``latched``: who holds on now.
+    """
 
     contacts: tuple[tuple[Text, Text], ...]
     saturated: tuple[ChaserId, ...]
     late_commands: Count = 0
+    touches: tuple[ProbeTouch, ...] = ()
+    latched: tuple[ChaserId, ...] = ()
 
 
 class PoseSolution(Struct, frozen=True, kw_only=True):
@@ -160,7 +211,7 @@ class Reference(Message, frozen=True, kw_only=True):
     """
 
     chaser: ChaserId
-    phase: Literal["acquire", "hold", "approach", "docked", "retreat", "goto", "abort"]
+    phase: Phase
     phase_time_s: float
     position_m: Vector3
     q_wxyz: Quaternion
@@ -172,7 +223,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     """What a chaser's actuators are to give, in body axes, from ``effective_time_ns`` on.
 
     Valid until ``expires_ns``; ``tick`` is that of the odometry it answers. ``mode`` says where it comes from:
-    the NMPC's plan, or a safe command (``brake`` stops the chaser, ``coast`` gives nothing).
+    the NMPC's plan, a safe command (``brake`` stops the chaser, ``coast`` gives nothing), or the ``pull`` that
+    verifies a latch.
     ``isolated``: jets whose shut-off valve an operator wants closed; ``trusted``: jets that an operator vouches for,
     whatever the chaser has found. ``free``: nothing holds or touches the chaser, so that its motion shows its jets.
     """
@@ -180,12 +232,13 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "brake", "coast"]
+    mode: Literal["nmpc", "brake", "coast", "pull"]
     force_N: Vector3
     torque_N_m: Vector3
     isolated: Jets = ()
     trusted: Jets = ()
     free: bool = True
+    latch: Latch = "keep"
 
 
 class Plan(Message, frozen=True, kw_only=True):
@@ -235,6 +288,7 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     source: Literal["command", "brake"]
     force_N: Vector3
     torque_N_m: Vector3
+    latch: Latch = "keep"
     pulses: Annotated[tuple[JetPulse, ...], Meta(max_length=10_000)] = ()
     isolated: Jets = ()
 
@@ -284,6 +338,8 @@ class RecorderAck(Message, frozen=True, kw_only=True):
 class OperatorCommand(Message, frozen=True, kw_only=True):
     """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone.
 
+    ``operator`` says who asks, for the log; after ``expires_ns`` the wish is stale and refused.
+
     The controller publishes it again, with the tick it was obeyed or refused at: the log must hold all inputs.
 
     ``isolate`` closes a jet's shut-off valve, ``restore`` opens it and vouches for the jet; ``jet`` goes with these.
@@ -293,6 +349,8 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     offset_m: Vector3 | None = None
     jet: JetId | None = None
+    operator: Text = ""
+    expires_ns: Count | None = None
 
 
 class CommandReply(Message, frozen=True, kw_only=True):
@@ -302,6 +360,7 @@ class CommandReply(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     accepted: bool
     reason: Text
+    operator: Text = ""
 
 
 class Presence(Message, frozen=True, kw_only=True):
@@ -341,6 +400,7 @@ VERSION: dict[type[Struct], int] = {
     MissionEnd: 1,
     Image: 1,
     Odometry: 1,
+    DockingStatus: 1,
     BodyTruth: 1,
     WorldTruth: 1,
     Sighting: 1,

@@ -10,13 +10,16 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from . import plugins, rotations
 from .camera import Camera
 from .clock import Timing
+from .docking import axis_error_deg, centre_offset
 from .scenario_bodies import Body, Target
 from .scenario_camera import CameraSection
+from .scenario_docking import Docking
 from .scenario_fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
 from .scenario_files import read_toml, resolve_files
 from .scenario_odometry import OdometrySection
@@ -178,6 +181,7 @@ class Success(Section):
     reached: tuple[Annotated[int, Field(ge=0)], ...] = ()
     reached_position_m: Positive = 0.02
     reached_within_s: Positive | None = None
+    latched: tuple[Annotated[int, Field(ge=0)], ...] = ()
     max_collisions: Annotated[int, Field(ge=0)] = 0
     keep_distances: bool = True
     steady_position_rms_m: Positive | None = None
@@ -205,6 +209,7 @@ class Scenario(Section):
     controller: Controller = Controller()
     limits: Limits = Limits()
     approach: Approach = Approach()
+    docking: Docking = Docking()
     chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
     timeline: tuple[TimelineEntry, ...] = ()
     jet_failure: tuple[JetFailure, ...] = ()
@@ -221,7 +226,8 @@ class Scenario(Section):
             raise ValueError('target.geometry.mesh: is drawn by camera.renderer = "pybullet" alone')
         named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
         last = len(self.chasers) - 1
-        judged = (("success.docked", self.success.docked), ("success.reached", self.success.reached))
+        named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(self.docking.ports)]
+        judged = [(f"success.{what}", getattr(self.success, what)) for what in ("docked", "latched", "reached")]
         for where, chasers in (*named, *judged):
             if max(chasers, default=0) > last:
                 raise ValueError(f"{where}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
@@ -231,6 +237,7 @@ class Scenario(Section):
         if self.chaser.actuation == "thrusters":
             check_pulses(self.chaser.thrusters, self.chaser.modulation, self.time.physics_hz)
         _check_failures(self)
+        _check_ports(self)
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
@@ -297,6 +304,37 @@ def _check_failures(scenario: Scenario) -> None:
             )
         if any((f.chaser, f.jet) == (failure.chaser, failure.jet) for f in scenario.jet_failure[:k]):
             raise ValueError(f"jet_failure.{k}: jet {failure.jet} of chaser {failure.chaser} fails twice")
+
+
+def _check_ports(scenario: Scenario) -> None:
+    docking = scenario.docking
+    for i in scenario.success.latched:
+        if docking.port_of(i) is None:
+            raise ValueError(
+                f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]"
+            )
+    if docking.kind != "capture":
+        return
+    if scenario.target.motion != "torque_free":
+        raise ValueError(
+            f"target.motion: docking by capture needs torque_free, a target that feels it, not {scenario.target.motion}"
+        )
+    if scenario.chaser.probe_reach_m <= scenario.chaser.size_m[0] / 2:
+        raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
+    for k, port in enumerate(docking.ports):
+        entry = centre_offset(port, scenario.chaser.probe_reach_m, docking.entry_m)
+        nearest_m = scenario.limits.min_distance_target_m
+        if math.hypot(*entry) <= nearest_m:
+            raise ValueError(
+                f"docking.ports.{k}: its corridor begins {math.hypot(*entry):.3g} m from the target's centre, inside "
+                f"limits.min_distance_target_m ({nearest_m:g} m); make docking.entry_m longer"
+            )
+        off_deg = axis_error_deg(port, np.asarray(scenario.chasers[port.chaser].q_wxyz))
+        if off_deg > 0.1:
+            raise ValueError(
+                f"docking.ports.{k}.axis: chaser {port.chaser} looks along its +X {off_deg:.3g} degrees off the "
+                "axis into the port; turn chasers.q_wxyz or the axis"
+            )
 
 
 def _checked(validate: Callable[[Any], Scenario], values: Any, source: str) -> Scenario:

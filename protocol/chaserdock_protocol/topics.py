@@ -57,6 +57,9 @@ IMAGE = _topic("world/chaser/{chaser}/image", m.Image, "world", {"chaser"}, "pic
 ODOMETRY = _topic(
     "world/chaser/{chaser}/odometry", m.Odometry, "world", {"chaser", "controller"}, "tick", "state"
 )
+DOCKING = _topic(
+    "world/chaser/{chaser}/docking", m.DockingStatus, "world", {"chaser", "controller"}, "tick", "state"
+)
 TRUTH_BODY = Topic(
     "truth/body/{process}", m.BodyTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state"
 )
@@ -86,6 +89,7 @@ TOPICS: tuple[Topic, ...] = (
     END,
     IMAGE,
     ODOMETRY,
+    DOCKING,
     TRUTH_BODY,
     TRUTH_WORLD,
     SIGHTING,

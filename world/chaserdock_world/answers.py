@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
-from chaserdock_protocol.messages import ActuatorCommand, Event, Presence, RecorderAck, Tick
+from chaserdock_protocol.messages import ActuatorCommand, Event, Latch, Presence, RecorderAck, Tick
 from chaserdock_protocol.presence import PresenceTeller, health_of
 from chaserdock_protocol.runtime import say
 from chaserdock_protocol.transport import Node
@@ -31,6 +31,7 @@ class Answers:
         timing: Timing,
         actuators: Mapping[str, Actuators],
         step_now: Callable[[], int],
+        command_latch: Callable[[int, Latch, int], None],
         recorder_expected: bool,
     ) -> None:
         self.chasers: tuple[int, ...] = ()
@@ -41,6 +42,7 @@ class Answers:
         self._timing = timing
         self._actuators = actuators
         self._step_now = step_now
+        self._command_latch = command_latch
         self._recorder_expected = self._recorder_wanted = recorder_expected
         self._recorded_tick = -1
         self._tick = -1
@@ -112,6 +114,7 @@ class Answers:
             self._answered.add(command.chaser)
         effective = self._timing.step_of_time(command.effective_time_ns)
         actuators.command(command, effective, self._step_now())
+        self._command_latch(command.chaser, command.latch, effective)
 
     def _take_leave(self) -> bool:
         """Notes processes that are gone; True when that changes who is expected in the open tick."""

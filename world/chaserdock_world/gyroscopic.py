@@ -16,6 +16,14 @@ def _times_inertia(inertia: Sequence[float], a: float, b: float, c: float) -> tu
     return (b * c * (ic - ib), c * a * (ia - ic), a * b * (ib - ia))
 
 
+def _in_body(xyzw: Sequence[float], omega_world: Sequence[float]) -> tuple[float, float, float]:
+    """A rate in body axes: q* omega q."""
+    x, y, z, w = xyzw
+    u, v, s = omega_world
+    tx, ty, tz = 2.0 * (v * z - s * y), 2.0 * (s * x - u * z), 2.0 * (u * y - v * x)
+    return (u + w * tx + ty * z - tz * y, v + w * ty + tz * x - tx * z, s + w * tz + tx * y - ty * x)
+
+
 def midpoint_torque(
     inertia: Sequence[float],
     xyzw: Sequence[float],
@@ -28,17 +36,27 @@ def midpoint_torque(
     ``inertia``: principal moments, kg m^2; ``xyzw``: attitude body to world in Bullet's order; ``omega_world``: rate in
     world axes, rad/s. Plain floats, as this runs once a body and physics step.
     """
-    x, y, z, w = xyzw
-    # The rate in body axes: q* omega q.
-    u, v, s = omega_world
-    tx, ty, tz = 2.0 * (v * z - s * y), 2.0 * (s * x - u * z), 2.0 * (u * y - v * x)
-    a = u + w * tx + ty * z - tz * y
-    b = v + w * ty + tz * x - tx * z
-    c = s + w * tz + tx * y - ty * x
+    a, b, c = _in_body(xyzw, omega_world)
     gx, gy, gz = _times_inertia(inertia, a, b, c)
     h = 0.5 * step_s
     ma = a + h * (torque[0] - gx) / inertia[0]
     mb = b + h * (torque[1] - gy) / inertia[1]
     mc = c + h * (torque[2] - gz) / inertia[2]
     nx, ny, nz = _times_inertia(inertia, ma, mb, mc)
+    return (gx - nx, gy - ny, gz - nz)
+
+
+def midpoint_torque_of_rates(
+    inertia: Sequence[float],
+    xyzw: Sequence[float],
+    omega_world: Sequence[float],
+    omega_world_before: Sequence[float],
+) -> tuple[float, float, float]:
+    """As ``midpoint_torque`` for a body that is held by another, whose torque on it nobody knows beforehand.
+
+    The rate in the middle of the step is extrapolated from that of the step before, ``omega_world_before``.
+    """
+    middle = [a + 0.5 * (a - b) for a, b in zip(omega_world, omega_world_before, strict=True)]
+    gx, gy, gz = _times_inertia(inertia, *_in_body(xyzw, omega_world))
+    nx, ny, nz = _times_inertia(inertia, *_in_body(xyzw, middle))
     return (gx - nx, gy - ny, gz - nz)

@@ -26,7 +26,7 @@ from .imperfect import Navigation
 from .jet_actuators import actuators_of
 from .membership import Membership
 from .physics import Physics
-from .publish import publish_odometry, publish_truth
+from .publish import publish_docking, publish_odometry, publish_truth
 
 
 def main(options: ProcessOptions) -> int:
@@ -85,6 +85,8 @@ def gather(
         node.advertise(topic)
     for i in range(len(scenario.chasers)):
         node.advertise(topics.ODOMETRY, i)
+        if f"chaser/{i}" in physics.latches:
+            node.advertise(topics.DOCKING, i)
         node.advertise(topics.IMAGE, i, droppable=options.mode == "realtime")
     teller = PresenceTeller(node, membership.instance)
     node.announce()
@@ -95,6 +97,7 @@ def gather(
         scenario.timing,
         actuators,
         lambda: physics.step_count,
+        physics.command_latch,
         options.recorder_expected,
     )
 
@@ -147,7 +150,8 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     contacts: Contacts = set()
     while started:
         states = {name: physics.state(name) for name in physics.bodies}
-        publish_truth(node, states, tick, timing, actuators, contacts)
+        publish_docking(node, physics.latches, tick, timing)  # before the truth, which takes the touches
+        publish_truth(node, states, tick, timing, actuators, contacts, physics.latches)
         publish_odometry(node, states, tick, timing, navigation)
         if tick == scenario.ticks:
             break

@@ -8,12 +8,18 @@ from typing import Any
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import BodyTruth, Odometry, WorldTruth
+from chaserdock_protocol.messages import BodyTruth, DockingStatus, Odometry, WorldTruth
 from chaserdock_protocol.transport import Node
 
 from .actuators import Actuators
 from .imperfect import Navigation
+from .latch import ProbeLatch
 from .physics import BodyState
+
+
+def odometry_of(chaser: int, state: BodyState, tick: int, time_ns: int) -> Odometry:
+    """A chaser's own state as its navigation gives it."""
+    return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **_state_fields(state))
 
 
 def publish_odometry(
@@ -25,10 +31,25 @@ def publish_odometry(
             continue
         chaser = int(name.partition("/")[2])
         known = navigation.sensed(chaser, tick, state)
-        message = Odometry(
-            tick=tick, sim_time_ns=timing.tick_time_ns(tick), chaser=chaser, **_state_fields(known)
-        )
-        node.publish(topics.ODOMETRY, message, chaser)
+        node.publish(topics.ODOMETRY, odometry_of(chaser, known, tick, timing.tick_time_ns(tick)), chaser)
+
+
+def docking_status(latch: ProbeLatch, tick: int, time_ns: int) -> DockingStatus:
+    """What a chaser's docking sensor says of the time since the last tick."""
+    return DockingStatus(
+        tick=tick,
+        sim_time_ns=time_ns,
+        chaser=latch.chaser,
+        contact=latch.touched,
+        armed=latch.armed,
+        latched=latch.latched,
+    )
+
+
+def publish_docking(node: Node, latches: dict[str, ProbeLatch], tick: int, timing: Timing) -> None:
+    """What the docking sensors say, of the chasers that have a port."""
+    for latch in latches.values():
+        node.publish(topics.DOCKING, docking_status(latch, tick, timing.tick_time_ns(tick)), latch.chaser)
 
 
 def publish_truth(
@@ -38,8 +59,9 @@ def publish_truth(
     timing: Timing,
     actuators: Mapping[str, Actuators],
     contacts: set[tuple[str, str]],
+    latches: dict[str, ProbeLatch],
 ) -> None:
-    """Ground truth of all bodies, and what happened since the last tick."""
+    """Ground truth of all bodies, and what happened since the last tick; the latches' touches are taken."""
     time_ns = timing.tick_time_ns(tick)
     saturated, late = [], 0
     for name, state in states.items():
@@ -65,6 +87,8 @@ def publish_truth(
         contacts=tuple(sorted(contacts)),
         saturated=tuple(saturated),
         late_commands=late,
+        latched=tuple(latch.chaser for latch in latches.values() if latch.latched),
+        touches=tuple(touch for latch in latches.values() for touch in latch.take()),
     )
     node.publish(topics.TRUTH_WORLD, world)
 

@@ -13,6 +13,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
+from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
 from .flight import Flight, Track, load_flight
 from .reached import not_reached, reached_time
 
@@ -171,6 +172,8 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             "jet_impulse_N_s": flight.jet_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
         }
+        if (capture := capture_of(flight, i)) is not None:
+            chasers[str(i)]["capture"] = capture
     flown = [n for n in names if n in flight.truth]
     between = [
         float(np.min(_distance(flight.truth[a], flight.truth[b])))
@@ -252,8 +255,8 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         )
     for i, c in result["chasers"].items():
         distance = c["min_distance_target_m"]
-        if s.success.keep_distances and distance < s.limits.min_distance_target_m:
-            limit = s.limits.min_distance_target_m
+        limit = nearest_allowed_m(s, int(i))
+        if s.success.keep_distances and distance < limit:
             out.append(f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m")
         if int(i) in s.success.docked and not c["docked"]:
             out.append(f"chaser {i} is not docked")
@@ -274,6 +277,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             180.0 / math.pi,
             "deg",
         )
+    out += capture_failures(result, s)
     estimate = result["target_estimate"]
     for label, value, limit, unit, factor in (
         ("position", estimate["max_position_error_m"], s.success.max_estimate_position_m, "m", 1.0),
@@ -322,6 +326,8 @@ def text_of(result: dict[str, Any]) -> str:
             line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
         if c["docked"]:
             line += f"; docked since {c['dock_time_s']:.1f} s"
+        if "capture" in c:
+            line += capture_text(c["capture"])
         lines.append(line)
     estimate = result["target_estimate"]
     if estimate["position_rms_m"] is not None:

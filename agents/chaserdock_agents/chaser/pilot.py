@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from chaserdock_protocol.braking import brake_wrench
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
@@ -29,9 +30,9 @@ def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now
     return None
 
 
-def brake(odometry: Odometry, body: Body, effective_ns: int) -> ActuatorCommand:
-    """The command that brings a chaser to rest in WRF: see ``braking``."""
-    wrench = brake_wrench(odometry, body)
+def brake(odometry: Odometry, body: Body, effective_ns: int, latched: bool = False) -> ActuatorCommand:
+    """The command that brings a chaser to rest in WRF: see ``braking``. One that holds on to the target stays quiet."""
+    wrench = np.zeros(6) if latched else brake_wrench(odometry, body)
     return ActuatorCommand(
         tick=odometry.tick,
         sim_time_ns=odometry.sim_time_ns,
@@ -53,4 +54,5 @@ def passed_on(command: WrenchCommand) -> ActuatorCommand:
         source="command",
         force_N=command.force_N,
         torque_N_m=command.torque_N_m,
+        latch=command.latch,
     )

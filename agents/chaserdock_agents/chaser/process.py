@@ -10,6 +10,7 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
+    DockingStatus,
     Event,
     Image,
     JoinReply,
@@ -58,6 +59,7 @@ class Chaser:
     number: int
     ended: bool = False
     odometry: Odometry | None = None
+    latched: bool = False
     sighting: Sighting | None = None
     tick: Tick | None = None
     flown_tick: int = -1
@@ -82,6 +84,7 @@ class Chaser:
             node.advertise(topics.JETS, i)
         node.subscribe(topics.IMAGE, i, latest=realtime)
         node.subscribe(topics.ODOMETRY, i, latest=realtime)
+        node.subscribe(topics.DOCKING, i)
         node.subscribe(topics.WRENCH, i)
         node.subscribe(topics.TICK)
         node.subscribe(topics.END)
@@ -98,6 +101,8 @@ class Chaser:
                 self._watch_jets(odometry)
                 self._brake_if_alone()
                 self._brake_if_forgotten(odometry)
+            case DockingStatus() as docking:
+                self.latched = docking.latched
             case WrenchCommand() as command:
                 self._fly(command)
             case Tick() as tick:
@@ -176,7 +181,8 @@ class Chaser:
         self._actuate(self._braking(odometry))
 
     def _braking(self, odometry: Odometry) -> ActuatorCommand:
-        return brake(odometry, self.scenario.chaser, self.scenario.timing.effective_ns(odometry.tick))
+        effective_ns = self.scenario.timing.effective_ns(odometry.tick)
+        return brake(odometry, self.scenario.chaser, effective_ns, self.latched)
 
     def _send(self, command: ActuatorCommand) -> None:
         self.flown_tick = command.tick

@@ -31,6 +31,10 @@ def command(
     jet: Annotated[
         int | None, typer.Option(min=0, max=254, help="isolate, restore: which jet, from 0")
     ] = None,
+    operator: Annotated[str, typer.Option(help="who asks, for the log")] = "",
+    before: Annotated[
+        float | None, typer.Option(min=0, help="simulated seconds of the mission after which it is too late")
+    ] = None,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     net_mode: NetModeOpt = "peer",
@@ -42,6 +46,6 @@ def command(
     from chaserdock_agents.operator import send_command
 
     link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
-    reply = send_command(link, what.value, number, offset, timeout, jet)
+    reply = send_command(link, what.value, number, offset, timeout, jet, operator, before)
     print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
     raise typer.Exit(0 if reply.accepted else 1)

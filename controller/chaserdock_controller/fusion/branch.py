@@ -85,10 +85,21 @@ def predict(branch: Branch, time_ns: int, p: MekfParameters) -> Branch:
         f[i, i] = fade
         noise[i, i] = (1.0 - fade * fade) * np.tile(_prior_bias(p).diagonal(), len(branch.cameras))
         bias = bias * fade
+    position, velocity = branch.position_m + branch.velocity_m_s * dt, branch.velocity_m_s
+    if any(p.centre_of_mass_trf_m):
+        position, velocity, around = motion.about_centre(
+            (branch.position_m, branch.velocity_m_s, branch.q_wxyz, branch.omega_rad_s),
+            (q, w),
+            f[:12, :12],
+            np.array(p.centre_of_mass_trf_m),
+            dt,
+        )
+        f[:12, :12] = around
     return replace(
         branch,
         time_ns=time_ns,
-        position_m=branch.position_m + branch.velocity_m_s * dt,
+        position_m=position,
+        velocity_m_s=velocity,
         q_wxyz=q,
         omega_rad_s=w,
         bias=bias,

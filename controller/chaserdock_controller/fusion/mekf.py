@@ -8,20 +8,25 @@ from __future__ import annotations
 
 from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 from .branch import predict
 from .parameters import MekfParameters
-from .step import Event, FilterState, is_lost, mixture_covariance, process
-from .types import Measurement, TargetEstimate, content_key, is_usable, no_estimate
+from .step import Event, FilterState, is_lost, mixture_covariance, process, shaken
+from .types import Matrix3, Measurement, Shock, TargetEstimate, content_key, is_usable, no_estimate
 
 
 @dataclass
 class _Exposure:
-    """The measurements of one exposure time (sorted by chaser) and what they led to."""
+    """The measurements of one exposure time (sorted by chaser) and what they led to.
+
+    ``parameters`` hold up to it from the exposure before; ``shocks`` changed the rates after it.
+    """
 
     time_ns: int
     group: list[Measurement]
+    parameters: MekfParameters
+    shocks: list[Shock] = field(default_factory=list)
     state: FilterState | None = None
     events: tuple[Event, ...] = ()
 
@@ -124,6 +129,25 @@ class Mekf:
             state.rejected,
         )
 
+    def disturb(self, shock: Shock) -> None:
+        """Something has pushed the target since the newest exposure."""
+        if self._buffer:
+            newest = self._buffer[-1]
+            newest.shocks.append(shock)
+            if newest.state is not None:
+                newest.state = shaken(newest.state, [shock])
+
+    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
+        """From the newest exposure on the target is another rigid body, free of torque: ``inertia`` (TRF, rows, about
+        the centre of mass, to any factor), ``centre_trf_m`` its centre of mass in TRF. Raises ValueError for an
+        inertia that no body has."""
+        self.parameters = replace(
+            self.parameters,
+            motion_model="torque_free",
+            inertia_ratios=inertia,
+            centre_of_mass_trf_m=centre_trf_m,
+        )
+
     def drain_events(self) -> list[Event]:
         """What happened since the last call, as (simulated time in ns, text), in order of time."""
         fresh = [e for x in self._buffer for e in x.events if e not in self._drained]
@@ -142,7 +166,7 @@ class Mekf:
     def _insert(self, m: Measurement) -> bool:
         i = bisect_left(self._buffer, m.time_ns, key=lambda e: e.time_ns)
         if i == len(self._buffer) or self._buffer[i].time_ns != m.time_ns:
-            self._buffer.insert(i, _Exposure(m.time_ns, [m]))
+            self._buffer.insert(i, _Exposure(m.time_ns, [m], self.parameters))
             return True
         group = self._buffer[i].group
         if any(other.chaser == m.chaser for other in group):
@@ -156,8 +180,8 @@ class Mekf:
         i = bisect_left(self._buffer, time_ns, key=lambda e: e.time_ns)
         state = self._buffer[i - 1].state if i > 0 else self._base
         for exposure in self._buffer[i:]:
-            state, exposure.events = process(state, exposure.time_ns, exposure.group, self.parameters)
-            exposure.state = state
+            state, exposure.events = process(state, exposure.time_ns, exposure.group, exposure.parameters)
+            exposure.state = state = shaken(state, exposure.shocks)
 
     def _trim(self) -> None:
         horizon = self._buffer[-1].time_ns - self._buffer_ns

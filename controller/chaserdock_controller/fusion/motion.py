@@ -62,6 +62,45 @@ def torque_free(
     return q, w, transition
 
 
+def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
+    """Matrix (12, 12) from the errors of TRF's origin to those of a point ``centre_trf_m`` (3,) fixed in TRF.
+
+    The point is at p + R c and moves at v + R (omega x c); dtheta and omega stay.
+    """
+    rotation, turning = qmatrix(q_wxyz), np.cross(omega_rad_s, centre_trf_m)
+    m = np.eye(12)
+    m[0:3, 6:9] = -rotation @ skew(centre_trf_m)
+    m[3:6, 6:9] = -rotation @ skew(turning)
+    m[3:6, 9:12] = -rotation @ skew(centre_trf_m)
+    return m
+
+
+def about_centre(
+    before: tuple[Array, Array, Array, Array],
+    after: tuple[Array, Array],
+    transition: Array,
+    centre_trf_m: Array,
+    dt_s: float,
+) -> tuple[Array, Array, Array]:
+    """Position, velocity (3,) of TRF's origin and transition (12, 12) where the centre of mass is elsewhere.
+
+    ``before``: position, velocity, attitude, rate; ``after``: attitude and rate ``dt_s`` on; ``transition`` (12, 12)
+    of a body whose centre of mass is TRF's origin. The centre of mass moves on at its constant velocity.
+    """
+    position, velocity, q, omega = before
+    q_after, omega_after = after
+    arm, arm_after = qmatrix(q) @ centre_trf_m, qmatrix(q_after) @ centre_trf_m
+    turning = qmatrix(q) @ np.cross(omega, centre_trf_m)
+    centre_velocity = velocity + turning
+    there = position + arm + centre_velocity * dt_s
+    back = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
+    return (
+        there - arm_after,
+        centre_velocity - qmatrix(q_after) @ np.cross(omega_after, centre_trf_m),
+        back @ transition @ to_centre(q, omega, centre_trf_m),
+    )
+
+
 def process_noise(dt_s: float, acceleration_density: float, angular_density: float) -> Array:
     """Covariance (12, 12) that white noise adds in ``dt_s``.
 

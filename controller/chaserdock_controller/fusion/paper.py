@@ -19,7 +19,7 @@ from itertools import groupby
 import numpy as np
 
 from .scalar import qinv_mul, qlog
-from .types import Array, Measurement, TargetEstimate, content_key, is_usable, no_estimate
+from .types import Array, Matrix3, Measurement, Shock, TargetEstimate, content_key, is_usable, no_estimate
 
 
 @dataclass(frozen=True)
@@ -154,6 +154,12 @@ class PaperEstimator:
             self._seen,
             self._rejected,
         )
+
+    def disturb(self, shock: Shock) -> None:
+        """Nothing to do: the rates are differences of poses, and hold no belief that a push could belie."""
+
+    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
+        """Nothing to do: there is no model of the body."""
 
     def drain_events(self) -> list[tuple[int, str]]:
         """What happened since the last call, as (simulated time in ns, text)."""

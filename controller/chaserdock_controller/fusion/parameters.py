@@ -38,6 +38,7 @@ class MekfParameters:
 
     motion_model: "constant_rates", or "torque_free" with ``inertia_ratios``: the target's inertia
         tensor in TRF (rows), to any common factor.
+    centre_of_mass_trf_m: where the target's centre of mass is; TRF's origin circles round it.
     acceleration_noise_m_s2_sqrt_hz, angular_noise_rad_s2_sqrt_hz: square roots of the spectral
         densities of white (angular) acceleration. The target's rates are truly constant, so these only
         say how long the filter remembers: larger follows surprises faster, smaller is smoother.
@@ -61,6 +62,7 @@ class MekfParameters:
 
     motion_model: str = "constant_rates"
     inertia_ratios: tuple[_Row, _Row, _Row] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    centre_of_mass_trf_m: _Row = (0.0, 0.0, 0.0)
     acceleration_noise_m_s2_sqrt_hz: float = 1e-4
     angular_noise_rad_s2_sqrt_hz: float = 1e-4
     floor_position_m: float = 2e-4
@@ -94,6 +96,8 @@ class MekfParameters:
                 low_ok = value >= 0.0 if field.name in may_be_zero else value > 0.0
                 if not (low_ok and math.isfinite(value)):
                     raise ValueError(f"{field.name} is out of range: {value}")
+        if not all(math.isfinite(x) for x in self.centre_of_mass_trf_m):
+            raise ValueError(f"centre_of_mass_trf_m is out of range: {self.centre_of_mass_trf_m}")
         if not 0.0 < self.gate_probability < 1.0:
             raise ValueError(f"gate_probability must lie between 0 and 1: {self.gate_probability}")
         if (self.bias_position_m == 0.0) != (self.bias_attitude_rad == 0.0):

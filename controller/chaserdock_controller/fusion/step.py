@@ -14,7 +14,7 @@ import numpy as np
 from .branch import Branch, absorb, agree, pose_sigmas, predict, start
 from .parameters import MekfParameters
 from .scalar import qexp, qinv_mul, qlog, qmul
-from .types import Array, Measurement, PoseHypothesis
+from .types import Array, Measurement, PoseHypothesis, Shock
 
 Event = tuple[int, str]
 
@@ -72,6 +72,24 @@ def process(
         if all(_mostly_gated(b, now, p) for b in now.branches):
             now = _restart(now, seen, p, events)
     return _choose(now, p, events), tuple(events)
+
+
+def shaken(state: FilterState, shocks: list[Shock]) -> FilterState:
+    """The state with every branch's rates changed by ``shocks``, and their covariance by what these leave open."""
+    i = np.array([3, 4, 5, 9, 10, 11])
+    branches = list(state.branches)
+    for shock in shocks:
+        added = np.repeat([shock.sigma_velocity_m_s**2, shock.sigma_omega_rad_s**2], 3)
+        for k, b in enumerate(branches):
+            covariance = b.covariance.copy()
+            covariance[i, i] += added
+            branches[k] = replace(
+                b,
+                velocity_m_s=b.velocity_m_s + shock.velocity_m_s,
+                omega_rad_s=b.omega_rad_s + shock.omega_rad_s,
+                covariance=covariance,
+            )
+    return replace(state, branches=tuple(branches))
 
 
 def is_lost(branch: Branch, p: MekfParameters) -> bool:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,6 +67,17 @@ class TargetEstimate:
     rejected: tuple[int, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class Shock:
+    """A sudden change of the target's rates: sigmas of what is unknown of it, and what is known: velocity (3,) of
+    TRF's origin in WRF, rate (3,) in TRF."""
+
+    sigma_velocity_m_s: float
+    sigma_omega_rad_s: float
+    velocity_m_s: Array = field(default_factory=lambda: np.zeros(3))
+    omega_rad_s: Array = field(default_factory=lambda: np.zeros(3))
+
+
 class Estimator(Protocol):
     """What ``make_estimator`` returns: see ``mekf.Mekf`` for the meaning of each member."""
 
@@ -84,6 +96,10 @@ class Estimator(Protocol):
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate: ...
 
     def estimate_at(self, time_ns: int) -> TargetEstimate: ...
+
+    def disturb(self, shock: Shock) -> None: ...
+
+    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None: ...
 
     def drain_events(self) -> list[tuple[int, str]]: ...
 

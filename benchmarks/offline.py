@@ -1,0 +1,161 @@
+"""Missions in one process, without Zenoh: world, eyes and controller called in turn, tick by tick.
+
+The same code flies as in the processes; what is left out is what carries messages. Eyes and actuators are given, so
+that a statistical model can stand in for pictures, and jets for ideal actuation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from chaserdock_agents.chaser.eye import look, prediction_from
+from chaserdock_agents.chaser.pilot import passed_on
+from chaserdock_agents.perception import Perception
+from chaserdock_controller.flight import Flight, Inputs, Outputs
+from chaserdock_protocol import rotations
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import OperatorCommand, PoseSolution, Sighting
+from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.targets import target_model
+from chaserdock_world.actuators import IdealActuators, fly_to
+from chaserdock_world.cameras import Cameras
+from chaserdock_world.physics import TARGET, BodyState, Physics
+from chaserdock_world.publish import docking_status, odometry_of
+
+States = dict[str, BodyState]
+Eye = Callable[[int, int, int, States], Sighting]
+"""From chaser, tick, time (ns) and all bodies' states to what that chaser sees."""
+
+
+def seeing_eye(scenario: Scenario) -> Eye:
+    """Real pictures, rendered and searched for markers as in the chaser's process."""
+    cameras = Cameras(scenario)
+    perception = Perception(
+        scenario.camera_model(), target_model(scenario.target.model), scenario.perception.name
+    )
+    last: dict[int, Sighting] = {}
+
+    def see(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        number = tick // scenario.timing.ticks_per_picture
+        image = cameras.picture(chaser, number, tick, time_ns, states)
+        last[chaser] = look(perception, image, prediction_from(last.get(chaser)))
+        return last[chaser]
+
+    return see
+
+
+def statistical_eye(
+    scenario: Scenario, seed: int, position_m: float, attitude_rad: float, blind: float = 0.0
+) -> Eye:
+    """The target's true pose with white noise of these sigmas an axis; in the share ``blind`` of pictures, nothing."""
+    rng = np.random.default_rng([seed, 0xE1E])
+    camera = scenario.camera_model()
+    covariance = vector(np.diag([position_m**2] * 3 + [attitude_rad**2] * 3))
+
+    def see(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        own, target = states[f"chaser/{chaser}"], states[TARGET]
+        at, attitude = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
+        position = rotations.rotate_inverse(attitude, target.position_m - at) + rng.normal(0, position_m, 3)
+        turned = rotations.multiply(target.q_wxyz, rotations.exp(rng.normal(0.0, attitude_rad, 3)))
+        q = rotations.multiply(rotations.conjugate(attitude), turned)
+        seen = PoseSolution(
+            position_m=vector(position), q_wxyz=vector(q), covariance=covariance, reprojection_rms_px=0.1
+        )
+        nothing = rng.random() < blind
+        return Sighting(
+            tick=tick,
+            sim_time_ns=time_ns,
+            chaser=chaser,
+            status="nothing" if nothing else "seen",
+            solutions=() if nothing else (seen,),
+            marker_ids=() if nothing else (0, 1, 2, 3),
+            corners_px=(),
+            rejected_ids=(),
+        )
+
+    return see
+
+
+@dataclass
+class Offline:
+    """A mission in flight. ``actuators`` by chaser's name; ``last`` is the controller's latest answer.
+
+    ``touched``: pairs of bodies that touched since the start, but for a probe's tip on the target; ``on_step`` is
+    called with the physics after every flown slice.
+    """
+
+    scenario: Scenario
+    eye: Eye
+    make_actuators: Callable[[Scenario], Any] = lambda scenario: IdealActuators(scenario.chaser)
+    tick: int = 0
+    touched: set[tuple[str, str]] = field(default_factory=set)
+    touches: list[Any] = field(default_factory=list)
+    events: list[tuple[float, str]] = field(default_factory=list)
+    last: Outputs | None = None
+
+    def __post_init__(self) -> None:
+        s = self.scenario
+        self.physics = Physics(s)
+        self.flight = Flight(s, lambda: 0.0)
+        self.actuators = {f"chaser/{i}": self.make_actuators(s) for i in range(len(s.chasers))}
+
+    @property
+    def time_s(self) -> float:
+        return self.scenario.timing.tick_time_ns(self.tick) / 1e9
+
+    def states(self) -> States:
+        return {name: self.physics.state(name) for name in self.physics.bodies}
+
+    def phase(self, chaser: int) -> str:
+        return self.flight.guidance.chasers[chaser].phase
+
+    def step(self, commands: tuple[OperatorCommand, ...] = ()) -> Outputs:
+        """Flies one tick: senses, decides, acts, and moves on to the next."""
+        s, timing, physics = self.scenario, self.scenario.timing, self.physics
+        tick, time_ns, states = self.tick, timing.tick_time_ns(self.tick), self.states()
+        chasers = range(len(s.chasers))
+        docking = {x.chaser: docking_status(x, tick, time_ns) for x in physics.latches.values()}
+        for latch in physics.latches.values():
+            self.touches += latch.take()
+        odometry = {i: odometry_of(i, states[f"chaser/{i}"], tick, time_ns) for i in chasers}
+        seen = tuple(self.eye(i, tick, time_ns, states) for i in chasers) if timing.has_pictures(tick) else ()
+        out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, docking))
+        for i, wrench in out.wrenches.items():
+            command = passed_on(wrench)
+            effective = timing.step_of_time(command.effective_time_ns)
+            self.actuators[f"chaser/{i}"].command(command, effective, physics.step_count)
+            physics.command_latch(i, command.latch, effective)
+        self.events += [(time_ns / 1e9, e.what) for e in out.events]
+        self.fly(timing.step_of_tick(tick + 1))
+        self.tick += 1
+        self.last = out
+        return out
+
+    def fly(self, step: int) -> None:
+        """Moves the world on to a physics step."""
+        step_s = 1.0 / self.scenario.timing.physics_hz
+        self.touched |= fly_to(step, self.physics, self.actuators, step_s)
+
+    def close(self) -> None:
+        self.physics.close()
+
+
+def momentum(physics: Physics, masses: dict[str, tuple[float, Array]]) -> tuple[Array, Array]:
+    """Momentum (3,), N s, and angular momentum (3,) about the common centre of mass, N m s, in WRF axes.
+
+    ``masses``: mass and principal inertia (3,) of every body by name.
+    """
+    states = {name: physics.state(name) for name in masses}
+    total = sum(m for m, _ in masses.values())
+    centre = sum((m * states[n].position_m for n, (m, _) in masses.items()), np.zeros(3)) / total
+    linear = sum((m * states[n].velocity_m_s for n, (m, _) in masses.items()), np.zeros(3))
+    angular = np.zeros(3)
+    for name, (m, inertia) in masses.items():
+        s = states[name]
+        angular += np.cross(s.position_m - centre, m * (s.velocity_m_s - linear / total))
+        angular += rotations.rotate(s.q_wxyz, inertia * s.omega_rad_s)
+    return linear, angular

@@ -1,0 +1,100 @@
+"""Builders shared by the tests of docking by capture: a servicer, a chaser before its port, a world and a guidance."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from chaserdock_controller.capture import Senses
+from chaserdock_protocol import rotations
+from chaserdock_protocol.docking import PortView
+from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.scenario import Scenario, parse_scenario
+from chaserdock_world.physics import TARGET, BodyState, Physics
+
+TARGET_KG, CHASER_KG = 40.0, 17.8
+TARGET_INERTIA, CHASER_INERTIA = (0.683, 0.875, 0.9), (0.3, 0.31, 0.33)
+REACH_M = 0.35
+PORTS = (
+    {"chaser": 0, "position_m": [-0.2, 0.0, -0.05], "axis": [-1.0, 0.0, 0.0]},
+    {"chaser": 1, "position_m": [0.2, 0.0, -0.05], "axis": [1.0, 0.0, 0.0]},
+    {"chaser": 2, "position_m": [-0.2, 0.0, 0.1], "axis": [-1.0, 0.0, 0.0]},
+    {"chaser": 3, "position_m": [0.0, 0.16, 0.0], "axis": [0.0, 1.0, 0.0]},
+)
+_HALF = float(np.sqrt(0.5))
+CHASERS = (
+    {"position_m": [-1.0, 0.0, -0.05], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    {"position_m": [1.0, 0.0, -0.05], "q_wxyz": [0.0, 0.0, 0.0, 1.0]},
+    {"position_m": [-1.3, 0.0, 0.35], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    {"position_m": [0.0, 1.0, 0.0], "q_wxyz": [_HALF, 0.0, 0.0, -_HALF]},
+)
+
+
+def values(chasers: int = 1, **changes: Any) -> dict[str, Any]:
+    """The tables of a scenario with as many chasers, each with its port."""
+    out: dict[str, Any] = {
+        "name": "test",
+        "duration_s": 60.0,
+        "target": {
+            "model": "servicer",
+            "motion": "torque_free",
+            "mass_kg": TARGET_KG,
+            "inertia_kg_m2": TARGET_INERTIA,
+        },
+        "chaser": {
+            "mass_kg": CHASER_KG,
+            "size_m": [0.14, 0.33, 0.33],
+            "inertia_kg_m2": CHASER_INERTIA,
+            "torque_max_N_m": 0.4,
+        },
+        "limits": {"min_distance_target_m": 0.75},
+        "docking": {"kind": "capture", "ports": list(PORTS[:chasers])},
+        "chasers": list(CHASERS[:chasers]),
+    }
+    for key, value in changes.items():
+        out[key] = {**out[key], **value} if isinstance(value, dict) and key in out else value
+    return out
+
+
+def scenario(chasers: int = 1, **changes: Any) -> Scenario:
+    return parse_scenario(values(chasers, **changes), "test")
+
+
+def world(
+    gap_m: float = 0.002,
+    closing_m_s: float = 0.01,
+    lateral_m: float = 0.0,
+    turn_rad: float = 0.0,
+    omega_rad_s: tuple[float, float, float] = (0.045, 0.135, 0.09),
+    **changes: Any,
+) -> Physics:
+    """Chaser 0 with its tip ``gap_m`` before its port, closing in on the tumbling target in the target's own frame."""
+    mission = scenario(target={"omega_rad_s": list(omega_rad_s)}, **changes)
+    physics = Physics(mission)
+    target = physics.state(TARGET)
+    turn = rotations.exp((0.0, 0.0, turn_rad))
+    tip = np.array([-0.2 - gap_m, lateral_m, -0.05])
+    offset = tip - rotations.rotate(turn, (REACH_M, 0.0, 0.0))
+    moving = rotations.cross(target.omega_rad_s, offset) + np.array([closing_m_s, 0.0, 0.0])
+    state = BodyState(
+        target.position_m + rotations.rotate(target.q_wxyz, offset),
+        target.velocity_m_s + rotations.rotate(target.q_wxyz, moving),
+        rotations.multiply(target.q_wxyz, turn),
+        rotations.rotate_inverse(turn, target.omega_rad_s),
+    )
+    physics.place("chaser/0", state)
+    return physics
+
+
+def senses(offset_m: Any, **changes: Any) -> Senses:
+    """Perfectly in line, at rest, at ``offset_m`` (3,), unless said otherwise."""
+    view: dict[str, float] = {
+        "gap_m": 0.1,
+        "lateral_m": 0.0,
+        "angle_rad": 0.0,
+        "closing_m_s": 0.0,
+        "lateral_speed_m_s": 0.0,
+    }
+    contact, latched = changes.pop("contact", False), changes.pop("latched", False)
+    q: Array = changes.pop("q_wxyz", np.array([1.0, 0.0, 0.0, 0.0]))
+    return Senses(PortView(**(view | changes)), contact, latched, np.asarray(offset_m, dtype=float), q)

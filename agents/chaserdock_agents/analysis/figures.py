@@ -12,12 +12,12 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.errors import ChaserdockError
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from .figures_seen import cameras, consistency, estimate, latency, solver
 from .flight import Flight, load_flight
@@ -25,7 +25,6 @@ from .plots import (
     AXES_XYZ,
     FAINT,
     LIMIT,
-    STYLE,
     Nothing,
     colour,
     dashes,
@@ -33,6 +32,7 @@ from .plots import (
     limit_line,
     new_figure,
     save,
+    styled,
 )
 from .summary import tracking_errors
 from .traces import Traces, load_traces, log_of, phases
@@ -74,7 +74,7 @@ def trajectories(flight: Flight, _: Traces) -> Figure:
         axes.set_box_aspect(None, zoom=0.86)
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
             axis.pane.set_visible(False)
-            axis.set_major_locator(matplotlib.ticker.MaxNLocator(5))
+            axis.set_major_locator(MaxNLocator(5))
         axes.tick_params(labelsize=7.5)
         if not place:
             axes.legend(loc="upper left", bbox_to_anchor=(-0.12, 1.0))
@@ -214,7 +214,7 @@ def jets(_: Flight, traces: Traces) -> Figure:
     figure, axes = new_figure(len(firing), height=1.9, sharex=True)
     for a, (i, given) in zip(axes, firing.items(), strict=True):
         number = given.jet_duty.shape[1]
-        mesh = a.pcolormesh(
+        mesh: Any = a.pcolormesh(
             given.edges_s,
             np.arange(number + 1) - 0.5,
             given.jet_duty.T,
@@ -224,8 +224,8 @@ def jets(_: Flight, traces: Traces) -> Figure:
             rasterized=True,
         )
         a.set(ylabel=f"chaser {i}\njet")
+        figure.colorbar(mesh, ax=a, label="share open", pad=0.01)
         a.grid(False)
-    figure.colorbar(mesh, ax=axes, label="share of the tick open", pad=0.01)
     axes[-1].set_xlabel("time / s")
     return figure
 
@@ -311,7 +311,7 @@ KINDS: tuple[Kind, ...] = (
 
 def drawn(flight: Flight, traces: Traces) -> Iterator[tuple[Kind, Figure | str]]:
     """Every figure, or why there is none, one at a time."""
-    with matplotlib.rc_context(STYLE):
+    with styled():
         for kind in KINDS:
             try:
                 yield kind, kind.draw(flight, traces)

@@ -9,7 +9,7 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from .flight import Flight
 from .plots import AXES_XYZ, FAINT, LIMIT, SERIES, Nothing, colour, legend_above, limit_line, new_figure
@@ -96,8 +96,9 @@ def consistency(flight: Flight, _: Traces) -> Figure:
 
 def _bars(axes: Axes, looks: list[tuple[float, Look]], row: float, period_s: float) -> None:
     """One row of the raster: a bar for each stretch of pictures with the same fate."""
-    for look, group in groupby(looks, key=lambda item: item[1]):
-        times = [t for t, _ in group]
+    for _, group in groupby(looks, key=lambda item: item[1]):
+        stretch = list(group)
+        times, look = [t for t, _ in stretch], stretch[0][1]
         # A gap between pictures (a camera that was out) stays empty.
         for part in np.split(times, np.flatnonzero(np.diff(times) > 1.5 * period_s) + 1):
             axes.broken_barh(
@@ -119,15 +120,15 @@ def cameras(flight: Flight, traces: Traces) -> Figure:
         if seen:
             bottom.step(*np.array(seen).T, where="post", color=colour(i), label=f"chaser {i}", linewidth=0.9)
     found = {look for looks in traces.looks.values() for _, look in looks}
-    for look in _LOOKS:
+    for look, shade in _LOOKS.items():
         if look in found:
-            top.bar(0, 0, color=_LOOKS[look], label=look)
+            top.bar(0, 0, color=shade, label=look)
     top.set_yticks(range(len(traces.looks)), [f"chaser {i}" for i in traces.looks])
     top.invert_yaxis()
     top.grid(False)
     legend_above(top)
     bottom.set(ylabel="markers used", xlabel="time / s", ylim=(-0.2, None))
-    bottom.yaxis.get_major_locator().set_params(integer=True)
+    bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
     if bottom.get_legend_handles_labels()[0]:
         legend_above(bottom)
     last_s = max(looks[-1][0] for looks in traces.looks.values())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict, deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,25 +14,33 @@ from chaserdock_protocol.topics import IMAGE, SIGHTING
 
 Pair = tuple[Image, Sighting | None]
 
+_HELD = 4
+
 
 def pairs(log: Path, chasers: int) -> Iterator[Pair]:
-    """Every picture with the sighting of the same exposure, or None where the log has none; by time, all chasers.
+    """Every picture with the sighting of the same exposure, or None where the log has none; each chaser's by time.
 
-    Holds at most one picture a chaser; raises LogError where the log cannot be read.
+    A log's order is that of arrival: a sighting may lie a little before its picture, or behind the next one. Holds at most
+    a few pictures a chaser; raises LogError where the log cannot be read.
     """
-    waiting: dict[int, Image] = {}
+    waiting: dict[int, deque[Image]] = defaultdict(deque)
+    early: dict[int, dict[int, Sighting]] = defaultdict(dict)
     keys = [t.key_of(i) for i in range(chasers) for t in (IMAGE, SIGHTING)]
     for record in read_log(log, keys):
         message: Any = record.message
-        last = waiting.pop(message.chaser, None)
+        images, sightings = waiting[message.chaser], early[message.chaser]
         if isinstance(message, Image):
-            waiting[message.chaser] = message
-            if last is not None:
-                yield last, None
-        elif last is not None:
-            yield last, message if message.sim_time_ns == last.sim_time_ns else None
-    for _, last in sorted(waiting.items()):
-        yield last, None
+            images.append(message)
+        else:
+            sightings[message.sim_time_ns] = message
+            if len(sightings) > _HELD:
+                del sightings[min(sightings)]
+        while images and (images[0].sim_time_ns in sightings or len(images) > _HELD):
+            first = images.popleft()
+            yield first, sightings.pop(first.sim_time_ns, None)
+    for chaser, images in sorted(waiting.items()):
+        for image in images:
+            yield image, early[chaser].pop(image.sim_time_ns, None)
 
 
 def shots(
@@ -39,7 +48,8 @@ def shots(
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
     """At ``first_s`` and then ``every_s`` (simulated seconds): the time and each chaser's latest picture up to then.
 
-    The last one comes at or after the end of the pictures. Pictures of one exposure belong together.
+    The last one comes at or after the end of the pictures. Where the log's order is not that of time, a chaser's picture
+    may be one older than it could be.
     """
     latest: dict[int, Pair] = {}
     number = 0

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import re
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -64,6 +65,12 @@ class Nothing(Exception):
     """A figure cannot be drawn; the text says what the log lacks."""
 
 
+def styled(salt: str = "chaserdock") -> AbstractContextManager[None]:
+    """Our style, for as long as the context lasts; ``salt`` fixes the ids that matplotlib gives to SVG elements."""
+    settings: Any = STYLE | {"svg.hashsalt": salt}
+    return matplotlib.rc_context(settings)
+
+
 def colour(number: int) -> str:
     """The colour of chaser ``number`` in every figure."""
     return SERIES[number % len(SERIES)]
@@ -105,14 +112,14 @@ def legend_above(axes: Axes, columns: int = 8) -> None:
 
 def save(figure: Figure, path: Path) -> None:
     """Writes a figure in the format that the path's ending names; equal figures give equal SVG files."""
-    with matplotlib.rc_context(STYLE | {"svg.hashsalt": path.stem}):
+    with styled(path.stem):
         figure.savefig(path, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def to_inline_svg(figure: Figure, name: str, title: str) -> str:
     """An ``svg`` element for a page: ids unique to ``name``, colours by CSS variables, nothing that points elsewhere."""
     out = io.StringIO()
-    with matplotlib.rc_context(STYLE | {"svg.hashsalt": name}):
+    with styled(name):
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
     text = out.getvalue()
     text = text[text.index("<svg") :]

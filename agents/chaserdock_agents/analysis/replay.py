@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 from chaserdock_protocol.log import LogError
 from chaserdock_protocol.rotations import Array
+from numpy.typing import NDArray
 
 from .flight import Flight, Track
-from .pictures import shots
+from .pictures import Pair, shots
 from .scene import Face, scene_of
 from .snapshot import view
 from .summary import tracking_errors
@@ -41,7 +42,7 @@ def _faces(faces: tuple[Face, ...]) -> list[dict[str, Any]]:
     ]
 
 
-def _thinned(track: Track, rows: Array) -> dict[str, Any]:
+def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
     return {"p": _numbers(track.position_m[rows], 4), "q": _numbers(track.q_wxyz[rows], 4)}
 
 
@@ -107,7 +108,7 @@ def small_pictures(log: Path, flight: Flight) -> dict[str, Any]:
     return {"times": times, "chasers": {i: urls for i, urls in out.items() if any(urls)}}
 
 
-def _data_url(flight: Flight, pair: Any) -> str:
+def _data_url(flight: Flight, pair: Pair) -> str:
     try:
         picture = view(flight.scenario, *pair, _SHOT_WIDTH_PX)
     except LogError:

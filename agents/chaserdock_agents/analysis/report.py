@@ -24,7 +24,7 @@ from .replay import replay_data, small_pictures
 from .summary import summary_of
 from .traces import load_traces, log_of
 
-_PAGE = files(__package__) / "page"
+_PAGE = files("chaserdock_agents.analysis") / "page"
 _DASH = "–"  # noqa: RUF001
 
 
@@ -124,7 +124,7 @@ def _head(flight: Flight, result: dict[str, Any]) -> str:
     if "target" in flight.truth:
         where.insert(0, ("replay-section", "Replay"))
     links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name in where)
-    mode = {"lockstep": "lock-step", "realtime": "real time"}.get(result["mode"], result["mode"])
+    mode = {"lockstep": "lock-step", "realtime": "real time"}.get(result["mode"]) or "unknown mode"
     return (
         f"<h1>{escape(s.name)}</h1><p>{escape(s.description)}</p>\n<p>{verdict} "
         f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '

@@ -69,15 +69,17 @@ def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
         width, height, depth = face_extent(box.size_m, index)
         flat = [[x * width / 2, y * height / 2, depth] for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
         normal = rotations.rotate(q, (0.0, 0.0, 1.0))
-        decals: list[tuple[Array, Grey]] = []
+        # White borders may reach under neighbouring markers: all of them come first.
+        borders: list[tuple[Array, Grey]] = []
+        prints: list[tuple[Array, Grey]] = []
         for marker in model.markers if model else ():
             offset = np.array(marker.position_trf_m) - box.position_m
-            if abs(offset @ normal - depth) < 1e-6 and marker.normal_trf() @ normal > 0.999:
-                decals += marker_decals(model, marker) if model else ()
-        # Borders may reach under neighbours: all of them first.
-        decals.sort(key=lambda decal: -float(np.ptp(decal[0], axis=0).max()))
+            if model and abs(offset @ normal - depth) < 1e-6 and marker.normal_trf() @ normal > 0.999:
+                border, *printed = marker_decals(model, marker)
+                borders.append(border)
+                prints += printed
         corners = rotations.rotate(q, np.array(flat)) + box.position_m
-        out.append(Face(corners, normal, round(255 * box.shade), tuple(decals)))
+        out.append(Face(corners, normal, round(255 * box.shade), (*borders, *prints)))
     return out
 
 

@@ -144,7 +144,7 @@ class _Director:
         self.distance_m = 3.0 * min(reach, 3.0)
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
         self.phases = {i: phases(flight.references.get(i, [])) for i in self.numbers}
-        self.used = {
+        self.seen = {
             i: {m.sim_time_ns for m in flight.sightings.get(i, []) if m.status == "seen"}
             for i in self.numbers
         }
@@ -158,7 +158,7 @@ class _Director:
         at = _pose(target, time_s)
         look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
         time_ns = round(_time_of(target, time_s) * 1e9)
-        seeing = frozenset(i for i in self.numbers if time_ns in self.used[i])
+        seeing = frozenset(i for i in self.numbers if time_ns in self.seen[i])
         picture = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
         self._write(picture, time_s)
         return picture

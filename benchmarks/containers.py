@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from chaserdock_protocol.log import read_log
+from chaserdock_protocol.log import LogError, read_log
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
@@ -88,7 +88,7 @@ class Project:
     def wait_for_tick(self, log: Path, tick: int, timeout_s: float = 300.0) -> None:
         """Waits until a tick has been recorded."""
         deadline = time.monotonic() + timeout_s
-        while not any(r.message.tick >= tick for r in read_log(log, ["world/tick"])):
+        while last_tick(log) < tick:
             if time.monotonic() > deadline:
                 raise SystemExit(f"{self.name}: tick {tick} was not recorded within {timeout_s:g} s")
             time.sleep(0.5)
@@ -100,6 +100,14 @@ class Project:
 
     def down(self) -> None:
         self.compose("down", "--volumes", "--timeout", "5")
+
+
+def last_tick(log: Path) -> int:
+    """The newest tick in a log that is being written; -1 before there is any."""
+    try:
+        return max((r.message.tick for r in read_log(log, ["world/tick"])), default=-1)
+    except LogError:  # created, and not yet flushed for the first time
+        return -1
 
 
 def docker(*arguments: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:

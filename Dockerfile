@@ -33,5 +33,5 @@ RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=
     && rm -rf /tmp/warm && chmod -R a+rwX /var/cache/chaserdock/*
 WORKDIR /tmp
 ENTRYPOINT ["python", "-m", "chaserdock_agents.member"]
-HEALTHCHECK --interval=10s --timeout=5s --start-period=20s --retries=3 \
+HEALTHCHECK --interval=30s --timeout=20s --start-period=60s --retries=3 \
     CMD ["python", "-m", "chaserdock_agents.member", "--health"]

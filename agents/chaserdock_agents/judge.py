@@ -46,14 +46,14 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
         progress.close()
         if stop():
             return 1
+        log = folder / LOG_NAME
+        if not log.exists():
+            raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
+        if not _wait_for_end(log):
+            failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
+        return judge(Fleet(), folder, failure)
     finally:
-        node.close()
-    log = folder / LOG_NAME
-    if not log.exists():
-        raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
-    if not _wait_for_end(log):
-        failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
-    return judge(Fleet(), folder, failure)
+        node.close()  # only now, as the router may end with this
 
 
 def _watch(node: Node, progress: Progress, stop: Stop, world_away_s: float) -> str | None:

@@ -8,6 +8,7 @@ router goes when the judge has. Environment: SCENARIO, SET (overrides with blank
 
 from __future__ import annotations
 
+import math
 import os
 import shlex
 import signal
@@ -15,10 +16,11 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 ROUTER_AWAY_S = 60.0
-"""Without a link to the router for so long a member takes the mission for over."""
+"""A member that has lost its link to the router for so long takes the mission for over."""
 _ESTABLISHED, _LISTEN = "01", "0A"
 
 
@@ -100,7 +102,7 @@ def run(arguments: list[str], host: str, port: int) -> int:
 
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, pass_on)
-    linked_s = time.monotonic()
+    linked_s = math.inf  # until it has been linked once: on a busy machine starting alone takes long
     while True:
         try:
             status = process.wait(timeout=2.0)
@@ -118,7 +120,7 @@ def run(arguments: list[str], host: str, port: int) -> int:
     return status
 
 
-def wait_for_router_to_go(host: str, port: int, stopped) -> None:
+def wait_for_router_to_go(host: str, port: int, stopped: Callable[[], bool]) -> None:
     """Returns when the router has not been there three times in a row, a second apart, or when ``stopped()``."""
     away = 0
     while away < 3 and not stopped():

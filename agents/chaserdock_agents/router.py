@@ -6,8 +6,8 @@ a client, and then drops silently.
 
 from __future__ import annotations
 
-import threading
-from dataclasses import replace
+import time
+from dataclasses import dataclass, replace
 
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.rights import access_control
@@ -15,6 +15,9 @@ from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.transport import Node
 
 MOST_CHASERS = 256
+AFTERWARDS_S = 5.0
+"""Between the going of the process that it waits for and its own end: a cut link is not a farewell, and with Compose that
+process' own status has to be there before this one's."""
 
 
 def main(options: ProcessOptions) -> int:
@@ -27,19 +30,29 @@ def main(options: ProcessOptions) -> int:
     except ChaserdockError as error:
         say("router", str(error))
         return 2
-    stop, gone, seen = Stop(options.watch_parent), threading.Event(), threading.Event()
-
-    def changed(process: str, alive: bool) -> None:
-        if process == options.until:
-            (seen if alive else gone).set()
-
+    stop, last = Stop(options.watch_parent), _Guest(options.until or "")
     try:
         if options.until is not None:
-            node.watch_liveliness(changed)
+            node.watch_liveliness(last.changed)
         how = "TLS, with access rules" if link.tls is not None else "without TLS and access rules"
         say("router", f"listens on {', '.join(link.listen)} {how}")
-        while not (stop() or (seen.is_set() and gone.wait(0))):
-            gone.wait(0.2)
+        while not (stop() or last.gone_for_s() > AFTERWARDS_S):
+            time.sleep(0.2)
     finally:
         node.close()
     return 0
+
+
+@dataclass
+class _Guest:
+    """A process whose coming and going ends the router; told on Zenoh's thread."""
+
+    name: str
+    left_s: float | None = None
+
+    def changed(self, process: str, alive: bool) -> None:
+        if process == self.name:
+            self.left_s = None if alive else time.monotonic()
+
+    def gone_for_s(self) -> float:
+        return 0.0 if self.left_s is None else time.monotonic() - self.left_s

@@ -53,10 +53,17 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
             round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ()
         )
         seen = {
-            i: Odometry(tick=tick, sim_time_ns=exact.time_ns, chaser=i, position_m=vector(x[:3]), velocity_m_s=vector(x[3:6]),
-                        q_wxyz=vector(x[6:10]), omega_rad_s=vector(x[10:]))
+            i: Odometry(
+                tick=tick,
+                sim_time_ns=exact.time_ns,
+                chaser=i,
+                position_m=vector(x[:3]),
+                velocity_m_s=vector(x[3:6]),
+                q_wxyz=vector(x[6:10]),
+                omega_rad_s=vector(x[10:]),
+            )
             for i, x in enumerate(states)
-        }  # fmt: skip
+        }
         ids = tuple(range(n))
         problem = flight._problem(ids, Inputs(tick, exact.time_ns, seen, ()), exact, exact.time_ns)
         plan = flight._solver.solve(problem, TICK_S if tick else 0.0, ids)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_controller.facing import facing_attitudes
 from chaserdock_controller.flight import Flight, Inputs
 from chaserdock_controller.fusion.types import TargetEstimate
 from chaserdock_controller.nmpc import kernels
 from chaserdock_controller.reference import predict_target
 from chaserdock_protocol import rotations
 from chaserdock_protocol.codec import vector
+from chaserdock_protocol.facing import facing_attitudes
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT

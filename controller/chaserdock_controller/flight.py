@@ -9,6 +9,7 @@ import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.braking import brake_wrench
 from chaserdock_protocol.codec import vector
+from chaserdock_protocol.facing import facing_attitudes
 from chaserdock_protocol.messages import (
     CommandReply,
     Event,
@@ -25,7 +26,6 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
 from . import reference
-from .facing import facing_attitudes
 from .fusion import geometry
 from .fusion.types import Measurement
 from .fusion.types import TargetEstimate as Fused

@@ -3,7 +3,7 @@
 The hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m, on a ring about a target; half of the chasers
 start swapped with a neighbour, head-on. Closed loop, perfect state, 10 commands a second, each solve timed by the wall
 clock and by the thread's processor time (which a busy machine disturbs less). ``--quick``: fewer chasers and
-ticks, and no compiling of OpEn. ``--solver`` (repeatable) chooses back ends. One that cannot be had is named with
+ticks. ``--solver`` (repeatable) chooses back ends. One that cannot be had is named with
 its reason; one that takes more than ``--cell-s`` of processor time for a number of chasers is flown for as many
 ticks as fit, and says so.
 """

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -14,15 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmpc_cases import D_MIN_M, LEVEL, PARAMS, Array, at_rest, far_start, fixed_problem, fly, fresh, swap
 
-# Eight stages: the same mathematics, and what OpEn's compiler has to do stays bearable.
+# Eight stages: the same mathematics, sooner.
 CONFORM = replace(PARAMS, horizon_s=0.8)
 
 
 def installed(name: str) -> bool:
-    needs = {"alpaqa": "alpaqa", "open": "opengen"}
-    return importlib.util.find_spec(needs.get(name, "casadi")) is not None and (
-        name != "open" or shutil.which("cargo") is not None
-    )
+    return importlib.util.find_spec("alpaqa" if name == "alpaqa" else "casadi") is not None
 
 
 def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
@@ -36,9 +32,7 @@ def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
     )
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "open" else n for n in BACK_ENDS]
-)
+@pytest.mark.parametrize("name", BACK_ENDS)
 @pytest.mark.parametrize("case", ["transfer", "keep-out", "corridor"])
 def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
     """The plan's cost is the converged optimum's, its box holds exactly, its distances to 5 mm."""

@@ -181,7 +181,7 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("target.mass_kg", -1.0, "target.mass_kg", "greater than 0"),
     ("chaser.size_m", [0.2, -0.2, 0.1], "chaser.size_m.1", "greater than 0"),
     ("estimator.name", "kalman", "estimator.name", "'mekf' or 'paper'"),
-    ("controller.solver", "magic", "controller.solver", "'rti', 'ipopt', 'fatrop', 'alpaqa' or 'open'"),
+    ("controller.solver", "magic", "controller.solver", "'rti', 'ipopt', 'fatrop' or 'alpaqa'"),
     ("perception.name", "eyes", "perception.name", "'default' or 'paper'"),
     ("target.model", "death-star", "target", "death-star"),
     ("target.motion", "wobble", "target.motion", "constant_rates"),

@@ -67,7 +67,7 @@ class Controller(Section):
     ``max_iterations`` bounds a solve, in iterations as the solver counts them, so that it flies the same anywhere.
     """
 
-    solver: Literal["rti", "ipopt", "fatrop", "alpaqa", "open"] = "rti"
+    solver: Literal["rti", "ipopt", "fatrop", "alpaqa"] = "rti"
     max_iterations: Annotated[int, Field(ge=0)] | None = None
     horizon_s: Positive = 3.0
     dt_s: Positive = 0.1

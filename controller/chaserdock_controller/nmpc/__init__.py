@@ -6,13 +6,13 @@ from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
 
 __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver", "make_solver"]
 
-BACK_ENDS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
+BACK_ENDS = ("rti", "ipopt", "fatrop", "alpaqa")
 
 
 def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int | None = None) -> NmpcSolver:
     """The back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, as the back end counts.
 
-    Raises ValueError for an unknown name, n < 1, or a back end whose package or compiler is not installed.
+    Raises ValueError for an unknown name, n < 1, or a back end whose package is not installed.
     """
     # Imported here so that the one does not cost the start-up time of the other.
     if name == "rti":
@@ -27,8 +27,4 @@ def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int |
         from chaserdock_controller.nmpc.alm import AlpaqaSolver
 
         return AlpaqaSolver(params, n, max_iterations)
-    if name == "open":
-        from chaserdock_controller.nmpc.open_engine import OpenSolver
-
-        return OpenSolver(params, n, max_iterations)
     raise ValueError(f"unknown NMPC back end {name!r}; known: {', '.join(BACK_ENDS)}")

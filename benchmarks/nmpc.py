@@ -2,9 +2,10 @@
 
 The hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m, on a ring about a target; half of the chasers
 start swapped with a neighbour, head-on. Closed loop, perfect state, 10 commands a second, each solve timed by the wall
-clock and by the thread's processor time (which a busy machine disturbs less). One thread. ``--quick``: fewer chasers
-and ticks. ``--solver`` (repeatable) chooses back ends. A back end that cannot be had is named with its reason; one
-that would take longer than ``--cell-s`` for a number of chasers is flown for as many ticks as fit, and says so.
+clock and by the thread's processor time (which a busy machine disturbs less). ``--quick``: fewer chasers and
+ticks. ``--solver`` (repeatable) chooses back ends. One that cannot be had is named with
+its reason; one that takes more than ``--cell-s`` of processor time for a number of chasers is flown for as many
+ticks as fit, and says so.
 """
 
 from __future__ import annotations
@@ -103,11 +104,10 @@ class Flown:
 
 
 def fly_hard(solver: NmpcSolver, n: int, ticks: int, cell_s: float) -> Flown:
-    """Closed loop on the hard case; ends early after ``cell_s`` of wall clock."""
+    """Closed loop on the hard case; ends early after ``cell_s`` of processor time."""
     states, problem = hard_case(n)
     solver.reset()
     wall, cpu, cost, margin_m, failures = [], [], 0.0, np.inf, 0
-    begun = time.perf_counter()
     for k in range(ticks):
         now = replace(problem, states=states)
         t, c = time.perf_counter(), time.thread_time()
@@ -126,7 +126,7 @@ def fly_hard(solver: NmpcSolver, n: int, ticks: int, cell_s: float) -> Flown:
         gaps = np.linalg.norm(states[:, None, :3] - states[None, :, :3], axis=-1) + 9.0 * np.eye(n)
         nearest = min(float(gaps.min()), float(np.linalg.norm(states[:, :3], axis=-1).min()))
         margin_m = min(margin_m, nearest - D_MIN_M)
-        if time.perf_counter() - begun > cell_s:
+        if sum(cpu) > cell_s:
             break
     return Flown(np.array(wall), np.array(cpu), float(cost), float(margin_m), failures)
 
@@ -225,7 +225,9 @@ def main() -> None:
     parser.add_argument("--cell-s", type=float, default=120.0)
     options = parser.parse_args()
     sizes, ticks = ([1, 2, 4], 30) if options.quick else ([1, 2, 4, 8, 16], 150)
-    names = options.solver or ([n for n in BACK_ENDS if n != "open"] if options.quick else list(BACK_ENDS))
+    names: list[str] = options.solver or (
+        [n for n in BACK_ENDS if n != "open"] if options.quick else list(BACK_ENDS)
+    )
     result = measure(names, sizes, ticks, 10.0 if options.quick else options.cell_s)
     if importlib.util.find_spec("acados_template") is None:
         print("acados   not measured: acados_template is not installed")

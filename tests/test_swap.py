@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_controller.facing import facing_attitudes
 from chaserdock_controller.flight import Flight, Inputs
 from chaserdock_controller.fusion.types import TargetEstimate
 from chaserdock_controller.nmpc import kernels
 from chaserdock_controller.reference import predict_target
 from chaserdock_protocol import rotations
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.facing import facing_attitudes
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
@@ -40,7 +41,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         states[i, 6:10] = q
     matrix = np.diag(body.inertia)
     inverse = np.linalg.inv(matrix)
-    least, nearest = np.inf, np.inf
+    least, nearest, ends = np.inf, np.inf, states[:, :3]
     at = np.zeros(3)
     for tick in range(round(time_s / TICK_S)):
         now_s = tick * TICK_S
@@ -52,10 +53,17 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
             round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ()
         )
         seen = {
-            i: Odometry(tick=tick, sim_time_ns=exact.time_ns, chaser=i, position_m=x[:3], velocity_m_s=x[3:6],
-                        q_wxyz=x[6:10], omega_rad_s=x[10:])
-            for i, x in enumerate(states.tolist())
-        }  # fmt: skip
+            i: Odometry(
+                tick=tick,
+                sim_time_ns=exact.time_ns,
+                chaser=i,
+                position_m=vector(x[:3]),
+                velocity_m_s=vector(x[3:6]),
+                q_wxyz=vector(x[6:10]),
+                omega_rad_s=vector(x[10:]),
+            )
+            for i, x in enumerate(states)
+        }
         ids = tuple(range(n))
         problem = flight._problem(ids, Inputs(tick, exact.time_ns, seen, ()), exact, exact.time_ns)
         plan = flight._solver.solve(problem, TICK_S if tick else 0.0, ids)
@@ -66,9 +74,9 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         kernels.roll(x, held, TICK_S / 4, NODES, WEIGHTS, body.mass_kg, matrix, inverse)
         states = x[:, -1].copy()
         gaps = np.linalg.norm(states[:, None, :3] - states[None, :, :3], axis=-1) + 9.0 * np.eye(n)
+        ends = problem.references[:, 0, :3]
         least = min(least, float(gaps.min()))
         nearest = min(nearest, float(np.linalg.norm(states[:, :3] - p, axis=-1).min()))
-    ends = problem.references[:, 0, :3]
     for i in range(n):
         flight.guidance.observe(i, time_s, 0.0, 0.0)
         assert flight.guidance.chasers[i].phase == "hold"

@@ -10,6 +10,7 @@ import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.braking import brake_wrench
 from chaserdock_protocol.codec import vector
+from chaserdock_protocol.facing import facing_attitudes
 from chaserdock_protocol.messages import (
     CommandReply,
     DockingStatus,
@@ -29,7 +30,6 @@ from chaserdock_protocol.scenario import Scenario
 
 from . import reference
 from .captures import Captures
-from .facing import facing_attitudes
 from .fusion import geometry
 from .fusion.types import Estimator, Measurement
 from .fusion.types import TargetEstimate as Fused

@@ -65,7 +65,7 @@ class PerceptionSection(Section):
 
 PERCEPTIONS = ("default", "paper")
 ESTIMATORS = ("mekf", "paper")
-SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
+SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa")
 """Chaserdock's own parts, by the name that a scenario chooses them with; others may be installed (see ``plugins``)."""
 
 MAX_STAGES = 500

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_protocol import rotations
+from chaserdock_protocol.facing import facing_attitudes
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
@@ -37,7 +38,10 @@ def true_reference(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
         last = named.get(round(t * 1e9), last)
         offsets.append(last)
     positions = target.position_m + rotations.rotate(target.q_wxyz, np.array(offsets))
-    return target.time_s, positions, rotations.multiply(target.q_wxyz, np.array(c.q_wxyz))
+    q_off = np.array(c.q_wxyz)
+    if flight.scenario.approach.face_target:
+        q_off = facing_attitudes(c.position_m, q_off, np.array(offsets))
+    return target.time_s, positions, rotations.multiply(target.q_wxyz, q_off)
 
 
 def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:

@@ -16,8 +16,7 @@ def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int |
     """The back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, as the back end counts.
 
     One of ours, or an installed ``chaserdock.solvers`` entry point: a function of (params, n, max_iterations). Raises
-    PluginError when there is no such thing here, ValueError for n < 1, or a back end whose package or compiler is not
-    installed.
+    PluginError when there is no such thing here, ValueError for n < 1, or a back end whose package is not installed.
     """
     # Imported here so that the one does not cost the start-up time of the other.
     if name == "rti":
@@ -32,8 +31,4 @@ def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int |
         from chaserdock_controller.nmpc.alm import AlpaqaSolver
 
         return AlpaqaSolver(params, n, max_iterations)
-    if name == "open":
-        from chaserdock_controller.nmpc.open_engine import OpenSolver
-
-        return OpenSolver(params, n, max_iterations)
     return plugins.load("solver", name, BACK_ENDS)(params, n, max_iterations)

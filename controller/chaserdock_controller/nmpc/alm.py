@@ -40,6 +40,7 @@ class AlpaqaSolver:
             ) from None
         self._frame = Frame(params, n_chasers)
         inner = MAX_INNER if max_iterations is None else max_iterations
+        inner_solver: Any = alpaqa.PANOCSolver({"max_iter": inner}, {"memory": 30})
         self._solver: Any = alpaqa.ALMSolver(
             alm_params={
                 "tolerance": TOLERANCE,
@@ -49,7 +50,7 @@ class AlpaqaSolver:
                 "max_penalty": 1e7,
                 "penalty_update_factor": 10.0,
             },
-            inner_solver=alpaqa.PANOCSolver({"max_iter": inner}, {"memory": 30}),
+            inner_solver=inner_solver,
         )
         self._alpaqa = alpaqa
         self._converged, self._late = (

@@ -18,7 +18,7 @@ from chaserdock_controller.nmpc.ipm import BROKEN, LIMIT, MAX_ITERATIONS, solve_
 from chaserdock_controller.nmpc.kernels import roll_linearized
 from chaserdock_controller.nmpc.planes import REACH_SAFETY, build_rows
 from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
-from chaserdock_controller.nmpc.types import Array, NmpcInput, NmpcParameters, NmpcPlan
+from chaserdock_controller.nmpc.types import Array, IntArray, NmpcInput, NmpcParameters, NmpcPlan
 
 
 class RtiSolver:
@@ -83,8 +83,8 @@ class RtiSolver:
         return frame.finish(task, u, status, iterations)
 
     def _optimize(
-        self, task: Task, x: Array, u: Array, mats: Array, rows: tuple[Array, ...]
-    ) -> tuple[list[str], Array]:
+        self, task: Task, x: Array, u: Array, mats: Array, rows: tuple[IntArray, Array, Array, IntArray]
+    ) -> tuple[list[str], IntArray]:
         """One QP for each chaser about x (N, D+1, 13), u (N, D, 6); the new inputs replace u.
 
         Where the QP breaks down, u is left as it was. Returns the status and the iterations of each.

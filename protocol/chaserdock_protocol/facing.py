@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from chaserdock_protocol.rotations import multiply, normalize
 from numpy.typing import ArrayLike, NDArray
+
+from .rotations import multiply, normalize
 
 Array = NDArray[np.float64]
 

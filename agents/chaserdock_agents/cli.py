@@ -15,6 +15,7 @@ from .verbs.flights import snapshot, summary
 from .verbs.operate import command
 from .verbs.options import fail
 from .verbs.processes import chaser, controller, record, run, world
+from .verbs.seeing import calibrate, markers
 
 app = typer.Typer(
     name="chaserdock",
@@ -22,7 +23,7 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for verb in (run, world, chaser, controller, record, command, summary, snapshot):
+for verb in (run, world, chaser, controller, record, command, summary, snapshot, markers, calibrate):
     app.command()(verb)
 
 

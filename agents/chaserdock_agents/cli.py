@@ -21,6 +21,7 @@ from .verbs.processes import chaser, controller, record, run, world
 from .verbs.publish import figures, report, video
 from .verbs.replays import compare, replay
 from .verbs.reproduce import reproduce, study
+from .verbs.seeing import calibrate, markers
 
 app = typer.Typer(
     name="chaserdock",
@@ -48,6 +49,8 @@ for verb in (
     judge,
     reproduce,
     study,
+    markers,
+    calibrate,
 ):
     app.command()(verb)
 app.add_typer(logs.app, name="log")

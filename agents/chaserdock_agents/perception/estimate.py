@@ -77,7 +77,10 @@ class Perception:
             if sighting.solutions:
                 return sighting
         sighting = self._estimate_in(image, None)
-        if sighting.solutions:
+        rejected = sighting.rejected_ids
+        if sighting.solutions or len(set(rejected)) < len(
+            rejected
+        ):  # found, or two of one: not for want of looking
             return sighting
         again = self._estimate_in(image, None, thorough=True)
         return again if again.solutions else sighting

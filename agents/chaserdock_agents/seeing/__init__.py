@@ -1,0 +1,1 @@
+"""Tools round the cameras: marker sheets and calibration."""

@@ -1,0 +1,80 @@
+"""The pictures of docs/cameras.md: ``python benchmarks/pictures.py [FOLDER]`` (docs/pictures by default).
+
+One picture for each effect and target: what chaser 0 of ``harsh-light`` sees at its start, with one thing changed.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+from chaserdock_protocol import rotations
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_world.cameras import Cameras
+from chaserdock_world.physics import TARGET, BodyState, prescribed_state
+
+ROOT = Path(__file__).resolve().parents[1]
+PLAIN = (
+    "camera.effects.gain=1.0",
+    "camera.effects.point_spread_px=0.0",
+    "camera.effects.read_noise=0.0",
+    "camera.effects.shot_noise=0.0",
+    "camera.effects.exposure_s=0.0",
+    "camera.effects.glare=0.0",
+    "camera.intrinsics.distortion=[]",
+    "camera.lamp=0.0",
+    "camera.sun_direction=[-0.4, -0.5, 0.77]",
+    "camera.ambient=0.35",
+    "camera.earth={direction=[0.0, 0.0, -1.0], radius_deg=2.0}",
+    "camera.eclipses=[]",
+)
+ECLIPSE = "camera.eclipses=[{from_s=0.0, to_s=9.0}]"
+SUN = "camera.sun_direction=[1.0, -0.12, 0.22]"
+PICTURES: dict[str, tuple[str, ...]] = {
+    "camera-plain": (),
+    "camera-paper": ("target.model='paper'",),
+    "camera-pybullet": ("camera.renderer='pybullet'",),
+    "camera-distortion": ("camera.intrinsics.distortion=[-0.35, 0.12, 0.001, -0.001, 0.0]",),
+    "camera-motion-blur": ("camera.effects.exposure_s=0.2",),
+    "camera-noise": (
+        "camera.effects.point_spread_px=1.5",
+        "camera.effects.read_noise=8.0",
+        "camera.effects.shot_noise=0.3",
+    ),
+    "camera-overexposed": ("camera.effects.gain=1.6",),
+    "camera-jpeg": ("camera.effects.jpeg_quality=8",),
+    "camera-sun": (SUN, "camera.ambient=0.15", "camera.effects.glare=2000.0"),
+    "camera-earth": ("camera.earth={direction=[0.35, 0.4, -0.83], radius_deg=64.0}",),
+    "camera-eclipse": (ECLIPSE, "camera.lamp=0.0"),
+    "camera-eclipse-lamp": (ECLIPSE, "camera.lamp=60.0"),
+    "camera-harsh-light": (),
+}
+
+
+def main() -> None:
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "pictures"
+    for name, changes in PICTURES.items():
+        plain = () if name == "camera-harsh-light" else PLAIN
+        scenario = load_scenario(ROOT / "scenarios" / "harsh-light.toml", (*plain, *changes))
+        cameras = Cameras(scenario)
+        states = {TARGET: prescribed_state(scenario, 0.0)}
+        # Turned a little, so that three faces show; turning on, so that there is motion to blur.
+        q = rotations.exp([0.25, 0.35, 0.45])
+        states[TARGET] = BodyState(
+            states[TARGET].position_m, states[TARGET].velocity_m_s, q, np.array([0.1, 0.2, 0.3])
+        )
+        for i in range(len(scenario.chasers)):
+            position, attitude = scenario.start_pose(i)
+            states[f"chaser/{i}"] = BodyState(position, np.zeros(3), attitude, np.zeros(3))
+        picture = cameras.picture(0, 0, 0, 0, states)
+        shown = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        small = cv2.resize(shown, (640, 360), interpolation=cv2.INTER_AREA)
+        path = folder / f"{name}.jpg"
+        cv2.imwrite(str(path), small, [cv2.IMWRITE_JPEG_QUALITY, 80])
+        print(f"{path}  {path.stat().st_size} bytes")
+
+
+if __name__ == "__main__":
+    main()

@@ -227,7 +227,9 @@ class Scenario(Section):
         named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
         last = len(self.chasers) - 1
         named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(self.docking.ports)]
-        judged = [(f"success.{what}", getattr(self.success, what)) for what in ("docked", "latched", "reached")]
+        judged = [
+            (f"success.{what}", getattr(self.success, what)) for what in ("docked", "latched", "reached")
+        ]
         for where, chasers in (*named, *judged):
             if max(chasers, default=0) > last:
                 raise ValueError(f"{where}: there is no chaser {max(chasers)}; this mission has 0 to {last}")

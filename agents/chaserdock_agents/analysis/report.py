@@ -106,7 +106,10 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def _shown(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
-    return _DASH if value is None else f"{value * factor:#.{digits}g} {unit}".rstrip()
+    if value is None:
+        return _DASH
+    # With "#" trailing zeros stay; a bare point at the end does not.
+    return f"{f'{value * factor:#.{digits}g}'.rstrip('.')} {unit}".rstrip()
 
 
 def _rms(mean_square: float | None, unit: str, factor: float) -> str:

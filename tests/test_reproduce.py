@@ -368,8 +368,8 @@ def test_a_cut_down_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFix
     seen, perfect = flown(cut, results, group), errors_of_study(results.studies[group])
     assert seen is not None
     assert seen.failed == 0
-    # Seeing costs little: the table is about the transient.
-    assert seen.position == pytest.approx(perfect.position, rel=0.05)
+    # Seeing costs little, even with pictures in which the far start's marker is 20 pixels wide.
+    assert perfect.position < seen.position < 1.2 * perfect.position
     assert floor_of_study(results.studies[group]) < perfect.position
     assert fly_plan(cut, tmp_path, 2, False) == 0
     assert "0 missions and 0 studies to fly; 2 missions are finished already" in capsys.readouterr().err

@@ -88,7 +88,7 @@ def pulses(quick: bool) -> dict[str, float]:
         b, timing, rng = s.chaser, s.timing, np.random.default_rng(2)
         full = thrusts_max(b.thrusters)
         modulator, valves = Modulator(b.thrusters, b.modulation, timing), Valves(b.thrusters)
-        ticks = (20 if quick else 200) * rate_hz
+        ticks, level = (20 if quick else 200) * rate_hz, full
         asked = [np.zeros(len(full))]
         for tick in range(ticks):
             # Held for a second at most a third, so that small and large thrusts, and steps between, all come.

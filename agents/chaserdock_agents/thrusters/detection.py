@@ -15,6 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_thrusters import FailureKind
+from numpy.typing import NDArray
+
+Flags = NDArray[np.bool_]
 
 _LIKELIER = 20.0
 """Least log-likelihood gained over health: one in 5e8, for some thousand looks a minute and jet."""
@@ -27,6 +30,8 @@ _OFF_WINDOWS = (2, 3, 4, 6, 9, 15, 30)
 _GONE = 0.85
 _NOTICEABLE = 0.3
 """Parts of its thrust that a jet has lost when it counts as stuck off, and as weak."""
+_OWN_SCATTER = 0.1
+"""How well the failed jet's own thrust is known."""
 _LOSS_SIGMA = 0.07
 """How well the lost part must be known."""
 
@@ -55,7 +60,7 @@ class JetWatch:
         self._off = [deque(maxlen=max(_OFF_WINDOWS)) for _ in self._full_N]
 
     def look(
-        self, residual: Array, noise: Array, asked_N_s: Array, time_s: float, suspects: Array
+        self, residual: Array, noise: Array, asked_N_s: Array, time_s: float, suspects: Flags
     ) -> Verdict | None:
         """One tick's evidence: observed less expected impulse (6,) with its covariance (6, 6), what every jet was to
         give (n,) in ``time_s``; ``suspects`` (n,) are the jets that may have failed. A verdict, if there is one."""
@@ -70,20 +75,22 @@ class JetWatch:
         fired = suspects & (asked_N_s > 0.5 * self._least_N_s)
         for jet in np.flatnonzero(fired):
             self._off[jet].append((-asked_N_s * along, asked_N_s**2 * squared, energy))
-        return self._stuck_on(suspects) or self._lost(np.flatnonzero(fired), suspects)
+        return self._stuck_on(suspects) or self._lost(np.flatnonzero(fired).tolist(), suspects)
 
-    def _stuck_on(self, suspects: Array) -> Verdict | None:
+    def _stuck_on(self, suspects: Flags) -> Verdict | None:
         for length in _ON_WINDOWS:
             if len(self._on) < length:
                 break
             along, squared, energy = (np.sum(x, axis=0) for x in zip(*list(self._on)[-length:], strict=True))
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
-            if _stands_out(gain, best) and _explained(energy, 2.0 * gain[best], squared[best], length):
+            if _stands_out(gain, best) and _explained(
+                energy, float(2.0 * gain[best]), float(squared[best]), length
+            ):
                 return Verdict(best, "stuck_on", 1.0)
         return None
 
-    def _lost(self, fired: Array, suspects: Array) -> Verdict | None:
+    def _lost(self, fired: list[int], suspects: Flags) -> Verdict | None:
         for jet in fired:
             evidence = self._off[jet]
             for length in _OFF_WINDOWS:
@@ -98,10 +105,12 @@ class JetWatch:
                 known = squared[jet] * _LOSS_SIGMA**2 >= 1.0
                 if not known or loss[jet] < _NOTICEABLE or int(np.argmax(gain)) != jet:
                     continue
-                if _stands_out(gain, jet) and _explained(energy, 2.0 * gain[jet], squared[jet], length):
+                if _stands_out(gain, jet) and _explained(
+                    energy, float(2.0 * gain[jet]), float(squared[jet]), length
+                ):
                     gone = loss[jet] > _GONE
                     return Verdict(
-                        int(jet), "stuck_off" if gone else "weak", 0.0 if gone else float(1.0 - loss[jet])
+                        jet, "stuck_off" if gone else "weak", 0.0 if gone else float(1.0 - loss[jet])
                     )
         return None
 
@@ -112,12 +121,6 @@ def _stands_out(gain: Array, best: int) -> bool:
 
 
 def _explained(energy: float, taken: float, squared: float, ticks: int) -> bool:
-    """Whether what a hypothesis leaves of the residuals' ``energy`` is noise: chi-square of 6 a tick, five sigma.
-
-    The failed jet's own thrust is known to a few percent only.
-    """
+    """Whether what a hypothesis leaves of the residuals' ``energy`` is noise: chi-square of 6 a tick, five sigma."""
     freedoms = 6.0 * ticks
     return energy - taken < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _OWN_SCATTER**2 * squared
-
-
-_OWN_SCATTER = 0.1

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.moves import Move
+from chaserdock_controller.moves import Motion
 from chaserdock_protocol import rotations
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.rotations import Array
@@ -32,7 +32,7 @@ def scenario(**changes: Any) -> Scenario:
     return parse_scenario(values | changes, "test")
 
 
-def at(move: Move, t: float) -> tuple[Array, Array, Array]:
+def at(move: Motion, t: float) -> tuple[Array, Array, Array]:
     p, v, a = move.at(np.array([t]))
     return p[0], v[0], a[0]
 

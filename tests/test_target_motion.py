@@ -153,7 +153,11 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
 
     numeric = np.column_stack([apart(moved(e * d), moved(-e * d)) / (2 * e) for d in np.eye(12)])
     q, w, turn = motion.torque_free(
-        start.q_wxyz, start.omega_rad_s, 0.5, np.array(p.inertia_ratios), np.linalg.inv(p.inertia_ratios)
+        start.q_wxyz,
+        start.omega_rad_s,
+        0.5,
+        np.array(p.inertia_ratios),
+        np.linalg.inv(np.array(p.inertia_ratios, dtype=np.float64)).astype(np.float64),
     )
     f = np.eye(12)
     f[0, 3] = f[1, 4] = f[2, 5] = 0.5

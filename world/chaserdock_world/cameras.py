@@ -91,7 +91,7 @@ class Cameras:
         exact = pictures[0]
         if len(pictures) > 1:
             total = np.sum(pictures, axis=0, dtype=np.uint16)
-            exact = ((total + len(pictures) // 2) // len(pictures)).astype(np.uint8)
+            exact = np.asarray((total + len(pictures) // 2) // len(pictures), dtype=np.uint8)
         glare = self._glares[chaser]
         if glare is not None and not dark:
             position, attitude = self._eye(chaser, states)

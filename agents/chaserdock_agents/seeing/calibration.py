@@ -149,7 +149,7 @@ def find_board(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float
     px, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(image)
     if ids is None or px is None:
         return none
-    return board.points_m[np.ravel(ids)], np.asarray(px, np.float32).reshape(-1, 2)
+    return board.points_m[np.asarray(ids, dtype=np.intp).ravel()], np.asarray(px, np.float32).reshape(-1, 2)
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:

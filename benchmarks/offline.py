@@ -13,14 +13,13 @@ from typing import Any
 import numpy as np
 from chaserdock_agents.chaser.eye import look, prediction_from
 from chaserdock_agents.chaser.pilot import passed_on
-from chaserdock_agents.perception import Perception
+from chaserdock_agents.perception import make_perception
 from chaserdock_controller.flight import Flight, Inputs, Outputs
 from chaserdock_protocol import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import OperatorCommand, PoseSolution, Sighting
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.targets import target_model
 from chaserdock_world.actuators import IdealActuators, fly_to
 from chaserdock_world.cameras import Cameras
 from chaserdock_world.physics import TARGET, BodyState, Physics
@@ -34,9 +33,7 @@ Eye = Callable[[int, int, int, States], Sighting]
 def seeing_eye(scenario: Scenario) -> Eye:
     """Real pictures, rendered and searched for markers as in the chaser's process."""
     cameras = Cameras(scenario)
-    perception = Perception(
-        scenario.camera_model(), target_model(scenario.target.model), scenario.perception.name
-    )
+    perception = make_perception(scenario)
     last: dict[int, Sighting] = {}
 
     def see(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
@@ -123,7 +120,7 @@ class Offline:
             self.touches += latch.take()
         odometry = {i: odometry_of(i, states[f"chaser/{i}"], tick, time_ns) for i in chasers}
         seen = tuple(self.eye(i, tick, time_ns, states) for i in chasers) if timing.has_pictures(tick) else ()
-        out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, docking))
+        out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, docking=docking))
         for i, wrench in out.wrenches.items():
             command = passed_on(wrench)
             effective = timing.step_of_time(command.effective_time_ns)

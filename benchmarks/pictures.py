@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -69,7 +70,7 @@ def main() -> None:
             position, attitude = scenario.start_pose(i)
             states[f"chaser/{i}"] = BodyState(position, np.zeros(3), attitude, np.zeros(3))
         picture = cameras.picture(0, 0, 0, 0, states)
-        shown = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        shown: Any = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
         small = cv2.resize(shown, (640, 360), interpolation=cv2.INTER_AREA)
         path = folder / f"{name}.jpg"
         cv2.imwrite(str(path), small, [cv2.IMWRITE_JPEG_QUALITY, 80])

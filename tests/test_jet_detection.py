@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_agents.thrusters.detection import JetWatch, Verdict
+from chaserdock_agents.thrusters.detection import Flags, JetWatch, Verdict
 from chaserdock_agents.thrusters.residual import Noise, covariance, observed_impulse
 from chaserdock_controller.prediction import integrate
 from chaserdock_protocol.messages import Odometry
@@ -53,14 +53,14 @@ class Case:
             omega_rad_s=v[3],
         )
 
-    def step(self, asked_N_s: Array, given_N_s: Array, suspects: Array | None = None) -> Verdict | None:
+    def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> Verdict | None:
         self.state = integrate(self.state, self.matrix @ given_N_s / TICK_S, self.body, TICK_S)
         self.tick += 1
         now = self._odometry()
         residual = observed_impulse(self.last, now, self.body) - self.matrix @ asked_N_s
         spread = covariance(self.noise, self.body, self.matrix, asked_N_s, self.last, now)
         self.last = now
-        everyone = np.ones(len(self.full), dtype=bool)
+        everyone: Flags = np.ones(len(self.full), dtype=np.bool_)
         return self.watch.look(
             residual, spread, asked_N_s, TICK_S, everyone if suspects is None else suspects
         )

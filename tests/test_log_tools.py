@@ -284,7 +284,8 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
         elif isinstance(value, tuple) and value and isinstance(value[0], msgspec.Struct):
             inner = whole[f"{table_name(topic)}_{name}"].to_pylist()
             assert [r["index"] for r in inner] == list(range(len(value)))
-            assert inner[0]["covariance"] == list(value[0].covariance)
+            first: Any = value[0]
+            assert inner[0]["covariance"] == list(first.covariance)
         elif isinstance(value, dict):
             assert json.loads(row[name]) == value
         elif isinstance(value, bytes):

@@ -233,7 +233,8 @@ def test_a_camera_is_calibrated_from_rendered_boards(kind, tmp_path):
     got = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     assert np.abs(np.subtract(got, truth)).max() < 2.5
     # What counts: where it puts pixels. All over the picture, but its corners, to half a pixel.
-    ours = Camera(640, 480, *(float(v) for v in got), tuple(found.distortion.tolist()))
+    fx, fy, cx, cy = (float(v) for v in got)
+    ours = Camera(640, 480, fx, fy, cx, cy, tuple(found.distortion.tolist()))
     rays = np.stack(
         [*np.meshgrid(np.linspace(-0.3, 0.3, 9), np.linspace(-0.22, 0.22, 7)), np.ones((7, 9))], axis=-1
     )

@@ -82,6 +82,9 @@ class Motion(Protocol):
     """What a reference position does: a ``Move`` or a ``Glide``."""
 
     @property
+    def duration_s(self) -> float: ...
+
+    @property
     def goal_m(self) -> Array: ...
 
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]: ...

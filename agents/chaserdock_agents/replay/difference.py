@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, TypeGuard
 
 import msgspec
 from chaserdock_protocol.messages import Message
@@ -78,7 +78,7 @@ def field_differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any
         yield name, a, b, None
 
 
-def _is_number(x: Any) -> bool:
+def _is_number(x: Any) -> TypeGuard[int | float]:
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 

@@ -57,7 +57,7 @@ def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolera
     text, run = read_scenario(log)
     values = json.loads(text)
     for change in overrides:
-        override(values, change)
+        override(values, change, lambda: parse_scenario(values, "the log's scenario").model_dump(mode="json"))
     scenario = parse_scenario(values, "the log's scenario")
     keys = [
         topic.key_of(place)

@@ -33,7 +33,7 @@ class AlpaqaSolver:
 
     def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
         try:
-            import alpaqa
+            import alpaqa  # pyright: ignore[reportMissingImports] (an extra)
         except ImportError:
             raise ValueError(
                 "solver 'alpaqa' needs the package alpaqa: pip install 'chaserdock[alpaqa]'"

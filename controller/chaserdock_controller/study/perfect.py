@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from chaserdock_protocol.scenario_bodies import Target
 
-from chaserdock_controller.fusion.types import Measurement, TargetEstimate
+from chaserdock_controller.fusion.types import Matrix3, Measurement, Shock, TargetEstimate
 from chaserdock_controller.reference import predict_target
 
 
@@ -47,6 +47,12 @@ class PerfectEstimator:
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate:
         """The state now; measurements are not needed."""
         return self.estimate_at(now_ns)
+
+    def disturb(self, shock: Shock) -> None:
+        """Nothing to do: a prescribed target is not moved by a push."""
+
+    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
+        """Nothing to do: a prescribed target moves the same whoever holds on to it."""
 
     def drain_events(self) -> list[tuple[int, str]]:
         """None, ever."""

@@ -76,7 +76,7 @@ class Captures:
         centre, q = pose_in_target(before, odometry)
         force, torque = rotations.rotate(q, impulse[:3]), rotations.rotate(q, impulse[3:])
         torque = torque + rotations.cross(centre - self.body.centre_trf_m, force)
-        omega: Array = np.linalg.solve(self.body.inertia_kg_m2, torque)
+        omega = np.asarray(np.linalg.solve(self.body.inertia_kg_m2, torque), dtype=np.float64)
         moved = force / self.body.mass_kg - rotations.cross(omega, self.body.centre_trf_m)
         velocity = rotations.rotate(before.q_wxyz, moved)
         sigmas = [_PULL_UNKNOWN * float(np.linalg.norm(v)) for v in (velocity, omega)]

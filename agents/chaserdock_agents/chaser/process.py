@@ -69,6 +69,7 @@ class Chaser:
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
         self._forgotten = self._refusing = False
+        self._watched_tick = -1
         self._jets = (
             JetPilot(self.scenario, self.number) if self.scenario.chaser.actuation == "thrusters" else None
         )
@@ -98,7 +99,7 @@ class Chaser:
                 self._look(image)
             case Odometry() as odometry:
                 self.odometry = odometry
-                self._watch_jets(odometry)
+                self._watch_jets()
                 self._brake_if_alone()
                 self._brake_if_forgotten(odometry)
             case DockingStatus() as docking:
@@ -108,6 +109,7 @@ class Chaser:
             case Tick() as tick:
                 self.tick = tick
                 self.teller.settled.set()
+                self._watch_jets()
                 self._brake_if_alone()
                 if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
                     health = health_of(self.node, tick.tick, tick.sim_time_ns)
@@ -130,10 +132,15 @@ class Chaser:
             topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number
         )
 
-    def _watch_jets(self, odometry: Odometry) -> None:
-        """Tells the controller what the jets can do, and everyone what has been found of them."""
-        if self._jets is None:
+    def _watch_jets(self) -> None:
+        """Tells the controller what the jets can do, and everyone what has been found of them; once a tick that is
+        open. The last odometry belongs to none, and may come after the mission's end or before it."""
+        tick, odometry = self.tick, self.odometry
+        if self._jets is None or tick is None or odometry is None:
             return
+        if odometry.tick != tick.tick or self._watched_tick >= tick.tick:
+            return
+        self._watched_tick = tick.tick
         self.node.publish(topics.JETS, self._jets.observe(odometry), self.number)
         for level, what, detail in self._jets.drain_events():
             self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)

@@ -54,7 +54,7 @@ def raws(log: Path) -> list[tuple[Raw, Any]]:
 
 
 def recorded(folder: Path, rotation: Rotation = ONE_FILE, viewer: bool = True, repeat: int = 1) -> Path:
-    """The golden flight, recorded again without a network."""
+    """The golden flight, recorded again without a network; ``repeat`` times over."""
     text, run = read_scenario(GOLDEN)
     mission = m.JoinReply(accepted=True, reason="", run_id=run["run_id"], scenario_json=text)
     recording = Recording(folder, mission, rotation, scenario_from_json(text, "golden") if viewer else None)
@@ -146,20 +146,20 @@ def files_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
-@pytest.mark.parametrize("size", [1000, 60_000, 200_000, 333_333])
+@pytest.mark.parametrize("size", [1000, 60_000, 333_333, 3_000_000])
 def test_a_full_disk_is_told_and_what_fits_stays_readable(tmp_path: Path, size: int) -> None:
     with (
         files_at_most(size),
         pytest.raises(LogError, match=r"mission.mcap: cannot be written: File too large"),
     ):
-        recorded(tmp_path)
+        recorded(tmp_path, repeat=20)
     path = tmp_path / "mission.mcap"
     assert path.stat().st_size <= size
     state = FileState()
     kept = [s.data for channel, s in stored_messages(path, state) if not channel.topic.startswith("/viewer/")]
-    assert kept == [raw.payload for raw, _ in raws(GOLDEN)][: len(kept)]
+    assert kept == ([raw.payload for raw, _ in raws(GOLDEN)] * 20)[: len(kept)]
     assert (state.closed, state.cut_bytes) == (False, 0)
-    assert size < 100_000 or kept
+    assert size < 2_000_000 or kept  # a chunk is 1 MB at most
 
 
 def test_closing_on_a_full_disk_is_told(tmp_path: Path) -> None:
@@ -199,7 +199,8 @@ def test_flipped_bytes_are_told_or_change_nothing_and_the_rest_is_recovered(tmp_
             saved = [r.message for r in read_log(out)]
             assert all(message in rest for message in saved), place  # as they were, in order
             assert len(saved) >= 0.5 * len(expected), place
-            assert found.broken_records + found.messages_without_channel > 0 or saved == expected
+            lost = found.broken_records + found.messages_without_channel + found.skipped_bytes
+            assert lost > 0 or saved == expected
             out.unlink()
     assert told > 30
 
@@ -284,8 +285,12 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
         elif isinstance(value, tuple) and value and isinstance(value[0], msgspec.Struct):
             inner = whole[f"{table_name(topic)}_{name}"].to_pylist()
             assert [r["index"] for r in inner] == list(range(len(value)))
-            first: Any = value[0]
-            assert inner[0]["covariance"] == list(first.covariance)
+            first: Any = msgspec.to_builtins(value[0])
+            plain = {k: list(v) if isinstance(v, tuple) else v for k, v in first.items() if k in inner[0]}
+            assert plain
+            assert all(inner[0][k] == v for k, v in plain.items())
+        elif value == () and name not in row:
+            assert len(whole[f"{table_name(topic)}_{name}"]) == 0  # a list of structures, none this time
         elif isinstance(value, dict):
             assert json.loads(row[name]) == value
         elif isinstance(value, bytes):

@@ -17,6 +17,7 @@ from chaserdock_controller.nmpc.cost import plan_cost, quadratic_model
 from chaserdock_controller.nmpc.ipm import CONVERGED, FREE, MAX_ITERATIONS, MU_STOP, solve_qp
 from chaserdock_controller.nmpc.slack import SLACK_L1, SLACK_L2
 from chaserdock_protocol import rotations
+from chaserdock_protocol.plugins import PluginError
 from nmpc_cases import (
     INVERSE,
     MASS_KG,
@@ -240,7 +241,7 @@ def test_calls_are_checked() -> None:
     lopsided = replace(problem, min_distance_chasers_m=np.array([[0.0, 0.3], [0.4, 0.0]]))
     with pytest.raises(ValueError, match="symmetric"):
         chosen.solve(lopsided, 0.0)
-    with pytest.raises(ValueError, match="rti, ipopt"):
+    with pytest.raises(PluginError, match="rti, ipopt"):
         make_solver("snopt", PARAMS, 1)
     with pytest.raises(ValueError, match="n_chasers"):
         make_solver("rti", PARAMS, 0)

@@ -20,36 +20,22 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
-Count = Annotated[int, Meta(ge=0)]
-ChaserId = Annotated[int, Meta(ge=0, le=255)]
-JetId = Annotated[int, Meta(ge=0, le=254)]
-Jets = Annotated[tuple[JetId, ...], Meta(max_length=255)]
-Text = Annotated[str, Meta(max_length=2000)]
-Level = Literal["info", "warning", "error"]
-Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
-Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
-
-
-Phase = Literal[
-    "acquire",
-    "hold",
-    "approach",
-    "docked",
-    "retreat",
-    "goto",
-    "abort",
-    "wait",
-    "align",
-    "final",
-    "contact",
-    "latched",
-    "verified",
-]
-"""What a chaser is doing; from ``wait`` on, where docking ends by capture."""
-Latch = Literal["keep", "arm", "release"]
-"""What a probe's latch is told: as it is, to close at a proper touch (and stay closed), to open (and stay open)."""
+from .message_fields import (
+    ChaserId,
+    Count,
+    JetId,
+    JetPulse,
+    Jets,
+    Latch,
+    Level,
+    Phase,
+    PoseSolution,
+    ProbeTouch,
+    Quaternion,
+    Square12,
+    Text,
+    Vector3,
+)
 
 
 class Message(Struct, frozen=True, kw_only=True):
@@ -128,22 +114,6 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     propellant_kg: float = 0.0
 
 
-class ProbeTouch(Struct, frozen=True, kw_only=True):
-    """A probe's tip came to touch the target at ``sim_time_ns``: where and how fast, relative to its port.
-
-    ``latched`` says whether the latch closed, ``refused`` why not.
-    """
-
-    chaser: ChaserId
-    sim_time_ns: Count
-    lateral_m: float
-    angle_rad: float
-    closing_m_s: float
-    lateral_speed_m_s: float
-    latched: bool
-    refused: Text = ""
-
-
 class WorldTruth(Message, frozen=True, kw_only=True):
     """Contacts between bodies, in this tick and the physics steps since the last, and saturated commands.
 
@@ -155,19 +125,6 @@ class WorldTruth(Message, frozen=True, kw_only=True):
     late_commands: Count = 0
     touches: tuple[ProbeTouch, ...] = ()
     latched: tuple[ChaserId, ...] = ()
-
-
-class PoseSolution(Struct, frozen=True, kw_only=True):
-    """One pose of the target in the camera frame.
-
-    ``position_m`` is TRF's origin in IRF, ``q_wxyz`` takes TRF to IRF. ``covariance`` is row-major (6, 6)
-    over (position in IRF axes, dtheta in TRF axes) with q_true = q (x) exp(dtheta).
-    """
-
-    position_m: Vector3
-    q_wxyz: Quaternion
-    covariance: Square6
-    reprojection_rms_px: float
 
 
 class Sighting(Message, frozen=True, kw_only=True):
@@ -265,14 +222,6 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     max_violation_m: tuple[float, ...]
     wall_solve_s: float = 0.0
     wall_tick_s: float = 0.0
-
-
-class JetPulse(Struct, frozen=True, kw_only=True):
-    """A jet's valve is to be open between two times."""
-
-    jet: JetId
-    open_ns: Count
-    close_ns: Count
 
 
 class ActuatorCommand(Message, frozen=True, kw_only=True):

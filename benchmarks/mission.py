@@ -6,17 +6,16 @@ processes, and prints medians. ``--quick``: once, 30 s, without the docking.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import platform
 import statistics
 import subprocess
 import sys
 import tempfile
-from datetime import datetime
 from pathlib import Path
 from typing import Any
+
+from results import options_of, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 QUICK = ("duration_s=30.0", "steady_until_s=30.0", "timeline=[]", "success.docked=[]")
@@ -71,9 +70,7 @@ def figures(summaries: list[dict[str, Any]]) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser = options_of(__doc__)
     options = parser.parse_args()
     summaries = [fly(QUICK if options.quick else ()) for _ in range(1 if options.quick else 3)]
     digests = {s["digest"] for s in summaries}
@@ -83,17 +80,7 @@ def main() -> None:
     width = max(map(len, result))
     for name, value in result.items():
         print(f"{name:{width}}  {value:.5g}")
-    if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        about = {
-            "command": " ".join(sys.argv),
-            "commit": commit.stdout.strip(),
-            "machine": f"{platform.machine()} {platform.platform()}",
-            "date": f"{datetime.now():%Y-%m-%d}",
-        }
-        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

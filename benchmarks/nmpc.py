@@ -10,17 +10,12 @@ ticks as fit, and says so.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
-import json
-import platform
 import subprocess
 import sys
 import time
 from dataclasses import dataclass, replace
-from datetime import datetime
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from chaserdock_controller.nmpc import (
@@ -40,6 +35,7 @@ from chaserdock_controller.reference import (
 from chaserdock_protocol import rotations
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from numpy.typing import NDArray
+from results import options_of, write_json
 
 Array = NDArray[np.float64]
 
@@ -218,9 +214,7 @@ def measure(names: list[str], sizes: list[int], ticks: int, cell_s: float) -> di
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser = options_of(__doc__)
     parser.add_argument("--solver", action="append", choices=BACK_ENDS)
     parser.add_argument("--cell-s", type=float, default=120.0)
     options = parser.parse_args()
@@ -243,21 +237,7 @@ def main() -> None:
     for name, value in result.items():
         if "over_ipopt" in name or "tracking" in name or "start" in name:
             print(f"{name}  {value:.5g}")
-    if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        about: dict[str, Any] = {
-            "command": " ".join(sys.argv),
-            "commit": commit.stdout.strip(),
-            "machine": f"{platform.machine()} {platform.platform()}",
-            "date": f"{datetime.now():%Y-%m-%d}",
-        }
-        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

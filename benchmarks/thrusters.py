@@ -7,15 +7,10 @@ Flights are those of ``closed_loop``: everything that flies, without pictures. `
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import platform
-import subprocess
 import sys
 import time
 from collections.abc import Callable
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +23,7 @@ from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_protocol.scenario_thrusters import thrusts_max
 from chaserdock_protocol.valves import Valves
 from closed_loop import Record, fly
+from results import options_of, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 FAILED_AT_S = 30.01  # just after a tick: the longest until two whole ticks are seen
@@ -201,9 +197,7 @@ PARTS: dict[str, Callable[[bool], dict[str, float]]] = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser = options_of(__doc__)
     parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
     options = parser.parse_args()
     result: dict[str, float] = {}
@@ -213,17 +207,7 @@ def main() -> None:
         for name, value in figures.items():
             print(f"{name:{width}}  {value:.5g}", flush=True)
         result |= figures
-    if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        about = {
-            "command": " ".join(sys.argv),
-            "commit": commit.stdout.strip(),
-            "machine": f"{platform.machine()} {platform.platform()}",
-            "date": f"{datetime.now():%Y-%m-%d}",
-        }
-        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

@@ -7,16 +7,9 @@ renderers. Gross errors: over 10 degrees or 10 cm from the truth (of an ambiguou
 
 from __future__ import annotations
 
-import argparse
-import json
-import platform
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -31,6 +24,7 @@ from chaserdock_world.render import Renderer
 from chaserdock_world.sky import Light
 from chaserdock_world.tinyrenderer import TinyRenderer
 from numpy.typing import NDArray
+from results import options_of, write_json
 
 EYE, AHEAD = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)
@@ -290,9 +284,7 @@ def rendering(count: int) -> Figures:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser = options_of(__doc__)
     parser.add_argument("--only", choices=("accuracy", "metre", "reach", "near", "speed", "rendering"))
     options = parser.parse_args()
     cv2.setNumThreads(1)
@@ -312,21 +304,7 @@ def main() -> None:
             for key, value in figures.items():
                 print(f"{key:62}  {value:.4g}", flush=True)
             result |= figures
-    if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"],
-            cwd=Path(__file__).parent,
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-        about = {
-            "command": " ".join(sys.argv),
-            "commit": commit.stdout.strip(),
-            "machine": f"{platform.machine()} {platform.platform()}",
-            "date": f"{datetime.now():%Y-%m-%d}",
-        }
-        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

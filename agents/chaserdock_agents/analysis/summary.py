@@ -214,7 +214,7 @@ def summary_of(flight: Flight) -> dict[str, Any]:
         "late_commands": sum(w.late_commands for w in flight.world),
         "unanswered": _unanswered(flight),
         "solver": {
-            "name": s.controller.solver,
+            "name": next((m.solver for m in flight.solver), s.controller.solver),
             "solve_s": _percentiles(solve_s, {"p50": 50, "p95": 95}),
             "failures": sum(st == "failed" for m in flight.solver for st in m.status),
             "relaxed": sum(st == "infeasible_relaxed" for m in flight.solver for st in m.status),

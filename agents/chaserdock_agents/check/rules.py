@@ -69,6 +69,7 @@ class Ledger:
     _duties: dict[str, Topic] = field(default_factory=dict)
     _came: set[str] = field(default_factory=set)
     _next: dict[str, int] = field(default_factory=dict)
+    _unheard: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
         self.role, self.chaser = role_of(self.process, len(self.scenario.chasers))
@@ -116,7 +117,7 @@ class Ledger:
         except Rejected as refused:
             self.find(raw.key, _WORDS.get(refused.reason, refused.reason), refused.detail)
             return
-        self._number(raw.key, message)
+        self._number(raw.key, message, topic.rate in ("tick", "picture"))
         match message:
             case Presence():
                 self._presence(raw.key, message)
@@ -142,8 +143,11 @@ class Ledger:
             return None
         return topic
 
-    def _number(self, key: str, message: Message) -> None:
-        due = self._next.get(key, 0)
+    def _number(self, key: str, message: Message, from_zero: bool) -> None:
+        # What it tells before the declarations have reached it may go unheard: presence is there for that.
+        if key not in self._next and not from_zero:
+            self._unheard[key] = message.seq
+        due = self._next.get(key, self._unheard.get(key, 0))
         if message.seq != due:
             self.find(key, "seq does not count from 0 without gaps", f"{message.seq} instead of {due}")
         self._next[key] = message.seq + 1
@@ -198,7 +202,7 @@ class Ledger:
             self.find(topics.FAREWELL.key_of(self.process), "no farewell")
             return
         told = {key: n for key, n in self.farewell.published.items() if n}
-        counted = dict(self.counts)
+        counted = self.counts + self._unheard
         own = topics.FAREWELL.key_of(self.process)
         told.pop(own, None)  # it may count itself, or not
         counted.pop(own, None)

@@ -181,12 +181,15 @@ class Stand:
 
     def _not_joined_up(self, child: subprocess.Popen[bytes], start_s: float) -> None:
         ledger, name = self._ledger, self._ledger.process
-        if child.poll() is not None:
+        ended = child.poll() is not None
+        if ended:
             ledger.find(name, f"ended before the first tick, with status {child.returncode}")
         if ledger.instance is None:
             refused = self._node.counts.rejected
             detail = "; ".join(key for key in refused if key.startswith(topics.JOIN_KEY))
-            ledger.find(topics.JOIN_KEY, f"{name} did not join within {start_s:g} s", detail)
+            ledger.find(
+                topics.JOIN_KEY, f"{name} did not join{'' if ended else f' within {start_s:g} s'}", detail
+            )
             return
         if not self._was_alive:
             ledger.find(topics.LIVE_KEY.format(process=name), "no liveliness token")

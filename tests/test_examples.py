@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import ast
 import os
+import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 
+import numpy as np
 import pytest
+from chaserdock_controller.fusion.types import Measurement, PoseHypothesis
+from chaserdock_controller.setup import estimator_of
 from chaserdock_protocol.runtime import SINGLE_THREADED
+from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, ByHand, finished, run, sets, summary
 
 EXAMPLES = ROOT / "examples"
@@ -64,6 +69,25 @@ def test_a_part_that_is_not_installed_is_named(tmp_path: Path) -> None:
     assert status != 0
     assert "'pd'" in said
     assert "chaserdock.solvers" in said
+
+
+def test_the_pages_estimator_is_deaf_to_few_markers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "three_markers.py").write_text(code)
+    info = tmp_path / "three_markers-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: three-markers\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[chaserdock.estimators]\nthree = three_markers:ThreeMarkers\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    scenario = load_scenario(ROOT / "scenarios/single.toml", ("estimator.name=three",))
+    estimator = estimator_of(scenario)
+    pose = PoseHypothesis(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6))
+    assert estimator.update([Measurement(0, 0, (pose,), 2)], 0).status == "none"
+    assert estimator.accepted == 0
+    found = estimator.update([Measurement(0, 100_000_000, (pose,), 3)], 100_000_000)
+    assert found.status == "tracking"
+    np.testing.assert_allclose(found.position_m, pose.position_m)
 
 
 def test_foreign_controller_imports_nothing_of_ours() -> None:

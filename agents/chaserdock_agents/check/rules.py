@@ -72,6 +72,7 @@ class Ledger:
     _unheard: Counter[str] = field(default_factory=Counter)
 
     def __post_init__(self) -> None:
+        self.role: Role
         self.role, self.chaser = role_of(self.process, len(self.scenario.chasers))
 
     @property

@@ -13,6 +13,7 @@ from chaserdock_protocol.errors import ChaserdockError
 
 from .verbs import logs
 from .verbs.campaign import campaign
+from .verbs.check import check
 from .verbs.flights import snapshot, summary
 from .verbs.network import judge, keys, router, status
 from .verbs.operate import command
@@ -51,6 +52,7 @@ for verb in (
     study,
     markers,
     calibrate,
+    check,
 ):
     app.command()(verb)
 app.add_typer(logs.app, name="log")

@@ -20,6 +20,7 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.runtime import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, TransportError
 
 from .progress import Progress
@@ -110,12 +111,14 @@ def free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def open_hub(namespace: str, lease_ms: int) -> tuple[Node, str]:
-    """The launcher's own node, which the processes connect to first, and its endpoint. Raises TransportError."""
+def open_hub(
+    namespace: str, lease_ms: int, name: str = "operator", role: Role = "operator"
+) -> tuple[Node, str]:
+    """A launcher's own node, which the processes connect to first, and its endpoint. Raises TransportError."""
     for attempt in range(5):
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         try:
-            return Node("operator", "operator", Link(namespace, (), (endpoint,), lease_ms=lease_ms)), endpoint
+            return Node(name, role, Link(namespace, (), (endpoint,), lease_ms=lease_ms)), endpoint
         except TransportError:
             if attempt == 4:
                 raise

@@ -191,14 +191,15 @@ class Controller:
             )
             for key in keys
         ]
-        threading.Thread(target=self.tell_presence, daemon=True).start()
+        self.over = threading.Event()
+        self.teller = threading.Thread(target=self.tell_presence, daemon=True)
+        self.teller.start()
 
     def tell_presence(self):
-        while True:
+        while not self.over.wait(0.05):
             self.publish(
                 f"{NAME}/presence", "Presence", process=NAME, instance=self.instance, heard=dict(self.heard)
             )
-            time.sleep(0.05)
 
     def fly(self):
         scenario = self.join()
@@ -225,6 +226,8 @@ class Controller:
             if len(here) == len(tick["chasers"]) and (not tick["pictures"] or len(looked) == len(here)):
                 self.answer(scenario, tick, target, odometry, sightings if tick["pictures"] else {})
                 done = now
+        self.over.set()
+        self.teller.join()  # what it still says is to be in the counts
         counts = {key: n + 1 for key, n in self.seq.items()}
         time_ns = tick["sim_time_ns"] if tick else 0
         self.publish(

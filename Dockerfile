@@ -20,11 +20,12 @@ RUN useradd --uid 10001 --no-create-home --home-dir /tmp chaserdock \
     && for name in router world controller recorder operator analysis \
          $(seq -f chaser-%g 0 15); do mkdir /keys/$name; done \
     && chmod -R 1777 /keys /var/cache/chaserdock
-COPY requirements.txt /opt/chaserdock/
-RUN pip install --no-cache-dir --require-hashes -r /opt/chaserdock/requirements.txt
+COPY requirements.txt docker/slim.py /opt/chaserdock/
+RUN pip install --no-cache-dir --require-hashes -r /opt/chaserdock/requirements.txt \
+    && python /opt/chaserdock/slim.py
 COPY --from=wheel /wheels /opt/chaserdock/wheels
 RUN pip install --no-cache-dir --no-index --no-deps /opt/chaserdock/wheels/*.whl
-COPY docker/as-owner /usr/local/bin/
+COPY docker/as-owner docker/healthy /usr/local/bin/
 USER chaserdock
 # Compiles the solver for this kind of CPU (another kind compiles again, at its start), and shows that the image flies.
 RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
@@ -33,5 +34,4 @@ RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=
     && rm -rf /tmp/warm && chmod -R a+rwX /var/cache/chaserdock/*
 WORKDIR /tmp
 ENTRYPOINT ["python", "-m", "chaserdock_agents.member"]
-HEALTHCHECK --interval=30s --timeout=20s --start-period=60s --retries=3 \
-    CMD ["python", "-m", "chaserdock_agents.member", "--health"]
+HEALTHCHECK --interval=5s --timeout=60s --start-period=60s --retries=3 CMD ["healthy"]

@@ -77,7 +77,8 @@ def test_short_mission_by_compose(clone: Path) -> None:
     summary = json.loads((log.parent / "summary.json").read_text())
     assert summary["success"]
     assert summary["sim_time_s"] == 6.0
-    for path in (log, log.parent, log.parent / "summary.json"):
+    assert "</html>" in (log.parent / "report.html").read_text()
+    for path in (log, log.parent, log.parent / "summary.json", log.parent / "report.html"):
         assert (path.stat().st_uid, path.stat().st_gid) == (owner.st_uid, owner.st_gid)
     inspected = subprocess.run(
         ["docker", "image", "inspect", "chaserdock"], capture_output=True, check=True, text=True

@@ -132,6 +132,72 @@ def test_who_has_heard_an_earlier_start_has_not_heard_this_one() -> None:
     assert members.linked(again) == {"chaser/0", "controller"}
 
 
+def flying(chasers: int = 2) -> tuple[Membership, dict[str, str]]:
+    """A flight of so many chasers, and whom the world has heard."""
+    ids = [f"chaser/{i}" for i in range(chasers)]
+    members = joined(membership(chasers), *ids, "controller")
+    for name in ids:
+        tell(members, name, "world", "controller")
+    tell(members, "controller", "world", *ids)
+    heard = first(*ids, "controller")
+    members.flying = True
+    assert members.linked(heard) == set(heard)
+    return members, heard
+
+
+def again(members: Membership, name: str, *heard: str) -> None:
+    """A process that crashed has started again, and tells whom it has heard."""
+    members.alive_changed(name, False)
+    assert members.admit(JoinRequest(process=name, instance=f"{name}-2")).accepted
+    members.alive_changed(name, True)
+    assert tell(members, name, *heard, instance=f"{name}-2")
+
+
+def test_in_flight_a_chaser_that_joins_puts_nobody_out() -> None:
+    members, heard = flying(2)
+    again(members, "chaser/1", "world", "controller")
+    heard["chaser/1"] = "chaser/1-2"
+    for _ in range(3):  # the controller has not heard the second start yet
+        assert members.linked(heard) == {"chaser/0", "controller"}
+    with_it = {**first("chaser/0"), "world": "world-1", "chaser/1": "chaser/1-2"}
+    assert members.presence_told(Presence(process="controller", instance="controller-1", heard=with_it))
+    assert members.linked(heard) == {"chaser/0", "chaser/1", "controller"}
+
+
+def test_in_flight_a_controller_that_joins_puts_nobody_out_and_waits_for_all() -> None:
+    members, heard = flying(2)
+    again(members, "controller", "world", "chaser/0")
+    heard["controller"] = "controller-2"
+    with_it = {"world": "world-1", "controller": "controller-2"}
+    assert members.linked(heard) == {"chaser/0", "chaser/1"}
+    for i in (0, 1):
+        told = Presence(process=f"chaser/{i}", instance=f"chaser/{i}-1", heard=with_it)
+        assert members.presence_told(told)
+        assert members.linked(heard) == {"chaser/0", "chaser/1"}
+    tell(members, "controller", "world", "chaser/0", "chaser/1", instance="controller-2")
+    assert members.linked(heard) == {"chaser/0", "chaser/1", "controller"}
+
+
+def test_in_flight_two_who_fly_must_still_hear_each_other_and_the_world_them() -> None:
+    members, heard = flying(1)
+    assert members.linked(first("controller")) == {"controller"}  # the world lost sight of the chaser
+    members, heard = flying(1)
+    tell(members, "controller", "world")
+    assert members.linked(heard) == set()
+
+
+def test_when_all_were_lost_the_barrier_is_for_all_again() -> None:
+    members, heard = flying(1)
+    for name in ("chaser/0", "controller"):
+        again(members, name, "world")
+        heard[name] = f"{name}-2"
+    assert members.linked(heard) == set()
+    for name, other in (("chaser/0", "controller"), ("controller", "chaser/0")):
+        known = {"world": "world-1", other: f"{other}-2"}
+        assert members.presence_told(Presence(process=name, instance=f"{name}-2", heard=known))
+    assert members.linked(heard) == {"chaser/0", "controller"}
+
+
 def test_of_two_that_join_at_once_the_second_is_refused() -> None:
     now_s = [100.0]
     members = membership(1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import socket
 import stat
@@ -20,7 +21,7 @@ from chaserdock_agents.status import Status, expected
 from chaserdock_protocol.log import read_log
 from chaserdock_protocol.messages import Tick
 from cryptography import x509
-from harness import SHORT, all_gone, chaserdock, find_child, finished, sets, wait_for_log
+from harness import ROOT, SHORT, all_gone, chaserdock, find_child, finished, sets, wait_for_log
 from mission_keys import make_keys
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
@@ -154,6 +155,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     summary = json.loads((logs[0].parent / "summary.json").read_text())
     assert summary["success"]
     assert summary["sim_time_s"] == 15.0
+    assert "</html>" in (logs[0].parent / "report.html").read_text()
     ticks = [r.message for r in read_log(logs[0], ["world/tick"])]
     assert ticks[-1].chasers == (0, 1)
     assert ticks[-1].controller
@@ -176,6 +178,33 @@ def test_sockets_of_proc_net_tcp() -> None:
         with answering:
             assert member.linked(port)
     assert not member.router_there("127.0.0.1", port)
+
+
+def test_health_is_an_open_link_or_a_listening_router(tmp_path: Path) -> None:
+    """docker/healthy asks without Python what the member asks."""
+
+    def health(port: int, call: str) -> int:
+        environment = {
+            **os.environ,
+            "ROUTER": f"router:{port}",
+            "HEALTHY_SEEN": str(tmp_path / call),  # the first time in a container's life: it does not wait
+        }
+        return subprocess.run([ROOT / "docker" / "healthy"], env=environment, check=False).returncode
+
+    with socket.socket() as listening, socket.socket() as calling:
+        listening.bind(("127.0.0.1", 0))
+        port = listening.getsockname()[1]
+        assert health(port, "bound") != 0
+        assert not (tmp_path / "bound").exists()
+        listening.listen()
+        assert health(port, "listening") == 0
+        assert (tmp_path / "listening").exists()
+        calling.connect(("127.0.0.1", port))
+        answering, _ = listening.accept()
+        listening.close()
+        with answering:
+            assert health(port, "connected") == 0
+    assert health(port, "closed") != 0
 
 
 def test_a_world_gets_the_overrides_and_too_many_chasers_are_told() -> None:

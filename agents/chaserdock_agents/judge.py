@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from pathlib import Path
 
@@ -28,7 +29,8 @@ class JudgeError(ChaserdockError):
 
 
 def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s: float, quiet: bool) -> int:
-    """Watches the mission on ``link`` to its end and judges the log in ``out/SCENARIO-RUN``; the mission's status.
+    """Watches the mission on ``link`` to its end, judges the log in ``out/SCENARIO-RUN``, and writes report.html beside
+    it; the mission's status.
 
     ``world_away_s``: a world that has been gone (wall time) for so long counts as lost. Raises JoinRefused when no
     mission is there within ``patience_s``, JudgeError when it left no log.
@@ -51,7 +53,9 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
             raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
         if not _wait_for_end(log):
             failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
-        return judge(Fleet(), folder, failure)
+        status = judge(Fleet(), folder, failure)
+        _write_page(log)
+        return status
     finally:
         node.close()  # only now, as the router may end with this
 
@@ -77,6 +81,16 @@ def _watch(node: Node, progress: Progress, stop: Stop, world_away_s: float) -> s
         if time.monotonic() - seen["world"] > world_away_s:
             return f"the world has been gone for {world_away_s:g} s"
     return None
+
+
+def _write_page(log: Path) -> None:
+    """A page on the flight beside the log. That it cannot be written is told, and is no verdict on the flight."""
+    from .analysis.report import write_report
+
+    try:
+        write_report(log)
+    except ChaserdockError as error:
+        print(f"chaserdock: no report.html: {error}", file=sys.stderr)
 
 
 def _wait_for_end(log: Path) -> bool:

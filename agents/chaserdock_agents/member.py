@@ -1,7 +1,6 @@
 """One container's main process: runs ``chaserdock ARGUMENTS`` as a member of a composed mission.
 
-``python -m chaserdock_agents.member ARGUMENTS``; with ``--health`` it only says by its status whether this container
-is linked to the router (or, being the router, listens). Docker Compose ends everything as soon as one container
+``python -m chaserdock_agents.member ARGUMENTS``. Docker Compose ends everything as soon as one container
 ends when it is to pass on a status (``--exit-code-from``), so a member that is done waits for the router to go; the
 router goes when the judge has. Environment: SCENARIO, SET (overrides with blanks between), ROUTER (``host:port``).
 """
@@ -137,8 +136,6 @@ def main() -> int:
     arguments, environment = sys.argv[1:], os.environ
     host, _, port = environment.get("ROUTER", "router:7447").rpartition(":")
     scenario, sets = environment.get("SCENARIO", ""), environment.get("SET", "")
-    if arguments == ["--health"]:
-        return 0 if linked(int(port)) else 1
     if arguments[:1] in (["chaser"], ["judge"]):
         # In a process of its own, as it would keep tens of megabytes for the whole flight.
         check = subprocess.run([sys.executable, "-m", "chaserdock_agents.member", "--check", *arguments])

@@ -194,7 +194,8 @@ class Answers:
             self.listen(min(left, 0.02))
 
     def settle(self) -> None:
-        """All are there: presence is told less often from now on."""
+        """All are there, the flight begins: presence is told less often, and who joins from now on holds up nobody."""
+        self._membership.flying = True
         self._teller.settled.set()
 
     def farewell(self, tick: int, time_ns: int) -> None:

@@ -31,6 +31,9 @@ class Membership:
     _heard: dict[str, dict[str, str]] = field(default_factory=dict)
     _instances: dict[str, str] = field(default_factory=dict)
     _left: list[str] = field(default_factory=list)
+    flying: bool = False
+    """From the first tick on; those who are joined up then no longer wait for somebody who is only just joining."""
+    _joined_up: set[str] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @property
@@ -78,6 +81,7 @@ class Membership:
             elif name in self._alive:
                 self._alive.discard(name)
                 self._heard.pop(name, None)
+                self._joined_up.discard(name)
                 self._admitted_s.pop(name, None)
                 self._left.append(name)
 
@@ -99,6 +103,8 @@ class Membership:
         """Processes that are alive and joined up with all they deal with; ``world_heard``: whom the world has heard.
 
         Only the instances that are here now count: whoever has heard an earlier start of a process has not heard it.
+        Before the flight all pairs count for both. In flight a pair with a newcomer counts for the newcomer alone, so
+        that nobody who flies is put out by one who joins.
         """
         with self._lock:
             here = {**self._admitted, "world": self.instance}
@@ -109,16 +115,19 @@ class Membership:
                 if name in self._alive or name == "world"
             }
             present = {"world", *(n for n in heard if n.startswith("chaser/") or n == "controller")}
-            return {
+            linked = {
                 name
                 for name in heard
                 if name != "world"
                 and all(
                     name in heard[o] and o in heard[name]
                     for o in presence.partners_of(name, present)
-                    if o in heard
+                    if o in heard and (name not in self._joined_up or o in {*self._joined_up, "world"})
                 )
             }
+            if self.flying:
+                self._joined_up = set(linked)
+            return linked
 
     def alive(self) -> set[str]:
         """Processes whose liveliness token is there."""

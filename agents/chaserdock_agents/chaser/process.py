@@ -59,7 +59,7 @@ class Chaser:
     number: int
     ended: bool = False
     odometry: Odometry | None = None
-    latched: bool = False
+    docking: DockingStatus | None = None
     sighting: Sighting | None = None
     tick: Tick | None = None
     flown_tick: int = -1
@@ -69,6 +69,7 @@ class Chaser:
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
         self._forgotten = self._refusing = False
+        self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._jets = (
             JetPilot(self.scenario, self.number) if self.scenario.chaser.actuation == "thrusters" else None
         )
@@ -98,11 +99,12 @@ class Chaser:
                 self._look(image)
             case Odometry() as odometry:
                 self.odometry = odometry
-                self._watch_jets(odometry)
+                self._watch_jets()
                 self._brake_if_alone()
                 self._brake_if_forgotten(odometry)
             case DockingStatus() as docking:
-                self.latched = docking.latched
+                self.docking = docking
+                self._watch_jets()
             case WrenchCommand() as command:
                 self._fly(command)
             case Tick() as tick:
@@ -130,11 +132,18 @@ class Chaser:
             topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number
         )
 
-    def _watch_jets(self, odometry: Odometry) -> None:
-        """Tells the controller what the jets can do, and everyone what has been found of them."""
-        if self._jets is None:
+    def _watch_jets(self) -> None:
+        """Tells the controller what the jets can do, and everyone what has been found of them.
+
+        With a docking sensor, once a tick has brought both its word and the odometry, in whatever order.
+        """
+        odometry, docking = self.odometry, self.docking
+        if self._jets is None or odometry is None:
             return
-        self.node.publish(topics.JETS, self._jets.observe(odometry), self.number)
+        if self._has_port and (docking is None or docking.tick != odometry.tick):
+            return
+        touched = docking is not None and (docking.contact or docking.latched)
+        self.node.publish(topics.JETS, self._jets.observe(odometry, touched), self.number)
         for level, what, detail in self._jets.drain_events():
             self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
@@ -182,7 +191,8 @@ class Chaser:
 
     def _braking(self, odometry: Odometry) -> ActuatorCommand:
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
-        return brake(odometry, self.scenario.chaser, effective_ns, self.latched)
+        latched = self.docking is not None and self.docking.latched
+        return brake(odometry, self.scenario.chaser, effective_ns, latched)
 
     def _send(self, command: ActuatorCommand) -> None:
         self.flown_tick = command.tick

@@ -36,7 +36,7 @@ from offline import Eye, Offline, momentum, seeing_eye, statistical_eye
 
 ROOT = Path(__file__).resolve().parents[1]
 APPROACH_AT_S = 4.0
-LIMIT_S = 60.0
+LIMIT_S = 100.0
 OPEN_WITHIN_S = 30.0
 REACHED_M = 0.05
 

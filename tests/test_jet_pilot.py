@@ -107,6 +107,17 @@ def test_who_is_held_looks_for_no_failures() -> None:
         assert free or not pilot.drain_events()
 
 
+def test_impulse_given_is_told() -> None:
+    s = mission()
+    pilot = JetPilot(s, 0)
+    total = np.zeros(3)
+    for tick in range(31):
+        total += pilot.observe(at_rest(s, tick), touched=True).given_impulse_N_s
+        pilot.fly(passed_on(wrench(s, tick, 0.5 if tick < 15 else 0.0)))
+    # A second of 0.5 N; each of the jets that push within half of its least pulse, 15 mN s.
+    np.testing.assert_allclose(total, [0.5, 0.0, 0.0], atol=0.03)
+
+
 def test_impulse_under_way_is_told() -> None:
     s = mission(time={"rate_hz": 10, "picture_hz": 10})
     pilot = JetPilot(s, 0)

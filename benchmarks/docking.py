@@ -1,9 +1,12 @@
-"""Does it dock? ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--seen N] [--aborts N]``.
+"""Does it dock? ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--seen N] [--aborts N]``
+``[--actuation thrusters|ideal] [--rate HZ] [--failures N]``.
 
 Flies ``docking-contact`` many times in one process: from seeded starts, at target rates from zero to three times the
 paper's about any axis. ``--flights`` with a statistical eye (2 mm and 0.1 degrees of white noise, every tenth picture
 blind), ``--seen`` with rendered pictures and the real perception, ``--aborts`` aborted at a random time, with a second
-approach after every fifth. ``--first`` is the first seed. Prints outcomes by cause, and figures at contact.
+approach after every fifth; ``--failures`` with a jet that sticks open, and as many with one that sticks shut, untold,
+jet after jet: at ``--failed-at``, or at a random time between 2 and 24 s. ``--first`` is the first seed. Prints outcomes
+by cause, and figures at contact.
 """
 
 from __future__ import annotations
@@ -33,12 +36,18 @@ from offline import Eye, Offline, momentum, seeing_eye, statistical_eye
 
 ROOT = Path(__file__).resolve().parents[1]
 APPROACH_AT_S = 4.0
-LIMIT_S = 60.0
+LIMIT_S = 100.0
 OPEN_WITHIN_S = 30.0
 REACHED_M = 0.05
 
 
-def mission(seed: int) -> Scenario:
+Failure = tuple[str, int, float]
+"""Of a jet: kind, number, time in s."""
+
+
+def mission(
+    seed: int, actuation: str = "thrusters", rate_hz: int | None = None, failure: Failure | None = None
+) -> Scenario:
     """``docking-contact`` from a start and at rates that depend on the seed alone."""
     rng = np.random.default_rng([seed, 0xD0C])
     paper_omega, paper_velocity = math.hypot(0.015, 0.045, 0.03), math.hypot(0.015, 0.0075, 0.03)
@@ -54,7 +63,13 @@ def mission(seed: int) -> Scenario:
         "target.velocity_m_s": towards(factor * paper_velocity),
         "target.q_wxyz": rotations.normalize(rng.normal(size=4)).tolist(),
         "timeline": [],
+        "chaser.actuation": actuation,
     }
+    if rate_hz is not None:
+        values |= {"time.rate_hz": rate_hz, "time.picture_hz": rate_hz}
+    if failure is not None:
+        kind, jet, at_s = failure
+        values["jet_failure"] = f"[{{chaser=0,jet={jet},at_s={at_s},kind='{kind}'}}]"
     overrides = [f"{key}={value}" for key, value in values.items()]
     scenario = load_scenario(ROOT / "scenarios" / "docking-contact.toml", tuple(overrides))
     chaser = scenario.chasers[0].model_copy(
@@ -99,17 +114,17 @@ class Conservation:
             return
         if self._begun is None:
             self._begun = momentum(physics, self._masses)
-        step_s = 1.0 / scenario.time.physics_hz
+            self.flight.given("chaser/0")
         while physics.step_count < end_step:
             own, target = physics.state("chaser/0"), physics.state(TARGET)
             m, n = self._masses["chaser/0"][0], self._masses[TARGET][0]
             centre = (m * own.position_m + n * target.position_m) / (m + n)
             Offline.fly(self.flight, physics.step_count + 1)
-            wrench = self.flight.actuators["chaser/0"].wrench
-            force = rotations.rotate(own.q_wxyz, wrench[:3])
-            torque = rotations.rotate(own.q_wxyz, wrench[3:]) + np.cross(own.position_m - centre, force)
-            self._given[0] = self._given[0] + np.asarray(force) * step_s
-            self._given[1] = self._given[1] + np.asarray(torque, dtype=float) * step_s
+            given = self.flight.given("chaser/0")
+            pushed = rotations.rotate(own.q_wxyz, given[:3])
+            turned = rotations.rotate(own.q_wxyz, given[3:]) + np.cross(own.position_m - centre, pushed)
+            self._given[0] = self._given[0] + np.asarray(pushed)
+            self._given[1] = self._given[1] + np.asarray(turned, dtype=float)
             if self._left_steps is None and physics.latches["chaser/0"].latched:
                 self._left_steps = scenario.time.physics_hz // 2
             elif self._left_steps is not None and self.linear is None:
@@ -148,6 +163,8 @@ class Outcome:
     opened_s: float | None = None
     again: bool | None = None
     phase: str = ""
+    propellant_kg: float = 0.0
+    verdicts: list[tuple[float, str]] = field(default_factory=list)
 
     def line(self) -> str:
         """The flight on its own, while the others still fly."""
@@ -158,6 +175,8 @@ class Outcome:
             text += f"; momentum {self.linear:.1e}, {self.angular:.1e}"
         if self.opened_s is not None:
             text += f" after {self.opened_s:.1f} s" + ("" if self.again is None else f", again: {self.again}")
+        for at_s, what in self.verdicts:
+            text += f"; at {at_s:.2f} s {what}"
         return text
 
 
@@ -177,9 +196,8 @@ def order(what: str) -> OperatorCommand:
     return OperatorCommand(command=what, chaser=0, operator="benchmark")  # type: ignore[arg-type]
 
 
-def dock(seed: int, eye_of: Callable[[Scenario], Eye]) -> Outcome:
+def dock(seed: int, scenario: Scenario, eye_of: Callable[[Scenario], Eye]) -> Outcome:
     """One approach until it is verified, given up or the time is over."""
-    scenario = mission(seed)
     flight = Offline(scenario, eye_of(scenario))
     conservation, told = Conservation(flight), False
     while flight.time_s < LIMIT_S and flight.phase(0) != "verified":
@@ -197,6 +215,8 @@ def dock(seed: int, eye_of: Callable[[Scenario], Eye]) -> Outcome:
         flight.touched,
         conservation.linear,
         conservation.angular,
+        propellant_kg=flight.propellant_kg,
+        verdicts=flight.verdicts,
     )
 
 
@@ -207,9 +227,8 @@ def offset_error_m(flight: Offline) -> float:
     return float(np.linalg.norm(offset - np.array(flight.scenario.chasers[0].position_m)))
 
 
-def abort(seed: int, eye_of: Callable[[Scenario], Eye], again: bool) -> Outcome:
+def abort(seed: int, scenario: Scenario, eye_of: Callable[[Scenario], Eye], again: bool) -> Outcome:
     """An approach, aborted at a random time; then, if ``again``, a second one to its end."""
-    scenario = mission(seed)
     flight = Offline(scenario, eye_of(scenario))
     abort_at_s = APPROACH_AT_S + float(np.random.default_rng([seed, 0xAB0]).uniform(0.0, 32.0))
     for what, until_s in (("", APPROACH_AT_S), ("approach", abort_at_s)):
@@ -235,7 +254,15 @@ def abort(seed: int, eye_of: Callable[[Scenario], Eye], again: bool) -> Outcome:
     if flight.touched:
         cause += ", COLLISION"
     return Outcome(
-        seed, cause, bool(verified), None, flight.touched, opened_s=opened_s, again=verified, phase=phase
+        seed,
+        cause,
+        bool(verified),
+        None,
+        flight.touched,
+        opened_s=opened_s,
+        again=verified,
+        phase=phase,
+        verdicts=flight.verdicts,
     )
 
 
@@ -254,6 +281,7 @@ def figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
         "contact_lateral_speed_m_s": [t.lateral_speed_m_s for t in touches],
         "momentum_error": [o.linear for o in outcomes if o.linear is not None],
         "angular_momentum_error": [o.angular for o in outcomes if o.angular is not None],
+        "propellant_kg": [o.propellant_kg for o in outcomes if o.verified and o.propellant_kg],
     }.items():
         if values:
             out[f"{name}_{key}_median"] = float(np.median(values))
@@ -271,32 +299,50 @@ def table(name: str, outcomes: list[Outcome]) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="4 flights, 1 seen, 4 aborts")
+    parser.add_argument("--quick", action="store_true", help="4 flights, 1 seen, 4 aborts, 2 failures each")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--flights", type=int, default=100)
     parser.add_argument("--seen", type=int, default=100)
     parser.add_argument("--aborts", type=int, default=50)
+    parser.add_argument("--failures", type=int, default=12)
+    parser.add_argument("--failed-at", type=float, help="s; at random by default")
+    parser.add_argument("--actuation", choices=("thrusters", "ideal"), default="thrusters")
+    parser.add_argument("--rate", type=int, help="Hz, of control and pictures; the scenario's by default")
     parser.add_argument("--first", type=int, default=0)
     options = parser.parse_args()
     flights, seen, aborts = (4, 1, 4) if options.quick else (options.flights, options.seen, options.aborts)
+    failures = 0 if options.actuation == "ideal" else 2 if options.quick else options.failures
 
     def noisy(scenario: Scenario) -> Eye:
         return statistical_eye(scenario, scenario.seed, 0.002, math.radians(0.1), blind=0.1)
 
     result: dict[str, float] = {}
     begun_s = time.perf_counter()
-    seeds = range(options.first, options.first + max(flights, seen, aborts))
+    seeds = range(options.first, options.first + max(flights, seen, aborts, failures))
+
+    def scenario_of(seed: int, failure: Failure | None = None) -> Scenario:
+        return mission(seed, options.actuation, options.rate, failure)
+
     for name, number, eye in (("noise", flights, noisy), ("vision", seen, seeing_eye)):
         outcomes = []
         for seed in seeds[:number]:
-            outcomes.append(dock(seed, eye))
+            outcomes.append(dock(seed, scenario_of(seed), eye))
             print(f"{name} {outcomes[-1].line()}", file=sys.stderr, flush=True)
         if outcomes:
             table(name, outcomes)
             result |= figures(name, outcomes)
+    for kind in ("stuck_on", "stuck_off"):
+        outcomes = []
+        for seed in seeds[:failures]:
+            at_s = options.failed_at or float(np.random.default_rng([seed, 0xFA1]).uniform(2.0, 24.0))
+            outcomes.append(dock(seed, scenario_of(seed, (kind, seed % 12, at_s)), noisy))
+            print(f"{kind} jet {seed % 12} {at_s:.2f} s {outcomes[-1].line()}", file=sys.stderr, flush=True)
+        if outcomes:
+            table(kind, outcomes)
+            result |= figures(kind, outcomes)
     outcomes = []
     for seed in seeds[:aborts]:
-        outcomes.append(abort(seed, noisy, again=seed % 5 == 0))
+        outcomes.append(abort(seed, scenario_of(seed), noisy, again=seed % 5 == 0))
         print(f"abort {outcomes[-1].line()}", file=sys.stderr, flush=True)
     if outcomes:
         table("abort", outcomes)

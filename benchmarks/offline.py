@@ -1,7 +1,7 @@
 """Missions in one process, without Zenoh: world, eyes and controller called in turn, tick by tick.
 
-The same code flies as in the processes; what is left out is what carries messages. Eyes and actuators are given, so
-that a statistical model can stand in for pictures, and jets for ideal actuation.
+The same code flies as in the processes; what is left out is what carries messages. Eyes are given, so that a
+statistical model can stand in for pictures; chasers have jets or not, and jets fail, as the scenario has it.
 """
 
 from __future__ import annotations
@@ -14,14 +14,16 @@ import numpy as np
 from chaserdock_agents.chaser.eye import look, prediction_from
 from chaserdock_agents.chaser.pilot import passed_on
 from chaserdock_agents.perception import make_perception
+from chaserdock_agents.thrusters.pilot import JetPilot
 from chaserdock_controller.flight import Flight, Inputs, Outputs
 from chaserdock_protocol import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import OperatorCommand, PoseSolution, Sighting
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.actuators import IdealActuators, fly_to
+from chaserdock_world.actuators import fly_to
 from chaserdock_world.cameras import Cameras
+from chaserdock_world.jet_actuators import actuators_of
 from chaserdock_world.physics import TARGET, BodyState, Physics
 from chaserdock_world.publish import docking_status, odometry_of
 
@@ -81,24 +83,27 @@ def statistical_eye(
 class Offline:
     """A mission in flight. ``actuators`` by chaser's name; ``last`` is the controller's latest answer.
 
-    ``touched``: pairs of bodies that touched since the start, but for a probe's tip on the target; ``on_step`` is
-    called with the physics after every flown slice.
+    ``touched``: pairs of bodies that touched since the start, but for a probe's tip on the target; ``events``, with
+    what the chasers found of their jets (``verdicts``); ``propellant_kg``, of all chasers.
     """
 
     scenario: Scenario
     eye: Eye
-    make_actuators: Callable[[Scenario], Any] = lambda scenario: IdealActuators(scenario.chaser)
     tick: int = 0
     touched: set[tuple[str, str]] = field(default_factory=set)
     touches: list[Any] = field(default_factory=list)
     events: list[tuple[float, str]] = field(default_factory=list)
+    verdicts: list[tuple[float, str]] = field(default_factory=list)
+    propellant_kg: float = 0.0
     last: Outputs | None = None
 
     def __post_init__(self) -> None:
         s = self.scenario
         self.physics = Physics(s)
         self.flight = Flight(s, lambda: 0.0)
-        self.actuators = {f"chaser/{i}": self.make_actuators(s) for i in range(len(s.chasers))}
+        self.actuators = {f"chaser/{i}": actuators_of(s, i) for i in range(len(s.chasers))}
+        jets = s.chaser.actuation == "thrusters"
+        self.pilots = {i: JetPilot(s, i) for i in range(len(s.chasers))} if jets else {}
 
     @property
     def time_s(self) -> float:
@@ -119,15 +124,27 @@ class Offline:
         for latch in physics.latches.values():
             self.touches += latch.take()
         odometry = {i: odometry_of(i, states[f"chaser/{i}"], tick, time_ns) for i in chasers}
+        reports = {}
+        for i, pilot in self.pilots.items():
+            felt = docking.get(i)
+            reports[i] = pilot.observe(odometry[i], felt is not None and (felt.contact or felt.latched))
+            self.verdicts += [
+                (time_ns / 1e9, f"{what}, {detail}") for _, what, detail in pilot.drain_events()
+            ]
         seen = tuple(self.eye(i, tick, time_ns, states) for i in chasers) if timing.has_pictures(tick) else ()
-        out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, docking=docking))
+        out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, reports, docking))
         for i, wrench in out.wrenches.items():
             command = passed_on(wrench)
+            if i in self.pilots:
+                self.pilots[i].heed(wrench)
+                command = self.pilots[i].fly(command)
             effective = timing.step_of_time(command.effective_time_ns)
             self.actuators[f"chaser/{i}"].command(command, effective, physics.step_count)
             physics.command_latch(i, command.latch, effective)
         self.events += [(time_ns / 1e9, e.what) for e in out.events]
         self.fly(timing.step_of_tick(tick + 1))
+        for name in self.actuators:
+            self.given(name)
         self.tick += 1
         self.last = out
         return out
@@ -136,6 +153,12 @@ class Offline:
         """Moves the world on to a physics step."""
         step_s = 1.0 / self.scenario.timing.physics_hz
         self.touched |= fly_to(step, self.physics, self.actuators, step_s)
+
+    def given(self, name: str) -> Array:
+        """Impulse (6,), N s and N m s, body axes, that a chaser's actuators gave since this was last asked."""
+        took = self.actuators[name].take(self.physics.step_count)
+        self.propellant_kg += took.propellant_kg
+        return took.impulse
 
     def close(self) -> None:
         self.physics.close()

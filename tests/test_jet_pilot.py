@@ -14,6 +14,7 @@ from chaserdock_controller.jets import JetDesk
 from chaserdock_controller.prediction import CommandHistory, predict_state, predict_state_with_impulse
 from chaserdock_protocol.messages import JetReport, Odometry, OperatorCommand, WrenchCommand
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.wrench_set import wrench_matrix
 from closed_loop import fly
 from flight_cases import odometry
 from thruster_cases import box, mission
@@ -105,6 +106,37 @@ def test_who_is_held_looks_for_no_failures() -> None:
             pilot.heed(push)
             pilot.fly(passed_on(push))
         assert free or not pilot.drain_events()
+
+
+def test_what_the_docking_sensor_feels_is_no_jets_fault() -> None:
+    """Pushed as by jet 3, which nobody asked: blamed in free flight, and not when the sensor has felt something."""
+    for touched in (False, True):
+        s = mission()
+        pilot = JetPilot(s, 0)
+        push = wrench_matrix(s.chaser.thrusters)[:, 3] * s.chaser.thrusters[3].thrust_N
+        for tick in range(10):
+            time_ns = s.timing.tick_time_ns(tick)
+            rates = push * (time_ns / 1e9) / ([s.chaser.mass_kg] * 3 + list(s.chaser.inertia))
+            linear, angular = tuple(rates[:3].tolist()), tuple(rates[3:].tolist())
+            still: Any = (1.0, 0.0, 0.0, 0.0)
+            moved = odometry(
+                tick=tick, time_ns=time_ns, velocity_m_s=linear, q_wxyz=still, omega_rad_s=angular
+            )
+            pilot.observe(moved, touched)
+            pilot.heed(wrench(s, tick))
+            pilot.fly(passed_on(wrench(s, tick)))
+        assert pilot.isolated == (() if touched else (3,))
+
+
+def test_impulse_given_is_told() -> None:
+    s = mission()
+    pilot = JetPilot(s, 0)
+    total = np.zeros(3)
+    for tick in range(31):
+        total += pilot.observe(at_rest(s, tick), touched=True).given_impulse_N_s
+        pilot.fly(passed_on(wrench(s, tick, 0.5 if tick < 15 else 0.0)))
+    # A second of 0.5 N; each of the jets that push within half of its least pulse, 15 mN s.
+    np.testing.assert_allclose(total, [0.5, 0.0, 0.0], atol=0.03)
 
 
 def test_impulse_under_way_is_told() -> None:

@@ -50,10 +50,12 @@ class Captures:
         odometry: Mapping[int, Odometry],
         history: CommandHistory,
         now_ns: int,
+        given: Mapping[int, Array],
     ) -> None:
         """Takes in what the docking sensors say, before this tick's sightings: the target may have been pushed.
 
-        ``history``: commands sent; those of a chaser that holds on have moved the target as well.
+        ``history``: commands sent; those of a chaser that holds on have moved the target as well. ``given``: impulses
+        (6,), body axes, since the tick before, of chasers that tell: pulses are not where their commands are.
         """
         latched = self.latched - told.keys() | {i for i, status in told.items() if status.latched}
         changed = latched != self.latched
@@ -61,15 +63,19 @@ class Captures:
             self._estimator.disturb(_TOUCH)
         else:
             for i in sorted(latched & odometry.keys()):
-                self._pushed(i, odometry[i], history, now_ns)
+                impulse = given[i] if i in given else self._commanded(i, history, now_ns)
+                self._pushed(odometry[i], impulse, now_ns)
         self._changed |= changed
         self.latched = latched
 
-    def _pushed(self, i: int, odometry: Odometry, history: CommandHistory, now_ns: int) -> None:
-        """What chaser ``i``, holding on, has done to the common body's rates since the tick before."""
+    def _commanded(self, i: int, history: CommandHistory, now_ns: int) -> Array:
+        """Impulse (6,), body axes, that the commands to chaser ``i`` are since the tick before."""
         since_ns = now_ns - round(1e9 / self._scenario.time.rate_hz)
         segments = history.segments(i, since_ns, now_ns)
-        impulse = sum((w * ((end - begin) / 1e9) for begin, end, w in segments), np.zeros(6))
+        return sum((w * ((end - begin) / 1e9) for begin, end, w in segments), np.zeros(6))
+
+    def _pushed(self, odometry: Odometry, impulse: Array, now_ns: int) -> None:
+        """What a chaser that holds on has done to the common body's rates by an ``impulse`` (6,), body axes."""
         if not impulse.any():
             return
         before = self._estimator.estimate_at(now_ns)

@@ -110,7 +110,6 @@ class Flight:
     def step(self, inputs: Inputs) -> Outputs:
         """Everything that one tick asks of the controller."""
         now_s = inputs.time_ns / 1e9
-        self._jets.take(inputs.jets)
         fused, target = self.fuse(inputs)
         out = Outputs(target=target)
         self._events(out, inputs, [("info", text) for _, text in self._estimator.drain_events()])
@@ -144,7 +143,9 @@ class Flight:
         """The estimation of ``step`` alone: the fused state and its message. Once a tick, by ``step`` or instead of it."""
         for odometry in inputs.odometry.values():
             self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
-        self._captures.feel(inputs.docking, inputs.odometry, self._history, inputs.time_ns)
+        self._jets.take(inputs.jets)
+        given = self._jets.given(inputs.tick)
+        self._captures.feel(inputs.docking, inputs.odometry, self._history, inputs.time_ns, given)
         fused = self._estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
         if fused.status in ("tracking", "predicting"):
             self._captures.join(fused, inputs.odometry)

@@ -44,6 +44,14 @@ class JetDesk:
             return None
         return np.array([*report.coming_impulse_N_s, *report.coming_angular_impulse_N_m_s])
 
+    def given(self, tick: int) -> dict[int, Array]:
+        """Impulse (6,), body axes, that jets gave from the tick before to ``tick``, of the chasers that tell."""
+        return {
+            i: np.array([*r.given_impulse_N_s, *r.given_angular_impulse_N_m_s])
+            for i, r in self._reports.items()
+            if r.tick == tick
+        }
+
     def isolated(self, chaser: int) -> tuple[int, ...]:
         """Jets that an operator wants shut off."""
         return tuple(sorted(self._isolated.get(chaser, ())))

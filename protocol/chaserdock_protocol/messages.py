@@ -249,7 +249,8 @@ class JetReport(Message, frozen=True, kw_only=True):
     """What a chaser's jets can do, as it knows them, at the time of the odometry of the same tick.
 
     ``force_max_N`` and ``torque_max_N_m`` are within reach on all body axes at once. ``coming_*`` is the impulse (body
-    axes) that it will get from pulses under way, less what of them counts as the next command's.
+    axes) that it will get from pulses under way, less what of them counts as the next command's; ``given_*`` is what
+    its jets should have given since the report before.
     """
 
     chaser: ChaserId
@@ -259,6 +260,8 @@ class JetReport(Message, frozen=True, kw_only=True):
     coming_angular_impulse_N_m_s: Vector3
     jets: Annotated[tuple[JetState, ...], Meta(max_length=255)]
     isolated: Jets = ()
+    given_impulse_N_s: Vector3 = (0.0, 0.0, 0.0)
+    given_angular_impulse_N_m_s: Vector3 = (0.0, 0.0, 0.0)
 
 
 class Event(Message, frozen=True, kw_only=True):

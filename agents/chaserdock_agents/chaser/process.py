@@ -59,7 +59,7 @@ class Chaser:
     number: int
     ended: bool = False
     odometry: Odometry | None = None
-    latched: bool = False
+    docking: DockingStatus | None = None
     sighting: Sighting | None = None
     tick: Tick | None = None
     flown_tick: int = -1
@@ -70,6 +70,7 @@ class Chaser:
         self.name = f"chaser/{self.number}"
         self._forgotten = self._refusing = False
         self._watched_tick = -1
+        self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._jets = (
             JetPilot(self.scenario, self.number) if self.scenario.chaser.actuation == "thrusters" else None
         )
@@ -103,7 +104,8 @@ class Chaser:
                 self._brake_if_alone()
                 self._brake_if_forgotten(odometry)
             case DockingStatus() as docking:
-                self.latched = docking.latched
+                self.docking = docking
+                self._watch_jets()
             case WrenchCommand() as command:
                 self._fly(command)
             case Tick() as tick:
@@ -133,15 +135,21 @@ class Chaser:
         )
 
     def _watch_jets(self) -> None:
-        """Tells the controller what the jets can do, and everyone what has been found of them; once a tick that is
-        open. The last odometry belongs to none, and may come after the mission's end or before it."""
-        tick, odometry = self.tick, self.odometry
+        """Tells the controller what the jets can do, and everyone what has been found of them.
+
+        Once a tick that is open, when it has brought the odometry and, with a docking sensor, its word, in whatever
+        order. The last odometry belongs to no open tick, and may come after the mission's end or before it.
+        """
+        tick, odometry, docking = self.tick, self.odometry, self.docking
         if self._jets is None or tick is None or odometry is None:
             return
         if odometry.tick != tick.tick or self._watched_tick >= tick.tick:
             return
+        if self._has_port and (docking is None or docking.tick != tick.tick):
+            return
         self._watched_tick = tick.tick
-        self.node.publish(topics.JETS, self._jets.observe(odometry), self.number)
+        touched = docking is not None and (docking.contact or docking.latched)
+        self.node.publish(topics.JETS, self._jets.observe(odometry, touched), self.number)
         for level, what, detail in self._jets.drain_events():
             self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
@@ -189,7 +197,8 @@ class Chaser:
 
     def _braking(self, odometry: Odometry) -> ActuatorCommand:
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
-        return brake(odometry, self.scenario.chaser, effective_ns, self.latched)
+        latched = self.docking is not None and self.docking.latched
+        return brake(odometry, self.scenario.chaser, effective_ns, latched)
 
     def _send(self, command: ActuatorCommand) -> None:
         self.flown_tick = command.tick

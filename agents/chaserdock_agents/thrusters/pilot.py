@@ -59,26 +59,33 @@ class JetPilot:
     def _useless(self) -> set[int]:
         return {jet for jet, verdict in self._failed.items() if verdict.kind != "weak"}
 
-    def observe(self, odometry: Odometry) -> JetReport:
-        """Looks for failed jets in the motion since the last odometry; what the jets can do now."""
+    def observe(self, odometry: Odometry, touched: bool = False) -> JetReport:
+        """Looks for failed jets in the motion since the last odometry; what the jets can do now.
+
+        ``touched``: the docking sensor felt something since then. That motion is not the jets' alone.
+        """
         before, self._odometry = self._odometry, odometry
         now_ns = odometry.sim_time_ns
         for failure in [f for f in self._told if round(f.at_s * 1e9) <= now_ns]:
             self._told.remove(failure)
             factor = 1.0 if failure.kind == "stuck_on" else failure.factor or 0.0
             self._convict(Verdict(failure.jet, failure.kind, factor), round(failure.at_s * 1e9), "was told")
+        given = np.zeros(len(self._full_N))
         if before is not None and before.sim_time_ns < now_ns:
-            self._compare(before, odometry)
+            given = self._impulses(before.sim_time_ns, now_ns)
+            if touched:
+                self._watch.forget()
+            else:
+                self._compare(before, odometry, given)
         if now_ns - self._forgotten_ns > _FORGET_NS:
             self._forgotten_ns = now_ns
             self._valves.forget_before(now_ns - _FORGET_NS)
-        return self._report(odometry)
+        return self._report(odometry, self._matrix @ given)
 
-    def _compare(self, before: Odometry, after: Odometry) -> None:
+    def _compare(self, before: Odometry, after: Odometry, jets: Array) -> None:
         if self._free_since_ns is None or before.sim_time_ns < self._free_since_ns:
             self._watch.forget()
             return
-        jets = self._impulses(before.sim_time_ns, after.sim_time_ns)
         residual = observed_impulse(before, after, self._body) - self._matrix @ jets
         noise = covariance(self._noise, self._body, self._matrix, jets, before, after)
         out = {*self._failed, *self._valves.shut_at(before.sim_time_ns), *self._trusted}
@@ -106,7 +113,7 @@ class JetPilot:
         can[list(self.isolated)] = 0.0
         return can
 
-    def _report(self, odometry: Odometry) -> JetReport:
+    def _report(self, odometry: Odometry, given: Array) -> JetReport:
         scale = min(1.0, self._set.box_scale(self._can_N(), self._box))
         if scale != self._scale and self._scale is not None:
             text = f"the controller's limits are {scale:.3f} of the body's"
@@ -133,6 +140,8 @@ class JetPilot:
             coming_angular_impulse_N_m_s=vector(coming[3:]),
             jets=tuple(kinds),
             isolated=self.isolated,
+            given_impulse_N_s=vector(given[:3]),
+            given_angular_impulse_N_m_s=vector(given[3:]),
         )
 
     def heed(self, command: WrenchCommand) -> None:

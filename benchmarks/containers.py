@@ -10,13 +10,10 @@ again), ``kill`` of a chaser (``docker kill``: Docker does not start that again,
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import os
-import platform
 import subprocess
-import sys
 import time
 import uuid
 from collections.abc import Callable
@@ -24,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from chaserdock_protocol.log import LogError, read_log
+from results import options_of, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
@@ -209,9 +207,7 @@ def figures(log: Path, struck_ns: int, status: int, took_s: float) -> dict[str, 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--json", type=Path)
+    parser = options_of(__doc__)
     parser.add_argument("--only", choices=FAULTS, action="append")
     options = parser.parse_args()
     (ROOT / "runs").mkdir(exist_ok=True)
@@ -225,16 +221,7 @@ def main() -> None:
         for name, value in fly(fault, scenario, overrides).items():
             result[f"{fault}_{name}"] = value
             print(f"{fault}_{name:24} {value:.5g}", flush=True)
-    if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        about = {
-            "command": " ".join(sys.argv),
-            "commit": commit.stdout.strip(),
-            "machine": f"{platform.machine()} {platform.platform()}",
-        }
-        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

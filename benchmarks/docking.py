@@ -11,17 +11,12 @@ by cause, and figures at contact.
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import platform
-import subprocess
 import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +28,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.physics import TARGET
 from offline import Eye, Offline, momentum, seeing_eye, statistical_eye
+from results import options_of, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
 APPROACH_AT_S = 4.0
@@ -298,9 +294,7 @@ def table(name: str, outcomes: list[Outcome]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="4 flights, 1 seen, 4 aborts, 2 failures each")
-    parser.add_argument("--json", type=Path)
+    parser = options_of(__doc__)
     parser.add_argument("--flights", type=int, default=100)
     parser.add_argument("--seen", type=int, default=100)
     parser.add_argument("--aborts", type=int, default=50)
@@ -359,17 +353,7 @@ def main() -> None:
     for name, value in result.items():
         print(f"{name:{width}}  {value:.5g}")
     print(f"{time.perf_counter() - begun_s:.0f} s", file=sys.stderr)
-    if options.json is not None:
-        commit = subprocess.run(
-            ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-        )
-        about = {
-            "command": " ".join(sys.argv),
-            "commit": commit.stdout.strip(),
-            "machine": f"{platform.machine()} {platform.platform()}",
-            "date": f"{datetime.now():%Y-%m-%d}",
-        }
-        options.json.write_text(json.dumps({**result, "about": about}, indent=2) + "\n")
+    write_json(options.json, result)
 
 
 if __name__ == "__main__":

@@ -233,7 +233,7 @@ def test_frozen_controller_in_real_time(tmp_path: Path) -> None:
         wait_for_log(out / "mission.mcap", FLYING_BYTES)
         controller = find_child(mission, "controller")
         controller.suspend()
-        time.sleep(1.5)  # less than the lease
+        time.sleep(1.1)  # a good deal less than the lease, more than a command lives
         controller.resume()
         mission.wait(timeout=120)
     finally:
@@ -242,7 +242,7 @@ def test_frozen_controller_in_real_time(tmp_path: Path) -> None:
     records = list(read_log(out / "mission.mcap", ["chaser/0/actuators"]))
     flown = [r.message for r in records]
     braking = [m.tick for m in flown if m.source == "brake"]
-    assert 5 < len(braking) < 60
+    assert 3 < len(braking) < 60
     assert max(m.tick for m in flown if m.source == "command") > max(braking) + 15
     result = summary(out)
     assert any("no command, braking" in e["what"] for e in result["events"])

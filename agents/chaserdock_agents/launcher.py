@@ -17,6 +17,7 @@ from types import FrameType
 import psutil
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.log_scan import LOG_NAME
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.runtime import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, load_scenario
@@ -135,7 +136,7 @@ def run_mission(
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
     words = folder / "processes"
-    if (folder / "mission.mcap").exists():
+    if (folder / LOG_NAME).exists():
         raise RunError(
             f"{folder} holds a mission.mcap already; a log is never overwritten, choose another --out"
         )
@@ -152,7 +153,7 @@ def run_mission(
     try:
         network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(lease_ms)]
         start_all(fleet, scenario, path, folder, mode, overrides, network)
-        failure = watch(fleet, hub, scenario, Progress(scenario, mode, quiet), stop)
+        failure = watch(fleet, hub, Progress(scenario, mode, quiet), stop)
     finally:
         fleet.end()
         hub.close()
@@ -182,7 +183,7 @@ def start_all(
     fleet.start("recorder", ["record", "--out", str(folder), *network, *patient], words)
 
 
-def watch(fleet: Fleet, hub: Node, scenario: Scenario, progress: Progress, stop: _Stop) -> str | None:
+def watch(fleet: Fleet, hub: Node, progress: Progress, stop: _Stop) -> str | None:
     """Shows the flight until it has ended; why it failed, or None."""
     hub.subscribe(topics.END)
     progress.subscribe(hub)
@@ -225,7 +226,7 @@ def judge(fleet: Fleet, folder: Path, failure: str | None) -> int:
 
     from .analysis.summary import summarize, text_of
 
-    log = folder / "mission.mcap"
+    log = folder / LOG_NAME
     try:
         summary = summarize(log)
     except LogError as error:

@@ -12,10 +12,9 @@ import numpy as np
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.log import Record, read_log
+from chaserdock_protocol.log_scan import LOG_NAME
 from chaserdock_protocol.messages import BodyTruth, Reference
 from chaserdock_protocol.rotations import Array
-
-LOG_NAME = "mission.mcap"
 
 Look = Literal["used", "rejected", "nothing", "bad picture", "unanswered"]
 """What became of a picture: its sighting was used, or refused by the fusion; nothing was seen in it; it could not be
@@ -59,9 +58,7 @@ class _Collector:
         time_s = message.sim_time_ns / 1e9
         if isinstance(message, BodyTruth):
             if message.body.startswith("chaser/"):
-                # Jets came with a later version of the message; older logs and ideal actuators have none.
-                jets = getattr(message, "jet_open_s", ())
-                row = (time_s, message.impulse_N_s, message.angular_impulse_N_m_s, jets)
+                row = (time_s, message.impulse_N_s, message.angular_impulse_N_m_s, message.jet_open_s)
                 self.bodies[int(message.body.partition("/")[2])].append(row)
         elif record.topic is topics.IMAGE:
             self.sent[message.chaser, message.tick] = record.sent_ns

@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from types import FrameType
 
 from .fly import CampaignError, Keep, Result, fly, fly_campaign
 from .page import page
@@ -28,9 +27,7 @@ def direct(
     if only is not None:
         return _fly_one(campaign, folder, only)
     stop = threading.Event()
-    before = {
-        s: signal.signal(s, lambda number, frame: _stop(stop, frame)) for s in (signal.SIGINT, signal.SIGTERM)
-    }
+    before = {s: signal.signal(s, lambda number, frame: _stop(stop)) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
         told = _Teller()
         flown = fly_campaign(campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, told, stop)
@@ -82,7 +79,7 @@ def _fly_one(campaign: Campaign, folder: Path, only: int) -> int:
     return 0 if result.status == 0 else 1
 
 
-def _stop(stop: threading.Event, frame: FrameType | None) -> None:
+def _stop(stop: threading.Event) -> None:
     if not stop.is_set():
         print("\nchaserdock: stopping when the runs in flight are over", file=sys.stderr)
     stop.set()

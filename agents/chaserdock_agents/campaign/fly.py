@@ -20,11 +20,11 @@ from typing import Any, Literal
 
 import msgspec
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.log_scan import LOG_NAME
 
 from .plan import Campaign, Run
 
 Keep = Literal["failures", "all", "none"]
-LOG = "mission.mcap"
 
 
 class CampaignError(ChaserdockError):
@@ -100,7 +100,7 @@ def fly(run: Run, scenario: Path, keep: Keep, logs: Path) -> Result:
         summary = json.loads(summary_file.read_text()) if summary_file.is_file() else None
         said = (done.stderr.strip() or done.stdout.strip()).splitlines()
         wanted = keep == "all" or (keep == "failures" and done.returncode != 0)
-        kept = _keep(out / LOG, logs / run.name) if wanted and (out / LOG).is_file() else None
+        kept = _keep(out / LOG_NAME, logs / run.name) if wanted and (out / LOG_NAME).is_file() else None
         return Result(run.name, done.returncode, summary, said[-1] if said else "", kept)
     finally:
         shutil.rmtree(work, ignore_errors=True)
@@ -109,10 +109,10 @@ def fly(run: Run, scenario: Path, keep: Keep, logs: Path) -> Result:
 def _keep(log: Path, folder: Path) -> str:
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        shutil.move(log, folder / LOG)
-        return str(folder / LOG)
+        shutil.move(log, folder / LOG_NAME)
+        return str(folder / LOG_NAME)
     except OSError:
-        stay = Path(tempfile.mkdtemp(prefix=f"chaserdock-log-{folder.name}-")) / LOG
+        stay = Path(tempfile.mkdtemp(prefix=f"chaserdock-log-{folder.name}-")) / LOG_NAME
         shutil.move(log, stay)
         return f"{socket.gethostname()}:{stay}"
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.log_scan import LOG_NAME
 from chaserdock_protocol.runtime import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.study import StudyCase, StudyResult, line_of, read_lines
@@ -173,7 +174,7 @@ class Runner:
         flown = Flown(key=self._mission_key(mission), summary=summary)
         (place / "flown.json").write_bytes(msgspec.json.encode(flown))
         if not self.keep_logs:
-            (place / "mission.mcap").unlink(missing_ok=True)
+            (place / LOG_NAME).unlink(missing_ok=True)
         self._told(mission.name, begun_s, "flown" if summary["success"] else "; ".join(summary["failures"]))
         return None
 

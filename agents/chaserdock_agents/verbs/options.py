@@ -46,6 +46,7 @@ KeysOpt = Annotated[
     ),
 ]
 LeaseOpt = Annotated[int, typer.Option("--lease-ms", help="after that long a silent process counts as lost")]
+PatienceOpt = Annotated[float | None, typer.Option(help="seconds to wait for a world; for ever by default")]
 WatchOpt = Annotated[bool, typer.Option("--watch-parent", hidden=True)]
 OutOpt = Annotated[Path | None, typer.Option("--out", help="folder for log and summary; runs/… by default")]
 

@@ -23,6 +23,7 @@ from .options import (
     NamespaceOpt,
     NetModeOpt,
     OutOpt,
+    PatienceOpt,
     ScenarioArg,
     SeedOpt,
     SetOpt,
@@ -118,9 +119,7 @@ def chaser(
     config: ConfigOpt = None,
     keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
-    patience: Annotated[
-        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
-    ] = None,
+    patience: PatienceOpt = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """One chaser: sees the target, drives its actuators."""
@@ -140,9 +139,7 @@ def controller(
     config: ConfigOpt = None,
     keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
-    patience: Annotated[
-        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
-    ] = None,
+    patience: PatienceOpt = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """The central controller: fuses what all chasers see, plans for all of them."""
@@ -162,9 +159,7 @@ def record(
     config: ConfigOpt = None,
     keys: KeysOpt = None,
     lease_ms: LeaseOpt = 60_000,
-    patience: Annotated[
-        float | None, typer.Option(help="seconds to wait for a world; for ever by default")
-    ] = None,
+    patience: PatienceOpt = None,
     rotate_size_mb: Annotated[
         float | None,
         typer.Option(min=1, help="begin a new file (mission-0000.mcap …) after so many megabytes"),

@@ -2,7 +2,7 @@
 FROM python:3.11-slim AS wheel
 COPY docker/build-requirements.txt /src/docker/
 RUN pip install --no-cache-dir --require-hashes -r /src/docker/build-requirements.txt
-COPY pyproject.toml README.md LICENSE /src/
+COPY pyproject.toml README.md LICENSE build_hook.py /src/
 COPY scenarios /src/scenarios
 COPY protocol /src/protocol
 COPY world /src/world
@@ -12,14 +12,13 @@ RUN pip wheel --no-deps --no-build-isolation --wheel-dir /wheels /src
 
 FROM python:3.11-slim
 ENV PYTHONUNBUFFERED=1 HOME=/tmp \
-    NUMBA_CACHE_DIR=/var/cache/chaserdock \
-    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1 NUMBA_NUM_THREADS=1
+    OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # What changes rarely comes first. Volumes take over the owner and mode of the folder that they are mounted on.
 RUN useradd --uid 10001 --no-create-home --home-dir /tmp chaserdock \
-    && mkdir -p /keys /runs /scenarios /var/cache/chaserdock \
-    && for name in router world controller recorder operator analysis \
+    && mkdir -p /keys /runs /scenarios \
+    && for name in router world controller standby recorder operator analysis viewer \
          $(seq -f chaser-%g 0 15); do mkdir /keys/$name; done \
-    && chmod -R 1777 /keys /var/cache/chaserdock
+    && chmod -R 1777 /keys
 COPY requirements.txt docker/slim.py /opt/chaserdock/
 RUN pip install --no-cache-dir --require-hashes -r /opt/chaserdock/requirements.txt \
     && python /opt/chaserdock/slim.py
@@ -27,11 +26,11 @@ COPY --from=wheel /wheels /opt/chaserdock/wheels
 RUN pip install --no-cache-dir --no-index --no-deps /opt/chaserdock/wheels/*.whl
 COPY docker/as-owner docker/healthy /usr/local/bin/
 USER chaserdock
-# Compiles the solver for this kind of CPU (another kind compiles again, at its start), and shows that the image flies.
+# Shows that the image flies.
 RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
       --set camera.width_px=640 --set camera.height_px=480 \
       --set success.steady_position_rms_m=0.2 --set success.steady_orientation_rms_deg=10.0 \
-    && rm -rf /tmp/warm && chmod -R a+rwX /var/cache/chaserdock/*
+    && rm -rf /tmp/warm
 WORKDIR /tmp
 ENTRYPOINT ["python", "-m", "chaserdock_agents.member"]
 HEALTHCHECK --interval=5s --timeout=60s --start-period=60s --retries=3 CMD ["healthy"]

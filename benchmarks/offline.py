@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
 import numpy as np
 from chaserdock_agents.chaser.eye import look, prediction_from
 from chaserdock_agents.chaser.pilot import passed_on
@@ -18,7 +19,7 @@ from chaserdock_agents.thrusters.pilot import JetPilot
 from chaserdock_controller.flight import Flight, Inputs, Outputs
 from chaserdock_protocol import rotations
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import OperatorCommand, PoseSolution, Sighting
+from chaserdock_protocol.messages import ActuatorCommand, OperatorCommand, PoseSolution, Sighting
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators import fly_to
@@ -81,7 +82,8 @@ def statistical_eye(
 
 @dataclass
 class Offline:
-    """A mission in flight. ``actuators`` by chaser's name; ``last`` is the controller's latest answer.
+    """A mission in flight. ``actuators`` by chaser's name; ``last`` is the controller's latest answer;
+    ``actuator_gain``: what ideal actuators give of what they are asked for.
 
     ``touched``: pairs of bodies that touched since the start, but for a probe's tip on the target; ``events``, with
     what the chasers found of their jets (``verdicts``); ``propellant_kg``, of all chasers.
@@ -89,6 +91,7 @@ class Offline:
 
     scenario: Scenario
     eye: Eye
+    actuator_gain: float = 1.0
     tick: int = 0
     touched: set[tuple[str, str]] = field(default_factory=set)
     touches: list[Any] = field(default_factory=list)
@@ -138,6 +141,8 @@ class Offline:
             if i in self.pilots:
                 self.pilots[i].heed(wrench)
                 command = self.pilots[i].fly(command)
+            if self.actuator_gain != 1.0:
+                command = stronger(command, self.actuator_gain)
             effective = timing.step_of_time(command.effective_time_ns)
             self.actuators[f"chaser/{i}"].command(command, effective, physics.step_count)
             physics.command_latch(i, command.latch, effective)
@@ -162,6 +167,15 @@ class Offline:
 
     def close(self) -> None:
         self.physics.close()
+
+
+def stronger(command: ActuatorCommand, gain: float) -> ActuatorCommand:
+    """The command to ideal actuators that gives ``gain`` times as much."""
+    return msgspec.structs.replace(
+        command,
+        force_N=vector(gain * np.array(command.force_N)),
+        torque_N_m=vector(gain * np.array(command.torque_N_m)),
+    )
 
 
 def momentum(physics: Physics, masses: dict[str, tuple[float, Array]]) -> tuple[Array, Array]:

@@ -11,6 +11,7 @@ import math
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,14 @@ from results import options_of, write_json
 ROOT = Path(__file__).resolve().parents[1]
 FAILED_AT_S = 30.01  # just after a tick: the longest until two whole ticks are seen
 PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.045, 0.03)}
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "untested": {"jet_test_s": 0.0},
+    "carrier_15_hz": {"modulation": {"carrier_hz": 15}},
+    "schmitt": {"modulation": {"modulator": "schmitt"}},
+}
+"""Of the chasers, at 15 Hz: without test burns, with a period a tick, with a Schmitt trigger instead of pulse widths."""
 
 
 def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **changes: Any) -> Scenario:
@@ -77,10 +86,14 @@ def allocation(quick: bool) -> dict[str, float]:
 
 def pulses(quick: bool) -> dict[str, float]:
     """Thrusts asked for at random, new every tick: greatest difference of impulse given and asked for, over any whole
-    number of carrier periods that makes a second, in minimum pulses of the jet."""
+    number of carrier periods that makes a second, in minimum pulses of the jet.
+
+    ``less_late``: without what was asked for within a period after its pulse had been sent. Where every tick begins a
+    period there is none.
+    """
     out: dict[str, float] = {}
-    for rate_hz in (10, 15, 30):
-        s = scenario(1.0, rate_hz=rate_hz)
+    for rate_hz, carrier_hz in ((10, 10), (15, 10), (30, 10), (15, 15)):
+        s = scenario(1.0, rate_hz=rate_hz, chaser={"modulation": {"carrier_hz": carrier_hz}})
         b, timing, rng = s.chaser, s.timing, np.random.default_rng(2)
         full = thrusts_max(b.thrusters)
         modulator, valves = Modulator(b.thrusters, b.modulation, timing), Valves(b.thrusters)
@@ -96,14 +109,35 @@ def pulses(quick: bool) -> dict[str, float]:
             for p in modulator.pulses(thrusts, full, begin, end):
                 valves.pulse(p.jet, p.open_ns, p.close_ns)
         # Where periods and ticks begin together, every whole second of the carrier is one of the ticks, too.
-        edges = np.array([timing.effective_ns(k * rate_hz) for k in range(ticks // rate_hz + 1)], dtype=float)
-        given = valves.impulses(edges)
-        wanted = np.diff(np.array(asked)[::rate_hz], axis=0)
-        least = full * [t.min_on_s for t in b.thrusters]
-        out[f"pulses_{rate_hz}_hz_worst_second_min_pulses"] = float(
-            np.abs((given - wanted) / least)[1:-1].max()
+        edges = np.array([timing.effective_ns(k * rate_hz) for k in range(1, ticks // rate_hz)], dtype=float)
+        total = Asked(
+            np.array([timing.effective_ns(k) for k in range(ticks + 1)], dtype=float), np.array(asked)
         )
+        off = valves.impulses(edges) - np.diff(total.until(edges), axis=0)
+        late = np.diff(total.late(edges, 1e9 / carrier_hz), axis=0)
+        least = full * [t.min_on_s for t in b.thrusters]
+        name = f"pulses_{rate_hz}_hz" + (f"_carrier_{carrier_hz}_hz" if carrier_hz != 10 else "")
+        out[f"{name}_worst_second_min_pulses"] = float(np.abs(off / least).max())
+        out[f"{name}_less_late_min_pulses"] = float(np.abs((off + late) / least).max())
     return out
+
+
+@dataclass(frozen=True)
+class Asked:
+    """Impulse asked for up to times (K,) ns: (K, n) N s, growing evenly in between."""
+
+    times_ns: Array
+    total_N_s: Array
+
+    def until(self, times_ns: Array) -> Array:
+        """Asked for up to times (M,) ns: (M, n) N s."""
+        return np.array([np.interp(times_ns, self.times_ns, column) for column in self.total_N_s.T]).T
+
+    def late(self, ends_ns: Array, period_ns: float) -> Array:
+        """Of the periods that end at times (M,): asked for less what the thrust at their begin would make, (M, n)."""
+        begins = ends_ns - period_ns
+        first = self.until(begins + 1e-3 * period_ns) - self.until(begins)
+        return self.until(ends_ns) - self.until(begins) - 1e3 * first
 
 
 def tracking(quick: bool) -> dict[str, float]:
@@ -114,10 +148,12 @@ def tracking(quick: bool) -> dict[str, float]:
         ideal = fly(scenario(duration_s, body, chaser={"actuation": "ideal"}))[0]
         out[f"tracking_{body}_ideal_position_rms_m"] = ideal.rms(20.0)[0]
         out[f"tracking_{body}_ideal_absolute_impulse_N_s"] = ideal.absolute_impulse_N_s
-        for rate_hz in (15,) if quick else (15, 10, 30):
-            record = fly(scenario(duration_s, body, rate_hz))[0]
+        rates: list[tuple[str, int, dict[str, Any]]] = [(f"{hz}_hz", hz, {}) for hz in (15, 10, 30)]
+        rates += [(name, 15, chaser) for name, chaser in VARIANTS.items()]
+        for variant, rate_hz, chaser in rates[:1] if quick else rates:
+            record = fly(scenario(duration_s, body, rate_hz, chaser=chaser))[0]
             position, angle = record.rms(20.0)
-            name = f"tracking_{body}_{rate_hz}_hz"
+            name = f"tracking_{body}_{variant}"
             out |= {
                 f"{name}_position_rms_m": position,
                 f"{name}_orientation_rms_deg": math.degrees(angle),

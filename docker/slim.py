@@ -20,8 +20,6 @@ UNUSED = (
     "pybullet_robots",
     "pybullet_examples",
     "casadi/include",
-    "numba/tests",
-    "numba/cuda/tests",
     "matplotlib/tests",
     "pyarrow/include",
     "pyarrow/tests",

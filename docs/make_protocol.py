@@ -66,7 +66,7 @@ speaks it: [extend.md](extend.md); a worked one in 280 lines of Python with `zen
 
 Why: declarations reach the others one by one, and whoever hears a presence knows all subscriptions that were
 declared before. The world opens the first tick when all pairs that talk have heard each other: the controller
-with the world and all chasers, a chaser with the world and the controller.
+with the world and all chasers, a chaser with the world and the controller; a standby as a controller, and the two.
 
 ## A tick in lock-step
 1. The world publishes the odometry of every chaser (and its docking sensor's word, if it has a port), then
@@ -79,9 +79,16 @@ with the world and all chasers, a chaser with the world and the controller.
    `sim_time_ns`. `effective_time_ns` is when the command acts: physics step `tick * physics_hz / rate_hz +
    latency_steps`, as a time rounded down, with `latency_steps = round(time.latency_s * physics_hz)`.
 4. A chaser answers its wrench with an `ActuatorCommand` of the same tick and `effective_time_ns`. When
-   `Tick.controller` is false, it answers by itself, with a command that brings it to rest.
+   `Tick.controller` is false, it answers by itself, with a command that keeps it safe.
 5. The world flies on when every chaser in `chasers` has answered. A `Tick` with a higher `revision` says that
    somebody was lost meanwhile: it replaces the earlier one.
+
+## Who commands
+There may be two controllers, `controller` and `standby`; both publish on `controller/…`, one at a time. `Tick` names
+the one that commands (`commander`, `instance`) and its `term`. It copies the three into each `WrenchCommand`; another
+publishes none. A chaser copies `term` into the `ActuatorCommand` that passes a command on. Chasers and world refuse
+commands of another term (`stale term` among the rejected). A higher `revision` of a tick may name another commander,
+which then answers that tick. Rules of succession: [redundancy.md](redundancy.md).
 
 In real time the world waits for nobody; an answer that comes late acts late.
 
@@ -165,7 +172,8 @@ def fields_of(kind: type[Struct]) -> list[str]:
         return ["No fields of its own.", ""]
     rows = ["| field | type | default |", "| --- | --- | --- |"]
     for field in own:
-        default = "" if field.required else f"`{msgspec.json.encode(field.default).decode()}`"
+        plain = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
+        default = "" if field.required else f"`{msgspec.json.encode(plain).decode()}`"
         rows.append(f"| `{field.name}` | {words_of(field.type)} | {default} |")
     return [*rows, ""]
 
@@ -202,6 +210,7 @@ def page() -> str:
     for key, asked, answered in (
         (topics.JOIN_KEY, messages.JoinRequest, messages.JoinReply),
         (topics.OPERATE_KEY, messages.OperatorCommand, messages.CommandReply),
+        (topics.JET_FAULT_KEY, messages.JetFaultCommand, messages.CommandReply),
     ):
         names = [f"[{k.__name__}](#{k.__name__.lower()}) v{messages.VERSION[k]}" for k in (asked, answered)]
         parts.append(f"| `{key}` | {' | '.join(names)} |")

@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 from chaserdock_controller.fusion import (
+    Eye,
     Measurement,
     Mekf,
     MekfParameters,
@@ -13,7 +14,9 @@ from chaserdock_controller.fusion import (
     PoseHypothesis,
     TargetEstimate,
 )
+from chaserdock_controller.fusion.eyes import seen_by
 from chaserdock_protocol import rotations as rot
+from chaserdock_protocol.camera import Q_CRF_IRF_FORWARD_WXYZ
 from hypothesis import settings
 from hypothesis import strategies as st
 
@@ -23,7 +26,12 @@ HZ = 15
 SIGMA_P, SIGMA_A = 1e-3, math.radians(0.2)
 R = np.diag([SIGMA_P**2] * 3 + [SIGMA_A**2] * 3)
 NO_BIAS = MekfParameters(
-    bias_position_m=0.0, bias_attitude_rad=0.0, floor_position_m=0.0, floor_attitude_rad=0.0
+    bias_position_m=0.0,
+    bias_attitude_rad=0.0,
+    bias_focal_share=0.0,
+    floor_position_m=0.0,
+    floor_attitude_rad=0.0,
+    frozen_share=0.0,
 )
 Q0 = rot.normalize([0.4, -0.5, 0.6, 0.2])
 
@@ -41,6 +49,17 @@ def truth(time_ns: int) -> tuple[np.ndarray, np.ndarray]:
     return np.array([1.0, -2.0, 0.5]) + V * t, rot.integrate(Q0, W, t)
 
 
+LOOKS = [rot.exp([0.0, 0.0, 0.5 * math.pi * c]) for c in range(4)]
+"""Attitudes, chaser to TRF, of chasers all round the target's z axis, each facing it."""
+
+
+def eye_of(chaser: int, time_ns: int) -> Eye:
+    """The camera of a chaser in synchronized flight 1 m from the target."""
+    p, q = truth(time_ns)
+    place = p + rot.rotate(q, rot.rotate(LOOKS[chaser % 4], [-1.0, 0.0, 0.0]))
+    return Eye(place, rot.multiply(rot.multiply(q, LOOKS[chaser % 4]), Q_CRF_IRF_FORWARD_WXYZ))
+
+
 def see(
     rng: np.random.Generator,
     chaser: int,
@@ -51,10 +70,14 @@ def see(
     flip: np.ndarray | None = None,
     wrong_first: bool = False,
     markers: int = 4,
+    camera: np.ndarray | None = None,
 ) -> Measurement:
     """A measurement with white noise R; ``shift`` and ``turn`` are errors in TRF; ``flip`` is a rotation
-    vector in TRF axes that makes the second hypothesis of an ambiguous view."""
+    vector in TRF axes that makes the second hypothesis of an ambiguous view; ``camera`` (7,): its calibration errors."""
     p, q = truth(time_ns)
+    eye = eye_of(chaser, time_ns)
+    if camera is not None:
+        p, q, _, _ = seen_by(eye, p, q, camera)
     p = p + rng.normal(size=3) * SIGMA_P
     if shift is not None:
         p = p + rot.rotate(q, shift)
@@ -66,7 +89,7 @@ def see(
         hypotheses.append(PoseHypothesis(p, rot.multiply(q, rot.exp(flip)), R))
     if wrong_first:
         hypotheses.reverse()
-    return Measurement(chaser, time_ns, tuple(hypotheses), markers)
+    return Measurement(chaser, time_ns, tuple(hypotheses), markers, eye)
 
 
 def errors(e: TargetEstimate) -> np.ndarray:

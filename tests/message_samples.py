@@ -14,7 +14,17 @@ HEAD: dict[str, Any] = {"seq": 7, "tick": 12, "sim_time_ns": 800_000_000}
 SOLUTION = m.PoseSolution(position_m=V, q_wxyz=Q, covariance=EYE6, reprojection_rms_px=0.125)
 
 SAMPLES: tuple[msgspec.Struct, ...] = (
-    m.Tick(**HEAD, revision=1, pictures=True, chasers=(0, 3), controller=False),
+    m.Tick(
+        **HEAD,
+        revision=1,
+        pictures=True,
+        chasers=(0, 3),
+        controller=True,
+        term=2,
+        commander="standby",
+        instance="s1",
+        standing_by={"controller": "c1"},
+    ),
     m.MissionEnd(**HEAD, reason="flown to its end", complete=True),
     m.Image(**HEAD, chaser=2, width_px=4, height_px=2, encoding="mono8", data=bytes(range(8))),
     m.Odometry(**HEAD, chaser=255, position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
@@ -41,6 +51,17 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         covariance=EYE12,
         accepted=(0,),
         rejected=(),
+        cameras=(
+            m.CameraCalibration(
+                chaser=0,
+                turn_rad=V,
+                turn_sigma_rad=V,
+                shift_m=V,
+                shift_sigma_m=V,
+                focal_share=1e-3,
+                focal_sigma_share=5e-4,
+            ),
+        ),
     ),
     m.Reference(
         **HEAD,
@@ -89,8 +110,16 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Event(**HEAD, process="world", level="warning", what="process lost", detail="chaser/1 — ∆"),
     m.Health(**HEAD, process="chaser/0", rejected={"world/tick:format": 2}, lost=1, stale=0),
     m.RecorderAck(**HEAD),
+    m.JetFaultCommand(chaser=1, jet=3, kind="weak", factor=0.5, operator="me"),
     m.OperatorCommand(**HEAD, command="goto", chaser=1, offset_m=V),
     m.CommandReply(**HEAD, command="goto", chaser=1, accepted=False, reason="no"),
+    m.ControllerState(
+        **HEAD,
+        process="standby",
+        term=2,
+        operated=(m.OperatorCommand(command="hold", chaser=1),),
+        state=b"\x80",
+    ),
     m.Presence(**HEAD, process="chaser/0", instance="abc", heard={"controller": "c1", "world": "w1"}),
     m.Farewell(**HEAD, process="chaser/0", published={"chaser/0/sighting": 4}),
     m.JoinRequest(process="chaser/0", instance="abc"),

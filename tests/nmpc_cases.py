@@ -38,9 +38,6 @@ OFFSETS = np.array([[-1.0, 0, 0], [0, -1.0, 0], [0, 1.0, 0], [1.0, 0, 0]])
 Q_OFFSETS = np.array([[1.0, 0, 0, 0], [HALF, 0, 0, HALF], [HALF, 0, 0, -HALF], [0, 0, 0, 1.0]])
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 D_MIN_M = 0.35
-NODES, WEIGHTS = kernels.RK_NODES["rk4"], kernels.RK_WEIGHTS["rk4"]
-MATRIX = np.array(INERTIA)
-INVERSE = np.ascontiguousarray(np.linalg.inv(MATRIX))
 
 
 @cache
@@ -86,7 +83,7 @@ def advance(states: Array, inputs: Array, duration_s: float, parts: int = 4) -> 
     x = np.empty((len(states), parts + 1, 13))
     x[:, 0] = states
     held = np.repeat(inputs[:, None], parts, axis=1)
-    kernels.roll(x, held, duration_s / parts, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE)
+    kernels.roll(kernels.model_of(PARAMS, duration_s / parts), x, held)
     return x[:, -1].copy()
 
 
@@ -94,7 +91,7 @@ def advance(states: Array, inputs: Array, duration_s: float, parts: int = 4) -> 
 class Flight:
     states: Array  # (ticks + 1, N, 13)
     plans: list[NmpcPlan]
-    cost: float  # eq. 3's stage cost along the true motion, times the control period
+    cost: float  # eq. 6's stage cost along the true motion, times the control period
 
     def between(self) -> float:
         p = self.states[:, :, :3]

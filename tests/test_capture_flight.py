@@ -7,10 +7,10 @@ import math
 import numpy as np
 import pytest
 from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.scenario import ScenarioError, parse_scenario
+from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario
 from chaserdock_world.physics import TARGET
-from docking import Conservation, mission
 from docking_cases import PORTS, values
+from docking_flights import ROOT, Conservation, dock, mission
 from offline import Offline, statistical_eye
 
 
@@ -42,6 +42,41 @@ def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
     assert conservation.angular is not None
     assert max(conservation.linear, conservation.angular) <= 1e-4
     assert not flight.physics.latches["chaser/0"].latched
+
+
+@pytest.mark.slow
+def test_a_jet_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_slips() -> None:
+    """Jet 10 pulls, sticks shut and is not tested: the common body turns by another push than the one commanded."""
+    failure = ("stuck_off", 10, 16.38)
+    scenario = mission(10, failure=failure, changes=("chaser.jet_test_s=0",))
+    outcome = dock(10, scenario, lambda s: statistical_eye(s, 10, 0.002, math.radians(0.1), 0.1), failure)
+    assert outcome.found_s() is None  # or the test tests nothing
+    assert outcome.cause == "verified at the first attempt"
+
+
+@pytest.mark.slow
+def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
+    """The scenario as shipped, with noise in place of pictures."""
+    scenario = load_scenario(ROOT / "scenarios" / "four-chaser-capture.toml")
+    flight = Offline(scenario, statistical_eye(scenario, 1, 0.002, math.radians(0.1), 0.1))
+    holding_on: dict[int, float] = {}
+    while flight.time_s < scenario.duration_s and len(holding_on) < 3:
+        flight.step()
+        for i in set(scenario.success.latched) - holding_on.keys():
+            if flight.phase(i) == "verified":
+                holding_on[i] = flight.time_s
+    flight.close()
+    assert flight.touched == set()
+    assert sorted(holding_on) == [0, 1, 3]
+    assert abs(holding_on[0] - holding_on[3]) < 5.0
+    assert "chaser 1: wait (from hold: 2 are under way already)" in [what for _, what in flight.events]
+    first_latch = min(t for t, what in flight.events if ": latched" in what)
+    (its_turn,) = [t for t, what in flight.events if what.startswith("chaser 1: align")]
+    assert its_turn == pytest.approx(first_latch, abs=0.1)
+    for touch in (t for t in flight.touches if t.latched):
+        assert touch.lateral_m <= 0.01
+        assert touch.closing_m_s <= 0.02
+    assert flight.phase(2) == "hold"
 
 
 @pytest.mark.parametrize(

@@ -56,7 +56,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-@pytest.mark.timeout(900)
+@pytest.mark.timeout(2400)
 def test_short_mission_by_compose(clone: Path) -> None:
     """Built, flown with rights on to success, its status passed on, its files the owner's; the image is small enough."""
     owner = (clone / "compose.yaml").stat()
@@ -64,7 +64,7 @@ def test_short_mission_by_compose(clone: Path) -> None:
     try:
         built = project.compose("build", "router")
         assert built.returncode == 0, (built.stdout + built.stderr)[-3000:]
-        flown = project.compose("up", "--no-build", "--exit-code-from", "mission", timeout_s=400.0)
+        flown = project.compose("up", "--no-build", "--exit-code-from", "mission", timeout_s=900.0)
         said = flown.stdout + flown.stderr
         kept = docker("run", "--rm", "--entrypoint", "find", "chaserdock", "/keys", "-type", "f").stdout
     finally:
@@ -104,6 +104,25 @@ def test_a_container_mounts_its_own_keys_alone() -> None:
         assert mounted == [(owner, "/keys:ro")], service
 
 
-def test_nothing_is_published_on_the_host() -> None:
+def test_the_image_has_a_folder_for_everyones_keys() -> None:
+    """A volume takes over the mode of the folder that it is mounted on; without one only root could write there."""
+    found = re.search(
+        r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
+        (ROOT / "Dockerfile").read_text(),
+    )
+    assert found
+    names = set(found[1].replace("\\", " ").split())
+    assert names | {f"chaser-{i}" for i in range(16)} == {
+        "router",
+        *(who.common_name for who in identities(16)),
+    }
+
+
+def test_only_the_viewers_page_is_published_and_on_the_loopback_alone() -> None:
     text = (ROOT / "compose.yaml").read_text(encoding="utf-8")
-    assert not re.search(r"^\s*(ports|network_mode|privileged|container_name)\s*:", text, re.MULTILINE)
+    assert not re.search(r"^\s*(network_mode|privileged|container_name)\s*:", text, re.MULTILINE)
+    published = re.findall(r"^\s*ports\s*:.*$", text, re.MULTILINE)
+    assert [line.strip() for line in published] == ['ports: ["127.0.0.1:${VIEW_PORT:-8080}:8080"]']
+    viewer = text[text.index("\n  viewer:") :]
+    assert published[0] in viewer[: viewer.index("\n\n")]
+    assert "profiles: [view]" in viewer[: viewer.index("\n\n")]

@@ -1,4 +1,4 @@
-"""The chaser's prediction model: CasADi's and Numba's, against each other and against physics."""
+"""The chaser's prediction model: CasADi's and the compiled one, against each other and against physics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcParameters
-from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, roll, roll_linearized
+from chaserdock_controller.nmpc.kernels import model_of, roll, roll_linearized
 from chaserdock_controller.nmpc.problem import derivative, dynamics
 from chaserdock_controller.reference import (
     feed_forward,
@@ -24,7 +24,6 @@ Array = NDArray[np.float64]
 MASS_KG = 30.0
 INERTIA = ((0.9, 0.02, -0.03), (0.02, 1.3, 0.05), (-0.03, 0.05, 1.7))
 MATRIX = np.array(INERTIA)
-INVERSE = np.ascontiguousarray(np.linalg.inv(MATRIX))
 
 
 def params(integrator: str = "rk4", dt_s: float = 0.1) -> NmpcParameters:
@@ -38,17 +37,18 @@ def params(integrator: str = "rk4", dt_s: float = 0.1) -> NmpcParameters:
     )
 
 
-def numba_step(x: Array, u: Array, h: float, integrator: str) -> Array:
+def c_step(x: Array, u: Array, h: float, integrator: str) -> Array:
     states = np.tile(x, (1, 2, 1))
-    roll(states, u[None, None], h, RK_NODES[integrator], RK_WEIGHTS[integrator], MASS_KG, MATRIX, INVERSE)
+    roll(model_of(params(integrator), h), states, np.ascontiguousarray(u[None, None]))
     return states[0, 1]
 
 
-def numba_jacobians(x: Array, u: Array, h: float, integrator: str) -> tuple[Array, Array, Array]:
+def c_jacobians(x: Array, u: Array, h: float, integrator: str) -> tuple[Array, Array, Array]:
     """x_next (13,), A (12, 12), B (12, 6)."""
     states, mats = np.tile(x, (1, 2, 1)), np.empty((1, 1, 12, 12))
-    nodes, weights = RK_NODES[integrator], RK_WEIGHTS[integrator]
-    roll_linearized(states, u[None, None], np.ones((1, 6)), h, nodes, weights, MASS_KG, MATRIX, INVERSE, mats)
+    roll_linearized(
+        model_of(params(integrator), h), states, np.ascontiguousarray(u[None, None]), np.ones((1, 6)), mats
+    )
     return states[0, 1], full_a(mats[0, 0, :, :6], h), mats[0, 0, :, 6:]
 
 
@@ -83,10 +83,10 @@ def full_a(c_mat: Array, h: float) -> Array:
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
 @pytest.mark.parametrize("seed", range(5))
-def test_numba_step_equals_casadi(integrator: str, seed: int) -> None:
+def test_c_step_equals_casadi(integrator: str, seed: int) -> None:
     x, u = random_point(seed)
     expected = np.array(dynamics(params(integrator))(x, u)).ravel()
-    np.testing.assert_allclose(numba_step(x, u, 0.1, integrator), expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(c_step(x, u, 0.1, integrator), expected, rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("integrator", ["euler", "rk4"])
@@ -106,7 +106,7 @@ def test_jacobians_equal_casadis_in_the_tangent_space(integrator: str, seed: int
     lift[:6, :6], lift[6:10, 6:9], lift[10:, 9:] = np.eye(6), tangent(x[6:10]), np.eye(3)
     lower = np.zeros((12, 13))
     lower[:6, :6], lower[6:9, 6:10], lower[9:, 10:] = np.eye(6), 4.0 * tangent(x_next[6:10]).T, np.eye(3)
-    out, a_mat, b_mat = numba_jacobians(x, u, 0.1, integrator)
+    out, a_mat, b_mat = c_jacobians(x, u, 0.1, integrator)
     np.testing.assert_allclose(out, x_next, rtol=0, atol=1e-13)
     np.testing.assert_allclose(a_mat, lower @ np.array(jac_x(x, u)) @ lift, rtol=0, atol=1e-12)
     np.testing.assert_allclose(b_mat, lower @ np.array(jac_u(x, u)), rtol=0, atol=1e-12)
@@ -116,15 +116,15 @@ def test_jacobians_equal_casadis_in_the_tangent_space(integrator: str, seed: int
 @given(st.integers(0, 10_000), st.sampled_from(["euler", "rk4"]))
 def test_jacobians_equal_finite_differences(seed: int, integrator: str) -> None:
     x, u = random_point(seed)
-    _, a_mat, b_mat = numba_jacobians(x, u, 0.1, integrator)
+    _, a_mat, b_mat = c_jacobians(x, u, 0.1, integrator)
     e = 1e-6
     for j in range(12):
-        plus = numba_step(perturb(x, e * np.eye(12)[j]), u, 0.1, integrator)
-        minus = numba_step(perturb(x, -e * np.eye(12)[j]), u, 0.1, integrator)
+        plus = c_step(perturb(x, e * np.eye(12)[j]), u, 0.1, integrator)
+        minus = c_step(perturb(x, -e * np.eye(12)[j]), u, 0.1, integrator)
         np.testing.assert_allclose(a_mat[:, j], difference(plus, minus) / (2 * e), rtol=0, atol=2e-8)
     for j in range(6):
-        plus = numba_step(x, u + e * np.eye(6)[j], 0.1, integrator)
-        minus = numba_step(x, u - e * np.eye(6)[j], 0.1, integrator)
+        plus = c_step(x, u + e * np.eye(6)[j], 0.1, integrator)
+        minus = c_step(x, u - e * np.eye(6)[j], 0.1, integrator)
         np.testing.assert_allclose(b_mat[:, j], difference(plus, minus) / (2 * e), rtol=0, atol=2e-8)
 
 
@@ -168,7 +168,7 @@ def test_rk4_is_of_fourth_and_euler_of_first_order(seed: int) -> None:
         for n in (4, 8, 16):
             state = x
             for _ in range(n):
-                state = numba_step(state, u, 0.4 / n, integrator)
+                state = c_step(state, u, 0.4 / n, integrator)
             errors.append(np.max(np.abs(difference(state, exact))))
         rates = np.log2(np.array(errors[:-1]) / errors[1:])
         np.testing.assert_allclose(rates, order, atol=0.35)
@@ -179,7 +179,7 @@ def test_rk4_is_of_fourth_and_euler_of_first_order(seed: int) -> None:
 def test_quaternion_stays_of_unit_length(seed: int, integrator: str) -> None:
     x, u = random_point(seed)
     for _ in range(50):
-        x = numba_step(x, u, 0.1, integrator)
+        x = c_step(x, u, 0.1, integrator)
     assert abs(np.linalg.norm(x[6:10]) - 1.0) < 1e-12
 
 
@@ -188,7 +188,7 @@ def test_torque_free_motion_conserves_angular_momentum_and_energy() -> None:
     momentum = rotations.rotate(x[6:10], MATRIX @ x[10:])
     energy = x[10:] @ MATRIX @ x[10:]
     for _ in range(600):
-        x = numba_step(x, np.zeros(6), 0.1, "rk4")
+        x = c_step(x, np.zeros(6), 0.1, "rk4")
     np.testing.assert_allclose(rotations.rotate(x[6:10], MATRIX @ x[10:]), momentum, rtol=0, atol=1e-6)
     assert x[10:] @ MATRIX @ x[10:] == pytest.approx(energy, abs=1e-6)
 
@@ -196,7 +196,7 @@ def test_torque_free_motion_conserves_angular_momentum_and_energy() -> None:
 def test_force_acts_in_body_axes() -> None:
     x = np.zeros(13)
     x[6:10] = rotations.exp([0.0, 0.0, np.pi / 2])
-    x = numba_step(x, np.array([3.0, 0, 0, 0, 0, 0]), 0.1, "rk4")
+    x = c_step(x, np.array([3.0, 0, 0, 0, 0, 0]), 0.1, "rk4")
     np.testing.assert_allclose(x[3:6], [0.0, 0.01, 0.0], atol=1e-15)
 
 
@@ -250,14 +250,14 @@ def test_feed_forward_alone_holds_the_reference(omega: Array, closing: float) ->
     inputs = feed_forward(omega, held, -closing * held, closing**2 * held, Q_OFF, MASS_KG, INERTIA)
     x = reference_state(P0, V0, Q0, omega, offset, -closing * offset, Q_OFF)
     for u in inputs:
-        x = numba_step(x, u, h, "rk4")
+        x = c_step(x, u, h, "rk4")
     end = np.array([h * n])
     goal = reference_trajectory(P0, V0, Q0, omega, offsets(end), Q_OFF, end)[0]
     assert np.linalg.norm(x[:3] - goal[:3]) < 1e-4
     assert rotations.angle_between(x[6:10], goal[3:]) < 1e-4
     drifted = reference_state(P0, V0, Q0, omega, offset, -closing * offset, Q_OFF)
     for _ in range(n):
-        drifted = numba_step(drifted, np.zeros(6), h, "rk4")
+        drifted = c_step(drifted, np.zeros(6), h, "rk4")
     assert np.linalg.norm(drifted[:3] - goal[:3]) > 1e-2  # without it, the reference is lost
 
 

@@ -33,7 +33,7 @@ def test_make_estimator() -> None:
     [
         {"motion_model": "spline"},
         {"gate_probability": 1.0},
-        {"bias_position_m": 0.0},
+        {"bias_focal_share": -1e-3},
         {"buffer_s": -1.0},
         {"initial_omega_rad_s": math.nan},
         {"single_marker_scale": 0.5},

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.fusion import (
+    Eye,
     MekfParameters,
     PoseHypothesis,
     motion,
@@ -15,8 +16,10 @@ from chaserdock_controller.fusion import (
     to_world,
 )
 from chaserdock_controller.fusion.branch import Branch, correct, innovate
+from chaserdock_controller.fusion.eyes import seen_by
 from chaserdock_controller.fusion.parameters import chi_square_6
 from chaserdock_protocol import rotations as rot
+from chaserdock_protocol.camera import Camera
 from fusion_cases import (
     Q0,
     R,
@@ -114,18 +117,19 @@ def test_process_noise_composes_and_is_positive() -> None:
 
 
 def _branch(bias: np.ndarray, covariance: np.ndarray) -> Branch:
-    return Branch(0, np.array([1.0, 2.0, 3.0]), V, Q0, W, (7,), bias.reshape(1, 6), covariance, 0.0, {})
+    return Branch(0, np.array([1.0, 2.0, 3.0]), V, Q0, W, (7,), bias.reshape(1, 7), covariance, 0.0, {})
+
+
+EYE = Eye(np.array([0.3, -0.9, 0.2]), rot.normalize([0.6, -0.3, 0.5, -0.4]))
 
 
 def test_measurement_jacobian_by_differences() -> None:
     p = MekfParameters()
-    bias = np.array([0.02, -0.01, 0.03, 0.05, 0.02, -0.04])
-    branch = _branch(bias, np.eye(18))
-    rotation = rot.to_matrix(Q0)
-    seen = PoseHypothesis(
-        branch.position_m + rotation @ bias[:3], rot.multiply(Q0, rot.exp(bias[3:])), np.eye(6)
-    )
-    at_truth = innovate(branch, 7, seen, p)
+    bias = np.array([0.05, 0.02, -0.04, 0.02, -0.01, 0.03, 0.01])
+    branch = _branch(bias, np.eye(19))
+    expected = seen_by(EYE, branch.position_m, branch.q_wxyz, bias)
+    seen = PoseHypothesis(expected.position_m, expected.q_wxyz, np.eye(6))
+    at_truth = innovate(branch, 7, EYE, seen, p)
     np.testing.assert_allclose(at_truth.residual, 0.0, atol=1e-12)
     h = 1e-6
 
@@ -134,33 +138,53 @@ def test_measurement_jacobian_by_differences() -> None:
             branch,
             position_m=branch.position_m + d[:3],
             q_wxyz=rot.multiply(Q0, rot.exp(d[6:9])),
-            bias=(bias + d[12:]).reshape(1, 6),
+            bias=(bias + d[12:]).reshape(1, 7),
         )
-        return innovate(moved, 7, seen, p).residual
+        return innovate(moved, 7, EYE, seen, p).residual
 
-    for i in range(18):
-        d = h * np.eye(18)[i]
+    for i in range(19):
+        d = h * np.eye(19)[i]
         np.testing.assert_allclose(
             (residual(-d) - residual(d)) / (2 * h), at_truth.jacobian[:, i], atol=1e-7, err_msg=str(i)
         )
+
+
+def test_a_camera_with_errors_measures_what_its_pictures_show() -> None:
+    """The same points of the target through the true camera, as seen by one who is told the nominal one."""
+    errors = np.array([0.004, -0.006, 0.005, 0.002, -0.003, 0.001, 0.002])
+    told = Camera.from_hfov(1280, 720, math.radians(60.0))
+    true = replace(told, fx_px=told.fx_px * (1.0 + errors[6]), fy_px=told.fy_px * (1.0 + errors[6]))
+    position, q = EYE.position_m + rot.rotate(EYE.q_wxyz, [0.02, -0.03, 1.1]), Q0
+    points = 0.1 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+    q_true = rot.multiply(EYE.q_wxyz, rot.exp(errors[:3]))
+    lens = EYE.position_m + rot.rotate(EYE.q_wxyz, errors[3:6])
+    pixels = true.project(rot.rotate_inverse(q_true, position + rot.rotate(q, points) - lens))
+    seen = seen_by(EYE, position, q, errors)
+    again = told.project(
+        rot.rotate_inverse(EYE.q_wxyz, seen.position_m + rot.rotate(seen.q_wxyz, points) - EYE.position_m)
+    )
+    wrong = told.project(rot.rotate_inverse(EYE.q_wxyz, position + rot.rotate(q, points) - EYE.position_m))
+    # What is left is the depth within the target that a longer focal length changes: 0.2 % of 0.1 m.
+    assert np.abs(again - pixels).max() < 0.25
+    assert np.abs(wrong - pixels).max() > 5.0
 
 
 @deterministic
 @given(st.integers(0, 2**32 - 1))
 def test_correction_keeps_the_covariance_positive_and_shrinks_the_residual(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    a = rng.normal(size=(18, 18)) * 10.0 ** rng.uniform(-4, -1, size=(18, 1))
-    covariance = a @ a.T + 1e-12 * np.eye(18)
-    branch = _branch(rng.normal(size=6) * 1e-3, covariance)
+    a = rng.normal(size=(19, 19)) * 10.0 ** rng.uniform(-4, -1, size=(19, 1))
+    covariance = a @ a.T + 1e-12 * np.eye(19)
+    branch = _branch(rng.normal(size=7) * 1e-3, covariance)
     pose = PoseHypothesis(
         branch.position_m + rng.normal(size=3) * 0.01, rot.multiply(Q0, rot.exp(rng.normal(size=3) * 0.02)), R
     )
-    before = innovate(branch, 7, pose, MekfParameters())
+    before = innovate(branch, 7, EYE, pose, MekfParameters())
     after = correct(branch, before)
     assert np.array_equal(after.covariance, after.covariance.T)
     assert np.linalg.eigvalsh(after.covariance)[0] > -1e-15
     assert abs(float(after.q_wxyz @ after.q_wxyz) - 1.0) < 1e-14
-    assert innovate(after, 7, pose, MekfParameters()).nis <= before.nis * (1 + 1e-9)
+    assert innovate(after, 7, EYE, pose, MekfParameters()).nis <= before.nis * (1 + 1e-6)
 
 
 def test_chi_square_quantiles() -> None:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_controller import vision
 from chaserdock_controller.flight import Flight, Inputs
 from chaserdock_controller.guidance import Guidance
 from chaserdock_protocol import rotations
@@ -304,3 +306,64 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
         told = [(r.accepted, r.reason) for r in out.replies]
         assert told == ([(False, "the target has not been found yet")] if tick == 0 else [])
     assert flight.step(Inputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())).wrenches.keys() == {1}
+
+
+# -- when nobody sees the target ----------------------------------------------------------------------------
+
+
+def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple[float, str, str]]:
+    """Phases of chaser 0, told to approach at 0 s, with their reasons; ``command`` at 10 s."""
+    guidance, out = Guidance(scenario()), []
+    guidance.found(0.0)
+    for k in range(300):
+        now_s = 0.1 * k
+        guidance.watch(now_s, seen(now_s))
+        if k == 1:
+            assert guidance.command(operator("approach"), now_s).accepted
+        if k == 100 and command:
+            guidance.command(operator(command), now_s)
+        out += [(round(now_s, 1), what, why) for i, what, why in guidance.drain_events() if i == 0]
+    return out
+
+
+def test_an_approach_holds_while_nobody_sees_and_then_goes_on() -> None:
+    told = blind_phases(lambda s: not 5.0 < s < 15.0)
+    assert [(what, why.partition(": ")[2]) for _, what, why in told] == [
+        ("hold", ""),
+        ("approach", ""),
+        ("hold", "nobody has seen the target for 3 s"),
+        ("approach", "the target is seen again"),
+    ]
+    assert told[2][0] == pytest.approx(8.0, abs=0.11)
+    assert told[3][0] == pytest.approx(15.0, abs=0.11)
+
+
+def test_a_moment_without_sight_changes_nothing() -> None:
+    assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 7.9)] == ["hold", "approach"]
+
+
+def test_who_was_told_otherwise_does_not_approach_again_by_itself() -> None:
+    assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 15.0, "hold")] == [
+        "hold",
+        "approach",
+        "hold",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("phase", "port", "unseen_s", "instead"),
+    [
+        ("approach", False, 2.9, None),
+        ("approach", False, 3.0, "hold"),
+        ("approach", True, 3.0, "back off"),
+        ("align", True, 3.0, "back off"),
+        ("final", True, 9.0, "back off"),
+        ("contact", True, 9.0, None),
+        ("latched", True, 9.0, None),
+        ("docked", False, 9.0, None),
+        ("retreat", True, 9.0, None),
+        ("goto", False, 9.0, None),
+    ],
+)
+def test_what_is_done_without_sight(phase: str, port: bool, unseen_s: float, instead: str | None) -> None:
+    assert vision.on_loss(phase, port, unseen_s) == instead

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_agents.thrusters.detection import Flags, JetWatch, Verdict
-from chaserdock_agents.thrusters.residual import Noise, covariance, observed_impulse
+from chaserdock_agents.thrusters.residual import Noise, covariance, noise_of, observed_impulse
 from chaserdock_controller.prediction import integrate
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.rotations import Array
@@ -125,6 +125,12 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
         asked = case.random()
         given = asked * (1.0 + 0.05 * case.rng.normal(size=len(asked)))
         assert case.step(asked, given) is None
+
+
+def test_the_scenarios_odometry_is_the_pilots_noise() -> None:
+    s = mission(odometry={"velocity_noise_m_s": 0.002, "omega_noise_deg_s": 0.1, "attitude_noise_deg": 0.3})
+    assert noise_of(s.odometry) == Noise(0.002, np.radians(0.1), np.radians(0.3))
+    assert noise_of(mission().odometry) == Noise()
 
 
 @pytest.mark.parametrize("jet", [0, 4, 8])

@@ -12,31 +12,11 @@ from chaserdock_agents.thrusters.pilot import JetPilot
 from chaserdock_controller.flight import Flight, Inputs
 from chaserdock_controller.jets import JetDesk
 from chaserdock_controller.prediction import CommandHistory, predict_state, predict_state_with_impulse
-from chaserdock_protocol.messages import JetReport, Odometry, OperatorCommand, WrenchCommand
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.messages import JetReport, OperatorCommand
 from chaserdock_protocol.wrench_set import wrench_matrix
 from closed_loop import fly
 from flight_cases import odometry
-from thruster_cases import box, mission
-
-
-def at_rest(s: Scenario, tick: int) -> Odometry:
-    still: Any = (0.0, 0.0, 0.0)
-    return odometry(tick=tick, time_ns=s.timing.tick_time_ns(tick), velocity_m_s=still, omega_rad_s=still)
-
-
-def wrench(s: Scenario, tick: int, force_N: float = 0.0, **changes: Any) -> WrenchCommand:
-    values: dict[str, Any] = {
-        "tick": tick,
-        "sim_time_ns": s.timing.tick_time_ns(tick),
-        "chaser": 0,
-        "effective_time_ns": s.timing.effective_ns(tick),
-        "expires_ns": 10**12,
-        "mode": "nmpc",
-        "force_N": (force_N, 0.0, 0.0),
-        "torque_N_m": (0.0, 0.0, 0.0),
-    }
-    return WrenchCommand(**(values | changes))
+from thruster_cases import at_rest, box, mission, wrench
 
 
 def limits(report: JetReport) -> np.ndarray:
@@ -187,10 +167,15 @@ def test_the_controller_asks_for_no_more_than_the_jets_left_can_give() -> None:
         ({"chaser": 0, "jet": 12}, False, "needs a jet; this body has 0 to 11"),
         ({"chaser": 0}, False, "needs a jet"),
         ({"chaser": 4, "jet": 0}, False, "there is no chaser 4"),
+        (
+            {"chaser": 0, "jet": 3, "expires_ns": 10**9},
+            False,
+            "stale: it was to be done by 1.00 s, it is 2.00 s",
+        ),
     ],
 )
 def test_operators_are_answered(command: dict[str, Any], accepted: bool, reason: str) -> None:
-    answer = JetDesk(mission()).command(OperatorCommand(command="isolate", **command))
+    answer = JetDesk(mission()).command(OperatorCommand(command="isolate", **command), 2.0)
     assert (answer.accepted, reason in answer.reason) == (accepted, True)
 
 
@@ -205,7 +190,7 @@ def test_operators_commands_reach_the_chaser_and_stay() -> None:
     assert [r.reason for r in out.replies] == ["jet 2 restored", "jet 2 is already restored"]
     assert (out.wrenches[0].isolated, out.wrenches[0].trusted) == ((), (2,))
     ideal = JetDesk(mission(chaser={"actuation": "ideal"}))
-    assert not ideal.command(OperatorCommand(command="isolate", chaser=0, jet=2)).accepted
+    assert not ideal.command(OperatorCommand(command="isolate", chaser=0, jet=2), 0.0).accepted
 
 
 @pytest.mark.parametrize("jet", [1, 6])

@@ -7,6 +7,7 @@ import json
 from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import msgpack
 import pytest
@@ -42,7 +43,7 @@ class Clock:
 def flight(ticks: int) -> Iterator[tuple[topics.Topic, int | str | None, m.Message]]:
     """What a short mission with two chasers would publish."""
     for k in range(ticks):
-        head = {"seq": k, "tick": k, "sim_time_ns": k * 66_666_666}
+        head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * 66_666_666}
         yield topics.TICK, None, m.Tick(**head, pictures=True, chasers=(0, 1), controller=True)
         for i in (0, 1):
             state = {

@@ -21,6 +21,7 @@ from fusion_cases import (
     V,
     W,
     errors,
+    eye_of,
     fly,
     nees,
     ns,
@@ -34,7 +35,7 @@ def test_blind_for_five_seconds() -> None:
     last = fly(f, 2, 10.0, seed=4)[-1]
     e = no_estimate(0)
     for k in range(10 * HZ, 15 * HZ):
-        e = f.update([Measurement(c, ns(k), (), 0) for c in range(2)], ns(k))
+        e = f.update([Measurement(c, ns(k), (), 0, eye_of(c, ns(k))) for c in range(2)], ns(k))
     assert (e.status, e.sightings) == ("predicting", 0)
     assert nees(e) < 33.0  # 0.999 quantile for 12 degrees of freedom
     assert np.all(np.diag(e.covariance) > np.diag(last.covariance))

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import threading
+import time
+
 import pytest
 from chaserdock_protocol.messages import JoinRequest, Presence
+from chaserdock_protocol.presence import PresenceTeller
+from chaserdock_protocol.transport import Link, Node
 from chaserdock_world.membership import Membership
 
 
@@ -209,3 +214,13 @@ def test_of_two_that_join_at_once_the_second_is_refused() -> None:
     )
     now_s[0] += 6.0  # the first never came
     assert members.admit(JoinRequest(process="chaser/0", instance="b")).accepted
+
+
+def test_nobody_tells_its_presence_on_a_closed_session() -> None:
+    # A thread that is in Zenoh while the interpreter ends aborts the process: it has to end with the node, farewell or not.
+    node = Node("chaser/0", "chaser", Link("told", listen=("tcp/127.0.0.1:0",)))
+    teller = PresenceTeller(node, "first")
+    time.sleep(0.1)
+    node.close()
+    assert not [t for t in threading.enumerate() if t.name == "presence"]
+    teller.stop()  # twice does no harm

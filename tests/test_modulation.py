@@ -76,6 +76,38 @@ def test_nothing_is_lost_when_every_tick_asks_for_something_else(rate_hz: int, s
     assert np.all(np.abs(difference) <= bench.least + 0.6 * bench.full * 0.1)
 
 
+@pytest.mark.parametrize(("rate_hz", "carrier_hz"), [(10, 10), (15, 10), (30, 10), (15, 15), (30, 15)])
+@given(seed=st.integers(0, 2**31))
+@quick
+def test_what_is_off_beyond_a_minimum_pulse_was_asked_for_after_the_pulse_was_sent(
+    rate_hz: int, carrier_hz: int, seed: int
+) -> None:
+    """Thrusts new every tick: given less asked, over any second, is within a minimum pulse but for what the thrusts of
+    the last period of either end have changed within it. Where a tick is a period nothing has."""
+    bench, rng = Bench(rate_hz, carrier_hz=carrier_hz), np.random.default_rng(seed)
+    level = bench.full * rng.uniform(0.0, 0.7, len(bench.full))
+    thrusts = [level * rng.uniform(0.8, 1.2, len(level)) for _ in range(5 * rate_hz)]
+    for tick, asked in enumerate(thrusts):
+        bench.tick(tick, asked)
+
+    def late(second: int) -> Array:
+        end_ns = bench.timing.effective_ns(second * rate_hz)
+        begin_ns, out, first = end_ns - 1_000_000_000 // carrier_hz, np.zeros(len(bench.full)), None
+        for tick in range((second - 1) * rate_hz, second * rate_hz):
+            a, b = bench.timing.effective_ns(tick), bench.timing.effective_ns(tick + 1)
+            if (held_ns := b - max(a, begin_ns)) > 10:
+                first = thrusts[tick] if first is None else first
+                out = out + (thrusts[tick] - first) * (held_ns * 1e-9)
+        return out
+
+    for second in range(1, 4):
+        a, b = second * rate_hz, (second + 1) * rate_hz
+        off = bench.given(a, b) - (bench.asked[b] - bench.asked[a])
+        changed = late(second + 1) - late(second)
+        assert np.all(np.abs(off + changed) <= bench.least * 1.001)
+        assert rate_hz != carrier_hz or not changed.any()
+
+
 @given(seed=st.integers(0, 2**31), rate_hz=st.sampled_from(RATES))
 @quick
 def test_pulses_are_whole_steps_centred_long_enough_and_one_a_period(seed: int, rate_hz: int) -> None:

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import importlib.util
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import BACK_ENDS, NmpcInput, make_solver
-from chaserdock_controller.nmpc.planes import build_rows
+from chaserdock_controller.nmpc.checks import check_input
+from chaserdock_controller.nmpc.kernels import build_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nmpc_cases import D_MIN_M, LEVEL, PARAMS, Array, at_rest, far_start, fixed_problem, fly, fresh, swap
+from nmpc_cases import D_MIN_M, PARAMS, Array, at_rest, far_start, fixed_problem, fly, fresh, swap
 
 # Eight stages: the same mathematics, sooner.
 CONFORM = replace(PARAMS, horizon_s=0.8)
 
 
 def installed(name: str) -> bool:
-    return importlib.util.find_spec("alpaqa" if name == "alpaqa" else "casadi") is not None
+    needs = {"alpaqa": "alpaqa", "open": "opengen"}
+    found = importlib.util.find_spec(needs.get(name, "casadi")) is not None
+    return found and (name != "open" or shutil.which("cargo") is not None)
 
 
 def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
@@ -32,7 +36,10 @@ def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
     )
 
 
-@pytest.mark.parametrize("name", BACK_ENDS)
+# Compiling OpEn's solver takes minutes, the first time.
+@pytest.mark.parametrize(
+    "name", [pytest.param(n, marks=pytest.mark.slow) if n == "open" else n for n in BACK_ENDS]
+)
 @pytest.mark.parametrize("case", ["transfer", "keep-out", "corridor"])
 def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
     """The plan's cost is the converged optimum's, its box holds exactly, its distances to 5 mm."""
@@ -63,19 +70,13 @@ def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
 
 def corridor_room(r: Array, corridor: Array) -> tuple[float, Array]:
     """Room in a corridor (5,) at r (3,) from the target, and the normal of the plane there: the row's."""
-    x, references = np.tile(at_rest(r), (1, 2, 1)), np.tile(np.concatenate([r, LEVEL]), (1, 2, 1))
-    stage, row_a, row_c, n_rows = (
-        np.zeros((1, 3), np.int64),
-        np.zeros((1, 3, 3)),
-        np.zeros((1, 3)),
-        np.zeros(1, np.int64),
-    )
-    build_rows(
-        x, references, np.zeros((2, 3)), np.zeros((1, 2)), np.zeros((1, 1)), 1e6, np.tile(corridor, (1, 2, 1)),
-        np.full((1, 2), 1e3), stage, row_a, row_c, n_rows,
-    )  # fmt: skip
-    assert n_rows[0] == 1
-    return -row_c[0, 0], row_a[0, 0]
+    params = replace(PARAMS, horizon_s=0.1)
+    problem = short(fixed_problem(at_rest(r)[None], r[None], d_target=0.0), 1)
+    problem = replace(problem, corridors=np.tile(corridor, (1, 2, 1)))
+    x = np.tile(at_rest(r), (1, 2, 1))
+    rows = build_rows(check_input(problem, params, 1), x, 1e6, np.full((1, 2), 1e3))
+    assert rows.n_rows[0] == 1
+    return -rows.c[0, 0], rows.a[0, 0]
 
 
 @settings(derandomize=True, deadline=None, max_examples=50)
@@ -121,10 +122,22 @@ def test_a_budget_gives_the_best_plan_so_far(budget: int) -> None:
     chosen = make_solver("rti", PARAMS, 2, budget)
     plan = chosen.solve(problem_at(states, 0.0), 0.0)
     assert plan.iterations.sum() <= budget
-    assert "iteration_limit" in plan.status or "infeasible_relaxed" in plan.status
+    assert "budget" in plan.status
     flight = fly(chosen, problem_at, states, 0.1, 3.0)
     assert all(p.iterations.sum() <= budget for p in flight.plans)
     assert flight.between() > D_MIN_M - 1e-3
+
+
+@pytest.mark.parametrize("name", ["ipopt", "fatrop"])
+def test_an_iteration_limit_is_no_failure(name: str) -> None:
+    """The answer had by then is flown if it is better than the start; a start that is kept would be kept for ever."""
+    problem_at, states = far_start(1)
+    problem = short(problem_at(states, 0.0))
+    chosen = make_solver(name, CONFORM, 1, 3)
+    plan = chosen.solve(problem, 0.0)
+    assert plan.status == ("iteration_limit",)
+    assert plan.cost[0] < fresh("ipopt", 1, CONFORM).solve(problem, 0.0).cost[0] * 1.5
+    assert plan.inputs.any()
 
 
 def test_actuator_limits_change_in_flight() -> None:

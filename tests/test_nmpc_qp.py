@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -11,20 +10,15 @@ from chaserdock_controller.nmpc import (
     NmpcInput,
     kernels,
     make_solver,
-    planes,
 )
-from chaserdock_controller.nmpc.cost import plan_cost, quadratic_model
-from chaserdock_controller.nmpc.ipm import CONVERGED, FREE, MAX_ITERATIONS, MU_STOP, solve_qp
+from chaserdock_controller.nmpc.checks import check_input
+from chaserdock_controller.nmpc.kernels import CONVERGED, FREE, MU_STOP, QpAnswer, plan_cost, solve_qp
 from chaserdock_controller.nmpc.slack import SLACK_L1, SLACK_L2
+from chaserdock_controller.nmpc.types import IntArray
 from chaserdock_protocol import rotations
 from chaserdock_protocol.plugins import PluginError
 from nmpc_cases import (
-    INVERSE,
-    MASS_KG,
-    MATRIX,
-    NODES,
     PARAMS,
-    WEIGHTS,
     Array,
     at_rest,
     far_start,
@@ -34,46 +28,49 @@ from nmpc_cases import (
     tumbling,
 )
 
+Model = tuple[Array, ...]  # as `quadratic_model` returns it
+MODEL, WEIGHTS = kernels.model_of(PARAMS), kernels.Weights(PARAMS)
 
-def qp_data(problem: NmpcInput, u: Array) -> tuple[list[list[Any]], list[list[Any]], Array]:
-    """solve_qp's matrices for each chaser, linearized about u (N, D, 6), and the rolled states."""
+
+@dataclass
+class Qp:
+    mats: Array
+    model: Model
+    stage: IntArray
+    a: Array
+    c: Array
+
+    def solved(self) -> QpAnswer:
+        return solve_qp(self.mats, 0.1, self.model, self.stage, self.a, self.c, SLACK_L1, SLACK_L2)
+
+
+def qp_data(problem: NmpcInput, u: Array) -> list[Qp]:
+    """The QP of each chaser, linearized about u (N, D, 6)."""
     n, d = len(problem.states), PARAMS.stages
-    weights_p, weights_q = PARAMS.stage_weights()
-    weights_u = np.array([3.5] * 3 + [40.0] * 3)
+    problem = check_input(problem, PARAMS, n)
     x, mats = np.empty((n, d + 1, 13)), np.empty((n, d, 12, 12))
     x[:, 0] = problem.states
-    kernels.roll_linearized(x, u, problem.input_max, 0.1, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE, mats)
-    width = d * (n + 2)
-    stage, n_rows = np.zeros((n, width), dtype=np.int64), np.zeros(n, dtype=np.int64)
-    row_a, row_c = np.zeros((n, width, 3)), np.zeros((n, width))
-    corridors = np.zeros((n, d + 1, 5)) if problem.corridors is None else problem.corridors
-    planes.build_rows(
-        x, problem.references, problem.target_positions, np.tile(problem.min_distance_target_m[:, None], d + 1),
-        np.full((n, n), problem.min_distance_chasers_m), 25.0, corridors, np.full((n, d + 1), 10.0),
-        stage, row_a, row_c, n_rows,
-    )  # fmt: skip
-    data, rows = [], []
+    kernels.roll_linearized(MODEL, x, u, problem.input_max, mats)
+    rows = kernels.build_rows(problem, x, 25.0, np.full((n, d + 1), 10.0))
+    out = []
     for i in range(n):
-        q_pos, q_att, qx = np.empty((d + 1, 3, 3)), np.empty((d + 1, 3, 3)), np.empty((d + 1, 12))
-        r_diag, r, w_bar = np.empty((d, 6)), np.empty((d, 6)), np.empty((d, 6))
-        quadratic_model(
-            x[i], u[i], problem.references[i], problem.u_ref[i], problem.input_max[i],
-            weights_p, weights_q, weights_u, q_pos, q_att, qx, r_diag, r, w_bar,
-        )  # fmt: skip
-        data.append([mats[i], 0.1, q_pos, q_att, qx, r_diag, r, w_bar])
-        rows.append([stage[i], row_a[i], row_c[i], n_rows[i]])
-    return data, rows, x
+        model = kernels.quadratic_model(
+            WEIGHTS, x[i], u[i], problem.references[i], problem.u_ref[i], problem.input_max[i]
+        )
+        m = rows.n_rows[i]
+        out.append(Qp(mats[i], model, rows.stage[i, :m], rows.a[i, :m], rows.c[i, :m]))
+    return out
 
 
-def condensed(data: list[Any]) -> tuple[Array, Array, Array]:
+def condensed(qp: Qp) -> tuple[Array, Array, Array]:
     """Dense gradient, Hessian (6 D) and the maps (D+1, 12, 6 D) from inputs to states, by brute force."""
-    mats, h, q_pos, q_att, qx, r_diag, r, _ = data
+    mats, (q_pos, q_att, qx, r_diag, r, _) = qp.mats, qp.model
     d = len(mats)
     maps = np.zeros((d + 1, 12, 6 * d))
     for k in range(d):
         a = np.zeros((12, 12))
         a[:6, :6] = np.eye(6)
-        a[:3, 3:6] = h * np.eye(3)
+        a[:3, 3:6] = 0.1 * np.eye(3)
         a[:, 6:] = mats[k][:, :6]
         maps[k + 1] = a @ maps[k]
         maps[k + 1][:, 6 * k : 6 * k + 6] += mats[k][:, 6:]
@@ -91,26 +88,18 @@ def random_inputs(seed: int, n: int, share: float) -> Array:
     return share * PARAMS.input_limits() * rng.uniform(-1, 1, size=(n, PARAMS.stages, 6))
 
 
-def run_qp(one: list[Any], rows: list[Any]) -> tuple[int, int, float, Array, Array, Array]:
-    """`solve_qp`: code, iterations, complementarity, dx, dw, multipliers."""
-    d = len(one[0])
-    dx, dw, mul = np.zeros((d + 1, 12)), np.zeros((d, 6)), np.zeros(2 * len(rows[0]) + 12 * d)
-    code, iterations, _, mu = solve_qp(*one, *rows, SLACK_L1, SLACK_L2, MAX_ITERATIONS, dx, dw, mul)
-    return code, iterations, mu, dx, dw, mul
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_riccati_minimizes_the_quadratic_model(seed: int) -> None:
     problem_at, states = tumbling(1)
     states[:, :3] += 0.01
-    data, rows, _ = qp_data(problem_at(states, 0.0), random_inputs(seed, 1, 0.3))
-    code, _, _, dx, dw, mul = run_qp(data[0], rows[0])
-    assert code == FREE
-    assert not mul.any()
-    gradient, hessian, maps = condensed(data[0])
+    (qp,) = qp_data(problem_at(states, 0.0), random_inputs(seed, 1, 0.3))
+    answer = qp.solved()
+    assert answer.code == FREE
+    assert not answer.multipliers.any()
+    gradient, hessian, maps = condensed(qp)
     expected = -np.linalg.solve(hessian, gradient)
-    np.testing.assert_allclose(dw.ravel(), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
-    np.testing.assert_allclose(dx, maps @ dw.ravel(), rtol=0, atol=1e-8)
+    np.testing.assert_allclose(answer.dw.ravel(), expected, rtol=0, atol=1e-8 * np.max(np.abs(expected)))
+    np.testing.assert_allclose(answer.dx, maps @ answer.dw.ravel(), rtol=0, atol=1e-8)
 
 
 def test_quadratic_model_is_the_costs_first_order() -> None:
@@ -118,15 +107,13 @@ def test_quadratic_model_is_the_costs_first_order() -> None:
     problem_at, states = tumbling(1)
     states[0, 6:10] = rotations.multiply(states[0, 6:10], rotations.exp([0.8, -0.5, 0.4]))
     problem, u = problem_at(states, 0.0), random_inputs(3, 1, 0.5)
-    gradient, _, _ = condensed(qp_data(problem, u)[0][0])
+    gradient, _, _ = condensed(qp_data(problem, u)[0])
 
     def cost(inputs: Array) -> float:
-        x, value = np.empty((1, 31, 13)), np.empty(1)
+        x = np.empty((1, 31, 13))
         x[:, 0] = states
-        kernels.roll(x, inputs, 0.1, NODES, WEIGHTS, MASS_KG, MATRIX, INVERSE)
-        weights = np.array([3.5] * 3 + [40.0] * 3)
-        plan_cost(x, inputs, problem.references, problem.u_ref, *PARAMS.stage_weights(), weights, value)
-        return float(value[0])
+        kernels.roll(MODEL, x, inputs)
+        return float(plan_cost(WEIGHTS, x, inputs, problem.references, problem.u_ref)[0])
 
     limits = PARAMS.input_limits()
     for k in (0, 7, 29):
@@ -144,31 +131,31 @@ def test_interior_point_meets_the_kkt_conditions(seed: int) -> None:
     states = np.array([at_rest(np.array([-0.25, 0.6, 0.0])), at_rest(np.array([0.25, 0.6, 0.05]))])
     states[:, 3:6] = rng.normal(scale=0.05, size=(2, 3))
     problem = fixed_problem(states, np.array([[0.8, 0.5, 0], [-0.8, 0.5, 0.0]]), rotations.exp([0, 0, 0.7]))
-    data, rows, _ = qp_data(problem, random_inputs(seed, 2, 0.3))
     active = 0
-    for one, row in zip(data, rows, strict=True):
-        stage, row_a, row_c, n_rows = row
-        code, iterations, mu, _, dw, mul = run_qp(one, row)
-        assert code == CONVERGED
-        assert 0 < iterations < 30
-        gradient, hessian, maps = condensed(one)
-        w = (one[-1] + dw).ravel()
+    for qp in qp_data(problem, random_inputs(seed, 2, 0.3)):
+        answer, n_rows = qp.solved(), len(qp.stage)
+        assert answer.code == CONVERGED
+        assert 0 < answer.iterations < 30
+        gradient, hessian, maps = condensed(qp)
+        dw = answer.dw.ravel()
+        w = qp.model[-1].ravel() + dw
         assert np.all(np.abs(w) < 1.0)
-        lam, low = mul[:n_rows], mul[2 * n_rows : 2 * n_rows + len(w)]
-        high = mul[2 * n_rows + len(w) : 2 * n_rows + 2 * len(w)]
-        stationarity = gradient + hessian @ dw.ravel() - low + high
+        lam, _, low, high = np.split(answer.multipliers, np.cumsum([n_rows, n_rows, len(w)]))
+        stationarity = gradient + hessian @ dw - low + high
         for j in range(n_rows):
-            normal = maps[stage[j]][:3].T @ row_a[j]
+            normal = maps[qp.stage[j]][:3].T @ qp.a[j]
             stationarity -= lam[j] * normal
-            gap = normal @ dw.ravel() - row_c[j]
+            gap = normal @ dw - qp.c[j]
             slack = max(-gap, 0.0)
-            assert 0.0 < lam[j] < SLACK_L1 + SLACK_L2 * slack + 1.0
+            # A row far from the plan takes no part: then it is met, without a multiplier.
+            assert lam[j] > 0.0 or gap > 0.0
+            assert 0.0 <= lam[j] < SLACK_L1 + SLACK_L2 * slack + 1.0
             assert lam[j] * (gap + slack) < 60 * MU_STOP * 30
             active += lam[j] > 1.0
         assert np.max(np.abs(stationarity)) < 1e-6 * np.max(np.abs(gradient))
         assert np.all(low > 0.0)
         assert np.all(high > 0.0)
-        assert mu <= MU_STOP
+        assert answer.complementarity <= MU_STOP
         assert np.max(low * (1 + w)) < 400 * MU_STOP
     assert active > 0
 

@@ -259,6 +259,18 @@ def test_a_small_marker_far_away_gives_both_of_its_poses():
     assert solutions[0].reprojection_rms_px <= solutions[1].reprojection_rms_px
 
 
+@pytest.mark.parametrize("name", ["paper", "servicer"])
+@pytest.mark.parametrize("distance_m", [0.4, 0.5, 0.75, 1.0, 1.5])
+def test_a_face_exactly_ahead_is_seen_without_any_noise(name, distance_m):
+    scene = Scene(name, 1280, 720)
+    position = np.array([0.0, 0.0, distance_m])
+    exact = scene.renderer.render(EYE, AHEAD, position, FACING, (), Light((0.2, 0.1, -1.0)))
+    solutions = scene.perception.estimate(exact).solutions
+    assert solutions
+    assert np.linalg.norm(error_of(solutions[0], position, FACING)[:3]) < 1e-3
+    assert np.linalg.norm(error_of(solutions[0], position, FACING)[3:]) < np.deg2rad(0.1)
+
+
 def test_a_single_marker_at_a_grazing_angle_is_not_trusted():
     camera, model = Camera.from_hfov(1280, 720, HFOV), target_model("paper")
     table = pnp.MarkerTable.of(model)

@@ -22,8 +22,8 @@ from chaserdock_agents.analysis.pictures import columns_for, pairs, shots
 from chaserdock_agents.analysis.plots import Nothing
 from chaserdock_agents.analysis.report import report_of, table, write_report
 from chaserdock_agents.analysis.scene import scene_of
-from chaserdock_agents.analysis.traces import Inputs, Traces, load_traces
-from chaserdock_agents.analysis.video import write_video
+from chaserdock_agents.analysis.traces import LOOKS, Inputs, Looks, Traces, load_traces
+from chaserdock_agents.analysis.video import frames, write_video
 from chaserdock_protocol import messages as m
 from chaserdock_protocol import rotations, topics
 from chaserdock_protocol.codec import encode
@@ -237,9 +237,25 @@ def test_inputs_are_the_impulses_over_the_ticks(tmp_path: Path) -> None:
 
 
 def test_pictures_have_their_fate(tmp_path: Path) -> None:
-    assert {look for _, look in load_traces(made_log(tmp_path / "a.mcap", 4), [0]).looks[0]} == {"nothing"}
+    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).looks[0]
+    assert {LOOKS[code] for code in nothing.code} == {"nothing"}
     seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).looks[0]
-    assert seen == [(k * TICK_NS / 1e9, "used") for k in range(4)]
+    assert list(seen.stretches()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
+    np.testing.assert_array_equal(seen.time_s, [k * TICK_NS / 1e9 for k in range(4)])
+
+
+def test_stretches_end_where_the_fate_changes_and_at_gaps() -> None:
+    looks = Looks(np.array([0.0, 1.0, 2.0, 3.0, 7.0]), np.array([0, 0, 2, 2, 2]))
+    assert list(looks.stretches()) == [(0.0, 1.0, "used"), (2.0, 7.0, "nothing")]
+    assert list(looks.stretches(1.5)) == [(0.0, 1.0, "used"), (2.0, 3.0, "nothing"), (7.0, 7.0, "nothing")]
+    assert list(Looks(np.zeros(0), np.zeros(0, dtype=np.intp)).stretches()) == []
+
+
+def test_inputs_of_several_ticks_are_means_over_all_of_them(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 8)
+    one, three = (load_traces(log, [0], every).inputs[0] for every in (1, 3))
+    np.testing.assert_array_equal(three.edges_s, one.edges_s[::3])
+    np.testing.assert_allclose(three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12)
 
 
 def test_jets_are_drawn_where_there_are_any(tmp_path: Path) -> None:
@@ -321,6 +337,19 @@ def test_a_film_plays(flown: Path, tmp_path: Path) -> None:
     assert np.mean(np.abs(pictures[0].astype(float) - pictures[-1])) > 0.3  # something moves
 
 
+def test_a_film_of_a_part(tmp_path: Path) -> None:
+    """Frames from the first time named to the last; a part without length, or behind the end, is no film."""
+    log = made_log(tmp_path / "a.mcap", 8)
+    every = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180)]
+    part = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180, (every[2], every[5]))]
+    assert part == pytest.approx(every[2:6])
+    with pytest.raises(ChaserdockError, match="no length"):
+        write_video(log, tmp_path / "a.webp", part_s=(2.0, 2.0))
+    with pytest.raises(LogError, match="no picture after 100 s"):
+        write_video(log, tmp_path / "a.webp", part_s=(100.0, 200.0))
+    assert not (tmp_path / "a.webp").exists()
+
+
 def test_a_film_for_a_web_page(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
     for name, begins in (("a.webp", b"RIFF"), ("a.gif", b"GIF89a")):
@@ -347,12 +376,12 @@ def test_a_film_of_nothing_is_refused(tmp_path: Path) -> None:
 
 def test_the_program_says_what_is_wrong(tmp_path: Path) -> None:
     status, said = finished("report", str(tmp_path))
-    assert (status, "holds no mission.mcap" in said, "Traceback" in said) == (2, True, False)
+    assert (status, "holds no log" in said, "Traceback" in said) == (2, True, False)
 
 
 def test_a_log_that_is_not_there_is_named(tmp_path: Path) -> None:
     for make in (report_of_path, figures_of_path, film_of_path):
-        with pytest.raises(ChaserdockError, match="none: no such file or folder"):
+        with pytest.raises(ChaserdockError, match="none: cannot be read: No such file"):
             make(tmp_path / "none", tmp_path)
 
 

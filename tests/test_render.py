@@ -209,13 +209,13 @@ def test_a_wide_near_box_is_in_front_though_its_centre_is_farther():
     wide = placed([3.0, 0.0, 1.0], [4.0, 0.5, 0.1])
     small = placed([-0.5, 0.0, 1.3], [0.1, 0.1, 0.1])
     assert np.linalg.norm(wide.centre_m) > np.linalg.norm(small.centre_m)
-    assert hides(wide, small) == 1
-    assert hides(small, wide) == -1
+    assert hides([wide, small], [(0, 1), (1, 0)]) == [1, -1]
     assert paint_order([wide, small]) == [1, 0]
 
 
 def test_boxes_on_either_side_of_the_eye_hide_nothing():
-    assert hides(placed([0.0, 0.0, 2.0], [0.5, 0.5, 0.5]), placed([0.0, 0.0, -2.0], [0.5, 0.5, 0.5])) == 0
+    before, behind = (placed([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in (2.0, -2.0))
+    assert hides([before, behind], [(0, 1)]) == [0]
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])

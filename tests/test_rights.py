@@ -16,12 +16,13 @@ from chaserdock_protocol.transport import zenoh_config
 from mission_keys import CHASERS, client, make_keys, router_with_rights
 
 EVERYONE = identities(CHASERS)
-PUBLISHERS = {w.process: w for w in EVERYONE if w.process != "analysis"}
+PUBLISHERS = {w.process: w for w in EVERYONE if w.role not in rights.LOOK_ON}
+PATIENCE_S = 20.0
 SETTLE_S = 0.5
 
 
 def keys_with_owners() -> list[tuple[str, str]]:
-    """Every concrete key of the topics table and the one process that may publish on it."""
+    """Every concrete key of the topics table and who may publish on it: one process, of controllers each."""
     out = []
     for topic in TOPICS:
         if "{chaser}" in topic.key:
@@ -35,7 +36,13 @@ def keys_with_owners() -> list[tuple[str, str]]:
             out += [(topic.key_of(body), topic.writer) for body in bodies]
         else:
             out.append((topic.key, topic.writer))
-    return out
+    # What is one controller's to say is the other's, too: the world says which of them is obeyed.
+    return out + [
+        (key, "standby") for key, owner in out if owner == "controller" and not key.startswith(_OWN)
+    ]
+
+
+_OWN = tuple(f"controller/{what}" for what in ("event", "health", "presence", "farewell"))
 
 
 def readers_of(key: str) -> set[str]:
@@ -88,7 +95,7 @@ def test_every_wrong_identity_on_every_key_is_dropped(mission: Mission) -> None:
             publisher.undeclare()
             if name == "recorder":  # its own session hears itself without any router
                 own |= {(key, name), (key, f"{name} declared"), (key, "")}
-    time.sleep(2 * SETTLE_S)
+    time.sleep(4 * SETTLE_S)
     subscriber.undeclare()
     allowed = {(key, owner + how) for key, owner in table for how in ("", " declared")}
     assert arrived - own == allowed - own
@@ -103,17 +110,17 @@ def test_every_key_reaches_its_readers_and_nobody_else(mission: Mission) -> None
         # The key itself, what lies around it, and everything.
         expressions = {key for key, _ in keys_with_owners()} | {"**", "truth/**", "*/body/target", "world/*"}
         subscribers += [session.declare_subscriber(expression, callback) for expression in expressions]
-    time.sleep(2 * SETTLE_S)
+    time.sleep(4 * SETTLE_S)
     for key, owner in keys_with_owners():
         mission.sessions[owner].put(key, owner)
-    time.sleep(2 * SETTLE_S)
+    time.sleep(4 * SETTLE_S)
     for subscriber in subscribers:
         subscriber.undeclare()
     for name, heard in arrived.items():
         own = {key for key, owner in keys_with_owners() if owner == name}
         meant = {key for key, _ in keys_with_owners() if name in readers_of(key)}
         assert heard - own == meant - own, name
-        if name in ("controller", *(f"chaser/{i}" for i in range(CHASERS))):
+        if name in (*topics.CONTROLLERS, *(f"chaser/{i}" for i in range(CHASERS))):
             assert not any(key.startswith("truth") for key in heard), name
 
 
@@ -135,10 +142,15 @@ def test_only_its_answerer_answers_a_query_and_only_those_meant_may_ask(
     ]
     time.sleep(SETTLE_S)
     for who in EVERYONE:
-        session = mission.sessions[who.process]
-        replies = session.get(query.key, timeout=0.5, target=zenoh.QueryTarget.ALL)
-        answers = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {who.process}
-        assert answers == ({query.answerer} - {who.process} if who.role in query.askers else set()), who
+        meant = {query.answerer} - {who.process} if who.role in query.askers else set()
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            replies = mission.sessions[who.process].get(query.key, timeout=0.5, target=zenoh.QueryTarget.ALL)
+            answers = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {who.process}
+            answers = {"controller" if name == "standby" else name for name in answers}  # either may
+            if not answers < meant or time.monotonic() > deadline:
+                break  # a slow machine's answers may still be on their way; what is too much stays too much
+        assert answers == meant, who
     for queryable in offered:
         queryable.undeclare()
 
@@ -148,7 +160,7 @@ def test_nobody_lives_under_anothers_name(mission: Mission) -> None:
         session.liveliness().declare_token(topics.LIVE_KEY.format(process=other))
         for name, session in mission.sessions.items()
         for other in (*PUBLISHERS, "chaser/9")
-        if other != name != "analysis"  # which looks on; a session sees its own tokens without any router
+        if name not in rights.LOOK_ON and other != name  # a session sees its own tokens without any router
     ]
     own = mission.sessions["chaser/1"].liveliness().declare_token("live/chaser/1")
     time.sleep(SETTLE_S)
@@ -199,5 +211,5 @@ def test_a_chaser_commands_nothing_and_reads_no_truth() -> None:
     assert {key.rpartition("/")[0] for key in rights.writes(chaser)} == {"chaser/1"}
     for who in EVERYONE:
         truth = [key for key in rights.reads(who) if key == "**" or key.startswith("truth")]
-        assert bool(truth) == (who.role in ("recorder", "analysis")), who
+        assert bool(truth) == (who.role in ("recorder", "analysis", "viewer")), who
         assert any(key.endswith("/wrench") for key in rights.writes(who)) == (who.role == "controller")

@@ -8,6 +8,7 @@ from chaserdock_controller.flight import Flight, Inputs
 from chaserdock_controller.fusion.types import TargetEstimate
 from chaserdock_controller.nmpc import kernels
 from chaserdock_controller.reference import predict_target
+from chaserdock_controller.setup import nmpc_parameters
 from chaserdock_protocol import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.facing import facing_attitudes
@@ -16,7 +17,6 @@ from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from nmpc_cases import NODES, WEIGHTS
 
 TICK_S = 0.2
 
@@ -28,7 +28,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     """
     rng = np.random.default_rng(seed)
     scenario = load_scenario(ROOT / "scenarios/swap.toml")
-    n, body, target = len(scenario.chasers), scenario.chaser, scenario.target
+    n, target = len(scenario.chasers), scenario.target
     velocity, omega = np.array(target.velocity_m_s), np.array(target.omega_rad_s)
     if seed:
         omega = rotations.rotate(rotations.normalize(rng.normal(size=4)), omega)
@@ -39,8 +39,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         p, q = scenario.start_pose(i)
         states[i, :3] = p + (0.05 * rng.normal(size=3) if seed else 0.0)
         states[i, 6:10] = q
-    matrix = np.diag(body.inertia)
-    inverse = np.linalg.inv(matrix)
+    model = kernels.model_of(nmpc_parameters(scenario), TICK_S / 4)
     least, nearest, ends = np.inf, np.inf, states[:, :3]
     at = np.zeros(3)
     for tick in range(round(time_s / TICK_S)):
@@ -71,7 +70,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         x = np.empty((n, 5, 13))
         x[:, 0] = states
         held = np.repeat(plan.inputs[:, :1], 4, axis=1)
-        kernels.roll(x, held, TICK_S / 4, NODES, WEIGHTS, body.mass_kg, matrix, inverse)
+        kernels.roll(model, x, held)
         states = x[:, -1].copy()
         gaps = np.linalg.norm(states[:, None, :3] - states[None, :, :3], axis=-1) + 9.0 * np.eye(n)
         ends = problem.references[:, 0, :3]

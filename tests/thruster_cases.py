@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from chaserdock_protocol.messages import Odometry, WrenchCommand
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario, parse_scenario
+from flight_cases import odometry
 
 
 def mission(body: str = "tetra12", **changes: Any) -> Scenario:
@@ -24,3 +26,22 @@ def mission(body: str = "tetra12", **changes: Any) -> Scenario:
 def box(s: Scenario) -> Array:
     """The greatest force and torque (6,) that the controller may ask for."""
     return np.array([s.chaser.force_max_N] * 3 + [s.chaser.torque_max_N_m] * 3)
+
+
+def at_rest(s: Scenario, tick: int) -> Odometry:
+    still: Any = (0.0, 0.0, 0.0)
+    return odometry(tick=tick, time_ns=s.timing.tick_time_ns(tick), velocity_m_s=still, omega_rad_s=still)
+
+
+def wrench(s: Scenario, tick: int, force_N: float = 0.0, **changes: Any) -> WrenchCommand:
+    values: dict[str, Any] = {
+        "tick": tick,
+        "sim_time_ns": s.timing.tick_time_ns(tick),
+        "chaser": 0,
+        "effective_time_ns": s.timing.effective_ns(tick),
+        "expires_ns": 10**12,
+        "mode": "nmpc",
+        "force_N": (force_N, 0.0, 0.0),
+        "torque_N_m": (0.0, 0.0, 0.0),
+    }
+    return WrenchCommand(**(values | changes))

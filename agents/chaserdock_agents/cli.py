@@ -1,34 +1,47 @@
 """The ``chaserdock`` program.
 
-Exit status: 0 done and successful, 1 done but not successful or stopped early, 2 bad input or nothing could be done.
+Exit statuses: ``statuses``.
 """
 
 from __future__ import annotations
 
 import os
 import sys
+from importlib import metadata
+from typing import Annotated
 
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 
+from .statuses import FAILED
 from .verbs import logs
 from .verbs.campaign import campaign
 from .verbs.check import check
 from .verbs.flights import snapshot, summary
 from .verbs.network import judge, keys, router, status
-from .verbs.operate import command
+from .verbs.operate import command, jet_fault
 from .verbs.options import fail
+from .verbs.plain import PlainGroup
 from .verbs.processes import chaser, controller, record, run, world
 from .verbs.publish import figures, report, video
 from .verbs.replays import compare, replay
 from .verbs.reproduce import reproduce, study
 from .verbs.seeing import calibrate, markers
+from .verbs.view import view
+
+
+def _version(asked: bool) -> None:
+    if asked:
+        typer.echo(f"chaserdock {metadata.version('chaserdock')}")
+        raise typer.Exit
+
 
 app = typer.Typer(
     name="chaserdock",
-    help="Vision-based docking of several satellites with a tumbling target.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
+    cls=PlainGroup,
+    rich_markup_mode=None,  # rich takes longer to load than help to read
 )
 for verb in (
     run,
@@ -37,6 +50,7 @@ for verb in (
     controller,
     record,
     command,
+    jet_fault,
     summary,
     snapshot,
     campaign,
@@ -53,8 +67,20 @@ for verb in (
     markers,
     calibrate,
     check,
+    view,
 ):
     app.command()(verb)
+
+
+@app.callback()
+def program(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_version, help="Say the version and leave.")
+    ] = False,
+) -> None:
+    """Vision-based docking of several satellites with a tumbling target."""
+
+
 app.add_typer(logs.app, name="log")
 app.add_typer(keys, name="keys")
 
@@ -66,5 +92,15 @@ def main() -> None:
     except ChaserdockError as error:
         sys.exit(fail(str(error)).exit_code)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+        sys.exit(FAILED)
+    finally:
+        _let_go()
+
+
+def _let_go() -> None:
+    """Writes what is still to be written; where nobody reads any more it goes nowhere, or Python would complain."""
+    assert sys.__stdout__ is not None  # sys.stdout may be click's wrapper by now
+    try:
+        sys.__stdout__.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.__stdout__.fileno())

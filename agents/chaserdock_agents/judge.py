@@ -15,9 +15,11 @@ from chaserdock_protocol.runtime import Stop
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Link, Node
 
+from .flight_lines import Start
 from .launcher import Fleet, judge
-from .progress import Progress
+from .progress import Show, Teller
 from .runs import run_name
+from .statuses import STOPPED
 
 LOG_CLOSED_S = 60.0
 """After the end the recorder has that long (wall time) to have everything and close its log."""
@@ -28,7 +30,7 @@ class JudgeError(ChaserdockError):
     """There is nothing to judge."""
 
 
-def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s: float, quiet: bool) -> int:
+def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s: float, show: Show) -> int:
     """Watches the mission on ``link`` to its end, judges the log in ``out/SCENARIO-RUN``, and writes report.html beside
     it; the mission's status.
 
@@ -40,27 +42,39 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
         stop = Stop(watch_parent=False)
         mission = join(node, new_instance(), stop, patience_s)
         if mission is None:
-            return 1
+            return STOPPED
         folder = out / run_name(mission)
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
-        progress = Progress(scenario, mission.mode, quiet)
-        failure = _watch(node, progress, stop, world_away_s)
-        progress.close()
+        teller = Teller(scenario, show)
+        teller.tell(
+            Start(
+                scenario=scenario.name,
+                seed=scenario.seed,
+                mode=mission.mode,
+                duration_s=scenario.duration_s,
+                chasers=len(scenario.chasers),
+                folder=str(folder),
+            )
+        )
+        try:
+            failure = _watch(node, teller, stop, world_away_s)
+        finally:
+            teller.close()
         if stop():
-            return 1
+            return STOPPED
         log = folder / LOG_NAME
         if not log.exists():
             raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
         if not _wait_for_end(log):
             failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
-        status = judge(Fleet(), folder, failure)
+        status = judge(Fleet(), folder, failure, teller)
         _write_page(log)
         return status
     finally:
         node.close()  # only now, as the router may end with this
 
 
-def _watch(node: Node, progress: Progress, stop: Stop, world_away_s: float) -> str | None:
+def _watch(node: Node, teller: Teller, stop: Stop, world_away_s: float) -> str | None:
     """Shows the flight until it has ended; why it failed, or None."""
     seen = {"world": time.monotonic()}
 
@@ -69,15 +83,16 @@ def _watch(node: Node, progress: Progress, stop: Stop, world_away_s: float) -> s
             seen["world"] = float("inf") if alive else time.monotonic()
 
     node.subscribe(topics.END)
-    progress.subscribe(node)
+    teller.subscribe(node)
     node.watch_liveliness(changed)
     node.announce()
     while not stop():
         received = node.receive(0.1)
         if received is not None:
-            progress.take(received.message)
+            teller.take(received.message)
             if isinstance(received.message, MissionEnd):
                 return None if received.message.complete else received.message.reason
+        teller.show()
         if time.monotonic() - seen["world"] > world_away_s:
             return f"the world has been gone for {world_away_s:g} s"
     return None

@@ -24,7 +24,11 @@ from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, TransportError
 
-from .progress import Progress
+from .flight_lines import Failed, Result, Start
+from .progress import Show, Teller
+from .statuses import DONE, FAILED, STOPPED
+from .viewer.address import DEFAULT_HOST, url_of
+from .viewer.address import free_port as free_page_port
 
 _PATIENCE_S = 120
 _END_S = 30.0
@@ -72,6 +76,11 @@ class Fleet:
 
     def running(self) -> list[Child]:
         return [c for c in self.children if c.process.poll() is None]
+
+    def is_made_up_for(self, child: Child) -> bool:
+        """Whether it is a controller whose loss another one, that flew to the end, has made up for."""
+        others = [c for c in self.children if c.name in topics.CONTROLLERS and c is not child]
+        return child.name in topics.CONTROLLERS and any(c.process.poll() == 0 for c in others)
 
     def measure(self) -> None:
         """Notes every process' CPU time and their memory together (proportional set size where the system tells it)."""
@@ -127,11 +136,18 @@ def open_hub(
 
 
 def run_mission(
-    path: Path, folder: Path, mode: str, seed: int | None, overrides: tuple[str, ...], quiet: bool
+    path: Path,
+    folder: Path,
+    mode: str,
+    seed: int | None,
+    overrides: tuple[str, ...],
+    show: Show,
+    view: bool = False,
 ) -> int:
-    """Flies a scenario; log, summary and the processes' words go to ``folder``. 0 if the flight was a success.
+    """Flies a scenario; log, summary and the processes' words go to ``folder``. The exit status (``statuses``).
 
-    Raises RunError, ScenarioError or TransportError when it cannot be started at all.
+    ``view``: with the viewer's page beside it, to the end of the flight. Raises ViewError, RunError, ScenarioError or
+    TransportError when it cannot be started at all.
     """
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
@@ -149,16 +165,33 @@ def run_mission(
     lease_ms = 2_000 if mode == "realtime" else 600_000
     hub, endpoint = open_hub(namespace, lease_ms)
     stop = _Stop()
-    fleet = Fleet()
+    fleet, onlookers = Fleet(), Fleet()
     try:
         network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(lease_ms)]
+        if view:
+            start_viewer(onlookers, words, network)
         start_all(fleet, scenario, path, folder, mode, overrides, network)
-        failure = watch(fleet, hub, Progress(scenario, mode, quiet), stop)
+        teller = Teller(scenario, show)
+        teller.tell(
+            Start(
+                scenario=scenario.name,
+                seed=scenario.seed,
+                mode="realtime" if mode == "realtime" else "lockstep",
+                duration_s=scenario.duration_s,
+                chasers=len(scenario.chasers),
+                folder=str(folder),
+            )
+        )
+        try:
+            failure = watch(fleet, hub, teller, stop)
+        finally:
+            teller.close()
     finally:
         fleet.end()
+        onlookers.end()
         hub.close()
         stop.restore()
-    return judge(fleet, folder, failure)
+    return judge(fleet, folder, failure, teller, stopped=stop.asked)
 
 
 def start_all(
@@ -178,50 +211,58 @@ def start_all(
         "world", ["world", str(path), "--mode", mode, *sets, *network, "-l", "tcp/127.0.0.1:0"], words
     )
     fleet.start("controller", ["controller", *network, *patient], words)
+    if scenario.controller.standby:
+        fleet.start("standby", ["controller", "--standby", *network, *patient], words)
     for i in range(len(scenario.chasers)):
         fleet.start(f"chaser/{i}", ["chaser", str(i), *network, *patient], words)
     fleet.start("recorder", ["record", "--out", str(folder), *network, *patient], words)
 
 
-def watch(fleet: Fleet, hub: Node, progress: Progress, stop: _Stop) -> str | None:
+def start_viewer(onlookers: Fleet, words: Path, network: list[str]) -> None:
+    """Starts a viewer and says where its page is. It is none of the mission's fleet: its end is no failure."""
+    port = free_page_port(DEFAULT_HOST, None)
+    onlookers.start("viewer", ["view", "--port", str(port), *network], words)
+    print(f"{url_of(DEFAULT_HOST, port)} shows the mission", file=sys.stderr, flush=True)
+
+
+def watch(fleet: Fleet, hub: Node, teller: Teller, stop: _Stop) -> str | None:
     """Shows the flight until it has ended; why it failed, or None."""
     hub.subscribe(topics.END)
-    progress.subscribe(hub)
+    teller.subscribe(hub)
     ended: MissionEnd | None = None
     measured_s = 0.0
     while ended is None:
         received = hub.receive(0.1)
         if received is not None:
-            progress.take(received.message)
+            teller.take(received.message)
             if isinstance(received.message, MissionEnd):
                 ended = received.message
+        teller.show()
         if time.monotonic() - measured_s > 2.0:
             measured_s = time.monotonic()
             fleet.measure()
         if stop.asked and not stop.passed_on:
             stop.passed_on = True
-            progress.say("stopping: the log is being closed")
+            teller.say("stopping: the log is being closed")
             fleet.children[0].process.send_signal(signal.SIGTERM)
         dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
         if dead and ended is None:
-            if dead[0].name == "world" or stop.asked or not progress.flying:
-                progress.close()
+            if dead[0].name == "world" or stop.asked or not teller.flying:
                 return "stopped by the operator" if stop.asked else dead[0].last_words()
             for child in dead:
-                progress.warn(child.name, child.last_words())
-    progress.close()
+                teller.warn(child.name, child.last_words())
     fleet.wait(_END_S)
     if stop.asked:
         return "stopped by the operator"
-    bad = [c for c in fleet.children if c.process.poll() != 0]
+    bad = [c for c in fleet.children if c.process.poll() != 0 and not fleet.is_made_up_for(c)]
     if not ended.complete:
         # The world ends with status 1 for having been left; whoever left it knows more.
         return "; ".join([ended.reason, *(f"{c.name}: {c.last_words()}" for c in bad if c.name != "world")])
     return bad[0].last_words() if bad else None
 
 
-def judge(fleet: Fleet, folder: Path, failure: str | None) -> int:
-    """Writes summary.json from the log; the run's status."""
+def judge(fleet: Fleet, folder: Path, failure: str | None, teller: Teller, stopped: bool = False) -> int:
+    """Writes summary.json from the log, and tells it; the run's status."""
     from chaserdock_protocol.log import LogError
 
     from .analysis.summary import summarize, text_of
@@ -230,19 +271,25 @@ def judge(fleet: Fleet, folder: Path, failure: str | None) -> int:
     try:
         summary = summarize(log)
     except LogError as error:
+        status = STOPPED if stopped else FAILED
+        teller.tell(Failed(status=status, text=failure or str(error)))
         print(f"chaserdock: {failure or error}", file=sys.stderr)
-        return 1
+        return status
     if failure is not None:
         summary["failures"] = [failure, *summary["failures"]]
         summary["success"] = False
     if fleet.children:  # processes elsewhere have not been measured
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-    print(text_of(summary))
-    print(f"log, summary and the processes' words: {folder}")
+    status = STOPPED if stopped else DONE if summary["success"] else FAILED
+    if teller.for_scripts:
+        teller.tell(Result(status=status, folder=str(folder), summary=summary))
+    else:
+        print(text_of(summary))
+        print(f"log, summary and the processes' words: {folder}")
     if not summary["success"]:
         print(f"chaserdock: failed: {summary['failures'][0]}", file=sys.stderr)
-    return 0 if summary["success"] else 1
+    return status
 
 
 class _Stop:

@@ -6,8 +6,9 @@ import time
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import CommandReply, OperatorCommand
+from chaserdock_protocol.messages import CommandReply, JetFaultCommand, JetState, OperatorCommand
 from chaserdock_protocol.transport import Link, Node
+from msgspec import Struct
 
 
 class OperatorError(ChaserdockError):
@@ -38,16 +39,36 @@ def send_command(
         operator=operator,
         expires_ns=None if before_s is None else round(before_s * 1e9),
     )
+    return _answer(link, topics.OPERATE_KEY, request, timeout_s, "controller")
+
+
+def send_jet_fault(
+    link: Link,
+    chaser: int,
+    jet: int,
+    kind: JetState,
+    factor: float | None,
+    timeout_s: float,
+    operator: str = "",
+) -> CommandReply:
+    """Has the world make a jet fail; raises OperatorError when nobody answers in time, TransportError."""
+    if (kind == "weak") != (factor is not None):
+        raise OperatorError("--factor goes with weak, and weak needs it")
+    request = JetFaultCommand(chaser=chaser, jet=jet, kind=kind, factor=factor, operator=operator)
+    return _answer(link, topics.JET_FAULT_KEY, request, timeout_s, "world")
+
+
+def _answer(link: Link, key: str, request: Struct, timeout_s: float, who: str) -> CommandReply:
     node = Node("operator", "operator", link)
     try:
         begun_s = time.monotonic()
         while time.monotonic() - begun_s < timeout_s:
-            reply = node.ask(topics.OPERATE_KEY, request, CommandReply, timeout_s)
+            reply = node.ask(key, request, CommandReply, timeout_s)
             if reply is not None:
                 return reply
             time.sleep(0.05)  # not connected yet
         raise OperatorError(
-            f"no controller answered within {timeout_s:g} s (namespace {link.namespace}, "
+            f"no {who} answered within {timeout_s:g} s (namespace {link.namespace}, "
             f"connect {', '.join(link.connect)}); is a mission running there?"
         )
     finally:

@@ -9,6 +9,11 @@ _HERE = Path(__file__).resolve()
 SHIPPED = (_HERE.parents[2] / "scenarios", _HERE.parent / "shipped")
 
 
+def shipped_names() -> list[str]:
+    """Names of the scenarios that are shipped, sorted."""
+    return sorted({path.stem for folder in SHIPPED for path in folder.glob("*.toml")})
+
+
 def find_scenario(name: str) -> Path | None:
     """A scenario file by its path, or by the name of a shipped one (with or without ``.toml``)."""
     path = Path(name)

@@ -79,8 +79,8 @@ def expected(name: str, tick: Tick | None) -> bool | None:
     """Whether the world expects this process' answer to a tick; None for those it never does, or when none flies."""
     if tick is None:
         return None
-    if name == "controller":
-        return tick.controller
+    if name in topics.CONTROLLERS:
+        return tick.controller and name == (tick.commander or "controller")
     head, _, number = name.partition("/")
     return int(number) in tick.chasers if head == "chaser" else None
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -20,9 +21,11 @@ from .prediction import CommandHistory
 from .target_motion import TargetBody, TargetPath, joined, tumble
 
 # One sigma of what a touch, and the shock of a capture at the tolerances' speed, may do to the target's rates
-# (m/s, rad/s); share of the known effect of a pull that may be otherwise.
+# (m/s, rad/s); share of the known effect of a pull that may be otherwise; and with jets, one of which may have failed
+# unknown to all, share of the impulse that may be otherwise, wherever it acts.
 _TOUCH = Shock(0.005, 0.01)
 _PULL_UNKNOWN = 0.1
+_JETS_UNKNOWN = 1.0
 
 
 def target_body(scenario: Scenario) -> TargetBody:
@@ -63,8 +66,10 @@ class Captures:
             self._estimator.disturb(_TOUCH)
         else:
             for i in sorted(latched & odometry.keys()):
-                impulse = given[i] if i in given else self._commanded(i, history, now_ns)
-                self._pushed(odometry[i], impulse, now_ns)
+                if i in given:
+                    self._pushed(odometry[i], given[i], now_ns, _JETS_UNKNOWN)
+                else:
+                    self._pushed(odometry[i], self._commanded(i, history, now_ns), now_ns)
         self._changed |= changed
         self.latched = latched
 
@@ -74,8 +79,11 @@ class Captures:
         segments = history.segments(i, since_ns, now_ns)
         return sum((w * ((end - begin) / 1e9) for begin, end, w in segments), np.zeros(6))
 
-    def _pushed(self, odometry: Odometry, impulse: Array, now_ns: int) -> None:
-        """What a chaser that holds on has done to the common body's rates by an ``impulse`` (6,), body axes."""
+    def _pushed(self, odometry: Odometry, impulse: Array, now_ns: int, unknown: float = 0.0) -> None:
+        """What a chaser that holds on has done to the common body's rates by an ``impulse`` (6,), body axes.
+
+        ``unknown``: share of the impulse that may have been in any other direction.
+        """
         if not impulse.any():
             return
         before = self._estimator.estimate_at(now_ns)
@@ -86,6 +94,13 @@ class Captures:
         moved = force / self.body.mass_kg - rotations.cross(omega, self.body.centre_trf_m)
         velocity = rotations.rotate(before.q_wxyz, moved)
         sigmas = [_PULL_UNKNOWN * float(np.linalg.norm(v)) for v in (velocity, omega)]
+        if unknown > 0.0:
+            other = unknown * float(np.linalg.norm(force))
+            arm_m = float(np.linalg.norm(centre - self.body.centre_trf_m))
+            turned = other * arm_m / float(np.linalg.eigvalsh(self.body.inertia_kg_m2)[-1])
+            away_m = float(np.linalg.norm(self.body.centre_trf_m))
+            sigmas[0] = math.hypot(sigmas[0], other / self.body.mass_kg, turned * away_m)
+            sigmas[1] = math.hypot(sigmas[1], turned)
         self._estimator.disturb(Shock(sigmas[0], sigmas[1], velocity, omega))
 
     def join(self, fused: Fused, odometry: dict[int, Odometry]) -> None:

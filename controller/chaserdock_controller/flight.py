@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Literal, cast
 
 import numpy as np
 from chaserdock_protocol import rotations
@@ -13,115 +13,109 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.facing import facing_attitudes
 from chaserdock_protocol.messages import (
     CommandReply,
-    DockingStatus,
     Event,
-    JetReport,
     Odometry,
-    OperatorCommand,
-    Plan,
     Reference,
     Sighting,
     SolverStatus,
     TargetEstimate,
     WrenchCommand,
 )
+from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
 from . import reference
-from .captures import Captures
+from .absent import Absent, with_absent
+from .captures import Captures, pose_in_target
+from .commands import in_steps
+from .corridors import corridor_rows
 from .fusion import geometry
-from .fusion.types import Estimator, Measurement
+from .fusion.types import Estimator, Eye, Measurement
 from .fusion.types import TargetEstimate as Fused
-from .guidance import Guidance
+from .guidance import CALIBRATED, Guidance
+from .inputs import Inputs, Outputs
 from .jets import JET_COMMANDS, JetDesk
 from .nmpc import NmpcInput, NmpcPlan, make_solver
-from .prediction import CommandHistory, predict_state, predict_state_with_impulse
+from .nmpc.budget import Bounded, SolveBudget
+from .prediction import CommandHistory, fault_of, predict_state, predict_state_with_impulse
+from .searches import Searches, settled
 from .setup import estimator_of, nmpc_parameters
+from .telling import in_words, plan_message, target_message
 
-Mode = Literal["nmpc", "brake", "coast", "pull"]
+Mode = Literal["nmpc", "brake", "coast", "pull", "search"]
 _ODOMETRY_KEPT_NS = 2_000_000_000
 _GREATEST_MARGIN_M = 0.1
 
 
-COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
-"""Resolution of commands: 15 uN and 0.24 uN m, 17 and 18 bits of the paper's actuators.
-
-A command word is finite anyway. Here it also swallows what another SIMD level or BLAS changes in the last bits, which
-pictures in whole grey levels would otherwise blow up to their own noise.
-"""
-
-
-def in_steps(wrench: Array, limits: Array) -> Array:
-    """The nearest wrench (6,) that a command can carry, within ``limits`` (6,)."""
-    return np.clip(np.rint(wrench / COMMAND_STEP) * COMMAND_STEP, -limits, limits)
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """What a tick brings. Sightings may belong to earlier ticks."""
-
-    tick: int
-    time_ns: int
-    odometry: dict[int, Odometry]
-    sightings: tuple[Sighting, ...]
-    commands: tuple[OperatorCommand, ...] = ()
-    jets: Mapping[int, JetReport] = field(default_factory=dict)
-    docking: Mapping[int, DockingStatus] = field(default_factory=dict)
-
-
-@dataclass
-class Outputs:
-    """What a tick yields; dictionaries by chaser."""
-
-    target: TargetEstimate
-    wrenches: dict[int, WrenchCommand] = field(default_factory=dict)
-    references: dict[int, Reference] = field(default_factory=dict)
-    plans: dict[int, Plan] = field(default_factory=dict)
-    solver: SolverStatus | None = None
-    replies: list[CommandReply] = field(default_factory=list)
-    events: list[Event] = field(default_factory=list)
-
-
 class Flight:
-    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver.
+    """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver; in
+    ``realtime`` the scenario's budget of seconds follows from what it measures.
 
-    ``estimator`` takes the place of the one that the scenario names.
+    ``estimator`` takes the place of the one that the scenario names. Raises PluginError for an installed solver that
+    cannot be held to a budget when there is one.
     """
 
     def __init__(
-        self, scenario: Scenario, now_s: Callable[[], float], estimator: Estimator | None = None
+        self,
+        scenario: Scenario,
+        now_s: Callable[[], float],
+        estimator: Estimator | None = None,
+        realtime: bool = False,
     ) -> None:
         self.scenario = scenario
         self.guidance = Guidance(scenario)
         self._jets = JetDesk(scenario)
         self._now_s = now_s
         self._camera = scenario.camera_model()
-        self._estimator = estimator or estimator_of(scenario)
-        self._captures = Captures(scenario, self._estimator)
+        self.estimator = estimator or estimator_of(scenario)
+        self._captures = Captures(scenario, self.estimator)
         self._parameters = nmpc_parameters(scenario)
         c = scenario.controller
         self._solver = make_solver(c.solver, self._parameters, len(scenario.chasers), c.max_iterations)
+        self._budget: SolveBudget | None = None
+        if realtime and c.solve_budget_s is not None:
+            self._budget = SolveBudget(c.solve_budget_s, c.max_iterations)
+            if not hasattr(self._solver, "max_iterations"):
+                raise PluginError(
+                    f"controller.solve_budget_s: solver {c.solver!r} has no max_iterations to set"
+                )
         self._odometry: dict[tuple[int, int], Odometry] = {}
         self._history = CommandHistory()
         self._last_solve_ns: int | None = None
         self._troubled: set[int] = set()
+        self._searches = Searches(scenario.chaser, self._camera)
+        self.absent = Absent()
 
     def step(self, inputs: Inputs) -> Outputs:
-        """Everything that one tick asks of the controller."""
+        """Everything that one tick asks of the controller. Who tells of a state that is none is left out, and coasts."""
         now_s = inputs.time_ns / 1e9
+        bad = {i: why for i, o in inputs.odometry.items() if (why := fault_of(o))}
+        if bad:
+            good = {i: o for i, o in inputs.odometry.items() if i not in bad}
+            inputs = replace(inputs, odometry=good)
         fused, target = self.fuse(inputs)
         out = Outputs(target=target)
-        self._events(out, inputs, [("info", text) for _, text in self._estimator.drain_events()])
+        told = [
+            ("warning" if "gated out" in text else "info", text) for _, text in self.estimator.drain_events()
+        ]
+        self._events(out, inputs, told)
         if fused.status in ("tracking", "predicting"):
+            self.guidance.watch(now_s, seen=fused.status == "tracking")
             self.guidance.found(now_s)
-        elif fused.status == "lost":
-            self.guidance.lost(now_s)
+            if settled(fused):
+                for i, odometry in inputs.odometry.items():
+                    offset = rotations.rotate_inverse(fused.q_wxyz, odometry.position_m - fused.position_m)
+                    self.guidance.follow(i, now_s, offset)
+        else:
+            if fused.status == "lost":
+                self.guidance.lost(now_s)
+            self.guidance.search(now_s)
         commands = (*self.guidance.due_commands(now_s), *inputs.commands)
         self.guidance.expect(commands)
         for command in commands:
             if command.command in JET_COMMANDS:
-                answer = self._jets.command(command)
+                answer = self._jets.command(command, now_s)
             else:
                 answer = self.guidance.command(command, now_s)
             out.replies.append(
@@ -135,7 +129,13 @@ class Flight:
                     operator=command.operator,
                 )
             )
+        self._events(out, inputs, list(self.absent.take(inputs.odometry, inputs.time_ns)))
         self._command(inputs, fused, out)
+        for i, why in bad.items():
+            if i not in self._troubled:
+                self._events(out, inputs, [("error", f"chaser {i}: odometry refused, coasting: {why}")])
+            self._troubled.add(i)
+            self._send(i, inputs, self.scenario.timing.effective_ns(inputs.tick), "coast", np.zeros(6), out)
         self._history.forget_before(inputs.time_ns)
         return out
 
@@ -146,12 +146,13 @@ class Flight:
         self._jets.take(inputs.jets)
         given = self._jets.given(inputs.tick)
         self._captures.feel(inputs.docking, inputs.odometry, self._history, inputs.time_ns, given)
-        fused = self._estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
+        fused = self.estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
         if fused.status in ("tracking", "predicting"):
             self._captures.join(fused, inputs.odometry)
         for key in [k for k in self._odometry if k[1] < inputs.time_ns - _ODOMETRY_KEPT_NS]:
             del self._odometry[key]
-        return fused, self._target_message(inputs, fused)
+        seen = {s.chaser for s in inputs.sightings if s.solutions and s.sim_time_ns == inputs.time_ns}
+        return fused, target_message(inputs.tick, inputs.time_ns, fused, seen, self.estimator, self._camera)
 
     def _measurements(self, sightings: tuple[Sighting, ...]) -> list[Measurement]:
         measurements = []
@@ -171,7 +172,8 @@ class Flight:
                 )
                 for solution in s.solutions
             )
-            measurements.append(Measurement(s.chaser, s.sim_time_ns, hypotheses, len(s.marker_ids)))
+            eye = Eye(*self._camera.irf_pose_in_world(odometry.position_m, odometry.q_wxyz))
+            measurements.append(Measurement(s.chaser, s.sim_time_ns, hypotheses, len(s.marker_ids), eye))
         return measurements
 
     def _command(self, inputs: Inputs, fused: Fused, out: Outputs) -> None:
@@ -183,21 +185,35 @@ class Flight:
         took_s = 0.0
         # Who holds on to the target is planned for only where others have to fly around it.
         held = {i for i in ids if self._is_held(i)}
-        planned = ids if held != set(ids) else ()
-        problem = None
+        searching = {i for i in ids if self.guidance.chasers[i].phase == "searching"}
+        planned = tuple(i for i in ids if i not in searching) if held != set(ids) else ()
+        problem, away = None, {}
         if known and planned:
-            problem = self._problem(planned, inputs, self._estimator.estimate_at(effective_ns), effective_ns)
+            problem = self._problem(planned, inputs, self.estimator.estimate_at(effective_ns), effective_ns)
+            away = self.absent.away(inputs.time_ns)
+            problem = with_absent(problem, away, effective_ns, self._parameters.dt_s)
         self._describe(ids if known else (), inputs, fused, out)
         if problem is not None:
             begun_s = self._now_s()
             since_ns = 0 if self._last_solve_ns is None else inputs.time_ns - self._last_solve_ns
+            if self._budget is not None:
+                cast(Bounded, self._solver).max_iterations = self._budget.iterations()
             try:
-                plan = self._solver.solve(problem, since_ns / 1e9, ids)
+                plan = self._solver.solve(problem, since_ns / 1e9, (*planned, *away))
                 self._last_solve_ns = inputs.time_ns
             except (ValueError, ArithmeticError, RuntimeError) as error:
                 self._events(out, inputs, [("error", f"the solver refused: {error}")])
             took_s = self._now_s() - begun_s
-        for row, i in enumerate(ids):
+            if self._budget is not None and plan is not None:
+                self._budget.note(took_s, int(plan.iterations.sum()))
+        rows, n = {i: row for row, i in enumerate(planned)}, len(planned)
+        for i in ids:
+            if i in searching:
+                since_s = self.guidance.chasers[i].since_s
+                wrench = self._searches.wrench(inputs.odometry[i], since_s, fused)
+                self._send(i, inputs, effective_ns, "search", wrench, out)
+                continue
+            row = rows.get(i, 0)
             if i in held or self._is_held(i):
                 pull = (-self.guidance.pull_N(i, inputs.time_ns / 1e9), 0.0, 0.0, 0.0, 0.0, 0.0)
                 self._send(i, inputs, effective_ns, "pull" if pull[0] else "coast", np.array(pull), out)
@@ -210,7 +226,7 @@ class Flight:
             if plan is not None and usable:
                 wrench: Array = plan.inputs[row, 0]
                 mode: Mode = "nmpc"
-                out.plans[i] = self._plan_message(i, inputs, effective_ns, plan, row)
+                out.plans[i] = plan_message(i, inputs.tick, effective_ns, self._parameters.dt_s, plan, row)
             else:
                 wrench, mode = brake_wrench(inputs.odometry[i], self.scenario.chaser), "brake"
             self._send(i, inputs, effective_ns, mode, wrench, out)
@@ -219,10 +235,10 @@ class Flight:
             sim_time_ns=inputs.time_ns,
             solver=self.scenario.controller.solver,
             chasers=planned if plan is not None else (),
-            status=plan.status if plan is not None else (),
-            iterations=tuple(int(n) for n in plan.iterations) if plan is not None else (),
-            cost=vector(plan.cost) if plan is not None else (),
-            max_violation_m=vector(plan.max_violation_m) if plan is not None else (),
+            status=plan.status[:n] if plan is not None else (),
+            iterations=tuple(int(k) for k in plan.iterations[:n]) if plan is not None else (),
+            cost=vector(plan.cost[:n]) if plan is not None else (),
+            max_violation_m=vector(plan.max_violation_m[:n]) if plan is not None else (),
             wall_solve_s=took_s,
         )
 
@@ -253,12 +269,13 @@ class Flight:
     def _problem(self, ids: tuple[int, ...], inputs: Inputs, ahead: Fused, effective_ns: int) -> NmpcInput:
         """The NMPC's problem at the time when the commands take effect."""
         p, s = self._parameters, self.scenario
-        times_s = np.arange(p.stages + 1) * p.dt_s
+        times_s = np.arange(p.stages + 1, dtype=float) * p.dt_s
         nodes, middles = self._captures.path(ahead, p.dt_s, p.stages)
         states, references, u_ref = [], [], []
         for i in ids:
-            offset = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s)
-            q_off = self._attitudes(i, offset[0])
+            when_s = effective_ns / 1e9 + times_s
+            offset = self.guidance.chasers[i].move.at(when_s)
+            q_off = self._attitudes(i, offset[0], when_s)
             coming = self._jets.coming(i, inputs.tick)
             if coming is None:
                 state = predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser)
@@ -267,12 +284,12 @@ class Flight:
             states.append(state)
             references.append(reference.references_on(nodes.positions_m, nodes.q_wxyz, offset[0], q_off))
             if s.controller.feed_forward:
-                held = self.guidance.chasers[i].move.at(effective_ns / 1e9 + times_s[:-1] + p.dt_s / 2)
+                held = self.guidance.chasers[i].move.at(when_s[:-1] + p.dt_s / 2)
                 u_ref.append(
                     reference.feed_forward(
                         middles.omega_rad_s,
                         *held,
-                        self._attitudes(i, held[0]),
+                        self._attitudes(i, held[0], when_s[:-1] + p.dt_s / 2),
                         s.chaser.mass_kg,
                         np.diag(s.chaser.inertia),
                         middles.alpha_rad_s2,
@@ -294,14 +311,17 @@ class Flight:
             + self._margin_m(ahead),
             min_distance_chasers_m=s.limits.min_distance_chasers_m,
             input_max=limits,
+            corridors=corridor_rows([self.guidance.corridor(i) for i in ids], nodes.q_wxyz),
         )
 
-    def _attitudes(self, i: int, offsets: Array) -> Array:
-        """Attitude of a chaser's reference, body to TRF, at offsets (K, 3): (K, 4), or (4,) where it never turns."""
-        c = self.scenario.chasers[i]
-        if not self.scenario.approach.face_target:
-            return np.array(c.q_wxyz)
-        return facing_attitudes(c.position_m, c.q_wxyz, offsets)
+    def _attitudes(self, i: int, offsets: Array, times_s: Array) -> Array:
+        """Attitude of a chaser's reference, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or (4,) where it
+        never turns."""
+        c, q = self.scenario.chasers[i], np.array(self.scenario.chasers[i].q_wxyz)
+        if self.scenario.approach.face_target or self.guidance.chasers[i].faces:
+            q = facing_attitudes(c.position_m, c.q_wxyz, offsets)
+        turns = self.guidance.turns(i, times_s)
+        return q if turns is None else rotations.multiply(q, turns)
 
     def _margin_m(self, ahead: Fused) -> float:
         """What the uncertainty of the target's position adds to the distance from it."""
@@ -314,10 +334,12 @@ class Flight:
         for i in ids:
             offset = self.guidance.chasers[i].move.at(np.array([now_s]))[0][0]
             position = fused.position_m + rotations.rotate(fused.q_wxyz, offset)
-            attitude = rotations.multiply(fused.q_wxyz, self._attitudes(i, offset[None]).reshape(4))
+            q_off = self._attitudes(i, offset[None], np.array([now_s])).reshape(4)
+            attitude = rotations.multiply(fused.q_wxyz, q_off)
             odometry = inputs.odometry[i]
             error_m = float(np.linalg.norm(position - odometry.position_m))
             error_rad = float(rotations.angle_between(attitude, odometry.q_wxyz))
+            self.guidance.placed(i, pose_in_target(fused, odometry)[0])
             self.guidance.observe(i, now_s, error_m, error_rad)
             senses = self._captures.senses(i, fused, odometry, inputs.docking.get(i))
             if senses is not None:
@@ -336,32 +358,10 @@ class Flight:
             )
         changes = self.guidance.drain_events()
         self._events(out, inputs, [("info", f"chaser {i}: {what} ({detail})") for i, what, detail in changes])
-
-    def _plan_message(self, i: int, inputs: Inputs, effective_ns: int, plan: NmpcPlan, row: int) -> Plan:
-        return Plan(
-            tick=inputs.tick,
-            sim_time_ns=effective_ns,
-            chaser=i,
-            step_s=self._parameters.dt_s,
-            positions_m=vector(plan.states[row, :, :3]),
-            quaternions_wxyz=vector(plan.states[row, :, 6:10]),
-            inputs=vector(plan.inputs[row]),
-        )
-
-    def _target_message(self, inputs: Inputs, fused: Fused) -> TargetEstimate:
-        seen = {s.chaser for s in inputs.sightings if s.solutions and s.sim_time_ns == inputs.time_ns}
-        return TargetEstimate(
-            tick=inputs.tick,
-            sim_time_ns=inputs.time_ns,
-            status=fused.status,  # type: ignore[arg-type]
-            position_m=vector(fused.position_m),
-            velocity_m_s=vector(fused.velocity_m_s),
-            q_wxyz=vector(fused.q_wxyz),
-            omega_rad_s=vector(fused.omega_rad_s),
-            covariance=vector(fused.covariance),
-            accepted=tuple(sorted(seen - set(fused.rejected))),
-            rejected=tuple(sorted(fused.rejected)),
-        )
+        for i, _, detail in changes:
+            found = next((c for c in out.target.cameras if c.chaser == i), None)
+            if detail.endswith(CALIBRATED) and found is not None:
+                self._events(out, inputs, [("info", f"chaser {i}: {in_words(found)}")])
 
     def _events(self, out: Outputs, inputs: Inputs, told: list[tuple[str, str]]) -> None:
         for level, text in told:

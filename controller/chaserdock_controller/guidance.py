@@ -1,7 +1,8 @@
 """What each chaser is doing, and where in TRF it is therefore to be. No I/O; time is given.
 
-Phases: ``acquire`` (the target has not been found), ``hold``, ``approach`` (the offset shrinks along its own line to
-the docking distance, the relative attitude kept, as in the paper, but at a bounded speed), ``docked`` (within
+Phases: ``acquire`` (the target has not been found), ``searching`` (it looks about for it), ``hold``, ``calibrate``
+(turns about, watching the target, which shows how its camera is mounted), ``approach`` (the offset shrinks along its
+own line to the docking distance, the relative attitude kept, as in the paper, but at a bounded speed), ``docked`` (within
 the docking tolerances for long enough), ``retreat`` and ``abort`` (back to the nominal offset), ``goto``. Where docking
 ends by capture, an approach goes through the phases of ``capture`` instead.
 """
@@ -10,13 +11,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from chaserdock_protocol.messages import Latch, OperatorCommand
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import ArrayLike, NDArray
 
+from . import vision
 from .capture import (
     HOLDING_ON,
     IN_CORRIDOR,
@@ -28,37 +30,22 @@ from .capture import (
     pull_N,
     why_not_approach,
 )
+from .corridors import Cone, cone_of
+from .guided import Answer, ChaserGuidance
+from .looking import CALIBRATION_S, calibration_turns
 from .moves import Motion, glide, move_to, stay, stop
+from .refusals import why_not_along, why_not_calibrate, why_not_goto, why_not_there, why_stale
 
 Array = NDArray[np.float64]
 
 _ABORT_HASTE = 2.0
+_SEARCH_AFTER_S = 1.0
+"""So long a chaser waits for the target to be seen before it looks about."""
 _GOTO_SPEED = 2.0
-
-
-@dataclass(frozen=True)
-class ChaserGuidance:
-    """One chaser: its phase since ``since_s``, the motion of its reference in TRF, how long it has been in place.
-
-    By capture: ``then``, what follows when the move is over (``nominal``, ``align`` or nothing, which is to hold);
-    ``attempt``, from 1; ``held``, its pose in TRF when the pull began.
-    """
-
-    phase: str
-    since_s: float
-    move: Motion
-    inside_since_s: float | None = None
-    then: str = ""
-    attempt: int = 1
-    held: tuple[Array, Array] | None = None
-
-
-@dataclass(frozen=True)
-class Answer:
-    """To a command: accepted or not, and why."""
-
-    accepted: bool
-    reason: str
+CALIBRATED = "the manoeuvre is over"
+# Who docks at a distance may plan to come so much nearer than that; who is so far outside its corridor has left it.
+_HELD_MARGIN_M = 0.03
+_OUTSIDE_M = 0.02
 
 
 class Guidance:
@@ -70,9 +57,13 @@ class Guidance:
         self.chasers = [ChaserGuidance("acquire", 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
         self._leaving: dict[int, Array] = {}
         self._docks = [dock_of(scenario, i) for i in range(len(scenario.chasers))]
+        self._cones = [cone_of(scenario, i) for i in range(len(scenario.chasers))]
         self._sensed: dict[int, Senses] = {}
+        self._places: dict[int, Array] = {}
         self._done: dict[int, tuple[float, OperatorCommand]] = {}
         self._due = sorted(scenario.timeline, key=lambda entry: entry.at_s)
+        self._seen_s: float | None = None
+        self._blind: set[int] = set()
 
     def found(self, now_s: float) -> None:
         """The target is known: everyone who waited for that holds."""
@@ -80,13 +71,53 @@ class Guidance:
             if c.phase == "acquire":
                 self._enter(i, "hold", now_s, c.move)
 
+    def search(self, now_s: float) -> None:
+        """Nobody knows where the target is: whoever has waited for a while looks about."""
+        for i, c in enumerate(self.chasers):
+            if c.phase in ("acquire", "hold") and now_s - c.since_s >= _SEARCH_AFTER_S:
+                self._enter(i, "searching", now_s, c.move)
+
+    def follow(self, i: int, now_s: float, offset_m: Array) -> None:
+        """The target's motion is known well enough to fly by: a chaser that searched, and is at ``offset_m`` (3,) TRF,
+        goes to its nominal offset, facing the target all the way."""
+        if self.chasers[i].phase != "searching":
+            return
+        speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED
+        move = move_to(stay(offset_m, now_s), self._scenario.chasers[i].position_m, now_s, speed)
+        self._enter(i, "goto", now_s, move, why="the target is found")
+        self.chasers[i] = replace(self.chasers[i], faces=True)
+
+    def turns(self, i: int, times_s: ArrayLike) -> Array | None:
+        """Rotations (K, 4) of a chaser's body away from its reference attitude at times (K,); None for none."""
+        c = self.chasers[i]
+        if c.phase != "calibrate":
+            return None
+        return calibration_turns(np.asarray(times_s, dtype=float) - c.since_s)
+
     def lost(self, now_s: float) -> None:
         """The target is not known any more: whoever moved relative to it stops there."""
         for i, c in enumerate(self.chasers):
             if self._docks[i] is not None and c.phase in IN_CORRIDOR:
                 self._back_out(i, "retreat", now_s, "the target is lost")
-            elif c.phase in ("approach", "retreat", "goto", "abort"):
+            elif c.phase in ("approach", "retreat", "goto", "abort", "calibrate"):
                 self._enter(i, "hold", now_s, stop(c.move, now_s))
+
+    def watch(self, now_s: float, seen: bool) -> None:
+        """Whoever comes nearer to a target that nobody sees any more (``seen``: somebody does) stops that: ``vision``."""
+        self._seen_s = now_s if seen or self._seen_s is None else self._seen_s
+        unseen_s = now_s - self._seen_s
+        for i, c in enumerate(self.chasers):
+            instead = vision.on_loss(c.phase, self._docks[i] is not None, unseen_s)
+            if instead == "back off":
+                self._back_out(i, "retreat", now_s, vision.BLIND)
+            elif instead == "hold":
+                self._enter(i, "hold", now_s, stop(c.move, now_s), why=vision.BLIND)
+                self._blind.add(i)
+            elif vision.goes_on(c.phase, i in self._blind, unseen_s):
+                move = move_to(c.move, self.dock_offset(i), now_s, self._scenario.approach.max_speed_m_s)
+                self._enter(i, "approach", now_s, move, why=vision.SEEN)
+            if self.chasers[i].phase != "hold":
+                self._blind.discard(i)
 
     def due_commands(self, now_s: float) -> list[OperatorCommand]:
         """Commands of the scenario's time line that have come due since the last call."""
@@ -94,10 +125,8 @@ class Guidance:
         while self._due and self._due[0].at_s <= now_s + 1e-9:
             entry = self._due.pop(0)
             for chaser in entry.chasers:
-                wish = OperatorCommand(
-                    command=entry.command, chaser=chaser, offset_m=entry.offset_m, jet=entry.jet
-                )
-                out.append(wish)
+                wish = {"command": entry.command, "offset_m": entry.offset_m, "jet": entry.jet}
+                out.append(OperatorCommand(chaser=chaser, **wish))
         return out
 
     def expect(self, commands: Sequence[OperatorCommand]) -> None:
@@ -105,7 +134,9 @@ class Guidance:
         self._leaving = {
             c.chaser: np.asarray(c.offset_m)
             for c in commands
-            if c.command == "goto" and c.offset_m is not None and not self._why_not_there(c.offset_m)
+            if c.command == "goto"
+            and c.offset_m is not None
+            and not why_not_there(self._scenario, c.offset_m)
         }
 
     def command(self, command: OperatorCommand, now_s: float) -> Answer:
@@ -116,11 +147,9 @@ class Guidance:
         i, what = command.chaser, command.command
         if i >= len(self.chasers):
             return Answer(False, f"there is no chaser {i}; this mission has 0 to {len(self.chasers) - 1}")
-        if command.expires_ns is not None and command.expires_ns < round(now_s * 1e9):
-            return Answer(
-                False, f"stale: it was to be done by {command.expires_ns / 1e9:.2f} s, it is {now_s:.2f} s"
-            )
-        if self.chasers[i].phase == "acquire":
+        if late := why_stale(command, now_s):
+            return Answer(False, late)
+        if self.chasers[i].phase in ("acquire", "searching"):
             return Answer(False, "the target has not been found yet")
         done_s, done = self._done.get(i, (-math.inf, command))
         differs = (done.command, done.offset_m) != (what, command.offset_m)
@@ -134,6 +163,7 @@ class Guidance:
 
     def _obey(self, command: OperatorCommand, now_s: float) -> Answer:
         i, what = command.chaser, command.command
+        self._blind.discard(i)  # what was asked for before does not come back by itself
         c, dock = self.chasers[i], self._docks[i]
         approaching = ("docked",) if dock is None else ("wait", *IN_CORRIDOR, *HOLDING_ON)
         if what != "goto" and (what == c.phase or (what == "approach" and c.phase in approaching)):
@@ -155,16 +185,20 @@ class Guidance:
                     self._enter(i, "wait", now_s, stop(c.move, now_s), why=taken)
                 else:
                     self._align(i, now_s, 1)
-            case "approach" if reason := self._why_not_approach(i, now_s):
+            case "approach" if reason := why_not_along(self._scenario, i, c.move.at(np.array([now_s]))[0][0]):
                 return Answer(False, reason)
             case "approach":
                 self._enter(i, "approach", now_s, move_to(c.move, self.dock_offset(i), now_s, speed))
             case "retreat" | "abort":
                 self._back_out(i, what, now_s)
+            case "calibrate" if reason := why_not_calibrate(self._scenario, c.phase, c.move.over_at(now_s)):
+                return Answer(False, reason)
+            case "calibrate":
+                self._enter(i, "calibrate", now_s, c.move)
             case "goto":
                 nominal = self._scenario.chasers[i].position_m
                 offset = np.asarray(command.offset_m if command.offset_m is not None else nominal)
-                if reason := self._why_not_goto(i, command, offset):
+                if reason := self._why_not_goto(i, command.offset_m):
                     return Answer(False, reason)
                 self._enter(i, "goto", now_s, move_to(c.move, offset, now_s, speed * _GOTO_SPEED))
         return Answer(True, f"phase {self.chasers[i].phase}")
@@ -202,10 +236,33 @@ class Guidance:
             self._sensed[i].offset_m
         )
 
+    def placed(self, i: int, offset_m: Array) -> None:
+        """Where a chaser is by estimate: its centre (3,) in TRF."""
+        self._places[i] = offset_m
+
+    def corridor(self, i: int) -> Cone | None:
+        """The cone in which a chaser on its way in or out is planned; it has one only while it is inside.
+
+        One that docks at a distance has it from the command on, and on its way out until it is at the distance that
+        everybody keeps.
+        """
+        place, dock = self._places.get(i), self._docks[i]
+        if place is None or self.chasers[i].phase in HOLDING_ON:
+            return None
+        if dock is None:
+            near = float(np.linalg.norm(place)) < self._scenario.limits.min_distance_target_m
+            wanted = near or self.chasers[i].phase in ("approach", "docked")
+        else:
+            wanted = self.in_corridor(i)
+        return self._cones[i] if wanted and self._cones[i].room_m(place) > -_OUTSIDE_M else None
+
     def min_distance_target_m(self, i: int) -> float:
         """How near to the target a chaser may plan to come; 0, any distance, when it holds on to it."""
         limit, dock = self._scenario.limits.min_distance_target_m, self._docks[i]
-        if dock is None or not self.in_corridor(i):
+        if dock is None:
+            docked_m = max(0.0, self._scenario.approach.dock_distance_m - _HELD_MARGIN_M)
+            return min(limit, docked_m) if self.corridor(i) is not None else limit
+        if not self.in_corridor(i):
             return limit
         return 0.0 if self.chasers[i].phase in HOLDING_ON else min(limit, dock.keep_out_m())
 
@@ -232,32 +289,9 @@ class Guidance:
                 return f"chaser {j} is in the way"
         return f"{flying} are under way already" if flying >= docking.at_once else ""
 
-    def _why_not_approach(self, i: int, now_s: float) -> str:
-        position = self.chasers[i].move.at(np.array([now_s]))[0][0]
-        nominal = np.asarray(self._scenario.chasers[i].position_m)
-        along = float(position @ nominal) / math.hypot(*nominal)
-        aside = math.sqrt(max(0.0, float(position @ position) - along * along))
-        if along <= 0.0 or aside > 0.1:
-            return f"its reference is {aside:.2f} m beside its approach line; retreat or goto first"
-        return ""
-
-    def _why_not_goto(self, i: int, command: OperatorCommand, offset: Array) -> str:
-        if command.offset_m is None:
-            return "goto needs an offset"
-        if reason := self._why_not_there(offset):
-            return reason
-        for j, other in enumerate(self.chasers):
-            apart = float(np.linalg.norm(self._leaving.get(j, other.move.goal_m) - offset))
-            if j != i and apart < self._scenario.limits.min_distance_chasers_m:
-                return f"the offset is {apart:.3g} m from where chaser {j} is to be"
-        return ""
-
-    def _why_not_there(self, offset_m: ArrayLike) -> str:
-        distance = float(np.linalg.norm(offset_m))
-        nearest = self._scenario.limits.min_distance_target_m
-        if not nearest < distance <= self._scenario.limits.max_reference_distance_m:
-            return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
-        return ""
+    def _why_not_goto(self, i: int, offset_m: ArrayLike | None) -> str:
+        ends = {j: self._leaving.get(j, c.move.goal_m) for j, c in enumerate(self.chasers) if j != i}
+        return why_not_goto(self._scenario, offset_m, ends)
 
     def dock_offset(self, i: int) -> Array:
         """Where in TRF a docked chaser's centre is, (3,)."""
@@ -267,7 +301,9 @@ class Guidance:
     def observe(self, i: int, now_s: float, position_error_m: float, angle_error_rad: float) -> None:
         """Advances a chaser's phase by its estimated errors from the reference pose."""
         c, approach = self.chasers[i], self._scenario.approach
-        if c.phase in ("retreat", "abort", "goto") and c.move.over_at(now_s):
+        if c.phase == "calibrate" and now_s - c.since_s >= CALIBRATION_S:
+            self._enter(i, "hold", now_s, c.move, why=CALIBRATED)
+        elif c.phase in ("retreat", "abort", "goto") and c.move.over_at(now_s):
             if c.then == "align":
                 self._align(i, now_s, c.attempt + 1)
             elif c.then == "nominal":
@@ -277,12 +313,13 @@ class Guidance:
                 self.chasers[i] = replace(c, move=move, then="")
             else:
                 self._enter(i, "hold", now_s, c.move)
+                self.chasers[i] = replace(self.chasers[i], faces=False)
         elif self._docks[i] is None and c.phase in ("approach", "docked") and c.move.over_at(now_s):
             inside = position_error_m <= approach.docked_position_m and angle_error_rad <= math.radians(
                 approach.docked_angle_deg
             )
             since = (c.inside_since_s if c.inside_since_s is not None else now_s) if inside else None
-            self.chasers[i] = ChaserGuidance(c.phase, c.since_s, c.move, since)
+            self.chasers[i] = ChaserGuidance(c.phase, c.since_s, c.move, since, faces=c.faces)
             if c.phase == "approach" and since is not None and now_s - since >= approach.docked_time_s:
                 self._enter(i, "docked", now_s, c.move, since)
             elif c.phase == "docked" and since is None:
@@ -343,7 +380,7 @@ class Guidance:
     ) -> None:
         before = self.chasers[i]
         number = before.attempt if attempt is None else attempt
-        self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number)
+        self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
         if phase != before.phase:
             self.events.append((i, phase, f"from {before.phase}" + (f": {why}" if why else "")))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,6 +11,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 
 from .guidance import Answer
+from .refusals import why_stale
 
 JET_COMMANDS = ("isolate", "restore")
 
@@ -25,6 +27,7 @@ class JetDesk:
         self._reports: dict[int, JetReport] = {}
         self._isolated: dict[int, set[int]] = {}
         self._trusted: dict[int, set[int]] = {}
+        self._done: dict[tuple[int, int], tuple[float, OperatorCommand]] = {}
 
     def take(self, reports: Mapping[int, JetReport]) -> None:
         """Notes reports, by chaser."""
@@ -60,15 +63,25 @@ class JetDesk:
         """Jets that an operator vouches for."""
         return tuple(sorted(self._trusted.get(chaser, ())))
 
-    def command(self, command: OperatorCommand) -> Answer:
-        """Does what an operator or the time line asks for, or says why not."""
+    def command(self, command: OperatorCommand, now_s: float) -> Answer:
+        """Does what an operator or the time line asks for, or says why not.
+
+        Of ``isolate`` and ``restore`` for one jet in one tick the first counts.
+        """
         i, jet = command.chaser, command.jet
         if i >= self._chasers:
             return Answer(False, f"there is no chaser {i}; this mission has 0 to {self._chasers - 1}")
+        if late := why_stale(command, now_s):
+            return Answer(False, late)
         if self._jets == 0:
             return Answer(False, 'this mission\'s chasers fly without jets (chaser.actuation = "ideal")')
         if jet is None or jet >= self._jets:
             return Answer(False, f"{command.command} needs a jet; this body has 0 to {self._jets - 1}")
+        done_s, done = self._done.get((i, jet), (-math.inf, command))
+        if done_s == now_s and done.command != command.command:
+            whose = f" by {done.operator}" if done.operator else ""
+            return Answer(False, f"{done.command}{whose} came first in this tick")
+        self._done[i, jet] = now_s, command
         shut, trusted = self._isolated.setdefault(i, set()), self._trusted.setdefault(i, set())
         wanted, other = (shut, trusted) if command.command == "isolate" else (trusted, shut)
         if jet in wanted:

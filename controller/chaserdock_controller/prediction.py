@@ -12,6 +12,7 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_bodies import Body
 
 _STEP_S = 0.02
+_UNIT_WITHIN = 0.1
 
 
 class CommandHistory:
@@ -86,6 +87,15 @@ def integrate(state: Array, wrench: Array, body: Body, duration_s: float) -> Arr
 
 def _state_of(odometry: Odometry) -> Array:
     return np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
+
+
+def fault_of(odometry: Odometry) -> str:
+    """What makes an odometry no state of a rigid body, in words; empty when nothing does."""
+    for name in ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s"):
+        if not all(map(math.isfinite, getattr(odometry, name))):
+            return f"{name} holds a value that is not finite"
+    length = math.hypot(*odometry.q_wxyz)
+    return f"q_wxyz has length {length:.3g}, not 1" if abs(length - 1.0) > _UNIT_WITHIN else ""
 
 
 def predict_state(odometry: Odometry, history: CommandHistory, until_ns: int, body: Body) -> Array:

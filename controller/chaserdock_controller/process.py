@@ -4,29 +4,60 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import msgspec
 from chaserdock_protocol import topics
+from chaserdock_protocol.dead_reckoning import went_on
+from chaserdock_protocol.faults import Lost, layer_of
 from chaserdock_protocol.messages import (
     CommandReply,
+    ControllerState,
     DockingStatus,
+    Event,
     JetReport,
     JoinReply,
+    Level,
     MissionEnd,
     Odometry,
     OperatorCommand,
     Presence,
     Sighting,
     Tick,
+    WrenchCommand,
 )
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
-from chaserdock_protocol.transport import Node
+from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport import Node, Received
 
+from .agreement import Agreement
 from .flight import Flight, Inputs, Outputs
+from .memory import Memory, NoMemory
+from .odometry_watch import OdometryWatch
+from .shadow import Shadow
+
+_REMEMBERED_TICKS = 256
+_IDLE = 5
+"""Waits in vain after which, in lock-step, nothing more is on its way here."""
+
+
+def no_command(chaser: int, tick: Tick) -> WrenchCommand:
+    """Tells a chaser, that may be waiting for it, that there is no command for this tick."""
+    zero = (0.0, 0.0, 0.0)
+    return WrenchCommand(
+        tick=tick.tick,
+        sim_time_ns=tick.sim_time_ns,
+        chaser=chaser,
+        effective_time_ns=tick.sim_time_ns,
+        expires_ns=tick.sim_time_ns,
+        mode="none",
+        force_N=zero,
+        torque_N_m=zero,
+    )
 
 
 def main(options: ProcessOptions) -> int:
@@ -34,26 +65,31 @@ def main(options: ProcessOptions) -> int:
 
     def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
-        controller = Controller(node, scenario, Flight(scenario, time.perf_counter))
+        flight = Flight(scenario, time.perf_counter, realtime=mission.mode == "realtime")
+        controller = Controller(node, scenario, flight, mission.mode == "realtime")
+        node.faults = layer_of(scenario, node.name, lockstep=mission.mode == "lockstep")
         controller.open(instance)
         while not (controller.ended or stop()):
             controller.listen()
         controller.farewell()
         return 0 if controller.ended else 1
 
-    return take_part("controller", "controller", options, work)
+    return take_part("standby" if options.standby else "controller", "controller", options, work)
 
 
 @dataclass
 class Controller:
     """What has come for the open tick. A tick is worked out once all that it expects is here.
 
-    In real time a tick that the next one overtakes is worked out with what is here.
+    In real time a tick that the next one overtakes is worked out with what is here. While another controller commands,
+    this one works out the same and keeps it to itself (``shadow``). ``replaying``: every tick is this one's to answer.
     """
 
     node: Node
     scenario: Scenario
     flight: Flight
+    realtime: bool = False
+    replaying: bool = False
     ended: bool = False
     tick: Tick | None = None
     done_tick: int = -1
@@ -61,71 +97,207 @@ class Controller:
     _jets: dict[int, JetReport] = field(default_factory=dict)
     _docking: dict[int, DockingStatus] = field(default_factory=dict)
     _seen: set[tuple[int, int]] = field(default_factory=set)
+    _used: dict[tuple[int, int], bool] = field(default_factory=dict)
+    _agreement: Agreement = field(default_factory=Agreement)
+    _missed: set[tuple[str, int, int]] = field(default_factory=set)
     _sightings: list[Sighting] = field(default_factory=list)
     _asked: list[tuple[OperatorCommand, Callable[[CommandReply], None]]] = field(default_factory=list)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     def __post_init__(self) -> None:
         s = self.scenario
+        self._watch = OdometryWatch(s)
         self._ports = [s.docking.port_of(i) for i in range(len(s.chasers))]
+        self.name = self.node.name
+        self.shadow = Shadow(self.name, self.realtime, self.replaying)
+        self._memory = Memory(self.flight, self._watch, self._agreement)
+        self._answered: tuple[Tick, Outputs, float] | None = None
+        self._given_state_to: dict[str, str] = {}
+        self._idle = 0
+        self._on_network = False
 
     def open(self, instance: str) -> None:
         """Opens the topics, then tells its presence."""
         node = self.node
-        for topic in (topics.TARGET, topics.SOLVER, topics.COMMAND, topics.OPERATED):
+        self.shadow.instance, self._on_network = instance, True
+        for topic in (topics.TARGET, topics.SOLVER, topics.COMMAND, topics.OPERATED, topics.STATE):
             node.advertise(topic)
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
         told = (topics.TICK, topics.END, topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.JETS)
-        for topic in told:
+        for topic in (*told, topics.STATE):
             node.subscribe(topic)
-        node.answer(topics.OPERATE_KEY, OperatorCommand, self.operate)
         self.teller = PresenceTeller(node, instance)
 
     def listen(self) -> None:
         """Waits for one message; works the tick out when it was the last missing."""
-        received = self.node.receive(0.2)
-        match received.message if received is not None else None:
+        due = self.shadow.due(self.done_tick)
+        received = due or self.node.receive(0.2)
+        self._idle = 0 if received is not None else self._idle + 1
+        if due is not None:
+            self._take(due)
+        elif received is not None and not self._is_about_command(received.message):
+            if self.shadow.holds_back(received, self.done_tick):
+                return
+            self._take(received)
+        tick = self.tick
+        if tick is not None and tick.tick > self.done_tick and self._may_work_out(tick):
+            self._work_out(tick)
+
+    def _is_about_command(self, message: Any) -> bool:
+        """Takes what says who commands, as soon as it comes; whether it was nothing else."""
+        if isinstance(message, ControllerState):
+            if message.process != self.name:
+                self._hear_word(message)
+            return True
+        if isinstance(message, Tick):
+            before = self.shadow.commands
+            for text in self.shadow.note(message):
+                self._tell("warning", text, message.tick, message.sim_time_ns)
+            self.teller.settled.set()
+            if self.shadow.commands != before:
+                self._take_or_leave_command(message)
+        return False
+
+    def _take_or_leave_command(self, tick: Tick) -> None:
+        if self._on_network and self.shadow.commands:
+            self.node.number_anew()
+            self.node.answer(topics.OPERATE_KEY, OperatorCommand, self.operate)
+        elif self._on_network:
+            self.node.answer_no_more(topics.OPERATE_KEY)
+            self._refuse_what_is_asked(tick)
+        if tick.term > 1:
+            text = f"commands in term {tick.term}" if self.shadow.commands else "stands by"
+            self._tell("info", text, tick.tick, tick.sim_time_ns)
+        answered = self._answered
+        if self.shadow.commands and answered is not None and answered[0].tick == tick.tick:
+            # Worked out already, in the shadow of one that cannot send its own any more.
+            self._publish(tick, answered[1], answered[2], ())
+
+    def _refuse_what_is_asked(self, tick: Tick) -> None:
+        with self._lock:
+            asked, self._asked = self._asked, []
+        reason = f"{tick.commander or 'nobody'} commands now: ask again"
+        for command, answer in asked:
+            head = {"command": command.command, "chaser": command.chaser, "operator": command.operator}
+            answer(
+                CommandReply(
+                    tick=tick.tick, sim_time_ns=tick.sim_time_ns, accepted=False, reason=reason, **head
+                )
+            )
+
+    def _hear_word(self, word: ControllerState) -> None:
+        """The commander has worked a tick out; now and then it says all that it knows after it."""
+        if not word.state:
+            self.shadow.words[word.tick] = word.operated
+        elif self.shadow.wants_state(word.tick, self.done_tick):
+            try:
+                self._memory.recall(word.state)
+            except NoMemory as error:
+                self.node.counts.rejected["controller/state:format"] += 1
+                self._tell(
+                    "error", f"the commander's state cannot be used: {error}", word.tick, word.sim_time_ns
+                )
+                return
+            self.done_tick = max(self.done_tick, word.tick)
+            self.shadow.caught_up(word.tick)
+            self._tell("info", "follows the commander's state", word.tick, word.sim_time_ns)
+
+    def _may_work_out(self, tick: Tick) -> bool:
+        """Whether all is here that a tick waits for: its inputs and, in another's shadow, the commander's word."""
+        if not self.shadow.follows():
+            return False
+        if self._complete(tick) and self.shadow.has_word(tick.tick):
+            return True
+        return self._idle >= _IDLE and not self.realtime and self.shadow.idle(tick.tick)
+
+    def _take(self, received: Received) -> None:
+        match received.message:
             case Tick() as tick:
                 if self.tick is not None and tick.tick > self.tick.tick > self.done_tick:
                     self._work_out(self.tick)
                 self.tick = tick
-                self.teller.settled.set()
             case Odometry() as odometry:
-                self._odometry[odometry.chaser] = odometry
+                self._know(odometry)
             case DockingStatus() as docking:
                 self._docking[docking.chaser] = docking
             case Sighting() as sighting:
-                self._sightings.append(sighting)
-                self._seen.add((sighting.tick, sighting.chaser))
+                self._see(sighting)
             case JetReport() as report:
                 self._jets[report.chaser] = report
             case Presence() as presence:
                 self.teller.take(presence)
             case MissionEnd():
                 self.ended = True
-        if self.tick is not None and self.tick.tick > self.done_tick and self._complete(self.tick):
-            self._work_out(self.tick)
+            case Lost(tick=tick):
+                self._miss(received.topic, int(received.place or 0), tick)
+
+    def _know(self, odometry: Odometry) -> None:
+        """Takes an odometry, unless a newer one of that chaser has come before it."""
+        known = self._odometry.get(odometry.chaser)
+        if known is None or odometry.tick > known.tick:
+            self._odometry[odometry.chaser], told = self._watch.believed(odometry)
+            for level, text in told:
+                if self.shadow.commands:
+                    self._tell(level, text, odometry.tick, odometry.sim_time_ns)
+
+    def _tell(self, level: Level, text: str, tick: int, time_ns: int) -> None:
+        event = Event(tick=tick, sim_time_ns=time_ns, process=self.name, level=level, what=text)
+        self.node.publish(topics.EVENT, event, self.name)
+
+    def _see(self, sighting: Sighting) -> None:
+        """Takes a sighting, each picture's once: twice the same is no more evidence."""
+        key = (sighting.tick, sighting.chaser)
+        if sighting.solutions and self._used.get(key):
+            self.node.counts.stale += 1
+            return
+        self._seen.add(key)
+        self._used[key] = bool(sighting.solutions)
+        self._sightings.append(sighting)
+
+    def _miss(self, topic: Topic, chaser: int, tick: int) -> None:
+        """What a tick waits for has been lost on its way."""
+        self._missed.add((topic.key, chaser, tick))
 
     def _complete(self, tick: Tick) -> bool:
-        if self.scenario.chaser.actuation == "thrusters" and any(
-            i not in self._jets or self._jets[i].tick != tick.tick for i in tick.chasers
-        ):
-            return False
+        def there(topic: Topic, known: Mapping[int, Odometry | JetReport | DockingStatus], i: int) -> bool:
+            return (i in known and known[i].tick == tick.tick) or (topic.key, i, tick.tick) in self._missed
+
+        jets = self.scenario.chaser.actuation == "thrusters"
         return all(
-            i in self._odometry
-            and self._odometry[i].tick == tick.tick
-            and (not tick.pictures or (tick.tick, i) in self._seen)
-            and (self._ports[i] is None or (i in self._docking and self._docking[i].tick == tick.tick))
+            there(topics.ODOMETRY, self._odometry, i)
+            and (not jets or there(topics.JETS, self._jets, i))
+            and (self._ports[i] is None or there(topics.DOCKING, self._docking, i))
+            and (
+                not tick.pictures
+                or (tick.tick, i) in self._seen
+                or (topics.SIGHTING.key, i, tick.tick) in self._missed
+            )
             for i in tick.chasers
         )
 
+    def _known_at(self, tick: Tick) -> dict[int, Odometry]:
+        """Odometry of the chasers at a tick. One that was lost is reckoned from the last, for a command's lifetime."""
+        known = {i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers}
+        for i in tick.chasers:
+            last = self._odometry.get(i)
+            if i in known or last is None or (topics.ODOMETRY.key, i, tick.tick) not in self._missed:
+                continue
+            # What was seen from a place that is only reckoned is no measurement.
+            self._sightings = [s for s in self._sightings if (s.chaser, s.tick) != (i, tick.tick)]
+            if tick.sim_time_ns - last.sim_time_ns <= self.scenario.controller.command_lifetime_s * 1e9:
+                known[i] = went_on(last, tick.tick, tick.sim_time_ns)
+        return dict(sorted(known.items()))
+
     def _work_out(self, tick: Tick) -> None:
         begun_s = time.perf_counter()
-        here = {i: o for i, o in self._odometry.items() if o.tick == tick.tick and i in tick.chasers}
+        here = self._known_at(tick)
+        commands_it = self.shadow.commands_at(tick.tick)
         with self._lock:
             asked, self._asked = self._asked, []
+        if not commands_it:
+            asked = [(command, lambda _: None) for command in self.shadow.operated(tick.tick)]
         docking = {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers}
         commands = tuple(c for c, _ in asked)
         out = self.flight.step(
@@ -136,31 +308,70 @@ class Controller:
         for (command, answer), reply in zip(asked, out.replies[len(out.replies) - len(asked) :], strict=True):
             answer(reply)
             known = msgspec.structs.replace(command, tick=tick.tick, sim_time_ns=tick.sim_time_ns)
-            self.node.publish(topics.OPERATED, known)
-        self._publish(out, time.perf_counter() - begun_s)
+            if commands_it:
+                self.node.publish(topics.OPERATED, known)
+        verdicts = self._agreement.observe(tick.sim_time_ns / 1e9, out.target.accepted, out.target.rejected)
+        for level, text in verdicts:
+            out.events.append(
+                Event(
+                    tick=tick.tick, sim_time_ns=tick.sim_time_ns, process="controller", level=level, what=text
+                )
+            )
+        for i in tick.chasers:
+            if i not in out.wrenches:
+                out.wrenches[i] = no_command(i, tick)
+        took_s = time.perf_counter() - begun_s
+        self._answered = (tick, out, took_s)
         self._sightings.clear()
         self._seen = {key for key in self._seen if key[0] > tick.tick}
+        self._used = {key: used for key, used in self._used.items() if key[0] > tick.tick - _REMEMBERED_TICKS}
+        self._missed = {missed for missed in self._missed if missed[2] > tick.tick}
         self.done_tick = tick.tick
+        if commands_it:
+            self._publish(tick, out, took_s, commands)
         if tick.tick % self.scenario.time.rate_hz == 0:
             health = health_of(self.node, tick.tick, tick.sim_time_ns)
-            self.node.publish(topics.HEALTH, health, "controller")
+            self.node.publish(topics.HEALTH, health, self.name)
 
-    def _publish(self, out: Outputs, took_s: float) -> None:
-        node = self.node
-        for i, wrench in out.wrenches.items():
-            node.publish(topics.WRENCH, wrench, i)
+    def _publish(
+        self, tick: Tick, out: Outputs, took_s: float, operated: tuple[OperatorCommand, ...]
+    ) -> None:
+        node, newest = self.node, self.shadow.newest or tick
+        if newest.standing_by and not self.replaying:
+            # Before the commands: who hears of a tick that was answered has heard what it was answered with.
+            self._say_word(tick, ControllerState(process=self.name, term=newest.term, operated=operated))
         node.publish(topics.TARGET, out.target)
+        for i, wrench in out.wrenches.items():
+            if i in out.plans:
+                node.publish(topics.PLAN, out.plans[i], i)
+            head = {"term": newest.term, "commander": newest.commander, "instance": newest.instance}
+            node.publish(topics.WRENCH, msgspec.structs.replace(wrench, **head), i)
         for i, reference in out.references.items():
             node.publish(topics.REFERENCE, reference, i)
-        for i, plan in out.plans.items():
-            node.publish(topics.PLAN, plan, i)
         for reply in out.replies:
             node.publish(topics.COMMAND, reply)
         for event in out.events:
-            node.publish(topics.EVENT, event, "controller")
+            node.publish(topics.EVENT, msgspec.structs.replace(event, process=self.name), self.name)
         # Last: its arrival tells the recorder that it has all of this tick.
         if out.solver is not None:
             node.publish(topics.SOLVER, msgspec.structs.replace(out.solver, wall_tick_s=took_s))
+        new = newest.standing_by != self._given_state_to
+        if newest.standing_by and not self.replaying and (new or tick.tick % self.scenario.time.rate_hz == 0):
+            self._say_state(tick, newest)
+
+    def _say_state(self, tick: Tick, newest: Tick) -> None:
+        """All that this controller knows after a tick, for one that came late."""
+        self._given_state_to = dict(newest.standing_by)
+        try:
+            state = self._memory.told()
+        except NoMemory as error:
+            self._tell("warning", f"its state cannot be given on: {error}", tick.tick, tick.sim_time_ns)
+            return
+        self._say_word(tick, ControllerState(process=self.name, term=newest.term, state=state))
+
+    def _say_word(self, tick: Tick, word: ControllerState) -> None:
+        stamped = msgspec.structs.replace(word, tick=tick.tick, sim_time_ns=tick.sim_time_ns)
+        self.node.publish(topics.STATE, stamped)
 
     def operate(self, command: OperatorCommand, reply: Callable[[CommandReply], None]) -> None:
         """An operator asks; answered when the next tick has been worked out. Runs on Zenoh's thread."""

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from itertools import groupby
 from typing import Any, cast
 
+import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.tape import Said, SilentTeller, Stage, Tape
@@ -28,22 +31,49 @@ def _flight_of(scenario: Scenario) -> Flight:
     return Flight(scenario, now_s=lambda: 0.0)
 
 
+def _named_once(recorded: Iterable[Received]) -> Iterator[tuple[str, list[Received]]]:
+    """Messages tick by tick, with who commanded at its end; a tick that was told again names that one from the start."""
+    for _, group in groupby(recorded, key=lambda r: r.message.tick):
+        came = list(group)
+        told = [r.message for r in came if r.topic is topics.TICK]
+        if not told:
+            yield "", came
+            continue
+        last = max(told, key=lambda tick: tick.revision)
+        names = {"term": last.term, "commander": last.commander, "instance": last.instance}
+        yield (
+            last.commander,
+            [
+                replace(r, message=msgspec.structs.replace(r.message, **names))
+                if r.topic is topics.TICK
+                else r
+                for r in came
+            ],
+        )
+
+
 def _play(scenario: Scenario, recorded: Iterable[Received], flight_of: Callable[[], Any]) -> Iterator[Said]:
-    tape, controller, last_seq = Tape("controller"), None, -1
-    for received in recorded:
-        is_target = received.topic is topics.TARGET
-        if controller is None or (is_target and received.message.seq < last_seq):
-            tape = Tape("controller")
-            controller = Controller(cast(Node, tape), scenario, flight_of())
-            controller.teller = cast(Any, SilentTeller())
-        if is_target:
-            last_seq = received.message.seq
-        if received.topic is topics.OPERATED:
-            controller.operate(received.message, lambda _: None)
-        elif received.topic in _INPUTS:
-            tape.put(received)
-            controller.listen()
-            yield from tape.said()
+    """The answers of whoever commanded. One that takes over knows what the other knew; one started again does not."""
+    tape, controller, last_seq, last_commander = Tape("controller"), None, -1, ""
+    for named, came in _named_once(recorded):
+        commander = named or last_commander
+        for received in came:
+            is_target = received.topic is topics.TARGET
+            anew = is_target and received.message.seq < last_seq and commander == last_commander
+            if controller is None or anew:
+                tape = Tape("controller")
+                controller = Controller(cast(Node, tape), scenario, flight_of(), replaying=True)
+                controller.teller = cast(Any, SilentTeller())
+            if is_target:
+                last_seq = received.message.seq
+            if received.topic is topics.OPERATED:
+                controller.operate(received.message, lambda _: None)
+            elif received.topic in _INPUTS:
+                tape.put(received)
+                controller.listen()
+                # What a standby tells is on a branch of its own, which is not compared.
+                yield from (s for s in tape.said() if s[0] is not topics.EVENT or commander != "standby")
+        last_commander = commander
 
 
 def play_controller(scenario: Scenario, recorded: Iterable[Received]) -> Iterator[Said]:

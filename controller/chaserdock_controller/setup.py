@@ -54,5 +54,6 @@ def estimator_of(scenario: Scenario) -> Estimator:
             inertia_ratios=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
             bias_position_m=e.camera_bias_position_m,
             bias_attitude_rad=math.radians(e.camera_bias_attitude_deg),
+            bias_focal_share=e.camera_bias_focal_share,
         ),
     )

@@ -6,12 +6,14 @@ TRF's origin need not be the centre of mass: with a captured chaser it no longer
 from __future__ import annotations
 
 from collections.abc import Sequence
+from ctypes import c_double, c_int64
 from dataclasses import dataclass, fields
 
 import numpy as np
 from chaserdock_protocol.rotations import cross, normalize, rotate, to_matrix
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
+
+from chaserdock_controller.native import address, function
 
 Array = NDArray[np.float64]
 
@@ -60,45 +62,6 @@ def joined(target: TargetBody, held: Sequence[tuple[float, Array, Array, Array]]
     return TargetBody(mass, total, centre)
 
 
-@njit(cache=True, error_model="numpy")
-def _product(matrix, v):
-    # Numba's own product of arrays asks for SciPy.
-    out = np.empty(3)
-    for i in range(3):
-        out[i] = matrix[i, 0] * v[0] + matrix[i, 1] * v[1] + matrix[i, 2] * v[2]
-    return out
-
-
-@njit(cache=True, error_model="numpy")
-def _slope(q, w, inertia, inverse, dq, dw):
-    momentum = _product(inertia, w)
-    torque = np.empty(3)
-    torque[0] = momentum[1] * w[2] - momentum[2] * w[1]
-    torque[1] = momentum[2] * w[0] - momentum[0] * w[2]
-    torque[2] = momentum[0] * w[1] - momentum[1] * w[0]
-    dw[:] = _product(inverse, torque)
-    dq[0] = 0.5 * (-q[1] * w[0] - q[2] * w[1] - q[3] * w[2])
-    dq[1] = 0.5 * (q[0] * w[0] + q[2] * w[2] - q[3] * w[1])
-    dq[2] = 0.5 * (q[0] * w[1] + q[3] * w[0] - q[1] * w[2])
-    dq[3] = 0.5 * (q[0] * w[2] + q[1] * w[1] - q[2] * w[0])
-
-
-@njit(cache=True, error_model="numpy")
-def _tumble(q, w, inertia, inverse, h, qs, ws, alphas):
-    """Fills attitudes, rates and angular accelerations at 0, h, 2 h ... by RK4."""
-    k = np.empty((4, 4))
-    m = np.empty((4, 3))
-    for i in range(len(qs)):
-        _slope(q, w, inertia, inverse, k[0], m[0])
-        qs[i], ws[i], alphas[i] = q, w, m[0]
-        _slope(q + 0.5 * h * k[0], w + 0.5 * h * m[0], inertia, inverse, k[1], m[1])
-        _slope(q + 0.5 * h * k[1], w + 0.5 * h * m[1], inertia, inverse, k[2], m[2])
-        _slope(q + h * k[2], w + h * m[2], inertia, inverse, k[3], m[3])
-        q = q + h / 6.0 * (k[0] + 2.0 * k[1] + 2.0 * k[2] + k[3])
-        w = w + h / 6.0 * (m[0] + 2.0 * m[1] + 2.0 * m[2] + m[3])
-        q = q / np.sqrt(np.sum(q * q))
-
-
 def tumble(
     body: TargetBody,
     position_m: ArrayLike,
@@ -118,7 +81,11 @@ def tumble(
     inertia, c = np.ascontiguousarray(body.inertia_kg_m2), body.centre_trf_m
     n = steps + 1
     qs, omegas, alphas = np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 3))
-    _tumble(q, omega, inertia, np.linalg.inv(inertia), step_s, qs, omegas, alphas)
+    inverse = np.linalg.inv(inertia)
+    function("tumble")(
+        address(q), address(omega), address(inertia), address(inverse), c_double(step_s), c_int64(n), address(qs),
+        address(omegas), address(alphas),
+    )  # fmt: skip
     centre = np.asarray(position_m, dtype=float) + rotate(q, c)
     velocity = np.asarray(velocity_m_s, dtype=float) + rotate(q, cross(omega, c))
     times = step_s * np.arange(n)[:, None]

@@ -258,6 +258,10 @@ class Controller:
                 mode="nmpc" if known else "coast",
                 force_N=force,
                 torque_N_m=torque,
+                # It is the only controller; with a second one, only who is named in the tick may command.
+                term=tick.get("term", 0),
+                commander=tick.get("commander", ""),
+                instance=tick.get("instance", ""),
             )
         self.publish(
             f"{NAME}/target",

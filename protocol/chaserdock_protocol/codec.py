@@ -13,6 +13,8 @@ from .messages import Message, encoding_of
 
 MAX_BYTES = 17_000_000
 UNIT_QUATERNION_TOLERANCE = 1e-6
+GREATEST_NUMBER = 1e15
+"""Bounds every float (SI units): far beyond any mission, and its powers stay finite in all that is worked out."""
 
 T = TypeVar("T", bound=Struct)
 
@@ -42,7 +44,7 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
     """Message of type ``kind`` from a payload, checked.
 
     Raises Rejected with reason ``encoding`` (another type or version than ``kind``'s), ``size``, ``format``
-    (no msgpack, wrong type or shape), ``not_finite`` or ``not_unit_quaternion``.
+    (no msgpack, wrong type or shape), ``not_finite``, ``range``, ``not_unit_quaternion`` or ``not_a_covariance``.
     """
     if encoding is not None and encoding != encoding_of(kind):
         raise Rejected("encoding", f"got {encoding!r}, expected {encoding_of(kind)!r}")
@@ -57,21 +59,37 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 
 
 def check_numbers(message: Struct) -> None:
-    """Raises Rejected unless every float is finite and every ``q_wxyz`` of unit length."""
+    """Raises Rejected unless every float is finite and within ``GREATEST_NUMBER``, every ``q_wxyz`` of unit length and
+    no variance negative."""
     for name in message.__struct_fields__:
         value = getattr(message, name)
         if isinstance(value, float):
-            if not math.isfinite(value):
-                raise Rejected("not_finite", f"{name} is {value}")
+            if not -GREATEST_NUMBER <= value <= GREATEST_NUMBER:
+                raise _bad_number(name, value)
         elif isinstance(value, tuple):
             for item in value:
                 if isinstance(item, float):
-                    if not math.isfinite(item):
-                        raise Rejected("not_finite", f"{name} holds {item}")
+                    if not -GREATEST_NUMBER <= item <= GREATEST_NUMBER:
+                        raise _bad_number(name, item)
                 elif isinstance(item, Struct):
                     check_numbers(item)
-            if name == "q_wxyz" and abs(math.hypot(*value) - 1.0) > UNIT_QUATERNION_TOLERANCE:
-                raise Rejected("not_unit_quaternion", f"{name} has length {math.hypot(*value)}")
+            if name == "q_wxyz":
+                if abs(math.hypot(*value) - 1.0) > UNIT_QUATERNION_TOLERANCE:
+                    raise Rejected("not_unit_quaternion", f"{name} has length {math.hypot(*value)}")
+            elif name == "covariance":
+                _check_covariance(value)
+
+
+def _bad_number(name: str, value: float) -> Rejected:
+    reason = "range" if math.isfinite(value) else "not_finite"
+    return Rejected(reason, f"{name} holds {value}, beyond {GREATEST_NUMBER:g}")
+
+
+def _check_covariance(values: tuple[float, ...]) -> None:
+    """Variances are not negative. That the whole is positive semi-definite is left to those who invert it."""
+    step = math.isqrt(len(values)) + 1
+    if min(values[::step]) < 0.0:
+        raise Rejected("not_a_covariance", "covariance has a negative variance")
 
 
 def vector(array: Any) -> Any:
@@ -83,7 +101,10 @@ def vector(array: Any) -> Any:
 
 
 def without_wall_time(message: Message) -> dict[str, Any]:
-    """The message as a dictionary without its wall-clock fields: what two equal flights must agree in."""
+    """The message as a dictionary without its wall-clock fields, and the words that are new at each start of a process:
+    what two equal flights must agree in."""
     return {
-        name: getattr(message, name) for name in message.__struct_fields__ if not name.startswith("wall_")
+        name: getattr(message, name)
+        for name in message.__struct_fields__
+        if not name.startswith("wall_") and name not in ("instance", "standing_by")
     }

@@ -50,7 +50,6 @@ _PACKAGES = (
     "eclipse-zenoh",
     "mcap",
     "msgspec",
-    "numba",
     "numpy",
     "opencv-python-headless",
 )

@@ -52,12 +52,13 @@ class FileState:
     """What became known of a file while its records were read: all of it only after the last one.
 
     ``closed``: its writer ended it properly, and all checksums hold. ``cut_bytes``: what follows the last whole
-    record of a file that ends without an end mark.
+    record of a file that ends without an end mark. ``place``: where the record that was read last begins.
     """
 
     closed: bool = False
     cut_bytes: int = 0
     recovered: bool = False
+    place: int = 0
 
 
 def part_name(part: int) -> str:
@@ -113,6 +114,7 @@ def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, b
                     state.closed = sealed
                     return
                 crc = zlib.crc32(content, zlib.crc32(head, crc))
+                state.place = place
                 place += _HEAD.size + length
                 yield opcode, content
             if sealed:
@@ -120,6 +122,21 @@ def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, b
             state.cut_bytes = size - place
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
+
+
+def record_at(path: Path, place: int) -> bytes:
+    """Content of the record that begins at byte ``place``; raises LogError where the file has changed meanwhile."""
+    try:
+        with path.open("rb") as file:
+            file.seek(place)
+            head = file.read(_HEAD.size)
+            if len(head) == _HEAD.size and (length := _HEAD.unpack(head)[1]) <= MAX_RECORD_BYTES:
+                content = file.read(length)
+                if len(content) == length:
+                    return content
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror or error}") from None
+    raise LogError(f"{path}: changed while it was open: no whole record at byte {place}")
 
 
 def chunk_records(content: bytes) -> list[McapMessage | Channel | Schema]:

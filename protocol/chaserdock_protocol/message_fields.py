@@ -8,11 +8,18 @@ from msgspec import Meta, Struct
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-Count = Annotated[int, Meta(ge=0)]
+GREATEST_COUNT = 2**53
+"""Bounds every whole number: 104 days in nanoseconds; exact as a double, too, and sums of some stay encodable."""
+Count = Annotated[int, Meta(ge=0, le=GREATEST_COUNT)]
 ChaserId = Annotated[int, Meta(ge=0, le=255)]
+ChaserIds = Annotated[tuple[ChaserId, ...], Meta(max_length=256)]
+MarkerIds = Annotated[tuple[Annotated[int, Meta(ge=0, le=2**31)], ...], Meta(max_length=1024)]
 JetId = Annotated[int, Meta(ge=0, le=254)]
 Jets = Annotated[tuple[JetId, ...], Meta(max_length=255)]
 Text = Annotated[str, Meta(max_length=2000)]
+JetState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
+Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
+Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
 Level = Literal["info", "warning", "error"]
 Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
@@ -20,7 +27,9 @@ Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 
 Phase = Literal[
     "acquire",
+    "searching",
     "hold",
+    "calibrate",
     "approach",
     "docked",
     "retreat",
@@ -49,6 +58,22 @@ class PoseSolution(Struct, frozen=True, kw_only=True):
     q_wxyz: Quaternion
     covariance: Square6
     reprojection_rms_px: float
+
+
+class CameraCalibration(Struct, frozen=True, kw_only=True):
+    """How far chaser ``chaser``'s camera is from its calibration, as estimated in flight, with one sigma of each.
+
+    ``turn_rad``: rotation vector in CRF by which it is turned from its told mounting; ``shift_m``: of its lens, in CRF;
+    ``focal_share``: how much longer its focal length is.
+    """
+
+    chaser: ChaserId
+    turn_rad: Vector3
+    turn_sigma_rad: Vector3
+    shift_m: Vector3
+    shift_sigma_m: Vector3
+    focal_share: float
+    focal_sigma_share: float
 
 
 class ProbeTouch(Struct, frozen=True, kw_only=True):

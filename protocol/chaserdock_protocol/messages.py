@@ -20,14 +20,21 @@ from typing import Annotated, Literal
 import msgspec
 from msgspec import Meta, Struct
 
+from .message_base import Message
 from .message_fields import (
+    CameraCalibration,
     ChaserId,
+    ChaserIds,
     Count,
+    Counts,
     JetId,
     JetPulse,
     Jets,
+    JetState,
     Latch,
     Level,
+    MarkerIds,
+    Names,
     Phase,
     PoseSolution,
     ProbeTouch,
@@ -36,23 +43,26 @@ from .message_fields import (
     Text,
     Vector3,
 )
-
-
-class Message(Struct, frozen=True, kw_only=True):
-    """Fields that every message has."""
-
-    seq: Count = 0
-    tick: Annotated[int, Meta(ge=-1)] = -1
-    sim_time_ns: Count = 0
+from .message_jet_fault import JetFaultCommand
+from .message_joining import Farewell, JoinReply, JoinRequest, Presence
 
 
 class Tick(Message, frozen=True, kw_only=True):
-    """The world opens a tick, or (``revision`` > 0) takes back whom it expects an answer from."""
+    """The world opens a tick, or (``revision`` > 0) takes back whom it expects an answer from.
+
+    ``controller``: whether one commands. ``commander`` is that process, ``instance`` its start, ``term`` numbers the
+    times that the command was given; 0 before the first, and in logs from before there were terms. ``standing_by``:
+    controllers that would take over, with their instances, the next in line first.
+    """
 
     revision: Count = 0
     pictures: bool
-    chasers: tuple[ChaserId, ...]
+    chasers: ChaserIds
     controller: bool
+    term: Count = 0
+    commander: Text = ""
+    instance: Text = ""
+    standing_by: Names = msgspec.field(default_factory=dict)
 
 
 class MissionEnd(Message, frozen=True, kw_only=True):
@@ -93,7 +103,7 @@ class DockingStatus(Message, frozen=True, kw_only=True):
 
 
 class BodyTruth(Message, frozen=True, kw_only=True):
-    """Ground truth of one body (``target`` or ``chaser/0``), for recorder and analysis alone.
+    """Ground truth of one body (``target`` or ``chaser/0``), for recorder, analysis and viewer alone.
 
     ``impulse_N_s`` and ``angular_impulse_N_m_s`` are what its actuators gave it since the last tick, in
     body axes; ``absolute_impulse_N_s`` is the time integral of the sum of the force components' magnitudes.
@@ -120,11 +130,11 @@ class WorldTruth(Message, frozen=True, kw_only=True):
     A touch of a probe's tip on the target is no contact here but one of ``touches``; ``latched``: who holds on now.
     """
 
-    contacts: tuple[tuple[Text, Text], ...]
-    saturated: tuple[ChaserId, ...]
+    contacts: Annotated[tuple[tuple[Text, Text], ...], Meta(max_length=1024)]
+    saturated: ChaserIds
     late_commands: Count = 0
-    touches: tuple[ProbeTouch, ...] = ()
-    latched: tuple[ChaserId, ...] = ()
+    touches: Annotated[tuple[ProbeTouch, ...], Meta(max_length=1024)] = ()
+    latched: ChaserIds = ()
 
 
 class Sighting(Message, frozen=True, kw_only=True):
@@ -137,9 +147,9 @@ class Sighting(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     status: Literal["seen", "nothing", "bad_picture"]
     solutions: Annotated[tuple[PoseSolution, ...], Meta(max_length=4)]
-    marker_ids: Annotated[tuple[int, ...], Meta(max_length=1024)]
+    marker_ids: MarkerIds
     corners_px: Annotated[tuple[float, ...], Meta(max_length=8192)]
-    rejected_ids: Annotated[tuple[int, ...], Meta(max_length=1024)]
+    rejected_ids: MarkerIds
     detail: Text = ""
     wall_estimate_s: float = 0.0
 
@@ -148,7 +158,8 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
     """The fused odometry of the target at ``sim_time_ns``; position and velocity WRF, rate in TRF.
 
     ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With status
-    ``none`` nothing has been seen yet and the numbers mean nothing.
+    ``none`` nothing has been seen yet and the numbers mean nothing. ``cameras``: where the estimator finds out how far the
+    cameras are from their calibration.
     """
 
     status: Literal["none", "tracking", "predicting", "lost"]
@@ -157,8 +168,9 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
     q_wxyz: Quaternion
     omega_rad_s: Vector3
     covariance: Square12
-    accepted: tuple[ChaserId, ...]
-    rejected: tuple[ChaserId, ...]
+    accepted: ChaserIds
+    rejected: ChaserIds
+    cameras: Annotated[tuple[CameraCalibration, ...], Meta(max_length=256)] = ()
 
 
 class Reference(Message, frozen=True, kw_only=True):
@@ -180,22 +192,27 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     """What a chaser's actuators are to give, in body axes, from ``effective_time_ns`` on.
 
     Valid until ``expires_ns``; ``tick`` is that of the odometry it answers. ``mode`` says where it comes from:
-    the NMPC's plan, a safe command (``brake`` stops the chaser, ``coast`` gives nothing), or the ``pull`` that
-    verifies a latch.
+    the NMPC's plan, a safe command (``brake`` stops the chaser, ``coast`` gives nothing), the ``search`` for a target
+    that nobody sees, the ``pull`` that verifies a latch, or ``none``: the controller has no command, as it does not know
+    where the chaser is.
     ``isolated``: jets whose shut-off valve an operator wants closed; ``trusted``: jets that an operator vouches for,
     whatever the chaser has found. ``free``: nothing holds or touches the chaser, so that its motion shows its jets.
+    ``term``, ``commander`` and ``instance``: as the ``Tick`` had them that gave the command to who sends this.
     """
 
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "brake", "coast", "pull"]
+    mode: Literal["nmpc", "brake", "coast", "pull", "search", "none"]
     force_N: Vector3
     torque_N_m: Vector3
     isolated: Jets = ()
     trusted: Jets = ()
     free: bool = True
     latch: Latch = "keep"
+    term: Count = 0
+    commander: Text = ""
+    instance: Text = ""
 
 
 class Plan(Message, frozen=True, kw_only=True):
@@ -215,11 +232,11 @@ class SolverStatus(Message, frozen=True, kw_only=True):
     """How the controller's solve of this tick went; one entry a chaser that took part."""
 
     solver: Text
-    chasers: tuple[ChaserId, ...]
-    status: tuple[Text, ...]
-    iterations: tuple[Count, ...]
-    cost: tuple[float, ...]
-    max_violation_m: tuple[float, ...]
+    chasers: ChaserIds
+    status: Annotated[tuple[Text, ...], Meta(max_length=256)]
+    iterations: Annotated[tuple[Count, ...], Meta(max_length=256)]
+    cost: Annotated[tuple[float, ...], Meta(max_length=256)]
+    max_violation_m: Annotated[tuple[float, ...], Meta(max_length=256)]
     wall_solve_s: float = 0.0
     wall_tick_s: float = 0.0
 
@@ -227,22 +244,21 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 class ActuatorCommand(Message, frozen=True, kw_only=True):
     """What a chaser tells its actuators, body axes, from ``effective_time_ns`` on.
 
-    ``source`` is ``command`` when it passes on the controller's, ``brake`` when it had none that it could trust.
+    ``source`` is ``command`` when it passes on the controller's, of ``term``. When it has none that it can trust it flies
+    its last ``plan`` to the end, then comes to rest (``brake``), then keeps clear of the target (``hold``).
     With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, and ``isolated``
     the jets whose shut-off valves are closed from ``effective_time_ns`` on; force and torque say what was asked for.
     """
 
     chaser: ChaserId
     effective_time_ns: Count
-    source: Literal["command", "brake"]
+    source: Literal["command", "plan", "brake", "hold"]
     force_N: Vector3
     torque_N_m: Vector3
     latch: Latch = "keep"
     pulses: Annotated[tuple[JetPulse, ...], Meta(max_length=10_000)] = ()
     isolated: Jets = ()
-
-
-JetState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
+    term: Count = 0
 
 
 class JetReport(Message, frozen=True, kw_only=True):
@@ -277,7 +293,7 @@ class Health(Message, frozen=True, kw_only=True):
     """A process counts: messages it rejected (by reason), lost (gaps in ``seq``), discarded as stale."""
 
     process: Text
-    rejected: dict[str, int]
+    rejected: Counts
     lost: Count
     stale: Count
     wall_busy_s: float = 0.0
@@ -294,10 +310,11 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
 
     The controller publishes it again, with the tick it was obeyed or refused at: the log must hold all inputs.
 
+    ``calibrate`` turns the chaser about while it watches the target, which shows how its camera is mounted.
     ``isolate`` closes a jet's shut-off valve, ``restore`` opens it and vouches for the jet; ``jet`` goes with these.
     """
 
-    command: Literal["approach", "hold", "retreat", "abort", "goto", "isolate", "restore"]
+    command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"]
     chaser: ChaserId
     offset_m: Vector3 | None = None
     jet: JetId | None = None
@@ -315,36 +332,16 @@ class CommandReply(Message, frozen=True, kw_only=True):
     operator: Text = ""
 
 
-class Presence(Message, frozen=True, kw_only=True):
-    """Who a process is, and whose presence has reached it: process name to instance (see ``presence``)."""
+class ControllerState(Message, frozen=True, kw_only=True):
+    """The commander's word to who stands by: this tick is worked out, with what operators asked in it (``operated``).
+
+    ``state``, now and then: all that it knows after the tick, for one that came late (``controller/state.py``); else empty.
+    """
 
     process: Text
-    instance: Text
-    heard: dict[str, str]
-
-
-class Farewell(Message, frozen=True, kw_only=True):
-    """The last message of a process: how many messages it has published on each key."""
-
-    process: Text
-    published: dict[str, int]
-
-
-class JoinRequest(Struct, frozen=True, kw_only=True):
-    """A process asks the world to take part, before it opens any topic."""
-
-    process: Text
-    instance: Text
-
-
-class JoinReply(Struct, frozen=True, kw_only=True):
-    """The world's answer: the resolved scenario as JSON, or why not."""
-
-    accepted: bool
-    reason: Text
-    run_id: Text = ""
-    mode: Literal["lockstep", "realtime"] = "lockstep"
-    scenario_json: Annotated[str, Meta(max_length=2_000_000)] = ""
+    term: Count
+    operated: Annotated[tuple[OperatorCommand, ...], Meta(max_length=1024)] = ()
+    state: Annotated[bytes, Meta(max_length=4_000_000)] = b""
 
 
 VERSION: dict[type[Struct], int] = {
@@ -367,7 +364,9 @@ VERSION: dict[type[Struct], int] = {
     Health: 1,
     RecorderAck: 1,
     OperatorCommand: 1,
+    JetFaultCommand: 1,
     CommandReply: 1,
+    ControllerState: 1,
     Presence: 1,
     Farewell: 1,
     JoinRequest: 1,

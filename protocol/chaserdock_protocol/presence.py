@@ -16,6 +16,7 @@ from collections.abc import Callable
 
 from . import topics
 from .errors import ChaserdockError
+from .message_fields import GREATEST_COUNT
 from .messages import Farewell, Health, JoinReply, JoinRequest, Presence
 from .runtime import ProcessOptions, Stop, say
 from .topics import Role
@@ -84,7 +85,7 @@ def take_part(
 def partners_of(process: str, present: set[str]) -> set[str]:
     """Those among ``present`` that ``process`` must have heard, and that must have heard it, before it flies."""
     if process.startswith("chaser/"):
-        return {"world", "controller"} & present
+        return {"world", *topics.CONTROLLERS} & present
     return present - {process}
 
 
@@ -106,6 +107,8 @@ class PresenceTeller:
         node.subscribe(topics.PRESENCE)
         self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
         self._thread.start()
+        # On every way out: a thread caught in Zenoh while the interpreter ends takes the process down with it.
+        node.before_close(self.stop)
 
     def take(self, message: Presence) -> None:
         """Notes a presence that the process' loop received."""
@@ -128,10 +131,14 @@ class PresenceTeller:
             self._node.publish(topics.PRESENCE, message, self._node.name)
             self._stop.wait(STEADY_PERIOD_S if self.settled.is_set() else EARLY_PERIOD_S)
 
+    def stop(self) -> None:
+        """Tells no more; returns when the thread has ended, which a blocked network may delay by its own patience."""
+        self._stop.set()
+        self._thread.join()
+
     def farewell(self, tick: int, time_ns: int) -> None:
         """Stops telling and publishes this process' last message: how many of each it has sent."""
-        self._stop.set()
-        self._thread.join(timeout=1.0)
+        self.stop()
         health = health_of(self._node, tick, time_ns)
         self._node.publish(topics.HEALTH, health, self._node.name)
         last = Farewell(
@@ -147,6 +154,6 @@ def health_of(node: Node, tick: int, time_ns: int) -> Health:
         sim_time_ns=time_ns,
         process=node.name,
         rejected=dict(node.counts.rejected),
-        lost=sum(node.counts.lost.values()),
+        lost=min(sum(node.counts.lost.values()), GREATEST_COUNT),
         stale=node.counts.stale,
     )

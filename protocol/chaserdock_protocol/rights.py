@@ -8,7 +8,7 @@ they are enforced, so every process but the router connects as a client (peers w
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, get_args
 
 from . import topics
 from .topics import TOPICS, Role, Topic, may_read, may_write
@@ -25,9 +25,12 @@ class Query:
 
 # A world asks, too: whether there is one already.
 QUERIES = (
-    Query(topics.JOIN_KEY, frozenset({"world", "chaser", "controller", "recorder", "operator"}), "world"),
-    Query(topics.OPERATE_KEY, frozenset({"operator"}), "controller"),
+    Query(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
+    Query(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
+    Query(topics.JET_FAULT_KEY, frozenset({"operator"}), "world"),
 )
+LOOK_ON: frozenset[Role] = frozenset({"analysis", "viewer"})
+"""These publish nothing, and have no name of their own on the network."""
 
 
 @dataclass(frozen=True)
@@ -50,9 +53,10 @@ def common_name(process: str) -> str:
 
 def identities(chasers: int) -> tuple[Identity, ...]:
     """Everyone who may connect to the router of a mission with at most so many chasers."""
-    single: tuple[Role, ...] = ("world", "controller", "recorder", "operator", "analysis")
+    single: tuple[Role, ...] = ("world", "recorder", "operator", "analysis", "viewer")
     return (
         *(Identity(role, role) for role in single),
+        *(Identity(name, "controller") for name in topics.CONTROLLERS),
         *(Identity(f"chaser/{i}", "chaser") for i in range(chasers)),
     )
 
@@ -68,7 +72,7 @@ def _expression(topic: Topic, who: Identity, *, writes: bool) -> str:
 
 def writes(who: Identity) -> list[str]:
     """Key expressions, without the namespace, on which a process may publish."""
-    if who.role == "analysis":  # looks on, and has no name of its own on the network
+    if who.role in LOOK_ON:
         return []
     return [_expression(t, who, writes=True) for t in TOPICS if may_write(who.role, t)]
 
@@ -120,7 +124,7 @@ def access_control(namespace: str, chasers: int) -> dict[str, Any]:
             *rule(f"{name}-is-answered", "egress", ["reply"], asks),
             *rule(f"{name}-offers-answers", "ingress", ["declare_queryable", "reply"], answers),
             *rule(f"{name}-is-asked", "egress", ["query"], answers),
-            *rule(f"{name}-lives", "ingress", ["liveliness_token"], live if who.role != "analysis" else []),
+            *rule(f"{name}-lives", "ingress", ["liveliness_token"], live if who.role not in LOOK_ON else []),
         ]
         policies.append({"subjects": [name], "rules": [*common, *own]})
     return {

@@ -18,7 +18,6 @@ SINGLE_THREADED = {
     "OMP_NUM_THREADS": "1",
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
-    "NUMBA_NUM_THREADS": "1",
 }
 """Environment of every process: one thread each, as there are more processes than cores, and for determinism."""
 
@@ -40,7 +39,8 @@ class ProcessOptions:
     """How a process was started. Which fields count depends on the process.
 
     ``rejoin_s``: wall seconds that a world in lock-step waits when it has lost everybody; ``by_run``: a recorder
-    makes a folder for each run in ``out``; ``until``: a router ends once that process has come and gone.
+    makes a folder for each run in ``out``; ``until``: a router ends once that process has come and gone; ``standby``: a
+    controller begins as the second one.
     """
 
     link: Link = field(default_factory=Link)
@@ -58,6 +58,7 @@ class ProcessOptions:
     rejoin_s: float = 0.0
     by_run: bool = False
     until: str | None = None
+    standby: bool = False
 
 
 class Stop:

@@ -19,7 +19,9 @@ from .clock import Timing
 from .docking import axis_error_deg, centre_offset
 from .scenario_bodies import Body, Target
 from .scenario_camera import CameraSection
+from .scenario_checks import check_apart, check_references
 from .scenario_docking import Docking
+from .scenario_faults import Fault, check_faults
 from .scenario_fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
 from .scenario_files import read_toml, resolve_files
 from .scenario_odometry import OdometrySection
@@ -48,13 +50,20 @@ class Time(Section):
 class EstimatorSection(Section):
     """How sightings become the target's odometry; the numbers are ``mekf``'s.
 
-    ``camera_bias_*``: one sigma of each camera's own calibration error, which is then estimated. 0: the cameras are as
-    calibrated, which is so in the world's pictures.
+    ``camera_bias_*``: one sigma of each camera's own calibration error (place of the lens, mounting, focal length),
+    which is then estimated. 0: the cameras are as calibrated, which is so in the world's pictures.
     """
 
     name: Name = "mekf"
     camera_bias_position_m: NotNegative = 0.0
     camera_bias_attitude_deg: NotNegative = 0.0
+    camera_bias_focal_share: NotNegative = 0.0
+
+    @property
+    def estimates_cameras(self) -> bool:
+        """Whether the cameras' calibration errors are estimated."""
+        told = (self.camera_bias_position_m, self.camera_bias_attitude_deg, self.camera_bias_focal_share)
+        return self.name == "mekf" and any(told)
 
 
 class PerceptionSection(Section):
@@ -65,21 +74,29 @@ class PerceptionSection(Section):
 
 PERCEPTIONS = ("default", "paper")
 ESTIMATORS = ("mekf", "paper")
-SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa")
+SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Chaserdock's own parts, by the name that a scenario chooses them with; others may be installed (see ``plugins``)."""
 
 MAX_STAGES = 500
 """Most prediction steps of a plan; more could not be solved in time, and messages bound their size."""
 
 
+MAX_DURATION_S = 90 * 86_400.0
+"""Longest mission: messages count simulated time in nanoseconds up to 2**53 (see ``message_fields``)."""
+
+
 class Controller(Section):
     """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md).
 
     ``max_iterations`` bounds a solve, in iterations as the solver counts them, so that it flies the same anywhere.
+    ``solve_budget_s``, wall time, bounds it in real time alone, by as many iterations as have been found to fit.
+    ``standby``: a second controller flies along, ready to take over (docs/redundancy.md).
     """
 
+    standby: bool = False
     solver: Name = "rti"
     max_iterations: Annotated[int, Field(ge=0)] | None = None
+    solve_budget_s: Positive | None = None
     horizon_s: Positive = 3.0
     dt_s: Positive = 0.1
     falloff: Annotated[float, AfterValidator(finite), Field(ge=0, le=1)] = 0.0
@@ -92,6 +109,14 @@ class Controller(Section):
     integrator: Literal["rk4", "euler"] = "rk4"
     feed_forward: bool = True
     command_lifetime_s: Positive = 0.5
+
+    @model_validator(mode="after")
+    def _budget(self) -> Controller:
+        if self.solve_budget_s is not None and self.solver in SOLVERS[1:]:
+            raise ValueError(
+                f"solve_budget_s goes with the solver rti; {self.solver} cannot be held to a time"
+            )
+        return self
 
     @model_validator(mode="after")
     def _stages(self) -> Controller:
@@ -156,7 +181,7 @@ class TimelineEntry(Section):
     """A command at a time of the mission."""
 
     at_s: NotNegative
-    command: Literal["approach", "hold", "retreat", "abort", "goto", "isolate", "restore"]
+    command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"]
     chasers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     offset_m: Vector | None = None
     jet: Annotated[int, Field(ge=0, le=254)] | None = None
@@ -195,7 +220,7 @@ class Scenario(Section):
 
     name: Name
     description: str = ""
-    duration_s: Positive
+    duration_s: Annotated[Positive, Field(le=MAX_DURATION_S)]
     settling_s: NotNegative = 20.0
     steady_until_s: Positive | None = None
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
@@ -213,11 +238,13 @@ class Scenario(Section):
     chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
     timeline: tuple[TimelineEntry, ...] = ()
     jet_failure: tuple[JetFailure, ...] = ()
+    fault: Annotated[tuple[Fault, ...], Field(max_length=100)] = ()
     success: Success = Success()
 
     @model_validator(mode="after")
     def _consistent(self) -> Scenario:
-        _check_apart(self)
+        check_apart(self)
+        check_references(self)
         if (
             self.target.geometry is not None
             and self.target.geometry.mesh
@@ -240,6 +267,7 @@ class Scenario(Section):
             check_pulses(self.chaser.thrusters, self.chaser.modulation, self.time.physics_hz)
         _check_failures(self)
         _check_ports(self)
+        check_faults(self.fault, self)
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
@@ -275,19 +303,6 @@ class Scenario(Section):
         position = self.target.position_m + rotations.rotate(self.target.q_wxyz, offset)
         attitude = rotations.multiply(self.target.q_wxyz, c.q_wxyz)
         return position, rotations.multiply(attitude, rotations.exp(c.start_rotation_rad))
-
-
-def _check_apart(scenario: Scenario) -> None:
-    starts = [scenario.start_pose(i)[0] for i in range(len(scenario.chasers))]
-    width = math.hypot(*scenario.chaser.size_m)
-    for i, a in enumerate(starts):
-        for j in range(i):
-            apart = math.dist(a, starts[j])
-            if apart < width:
-                raise ValueError(
-                    f"chasers.{j} and chasers.{i} start {apart:.3f} m apart, inside one another; "
-                    f"their bodies need {width:.3f} m"
-                )
 
 
 def _check_failures(scenario: Scenario) -> None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from .scenario_fields import Name, Positive, PositiveVector, Section, UnitQuaternion, Vector
+from .scenario_fields import Name, NotNegative, Positive, PositiveVector, Section, UnitQuaternion, Vector
 from .scenario_target import Geometry
 from .scenario_thrusters import MAX_JETS, Modulation, Thruster, check_layout
 from .targets import TargetModel, target_model, target_names
@@ -64,7 +64,9 @@ class Body(Section):
     """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's.
 
     ``body`` names one that is shipped with jets, whose figures are then the defaults. ``actuation``: the commanded
-    wrench itself (``ideal``), or pulses of the jets.
+    wrench itself (``ideal``), or pulses of the jets. ``jet_test_s``: a jet of which its chaser has not seen for so long
+    that it works is tested where that may be; 0: never. ``jet_faults_by_command``: operators may make jets fail in
+    flight, for tests.
     """
 
     body: Literal["slider", "tetra12"] | None = None
@@ -77,6 +79,8 @@ class Body(Section):
     actuation: Literal["ideal", "thrusters"] = "ideal"
     thrusters: Annotated[tuple[Thruster, ...], Field(max_length=MAX_JETS)] = ()
     modulation: Modulation = Modulation()
+    jet_test_s: NotNegative = 10.0
+    jet_faults_by_command: bool = False
 
     @model_validator(mode="before")
     @classmethod

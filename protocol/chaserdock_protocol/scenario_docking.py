@@ -68,7 +68,8 @@ class Docking(Section):
     last ``final_m`` are flown at ``contact_speed_m_s``, what is before at ``approach_speed_m_s``. The reference goes
     on to ``overdrive_m`` behind the port. ``pull_N`` for ``pull_s``, and as long a push back, must not move a latched
     chaser by more than ``verify_*``. A chaser whose way in comes within ``clearance_m`` of another's, centre to
-    centre, waits, as does one more than ``at_once``.
+    centre, waits, as does one more than ``at_once``. A chaser on its way in or out, by capture or not, is planned inside
+    a cone about its axis, of half angle ``corridor_angle_deg``, in place of the distance that the others keep.
     """
 
     kind: Literal["held", "capture"] = "held"
@@ -79,6 +80,7 @@ class Docking(Section):
     approach_speed_m_s: Positive = 0.025
     contact_speed_m_s: Positive = 0.01
     corridor: Corridor = Corridor()
+    corridor_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 20.0
     final: Final = Final()
     tolerances: Tolerances = Tolerances()
     clearance_m: NotNegative = 0.45

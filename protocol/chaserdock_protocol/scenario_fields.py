@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
 from . import rotations
 
@@ -35,7 +35,19 @@ UnitQuaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator
 Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]{0,63}$")]
 
 
-class Section(BaseModel):
-    """A table of the scenario file; unknown keys are errors."""
+def _frozen(value: Any) -> Any:
+    return tuple(_frozen(item) for item in value) if isinstance(value, list) else value
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+
+class Section(BaseModel):
+    """A table of the scenario file; unknown keys are errors, and so is text, or true, where a number belongs.
+
+    A whole number may stand for any number. Arrays are tuples here, which strictness would not take a list for.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _arrays(cls, values: Any) -> Any:
+        return {k: _frozen(v) for k, v in values.items()} if isinstance(values, dict) else values

@@ -25,6 +25,8 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise ScenarioError(f"{path}: not UTF-8 text: {error}") from None
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise ScenarioError(f"{path}: not TOML of ours: nested too deeply") from None
 
 
 def resolve_files(values: dict[str, Any], folder: Path) -> None:

@@ -15,18 +15,35 @@ class ScenarioError(ChaserdockError):
     """A scenario that cannot be flown; the text has one line a fault."""
 
 
+_KINDS = {
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text",
+    "tuple_type": "must be an array",
+    "model_type": "must be a table",
+}
+"""What a value of another kind should have been, by pydantic's name of the fault."""
+
+
+def _toml(value: object) -> str:
+    return str(value).lower() if isinstance(value, bool) else repr(value)
+
+
 def explain(error: ValidationError) -> list[str]:
     """One line a fault: path, what would be right, what was given."""
     lines = []
     places = [fault["loc"] for fault in error.errors()]
     for fault in error.errors():
         # A faulty item also makes its array too short; the item says it all.
-        if fault["type"] == "too_short" and any(p[:-1] == fault["loc"] for p in places):
+        loc = fault["loc"]
+        if fault["type"] == "too_short" and any(len(p) > len(loc) and p[: len(loc)] == loc for p in places):
             continue
         path = ".".join(str(p) for p in fault["loc"]) or "(scenario)"
-        message = fault["msg"].removeprefix("Value error, ")
+        message = _KINDS.get(fault["type"]) or fault["msg"].removeprefix("Value error, ")
         value = fault.get("input")
-        shown = f" (got {value!r})" if isinstance(value, int | float | str | list | tuple) else ""
+        value = list(value) if isinstance(value, tuple) else value
+        shown = f" (got {_toml(value)})" if isinstance(value, int | float | str | list) else ""
         if fault["type"] == "missing":
             message, shown = "is missing", ""
         elif fault["type"] == "extra_forbidden":
@@ -48,6 +65,8 @@ def override(values: dict[str, Any], text: str, resolved: Callable[[], dict[str,
         parsed = tomllib.loads(f"value = {value}")["value"]
     except tomllib.TOMLDecodeError:
         parsed = value.strip()
+    except RecursionError:
+        raise ScenarioError(f"--set {path.strip()}: nested too deeply") from None
     place: Any = values
     keys = path.strip().split(".")
     for depth, key in enumerate(keys[:-1]):

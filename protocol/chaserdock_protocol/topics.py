@@ -7,18 +7,21 @@ process to its own branch. ``truth/**`` is the world's, and no process that flie
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from msgspec import Struct
 
 from . import messages as m
 
-Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysis"]
+Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysis", "viewer"]
 Qos = Literal["bulk", "state", "command", "event"]
 
+CONTROLLERS = ("controller", "standby")
+"""Processes of the role ``controller``, in the order in which they are given the command."""
 FLYING: frozenset[Role] = frozenset({"chaser", "controller"})
-_EVERYONE: frozenset[Role] = frozenset({"world", "chaser", "controller", "recorder", "operator", "analysis"})
-_WATCHERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis"})
+_EVERYONE: frozenset[Role] = frozenset(get_args(Role))
+_WATCHERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "viewer"})
+_KNOW_THE_TRUTH: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
 
 
 @dataclass(frozen=True)
@@ -60,12 +63,8 @@ ODOMETRY = _topic(
 DOCKING = _topic(
     "world/chaser/{chaser}/docking", m.DockingStatus, "world", {"chaser", "controller"}, "tick", "state"
 )
-TRUTH_BODY = Topic(
-    "truth/body/{process}", m.BodyTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state"
-)
-TRUTH_WORLD = Topic(
-    "truth/world", m.WorldTruth, "world", frozenset({"recorder", "analysis"}), "tick", "state"
-)
+TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _KNOW_THE_TRUTH, "tick", "state")
+TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _KNOW_THE_TRUTH, "tick", "state")
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "picture", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
 JETS = _topic("chaser/{chaser}/jets", m.JetReport, "chaser", {"controller"}, "tick", "state")
@@ -73,10 +72,12 @@ WRENCH = _topic(
     "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
 )
 REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "controller", set(), "tick", "state")
-PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "state")
-TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "state")
+# As urgent as the command, and sent before it; the network may still bring it after the command.
+PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "command")
+TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "command")
 SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
 COMMAND = _topic("controller/command", m.CommandReply, "controller", set(), "event", "event")
+STATE = _topic("controller/state", m.ControllerState, "controller", {"controller"}, "tick", "command")
 OPERATED = _topic("controller/operated", m.OperatorCommand, "controller", set(), "event", "event")
 ACK = _topic("recorder/ack", m.RecorderAck, "recorder", {"world"}, "tick", "command")
 EVENT = _topic("{process}/event", m.Event, "any", set(), "event", "event")
@@ -102,6 +103,7 @@ TOPICS: tuple[Topic, ...] = (
     SOLVER,
     COMMAND,
     OPERATED,
+    STATE,
     ACK,
     EVENT,
     HEALTH,
@@ -113,6 +115,8 @@ JOIN_KEY = "world/join"
 """Query: JoinRequest -> JoinReply."""
 OPERATE_KEY = "controller/operate"
 """Query: OperatorCommand -> CommandReply."""
+JET_FAULT_KEY = "world/jet_fault"
+"""Query: JetFaultCommand -> CommandReply."""
 LIVE_KEY = "live/{process}"
 """Liveliness token of a process."""
 
@@ -149,7 +153,7 @@ def is_process_name(name: str) -> bool:
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)
-    return slash == "" and head in {"world", "target", "controller", "recorder", "operator"}
+    return slash == "" and head in {"world", "target", *CONTROLLERS, "recorder", "operator", "viewer"}
 
 
 def may_read(role: Role, topic: Topic) -> bool:

@@ -10,11 +10,10 @@ from __future__ import annotations
 import json
 import queue
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 import zenoh
@@ -22,11 +21,23 @@ import zenoh
 from . import codec, topics
 from .codec import Rejected
 from .errors import ChaserdockError
+from .faults import FaultLayer
+from .inbox import Inbox
+from .link import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, Raw, Received, Tls, open_error
 from .messages import Message, encoding_of
 from .topics import Role, Topic
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
-DEFAULT_NAMESPACE = "chaserdock"
+__all__ = [
+    "DEFAULT_ENDPOINT",
+    "DEFAULT_NAMESPACE",
+    "Link",
+    "Node",
+    "Raw",
+    "Received",
+    "Tls",
+    "TransportError",
+    "zenoh_config",
+]
 
 _PRIORITY = {
     "bulk": zenoh.Priority.DATA,
@@ -38,52 +49,6 @@ _PRIORITY = {
 
 class TransportError(ChaserdockError):
     """The network could not be had as asked; the text is one clear line."""
-
-
-@dataclass(frozen=True)
-class Tls:
-    """PEM files for mutual TLS: the mission's authority, this process' certificate, its private key."""
-
-    ca: Path
-    certificate: Path
-    key: Path
-
-
-@dataclass(frozen=True)
-class Link:
-    """How a process reaches the others. ``lease_ms``: after that long a silent peer counts as lost.
-
-    ``access_control`` is what a router enforces (see ``rights``).
-    """
-
-    namespace: str = DEFAULT_NAMESPACE
-    connect: tuple[str, ...] = ()
-    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
-    mode: Literal["peer", "client", "router"] = "peer"
-    config: Path | None = None
-    lease_ms: int = 60_000
-    tls: Tls | None = None
-    access_control: dict[str, Any] | None = None
-
-
-@dataclass(frozen=True)
-class Received:
-    """A message that passed all checks. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
-
-    topic: Topic
-    place: str | None
-    message: Any
-    sent_ns: int
-
-
-@dataclass(frozen=True)
-class Raw:
-    """What came over the wire, unopened."""
-
-    key: str
-    encoding: str
-    payload: bytes
-    sent_ns: int
 
 
 def zenoh_config(link: Link) -> zenoh.Config:
@@ -141,9 +106,10 @@ def _tls_values(tls: Tls) -> dict[str, Any]:
     }
 
 
-def _sent_ns(sample: zenoh.Sample) -> int:
+def _raw(sample: zenoh.Sample) -> Raw:
     stamp = sample.timestamp
-    return stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
+    sent_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
+    return Raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes(), sent_ns)
 
 
 @dataclass
@@ -166,18 +132,24 @@ class Node:
         self.name = name
         self.role: Role = role
         self.counts = Counts()
-        self._inbox: queue.SimpleQueue[tuple[Topic, str | None, Raw] | None] = queue.SimpleQueue()
+        self.faults: FaultLayer | None = None
+        """What the mission's scenario does to this process' messages."""
+        self._inbox: Inbox[tuple[Topic, str | None, Raw] | None] = Inbox()
+        self._ready: deque[Received] = deque()
         self._latest: dict[str, tuple[Topic, str | None, Raw]] = {}
         self._latest_lock = threading.Lock()
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._numbers: Counter[str] = Counter()
+        self._before_anew: Counter[str] = Counter()
         self._last_seq: dict[str, int] = {}
         self._declared: list[Any] = []
+        self._answering: dict[str, Any] = {}
+        self._before_close: list[Callable[[], None]] = []
         zenoh.init_log_from_env_or("error")
         try:
             self._session = zenoh.open(zenoh_config(link))
         except zenoh.ZError as error:
-            raise TransportError(_open_error(error, link)) from None
+            raise TransportError(open_error(error, link)) from None
 
     # -- publishing ---------------------------------------------------------------------------------------
 
@@ -204,9 +176,10 @@ class Node:
         key = topic.key_of(place)
         if key not in self._publishers:
             self.advertise(topic, place)
-        payload = codec.encode(msgspec.structs.replace(message, seq=self._numbers[key]))
-        self._numbers[key] += 1
-        self._publishers[key].put(payload, timestamp=self._session.new_timestamp())
+        for said in (message,) if self.faults is None else self.faults.outgoing(topic, place, message):
+            payload = codec.encode(msgspec.structs.replace(said, seq=self._numbers[key]))
+            self._numbers[key] += 1
+            self._publishers[key].put(payload, timestamp=self._session.new_timestamp())
 
     def publish_raw(self, raw: Raw) -> None:
         """Sends a recorded message as it was, with a new time stamp: for analysis alone."""
@@ -223,7 +196,14 @@ class Node:
     @property
     def published(self) -> dict[str, int]:
         """Messages published so far, by key."""
-        return dict(self._numbers)
+        return dict(self._numbers + self._before_anew)
+
+    def number_anew(self) -> None:
+        """Numbers from 0 again on the keys of its role, on which another process may have published since."""
+        for key in list(self._numbers):
+            found = topics.topic_of_key(key)
+            if found is not None and found[0].writer == self.role:
+                self._before_anew[key] += self._numbers.pop(key)
 
     # -- receiving ----------------------------------------------------------------------------------------
 
@@ -232,14 +212,7 @@ class Node:
 
         ``latest`` keeps only the newest sample of a key that waits to be read (pictures in real time).
         """
-        if not topics.may_read(self.role, topic):
-            raise PermissionError(f"{self.role} may not read {topic.key}")
-        if place is None and "{chaser}" in topic.key:
-            expression = topic.key.format(chaser="*")
-        elif place is None and "{process}" in topic.key:
-            expression = topic.key.format(process="**")
-        else:
-            expression = topic.key_of(place)
+        expression = self._readable(topic, place)
 
         def arrived(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
@@ -247,17 +220,50 @@ class Node:
             if found is None or found[0] is not topic:
                 self.counts.rejected["key"] += 1
                 return
-            raw = Raw(key, str(sample.encoding), sample.payload.to_bytes(), _sent_ns(sample))
+            raw = _raw(sample)
             if latest:
                 with self._latest_lock:
                     waiting = key in self._latest
                     self._latest[key] = (topic, found[1], raw)
                 if not waiting:
-                    self._inbox.put(None)
-            else:
-                self._inbox.put((topic, found[1], raw))
+                    self._inbox.put(None, 0)
+            elif not self._inbox.put((topic, found[1], raw), len(raw.payload)):
+                self.counts.rejected["queue full"] += 1
 
         self._declared.append(self._session.declare_subscriber(expression, arrived))
+
+    def follow(
+        self, topic: Topic, depth: int, place: int | str | None = None
+    ) -> Callable[[], list[Received]]:
+        """Subscribes a topic for a reader who looks on; each call of what is returned gives what came since the last.
+
+        Of all that comes only the newest ``depth`` are kept. Zenoh itself drops the others, so that a reader who is
+        slow or stands still costs the publishers nothing.
+        """
+        ring = self._session.declare_subscriber(
+            self._readable(topic, place), zenoh.handlers.RingChannel(depth)
+        )
+        self._declared.append(ring)
+
+        def take() -> list[Received]:
+            out: list[Received] = []
+            while (sample := ring.try_recv()) is not None and len(out) < depth:
+                raw = _raw(sample)
+                found = topics.topic_of_key(raw.key)
+                received = self._checked(topic, found[1], raw) if found and found[0] is topic else None
+                if received is not None:
+                    out.append(received)
+            return out
+
+        return take
+
+    def _readable(self, topic: Topic, place: int | str | None) -> str:
+        """The key expression of a topic that this role may read; raises PermissionError."""
+        if not topics.may_read(self.role, topic):
+            raise PermissionError(f"{self.role} may not read {topic.key}")
+        if place is None and "{" in topic.key:
+            return topic.key.format(chaser="*", process="**")
+        return topic.key_of(place)
 
     def subscribe_raw(self, expression: str, arrived: Callable[[Raw], None]) -> None:
         """Everything on a key expression, unopened, on Zenoh's thread: for recorder and analysis alone."""
@@ -265,9 +271,7 @@ class Node:
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def callback(sample: zenoh.Sample) -> None:
-            arrived(
-                Raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes(), _sent_ns(sample))
-            )
+            arrived(_raw(sample))
 
         self._declared.append(self._session.declare_subscriber(expression, callback))
 
@@ -277,8 +281,10 @@ class Node:
         Messages that do not pass are counted in ``counts.rejected`` by topic and reason; gaps in ``seq``
         in ``counts.lost``.
         """
+        if self._ready:
+            return self._ready.popleft()
         try:
-            item = self._inbox.get(timeout=timeout_s) if timeout_s != 0 else self._inbox.get_nowait()
+            item = self._inbox.get(timeout_s)
         except queue.Empty:
             return None
         if item is None:
@@ -288,6 +294,20 @@ class Node:
         return self._open(*item)
 
     def _open(self, topic: Topic, place: str | None, raw: Raw) -> Received | None:
+        received = self._checked(topic, place, raw)
+        if received is None:
+            return None
+        seq, last = received.message.seq, self._last_seq.get(raw.key)
+        if last is not None and seq > last + 1:
+            self.counts.lost[raw.key] += seq - last - 1
+        self._last_seq[raw.key] = seq
+        if self.faults is None:
+            return received
+        came = self.faults.incoming(topic, place, received.message, raw.payload)
+        self._ready.extend(Received(topic, place, m, raw.sent_ns) for m in came)
+        return self._ready.popleft() if self._ready else None
+
+    def _checked(self, topic: Topic, place: str | None, raw: Raw) -> Received | None:
         try:
             message: Any = codec.decode(topic.kind, raw.payload, raw.encoding)
             if place is not None and str(getattr(message, "chaser", place)) != place:
@@ -295,10 +315,6 @@ class Node:
         except Rejected as refusal:
             self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
             return None
-        last = self._last_seq.get(raw.key)
-        if last is not None and message.seq > last + 1:
-            self.counts.lost[raw.key] += message.seq - last - 1
-        self._last_seq[raw.key] = message.seq
         return Received(topic, place, message, raw.sent_ns)
 
     # -- questions and presence ---------------------------------------------------------------------------
@@ -330,7 +346,12 @@ class Node:
 
             handle(message, reply)
 
-        self._declared.append(self._session.declare_queryable(key, arrived))
+        self._answering[key] = self._session.declare_queryable(key, arrived)
+
+    def answer_no_more(self, key: str) -> None:
+        """Leaves the queries on a key to others."""
+        if key in self._answering:
+            self._answering.pop(key).undeclare()
 
     def ask(self, key: str, request: msgspec.Struct, reply: type[msgspec.Struct], timeout_s: float) -> Any:
         """The first answer to a query, or None when nobody answers. Raises TransportError for an error reply."""
@@ -365,18 +386,12 @@ class Node:
             self._session.liveliness().declare_subscriber(expression, callback, history=True)
         )
 
+    def before_close(self, stop: Callable[[], None]) -> None:
+        """Has ``stop`` called before the session closes: for threads that publish on this node."""
+        self._before_close.append(stop)
+
     def close(self) -> None:
-        """Closes the session; what was published is sent first."""
+        """Stops the threads that publish, then closes the session; what was published is sent first."""
+        for stop in self._before_close:
+            stop()
         self._session.close()
-
-
-def _open_error(error: Exception, link: Link) -> str:
-    text = " ".join(str(error).split())
-    if link.config is not None:
-        return f"cannot open the Zenoh session of {link.config}: {text}"
-    listen, connect = ", ".join(link.listen) or "-", ", ".join(link.connect) or "-"
-    if "in use" in text.lower():
-        return (
-            f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"
-        )
-    return f"cannot open the Zenoh session (listen {listen}, connect {connect}): {text}"

@@ -16,10 +16,11 @@ from chaserdock_protocol.scenario_text import ScenarioError
 from numpy.typing import NDArray
 
 from .effects import CameraEffects, Effects
+from .faces import Obstacle
 from .glare import Glare, is_hidden
 from .imperfect import true_camera
 from .physics import TARGET, BodyState
-from .render import Obstacle, Renderer, chaser_boxes
+from .render import Renderer, chaser_boxes
 from .sky import Earth, Light
 from .tinyrenderer import TinyRenderer
 

@@ -11,7 +11,7 @@ from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.rotations import Array
 from numpy.typing import NDArray
 
-from chaserdock_world.render import Obstacle
+from chaserdock_world.faces import Obstacle
 
 SUN_RADIUS_RAD = 0.00465
 _STEP_PX = 4

@@ -12,7 +12,7 @@ from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario_bodies import Body
-from chaserdock_protocol.scenario_thrusters import JetFailure
+from chaserdock_protocol.scenario_thrusters import FailureKind, JetFailure
 from chaserdock_protocol.valves import Valves
 from chaserdock_protocol.wrench_set import wrench_matrix
 
@@ -40,6 +40,11 @@ class JetActuators:
         self._refused = False
         self._late = 0
         self._taken_step = 0
+
+    def fail(self, jet: int, kind: FailureKind | None, factor: float | None, step: int) -> None:
+        """From ``step`` on, until which ``take`` has been called, a jet fails in a way; None: it works again."""
+        self._valves.fail(jet, kind, self._timing.time_ns(step), factor)
+        self._ahead = np.zeros((0, 6))
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
         """Takes a command's pulses and shut-off valves; what cannot be done counts as saturated."""

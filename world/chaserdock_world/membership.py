@@ -114,7 +114,7 @@ class Membership:
                 for name, others in known.items()
                 if name in self._alive or name == "world"
             }
-            present = {"world", *(n for n in heard if n.startswith("chaser/") or n == "controller")}
+            present = {"world", *(n for n in heard if n.startswith("chaser/") or n in topics.CONTROLLERS)}
             linked = {
                 name
                 for name in heard
@@ -128,6 +128,11 @@ class Membership:
             if self.flying:
                 self._joined_up = set(linked)
             return linked
+
+    def instance_of(self, name: str) -> str:
+        """The start of a process that was admitted last; empty when none was."""
+        with self._lock:
+            return self._admitted.get(name, "")
 
     def alive(self) -> set[str]:
         """Processes whose liveliness token is there."""

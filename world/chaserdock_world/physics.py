@@ -1,4 +1,4 @@
-"""The PyBullet adapter: the only module that imports pybullet, and the only one that knows its conventions.
+"""The PyBullet adapter: the only module that knows its conventions.
 
 PyBullet orders quaternions x, y, z, w and gives angular velocity in world axes; everything that leaves this module is
 scalar first and has body rates. There is no gravity, damping or sleeping.
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pybullet
 from chaserdock_protocol import rotations
 from chaserdock_protocol.docking import Motion, view_of
 from chaserdock_protocol.messages import Latch
@@ -18,8 +17,8 @@ from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from chaserdock_protocol.targets import TargetModel
-from pybullet_utils.bullet_client import BulletClient
 
+from .bullet import connect, pybullet
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch
 
@@ -49,7 +48,7 @@ class Physics:
         self._prescribed = scenario.target.motion != "torque_free"
         # How often Bullet's copy of a prescribed target is moved along; its ``state`` is exact at any step.
         self._steps_per_move = max(1, scenario.time.physics_hz // 120)
-        self._bullet = BulletClient(connection_mode=pybullet.DIRECT)
+        self._bullet = connect()
         self._client: int = self._bullet._client  # the wrapper is too slow for what happens every step
         self._bullet.setGravity(0, 0, 0)
         self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)

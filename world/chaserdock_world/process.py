@@ -13,7 +13,8 @@ from collections.abc import Callable, Mapping
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd
+from chaserdock_protocol.faults import layer_of
+from chaserdock_protocol.messages import JetFaultCommand, JoinReply, JoinRequest, MissionEnd
 from chaserdock_protocol.presence import PresenceTeller, new_instance
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
@@ -24,6 +25,7 @@ from .answers import Answers
 from .cameras import Cameras
 from .imperfect import Navigation
 from .jet_actuators import actuators_of
+from .jet_faults import JetFaultDesk
 from .membership import Membership
 from .physics import Physics
 from .publish import publish_docking, publish_odometry, publish_truth
@@ -99,6 +101,8 @@ def gather(
         lambda: physics.step_count,
         physics.command_latch,
         options.recorder_expected,
+        scenario.controller.command_lifetime_s,
+        scenario.controller.standby,
     )
 
 
@@ -135,7 +139,10 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
     navigation = Navigation(scenario)
     actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in range(len(scenario.chasers))}
+    node.faults = layer_of(scenario, "world", lockstep=options.mode == "lockstep")
     answers = gather(scenario, options, node, actuators, physics)
+    faults = JetFaultDesk(scenario, actuators)
+    node.answer(topics.JET_FAULT_KEY, JetFaultCommand, faults.ask)
     say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
     started = answers.wait(
         lambda: not answers.missing_at_start(), stop, lambda: ", ".join(answers.missing_at_start())
@@ -157,6 +164,8 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
             break
         pictures = timing.has_pictures(tick)
         answers.open(tick, pictures)
+        for what, detail in faults.decide(tick, timing):
+            answers.warn(what, detail)
         for i in answers.chasers if pictures else ():
             number = tick // timing.ticks_per_picture
             node.publish(topics.IMAGE, cameras.picture(i, number, tick, timing.tick_time_ns(tick), states), i)

@@ -13,17 +13,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import pybullet
 from chaserdock_protocol import rotations
 from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.targets import Box, TargetModel, face_extent, face_rotation
 from numpy.typing import ArrayLike, NDArray
-from pybullet_utils.bullet_client import BulletClient
 
 from chaserdock_world import textures
+from chaserdock_world.bullet import connect, pybullet
+from chaserdock_world.faces import NEAR_M, Obstacle
 from chaserdock_world.lens import Lens
-from chaserdock_world.render import DAYLIGHT, NEAR_M, Obstacle
+from chaserdock_world.render import DAYLIGHT
 from chaserdock_world.sky import WHITE_LEVEL, Earth, Light, Sky
 
 _FAR_M = 50.0
@@ -47,7 +47,7 @@ class TinyRenderer:
         self.camera, self.model, self._samples = camera, model, supersampled
         self._lens = Lens(camera)
         self._sky = Sky(camera, self._lens.origin_px, self._lens.size_px, earth)
-        self._bullet = BulletClient(connection_mode=pybullet.DIRECT)
+        self._bullet = connect()
         self._others: dict[tuple[Box, ...], list[int]] = {}
         with tempfile.TemporaryDirectory(prefix="chaserdock-") as folder:
             self._folder = Path(folder)

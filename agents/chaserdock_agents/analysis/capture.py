@@ -20,13 +20,13 @@ def capture_of(flight: Flight, chaser: int) -> dict[str, Any] | None:
     """
     if flight.scenario.docking.port_of(chaser) is None:
         return None
-    touches = [t for w in flight.world for t in w.touches if t.chaser == chaser]
+    touches = [t for t in flight.world.touches if t.chaser == chaser]
     closed = [t for t in touches if t.latched]
     last = closed[-1] if closed else None
-    phases = flight.references.get(chaser, [])
+    told = flight.told.get(chaser)
     return {
-        "latched": bool(flight.world) and chaser in flight.world[-1].latched,
-        "verified": bool(phases) and phases[-1].phase == "verified",
+        "latched": chaser in flight.world.latched,
+        "verified": told is not None and told.phases[-1][1] == "verified",
         "latch_time_s": None if last is None else last.sim_time_ns / 1e9,
         "contact_lateral_m": None if last is None else last.lateral_m,
         "contact_angle_rad": None if last is None else last.angle_rad,

@@ -28,14 +28,16 @@ from .plots import (
     Nothing,
     colour,
     dashes,
+    few,
     legend_above,
     limit_line,
     new_figure,
     save,
+    step_of,
     styled,
 )
 from .summary import tracking_errors
-from .traces import Traces, load_traces, log_of, phases
+from .traces import Traces, load_traces
 
 
 def flown(flight: Flight) -> list[int]:
@@ -63,9 +65,11 @@ def trajectories(flight: Flight, _: Traces) -> Figure:
             ]
             axes.scatter(0.0, 0.0, 0.0, color=FAINT, marker="s", s=28, label="target")
         else:
-            axes.plot(*target.position_m.T, color=FAINT, linewidth=1.6, label="target")
+            axes.plot(
+                *target.position_m[few(len(target.time_s))].T, color=FAINT, linewidth=1.6, label="target"
+            )
         for i, p in zip(numbers, paths, strict=True):
-            axes.plot(*p.T, color=colour(i), label=f"chaser {i}")
+            axes.plot(*p[few(len(p))].T, color=colour(i), label=f"chaser {i}")
             axes.scatter(*p[0], color=colour(i), marker="o", s=14)
             axes.scatter(*p[-1], color=colour(i), marker="^", s=22)
         axes.set_title(title)
@@ -84,8 +88,8 @@ def trajectories(flight: Flight, _: Traces) -> Figure:
 def _mark_phases(axes: Axes, flight: Flight, words: bool) -> None:
     """Thin lines where a chaser changes phase, after the first; its name on top, once."""
     told: dict[tuple[float, str], None] = {}
-    for references in flight.references.values():
-        told |= dict.fromkeys(phases(references)[1:])
+    for what in flight.told.values():
+        told |= dict.fromkeys(what.phases[1:])
     for time_s, name in told:
         axes.axvline(time_s, color=FAINT, linewidth=0.7, linestyle=":")
         if words:
@@ -106,8 +110,9 @@ def tracking(flight: Flight, _: Traces) -> Figure:
     s = flight.scenario
     for i in numbers:
         time_s, position, angle = tracking_errors(flight, i)
-        top.semilogy(time_s, np.maximum(position, 1e-7), color=colour(i), label=f"chaser {i}")
-        bottom.semilogy(time_s, np.maximum(np.degrees(angle), 1e-5), color=colour(i))
+        d = few(len(time_s))
+        top.semilogy(time_s[d], np.maximum(position[d], 1e-7), color=colour(i), label=f"chaser {i}")
+        bottom.semilogy(time_s[d], np.maximum(np.degrees(angle[d]), 1e-5), color=colour(i))
     for axes, limit, unit in (
         (top, s.success.steady_position_rms_m, "m"),
         (bottom, s.success.steady_orientation_rms_deg, "°"),
@@ -132,10 +137,11 @@ def docking(flight: Flight, _: Traces) -> Figure:
         n = min(len(own.time_s), len(target.time_s))
         distance = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)
         nearest = min(nearest, float(distance.min()))
-        top.plot(own.time_s[:n], distance, color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
+        d, time_s = few(n), own.time_s[:n]
+        top.plot(time_s[d], distance[d], color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
         if n > 2:
-            speed = -np.gradient(distance, own.time_s[:n])
-            bottom.plot(own.time_s[:n], speed * 1e3, color=colour(i), linestyle=dashes(i))
+            speed = -np.gradient(distance, time_s)
+            bottom.plot(time_s[d], speed[d] * 1e3, color=colour(i), linestyle=dashes(i))
     limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
     # The two may be close: this one is named below its line.
     top.axhspan(0.0, s.limits.min_distance_target_m, color=LIMIT, alpha=0.10, linewidth=0)
@@ -173,7 +179,8 @@ def separation(flight: Flight, _: Traces) -> Figure:
         a, b = flight.truth[f"chaser/{i}"], flight.truth[f"chaser/{j}"]
         n = min(len(a.time_s), len(b.time_s))
         distance = np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
-        axes.plot(a.time_s[:n], distance, color=colour(k), linestyle=dashes(k), label=f"{i} and {j}")
+        d = few(n)
+        axes.plot(a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i} and {j}")
     least = flight.scenario.limits.min_distance_chasers_m
     limit_line(axes, least, f"least allowed {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
@@ -324,9 +331,8 @@ def write_figures(log: Path, out: Path, ending: str) -> tuple[list[Path], dict[s
 
     Raises LogError for an unreadable log and ChaserdockError for a folder that cannot be written.
     """
-    log = log_of(log)
     flight = load_flight(log)
-    traces = load_traces(log, range(len(flight.scenario.chasers)))
+    traces = load_traces(log, range(len(flight.scenario.chasers)), step_of(flight.world.ticks))
     files, missing = [], {}
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import groupby
-
 import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.rotations import Array
@@ -12,9 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from .flight import Flight
-from .plots import AXES_XYZ, FAINT, LIMIT, SERIES, Nothing, colour, legend_above, limit_line, new_figure
+from .plots import AXES_XYZ, FAINT, LIMIT, SERIES, Nothing, colour, few, legend_above, limit_line, new_figure
 from .summary import estimate_errors, known_estimates
-from .traces import Look, Traces
+from .traces import LOOKS, Look, Looks, Traces
 
 _LOOKS: dict[Look, str] = {
     "used": SERIES[2],
@@ -26,11 +24,12 @@ _LOOKS: dict[Look, str] = {
 
 
 def component_errors(flight: Flight) -> tuple[Array, Array, Array]:
-    """Times (K,) s, errors (K, 12) truth less estimate, and their sigmas (K, 12), where the target was known.
+    """Times (K,) s, errors (K, 12) truth less estimate, and their sigmas (K, 12), where the target was known; of a long
+    flight as many as are drawn.
 
     Order and axes are the covariance's: position and velocity WRF, attitude and rate TRF.
     """
-    a, b = known_estimates(flight)
+    a, b = (rows[few(len(rows))] for rows in known_estimates(flight))
     if not len(a):
         raise Nothing("the target was never estimated in this log, or its ground truth is missing")
     truth, e = flight.truth["target"], flight.estimate
@@ -44,7 +43,9 @@ def component_errors(flight: Flight) -> tuple[Array, Array, Array]:
         ],
         axis=1,
     )
-    variances = np.diagonal(flight.estimate_covariance[a], axis1=1, axis2=2)
+    # The diagonal of the packed upper triangle; the covariance's order is position, velocity, attitude, rate.
+    pose, rates = flight.pose_covariance[a][:, [0, 6, 11, 15, 18, 20]], flight.rate_variance[a]
+    variances = np.concatenate([pose[:, :3], rates[:, :3], pose[:, 3:], rates[:, 3:]], axis=1)
     return e.time_s[a], errors, np.sqrt(np.maximum(variances, 0.0))
 
 
@@ -85,7 +86,8 @@ def consistency(flight: Flight, _: Traces) -> Figure:
     component_errors(flight)  # says what is missing
     errors = estimate_errors(flight)
     figure, (axes,) = new_figure(1)
-    axes.semilogy(errors["time_s"], np.maximum(errors["nees"], 1e-3), color=SERIES[0], linewidth=0.8)
+    d = few(len(errors["nees"]))
+    axes.semilogy(errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8)
     axes.axhspan(*_NEES_BAND, color=SERIES[2], alpha=0.15, linewidth=0)
     axes.axhline(6.0, color=SERIES[2], linewidth=0.8)
     outside = np.mean((errors["nees"] < _NEES_BAND[0]) | (errors["nees"] > _NEES_BAND[1]))
@@ -94,19 +96,16 @@ def consistency(flight: Flight, _: Traces) -> Figure:
     return figure
 
 
-def _bars(axes: Axes, looks: list[tuple[float, Look]], row: float, period_s: float) -> None:
-    """One row of the raster: a bar for each stretch of pictures with the same fate."""
-    for _, group in groupby(looks, key=lambda item: item[1]):
-        stretch = list(group)
-        times, look = [t for t, _ in stretch], stretch[0][1]
-        # A gap between pictures (a camera that was out) stays empty.
-        for part in np.split(times, np.flatnonzero(np.diff(times) > 1.5 * period_s) + 1):
-            axes.broken_barh(
-                [(part[0], part[-1] - part[0] + period_s)],
-                (row - 0.36, 0.72),
-                facecolor=_LOOKS[look],
-                linewidth=0,
-            )
+def _bars(axes: Axes, looks: Looks, row: float, period_s: float) -> None:
+    """One row of the raster: a bar for each stretch of pictures with the same fate.
+
+    A gap between pictures (a camera that was out) stays empty.
+    """
+    spans: dict[Look, list[tuple[float, float]]] = {}
+    for first_s, last_s, look in looks.stretches(1.5 * period_s):
+        spans.setdefault(look, []).append((first_s, last_s - first_s + period_s))
+    for look, bars in spans.items():
+        axes.broken_barh(bars, (row - 0.36, 0.72), facecolor=_LOOKS[look], linewidth=0)
 
 
 def cameras(flight: Flight, traces: Traces) -> Figure:
@@ -116,10 +115,18 @@ def cameras(flight: Flight, traces: Traces) -> Figure:
     figure, (top, bottom) = new_figure(2, sharex=True, height=2.0)
     for row, (i, looks) in enumerate(traces.looks.items()):
         _bars(top, looks, row, period_s)
-        seen = [(m.sim_time_ns / 1e9, len(m.marker_ids)) for m in flight.sightings.get(i, [])]
-        if seen:
-            bottom.step(*np.array(seen).T, where="post", color=colour(i), label=f"chaser {i}", linewidth=0.9)
-    found = {look for looks in traces.looks.values() for _, look in looks}
+        seen = flight.sightings.get(i)
+        if seen is not None:
+            d = few(len(seen.time_s))
+            bottom.step(
+                seen.time_s[d],
+                seen.markers[d],
+                where="post",
+                color=colour(i),
+                label=f"chaser {i}",
+                linewidth=0.9,
+            )
+    found = {LOOKS[code] for looks in traces.looks.values() for code in np.unique(looks.code)}
     for look, shade in _LOOKS.items():
         if look in found:
             top.bar(0, 0, color=shade, label=look)
@@ -131,7 +138,7 @@ def cameras(flight: Flight, traces: Traces) -> Figure:
     bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
     if bottom.get_legend_handles_labels()[0]:
         legend_above(bottom)
-    last_s = max(looks[-1][0] for looks in traces.looks.values())
+    last_s = max(float(looks.time_s[-1]) for looks in traces.looks.values())
     bottom.set_xlim(0, last_s + period_s)
     return figure
 
@@ -139,7 +146,9 @@ def cameras(flight: Flight, traces: Traces) -> Figure:
 def _share_below(axes: Axes, values: Array, number: int) -> None:
     """The empirical distribution: share of the values below, over milliseconds."""
     ordered = np.sort(values) * 1e3
-    axes.plot(ordered, np.arange(1, len(ordered) + 1) / len(ordered) * 100.0, color=colour(number))
+    share = np.arange(1, len(ordered) + 1) / len(ordered) * 100.0
+    d = few(len(ordered))
+    axes.plot(ordered[d], share[d], color=colour(number))
 
 
 def _time_and_share(what: str) -> tuple[Figure, Axes, Axes]:
@@ -154,17 +163,17 @@ def _time_and_share(what: str) -> tuple[Figure, Axes, Axes]:
 
 
 def solver(flight: Flight, _: Traces) -> Figure:
-    solves = [m for m in flight.solver if m.chasers]
-    if not solves:
+    solves = flight.solves
+    if not len(solves.time_s):
         raise Nothing("the controller has solved nothing in this log")
-    values = np.array([m.wall_solve_s for m in solves])
+    values = solves.wall_s
     figure, left, right = _time_and_share("solve time / ms")
-    times = np.array([m.sim_time_ns / 1e9 for m in solves])
-    left.plot(times, np.maximum(values, 1e-6) * 1e3, ".", markersize=2.2, color=SERIES[0])
-    bad = np.array([any(s != "solved" for s in m.status) for m in solves])
+    d, bad = few(len(values)), solves.imperfect
+    left.plot(solves.time_s[d], np.maximum(values[d], 1e-6) * 1e3, ".", markersize=2.2, color=SERIES[0])
     if np.any(bad):
-        words = ", ".join(sorted({s for m in solves for s in m.status} - {"solved"}))
-        left.plot(times[bad], values[bad] * 1e3, "x", markersize=4, color=LIMIT, label=words)
+        words = ", ".join(sorted(set(solves.statuses) - {"solved"}))
+        d = few(int(np.sum(bad)))
+        left.plot(solves.time_s[bad][d], values[bad][d] * 1e3, "x", markersize=4, color=LIMIT, label=words)
         legend_above(left)
     limit_line(left, 1e3 / flight.scenario.time.rate_hz, "one tick")
     _share_below(right, np.maximum(values, 1e-6), 0)
@@ -179,7 +188,8 @@ def latency(_: Flight, traces: Traces) -> Figure:
     figure, left, right = _time_and_share("latency / ms")
     for i, rows in traces.latency.items():
         values = np.maximum(rows[:, 1], 1e-6)
-        left.plot(rows[:, 0], values * 1e3, ".", markersize=2.2, color=colour(i), label=f"chaser {i}")
+        d = few(len(values))
+        left.plot(rows[d, 0], values[d] * 1e3, ".", markersize=2.2, color=colour(i), label=f"chaser {i}")
         _share_below(right, values, i)
     legend_above(left)
     return figure

@@ -1,23 +1,23 @@
-"""A recorded flight as arrays: time along the first axis, one row a tick."""
+"""A recorded flight as arrays: time along the first axis, one row a tick. Built while the log is read."""
 
 from __future__ import annotations
 
 import hashlib
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
-from chaserdock_protocol.log import Record, read_log, read_scenario
+from chaserdock_protocol.log import LogSource, Record, read_log, read_scenario
 from chaserdock_protocol.messages import (
     BodyTruth,
     CommandReply,
     Event,
     Health,
+    ProbeTouch,
     Reference,
     Sighting,
     SolverStatus,
@@ -26,9 +26,16 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from numpy.typing import NDArray
+
+from .columns import Columns
 
 # Wall-clock matters: how often presence was told, who counted what, when the recorder confirmed.
-_NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK)
+NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK, topics.STATE)
+_POSE = (0, 1, 2, 6, 7, 8)
+_UPPER = np.triu_indices(6)
+_KEPT = np.array([12 * _POSE[i] + _POSE[j] for i, j in zip(*_UPPER, strict=True)])
+_RATES = np.array([13 * k for k in (3, 4, 5, 9, 10, 11)])
 
 
 @dataclass
@@ -43,8 +50,64 @@ class Track:
 
 
 @dataclass
+class Told:
+    """What a chaser was told to do: ``offset_m`` (K, 3), TRF, since ``time_s`` (K,), where it changed; and when (s) which
+    phase began."""
+
+    time_s: Array
+    offset_m: Array
+    phases: list[tuple[float, str]]
+
+
+@dataclass
+class Seen:
+    """A chaser's sightings: exposure times (K,) s, whether anything was seen, and how many markers were used."""
+
+    time_s: Array
+    seen: NDArray[np.bool_]
+    markers: NDArray[np.intp]
+
+
+@dataclass
+class Solves:
+    """The solver's work where it had any: times (K,) s, wall-clock seconds (K,), whether any plan was less than solved."""
+
+    name: str | None
+    time_s: Array
+    wall_s: Array
+    imperfect: NDArray[np.bool_]
+    statuses: Counter[str]
+
+
+@dataclass
+class World:
+    """What the world tells of all bodies together. ``latched``: at the end; ``contacts``: how often two came to touch."""
+
+    ticks: int = 0
+    late_commands: int = 0
+    contacts: int = 0
+    touches: list[ProbeTouch] = field(default_factory=list)
+    latched: tuple[int, ...] = ()
+    _touching: set[Any] = field(default_factory=set)
+
+    def take(self, message: WorldTruth) -> None:
+        self.ticks += 1
+        self.late_commands += message.late_commands
+        touching = set(message.contacts)
+        self.contacts += len(touching - self._touching)
+        self._touching = touching
+        self.touches += message.touches
+        self.latched = message.latched
+
+
+@dataclass
 class Flight:
-    """What a log holds, without the pictures. Dictionaries by body name or chaser."""
+    """What a log holds, without the pictures. Dictionaries by body name or chaser.
+
+    ``estimate_known`` (K,): whether the target was known; ``pose_covariance`` (K, 21): upper triangle, row by row, of
+    position (WRF) and attitude (TRF); ``rate_variance`` (K, 6): of velocity (WRF) and rate (TRF).
+    ``expected_commands``: how many actuator commands all ticks together waited for.
+    """
 
     scenario: Scenario
     run: dict[str, str]
@@ -53,74 +116,125 @@ class Flight:
     jet_impulse_N_s: dict[str, float]
     propellant_kg: dict[str, float]
     estimate: Track
-    estimate_covariance: Array
-    estimate_status: list[str]
-    references: dict[int, list[Reference]]
-    sightings: dict[int, list[Sighting]]
-    solver: list[SolverStatus]
-    world: list[WorldTruth]
+    estimate_known: NDArray[np.bool_]
+    pose_covariance: Array
+    rate_variance: Array
+    told: dict[int, Told]
+    sightings: dict[int, Seen]
+    solves: Solves
+    world: World
     events: list[Event]
     replies: list[CommandReply]
     counts: dict[str, int]
     lost: dict[str, int]
     rejected: dict[str, int]
-    expected: dict[int, tuple[int, ...]]
+    expected_commands: int
     latency_s: Array
     wall_time_s: float
     digest: str
 
 
+def unpacked(upper: Array) -> Array:
+    """Symmetric matrices (K, 6, 6) from their upper triangles (K, 21)."""
+    out = np.empty((len(upper), 6, 6))
+    out[:, _UPPER[0], _UPPER[1]] = upper
+    out[:, _UPPER[1], _UPPER[0]] = upper
+    return out
+
+
+@dataclass
+class _Told:
+    changes: Columns = field(default_factory=lambda: Columns(4))
+    phases: list[tuple[float, str]] = field(default_factory=list)
+    last: tuple[float, ...] | None = None
+
+    def take(self, message: Reference) -> None:
+        time_s = message.sim_time_ns / 1e9
+        if message.offset_m != self.last:
+            self.changes.add((time_s,), message.offset_m)
+            self.last = message.offset_m
+        if not self.phases or self.phases[-1][1] != message.phase:
+            self.phases.append((time_s, message.phase))
+
+    def finish(self) -> Told:
+        table = self.changes.table()
+        return Told(table[:, 0], table[:, 1:], self.phases)
+
+
+def _motion() -> Columns:
+    return Columns(14)
+
+
 @dataclass
 class _Collector:
-    bodies: dict[str, list[BodyTruth]] = field(default_factory=lambda: defaultdict(list))
-    targets: list[TargetEstimate] = field(default_factory=list)
-    references: dict[int, list[Reference]] = field(default_factory=lambda: defaultdict(list))
-    sightings: dict[int, list[Sighting]] = field(default_factory=lambda: defaultdict(list))
-    solver: list[SolverStatus] = field(default_factory=list)
-    world: list[WorldTruth] = field(default_factory=list)
+    bodies: dict[str, Columns] = field(default_factory=lambda: defaultdict(_motion))
+    impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    jet_impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    propellant: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    target: Columns = field(default_factory=_motion)
+    known: bytearray = field(default_factory=bytearray)
+    covariance: Columns = field(default_factory=lambda: Columns(27))
+    told: dict[int, _Told] = field(default_factory=lambda: defaultdict(_Told))
+    sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
+    solves: Columns = field(default_factory=lambda: Columns(3))
+    statuses: Counter[str] = field(default_factory=Counter)
+    solver: str | None = None
+    world: World = field(default_factory=World)
     events: list[Event] = field(default_factory=list)
     replies: list[CommandReply] = field(default_factory=list)
     health: dict[str, Health] = field(default_factory=dict)
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
-    latency: list[float] = field(default_factory=list)
-    counts: dict[str, int] = field(default_factory=lambda: defaultdict(int))
+    latency: Columns = field(default_factory=lambda: Columns(1))
+    counts: Counter[str] = field(default_factory=Counter)
     last_seq: dict[str, int] = field(default_factory=dict)
-    lost: dict[str, int] = field(default_factory=dict)
+    lost: Counter[str] = field(default_factory=Counter)
     hashes: dict[str, Any] = field(default_factory=dict)
     wall: list[int] = field(default_factory=list)
-    expected: dict[int, tuple[int, ...]] = field(default_factory=dict)
+    expected: int = 0
+    tick: int = -1
+    tick_expected: int = 0
 
     def take(self, record: Record) -> None:
         message = record.message
         self.counts[record.key] += 1
         last = self.last_seq.get(record.key, -1)
-        self.lost[record.key] = self.lost.get(record.key, 0) + max(0, message.seq - last - 1)
+        self.lost[record.key] += max(0, message.seq - last - 1)
         self.last_seq[record.key] = message.seq
-        if record.topic not in _NOT_IN_DIGEST:
+        if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
             self.hashes.setdefault(record.key, hashlib.sha256()).update(content)
         if record.topic is topics.TICK:
-            self.expected[message.tick] = message.chasers
-            self.wall.append(record.sent_ns)
+            told_again = message.tick == self.tick
+            self.expected += len(message.chasers) - (self.tick_expected if told_again else 0)
+            self.tick, self.tick_expected = message.tick, len(message.chasers)
+            self.wall = [*self.wall[:1], record.sent_ns]
         elif record.topic is topics.IMAGE:
             self.sent[message.chaser, message.tick] = record.sent_ns
         elif record.topic is topics.ACTUATORS:
-            begun = self.sent.get((message.chaser, message.tick))
+            begun = self.sent.pop((message.chaser, message.tick), None)
             if begun is not None:
-                self.latency.append((record.sent_ns - begun) / 1e9)
+                self.latency.add(((record.sent_ns - begun) / 1e9,))
         match message:
             case BodyTruth():
-                self.bodies[message.body].append(message)
+                self._body(message)
             case TargetEstimate():
-                self.targets.append(message)
+                _add_motion(self.target, message)
+                self.known.append(message.status in ("tracking", "predicting"))
+                covariance = np.asarray(message.covariance)
+                self.covariance.add(covariance[_KEPT].tolist(), covariance[_RATES].tolist())
             case Reference():
-                self.references[message.chaser].append(message)
+                self.told[message.chaser].take(message)
             case Sighting():
-                self.sightings[message.chaser].append(message)
+                seen = (message.sim_time_ns / 1e9, message.status == "seen", len(message.marker_ids))
+                self.sightings[message.chaser].add(seen)
             case SolverStatus():
-                self.solver.append(message)
+                self.solver = self.solver or message.solver
+                self.statuses.update(message.status)
+                if message.chasers:
+                    imperfect = any(s != "solved" for s in message.status)
+                    self.solves.add((message.sim_time_ns / 1e9, message.wall_solve_s, imperfect))
             case WorldTruth():
-                self.world.append(message)
+                self.world.take(message)
             case Event():
                 self.events.append(message)
             case CommandReply():
@@ -128,21 +242,29 @@ class _Collector:
             case Health():
                 self.health[message.process] = message
 
-
-def _track(messages: list[Any]) -> Track:
-    def column(name: str, width: int) -> Array:
-        return np.array([getattr(m, name) for m in messages], dtype=float).reshape(-1, width)
-
-    return Track(
-        time_s=np.array([m.sim_time_ns for m in messages], dtype=float) / 1e9,
-        position_m=column("position_m", 3),
-        velocity_m_s=column("velocity_m_s", 3),
-        q_wxyz=column("q_wxyz", 4),
-        omega_rad_s=column("omega_rad_s", 3),
-    )
+    def _body(self, message: BodyTruth) -> None:
+        _add_motion(self.bodies[message.body], message)
+        self.impulse[message.body] += message.absolute_impulse_N_s
+        self.jet_impulse[message.body] += sum(message.jet_impulse_N_s)
+        self.propellant[message.body] += message.propellant_kg
 
 
-def load_flight(log: Path) -> Flight:
+def _add_motion(table: Columns, message: BodyTruth | TargetEstimate) -> None:
+    m = message
+    table.add((m.sim_time_ns / 1e9,), m.position_m, m.velocity_m_s, m.q_wxyz, m.omega_rad_s)
+
+
+def _track(motion: Columns) -> Track:
+    t = motion.table()
+    return Track(t[:, 0], t[:, 1:4], t[:, 4:7], t[:, 7:11], t[:, 11:14])
+
+
+def _seen(columns: Columns) -> Seen:
+    t = columns.table()
+    return Seen(t[:, 0], t[:, 1] > 0.0, t[:, 2].astype(np.intp))
+
+
+def load_flight(log: LogSource) -> Flight:
     """The flight in a log; raises LogError when it cannot be read or was not recorded by chaserdock."""
     text, run = read_scenario(log)
     scenario = scenario_from_json(text, f"{log}: scenario")
@@ -152,31 +274,32 @@ def load_flight(log: Path) -> Flight:
     digest = hashlib.sha256()
     for key in sorted(c.hashes):
         digest.update(f"{key} {c.hashes[key].hexdigest()}\n".encode())
-    rejected: dict[str, int] = defaultdict(int)
+    rejected: Counter[str] = Counter()
     for health in c.health.values():
-        for reason, number in health.rejected.items():
-            rejected[reason] += number
+        rejected.update(health.rejected)
+    covariance, solves = c.covariance.table(), c.solves.table()
     return Flight(
         scenario=scenario,
         run=run,
-        truth={name: _track(messages) for name, messages in c.bodies.items()},
-        absolute_impulse_N_s={n: sum(m.absolute_impulse_N_s for m in ms) for n, ms in c.bodies.items()},
-        jet_impulse_N_s={n: sum(sum(m.jet_impulse_N_s) for m in ms) for n, ms in c.bodies.items()},
-        propellant_kg={n: sum(m.propellant_kg for m in ms) for n, ms in c.bodies.items()},
-        estimate=_track(c.targets),
-        estimate_covariance=np.array([m.covariance for m in c.targets], dtype=float).reshape(-1, 12, 12),
-        estimate_status=[m.status for m in c.targets],
-        references=dict(c.references),
-        sightings=dict(c.sightings),
-        solver=c.solver,
+        truth={name: _track(motion) for name, motion in c.bodies.items()},
+        absolute_impulse_N_s=dict(c.impulse),
+        jet_impulse_N_s=dict(c.jet_impulse),
+        propellant_kg=dict(c.propellant),
+        estimate=_track(c.target),
+        estimate_known=np.frombuffer(c.known, dtype=np.bool_),
+        pose_covariance=covariance[:, :21],
+        rate_variance=covariance[:, 21:],
+        told={i: told.finish() for i, told in c.told.items()},
+        sightings={i: _seen(columns) for i, columns in c.sightings.items()},
+        solves=Solves(c.solver, solves[:, 0], solves[:, 1], solves[:, 2] > 0.0, c.statuses),
         world=c.world,
         events=c.events,
         replies=c.replies,
         counts=dict(sorted(c.counts.items())),
-        lost=c.lost,
+        lost=dict(c.lost),
         rejected=dict(rejected),
-        expected=c.expected,
-        latency_s=np.array(c.latency),
+        expected_commands=c.expected,
+        latency_s=c.latency.table()[:, 0],
         wall_time_s=(c.wall[-1] - c.wall[0]) / 1e9 if len(c.wall) > 1 else 0.0,
         digest=digest.hexdigest(),
     )

@@ -48,11 +48,11 @@ def shots(
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
     """At ``first_s`` and then ``every_s`` (simulated seconds): the time and each chaser's latest picture up to then.
 
-    The last one comes at or after the end of the pictures. Where the log's order is not that of time, a chaser's picture
-    may be one older than it could be.
+    The last one comes at or after the end of the pictures; none does where that is before ``first_s``. Where
+    the log's order is not that of time, a chaser's picture may be one older than it could be.
     """
     latest: dict[int, Pair] = {}
-    number = 0
+    number, time_s = 0, -math.inf
     for image, sighting in pairs(log, chasers):
         time_s = image.sim_time_ns / 1e9
         while time_s > first_s + number * every_s + 1e-9:
@@ -60,7 +60,7 @@ def shots(
                 yield first_s + number * every_s, dict(latest)
             number += 1
         latest[image.chaser] = (image, sighting)
-    if latest:
+    if time_s > first_s - every_s:
         yield first_s + number * every_s, latest
 
 

@@ -61,6 +61,20 @@ _VARIABLES = {
 }
 
 
+MOST_DRAWN = 20_000
+"""Of a longer series every n-th value is drawn: a figure of ten hours would be a file of gigabytes."""
+
+
+def step_of(number: int) -> int:
+    """Every how many of ``number`` values one is drawn."""
+    return max(1, -(-number // MOST_DRAWN))
+
+
+def few(number: int) -> slice:
+    """The values out of ``number`` that are drawn, evenly spread."""
+    return slice(None, None, step_of(number))
+
+
 class Nothing(Exception):
     """A figure cannot be drawn; the text says what the log lacks."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from .pictures import Pair, shots
 from .scene import Face, scene_of
 from .snapshot import view
 from .summary import tracking_errors
-from .traces import Traces, phases
+from .traces import Traces
 
 _MOST_SAMPLES = 1200
 _MOST_SHOTS = 120
@@ -65,13 +64,14 @@ def replay_data(flight: Flight, traces: Traces, pictures: dict[str, Any]) -> dic
         distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)
         # Far flown strays must not make all others small.
         reach_m = max(reach_m, min(float(distance.max()), 3.0))
-        looks = [next(group) for _, group in groupby(traces.looks.get(i, []), key=lambda item: item[1])]
+        looks = list(traces.looks[i].stretches()) if i in traces.looks else []
+        told = flight.told.get(i)
         chasers.append(
             {
                 "id": i,
                 **_thinned(own, mine),
-                "phase": [[round(t, 3), name] for t, name in phases(flight.references.get(i, []))],
-                "look": [[round(t, 3), look] for t, look in looks],
+                "phase": [[round(t, 3), name] for t, name in (told.phases if told else [])],
+                "look": [[round(t, 3), look] for t, _, look in looks],
                 "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
             }
         )

@@ -19,10 +19,10 @@ from chaserdock_protocol.errors import ChaserdockError
 
 from .figures import drawn
 from .flight import Flight, load_flight
-from .plots import to_inline_svg
+from .plots import step_of, to_inline_svg
 from .replay import replay_data, small_pictures
 from .summary import summary_of
-from .traces import load_traces, log_of
+from .traces import load_traces
 
 _PAGE = files("chaserdock_agents.analysis") / "page"
 _DASH = "–"  # noqa: RUF001
@@ -33,8 +33,7 @@ def write_report(log: Path, out: Path | None = None) -> Path:
 
     Raises LogError for a log that cannot be read and ChaserdockError where the page cannot be written.
     """
-    log = log_of(log)
-    out = out or log.parent / "report.html"
+    out = out or (log if log.is_dir() else log.parent) / "report.html"
     text = report_of(log)
     try:
         out.write_text(text, encoding="utf-8")
@@ -47,7 +46,8 @@ def report_of(log: Path) -> str:
     """The page as text; raises LogError for a log that cannot be read."""
     flight = load_flight(log)
     result = summary_of(flight)
-    traces = load_traces(log, range(len(flight.scenario.chasers)))
+    every = step_of(flight.world.ticks)
+    traces = load_traces(log, range(len(flight.scenario.chasers)), every)
     missing: list[str] = []
     figures = []
     for kind, figure in drawn(flight, traces):
@@ -78,6 +78,9 @@ def report_of(log: Path) -> str:
         _numbers(flight, result),
         replay,
         '<h2 id="figures">Figures</h2>',
+        f'<p class="faint">A long flight: one of {every} ticks is drawn; tables are of all.</p>'
+        if every > 1
+        else "",
         *figures,
         _missing(missing),
         _events(result, bool(replay)),

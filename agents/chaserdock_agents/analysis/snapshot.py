@@ -67,9 +67,12 @@ def view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: 
             cv2.polylines(view, [points], True, _MARKER, 1, cv2.LINE_AA, 4)
         if sighting.solutions:
             _axes(view, scenario, sighting, scale)
-    seen = f"{len(sighting.marker_ids)} marker(s)" if sighting and sighting.marker_ids else "sees nothing"
+    count = len(sighting.marker_ids) if sighting else 0
+    seen = f"{count} marker{'s' if count > 1 else ''}" if count else "sees nothing"
     text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen}"
-    cv2.putText(view, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _TEXT, 1, cv2.LINE_AA)
+    (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # a small picture gets small words
+    cv2.putText(view, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
     return np.asarray(view, dtype=np.uint8)
 
 

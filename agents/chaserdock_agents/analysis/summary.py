@@ -15,8 +15,11 @@ from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
 from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
-from .flight import Flight, Track, load_flight
+from .columns import nanoseconds, rows_since
+from .flight import Flight, Track, load_flight, unpacked
 from .reached import not_reached, reached_time
+
+_PART = 1 << 14  # rows whose covariances are taken apart at a time
 
 
 def summarize(log: Path) -> dict[str, Any]:
@@ -32,16 +35,21 @@ def true_reference(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
     """
     scenario, target = flight.scenario, flight.truth["target"]
     c = scenario.chasers[chaser]
-    named = {m.sim_time_ns: m.offset_m for m in flight.references.get(chaser, [])}
-    offsets, last = [], c.position_m
-    for t in target.time_s:
-        last = named.get(round(t * 1e9), last)
-        offsets.append(last)
-    positions = target.position_m + rotations.rotate(target.q_wxyz, np.array(offsets))
+    offsets = told_offsets(flight, chaser, np.array(c.position_m))
+    positions = target.position_m + rotations.rotate(target.q_wxyz, offsets)
     q_off = np.array(c.q_wxyz)
     if flight.scenario.approach.face_target:
-        q_off = facing_attitudes(c.position_m, q_off, np.array(offsets))
+        q_off = facing_attitudes(c.position_m, q_off, offsets)
     return target.time_s, positions, rotations.multiply(target.q_wxyz, q_off)
+
+
+def told_offsets(flight: Flight, chaser: int, before: Array) -> Array:
+    """The offset (K, 3) that a chaser was told, TRF, at each time of the target's truth; ``before`` the first one, (3,)."""
+    told, target = flight.told.get(chaser), flight.truth["target"]
+    if told is None:
+        return np.broadcast_to(before, (len(target.time_s), 3))
+    row = rows_since(nanoseconds(told.time_s), nanoseconds(target.time_s))
+    return np.vstack([before, told.offset_m])[row + 1]
 
 
 def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
@@ -55,15 +63,14 @@ def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
 
 def known_estimates(flight: Flight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Rows of the estimate (K,) at which the target was known, and the rows of its truth at the same times."""
-    truth = flight.truth.get("target")
-    index = {} if truth is None else {round(t * 1e9): k for k, t in enumerate(truth.time_s)}
-    rows = [
-        (k, index[key])
-        for k, status in enumerate(flight.estimate_status)
-        if status in ("tracking", "predicting") and (key := round(flight.estimate.time_s[k] * 1e9)) in index
-    ]
-    both = np.array(rows, dtype=np.intp).reshape(-1, 2)
-    return both[:, 0], both[:, 1]
+    none = np.zeros(0, dtype=np.intp)
+    truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
+    if truth is None or not len(known):
+        return none, none
+    at_ns, truth_ns = nanoseconds(flight.estimate.time_s[known]), nanoseconds(truth.time_s)
+    row = rows_since(truth_ns, at_ns)
+    both = (row >= 0) & (truth_ns[row] == at_ns)
+    return known[both], row[both]
 
 
 def estimate_errors(flight: Flight) -> dict[str, Array]:
@@ -75,8 +82,10 @@ def estimate_errors(flight: Flight) -> dict[str, Array]:
     position = truth.position_m[b] - e.position_m[a]
     angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
     pose = np.concatenate([position, angle], axis=1)
-    covariance = flight.estimate_covariance[a][:, [0, 1, 2, 6, 7, 8]][:, :, [0, 1, 2, 6, 7, 8]]
-    nees = np.einsum("ki,ki->k", pose, np.linalg.solve(covariance, pose[:, :, None])[:, :, 0])
+    nees = np.empty(len(a))
+    for part in (slice(k, k + _PART) for k in range(0, len(a), _PART)):
+        weighed = np.linalg.solve(unpacked(flight.pose_covariance[a[part]]), pose[part, :, None])[:, :, 0]
+        nees[part] = np.einsum("ki,ki->k", pose[part], weighed)
     return {
         "time_s": e.time_s[a],
         "position_m": np.linalg.norm(position, axis=1),
@@ -119,12 +128,8 @@ def dock_time(flight: Flight, chaser: int) -> float | None:
     """
     approach = flight.scenario.approach
     time_s, position, angle = tracking_errors(flight, chaser)
-    reached = np.zeros(len(time_s), dtype=bool)
-    named = {m.sim_time_ns: math.hypot(*m.offset_m) for m in flight.references.get(chaser, [])}
-    last = math.inf
-    for k, t in enumerate(time_s):
-        last = named.get(round(t * 1e9), last)
-        reached[k] = abs(last - approach.dock_distance_m) < 1e-6
+    away = np.linalg.norm(told_offsets(flight, chaser, np.full(3, math.inf))[: len(time_s)], axis=1)
+    reached = np.abs(away - approach.dock_distance_m) < 1e-6
     limit = math.radians(approach.docked_angle_deg)
     inside = reached & (position <= approach.docked_position_m) & (angle <= limit)
     if not len(inside) or not inside[-1]:
@@ -136,18 +141,9 @@ def dock_time(flight: Flight, chaser: int) -> float | None:
 
 def _unanswered(flight: Flight) -> int:
     """Commands that a tick expected and that never came (in lock-step none can be missing)."""
-    expected = sum(len(chasers) for chasers in flight.expected.values())
-    return max(0, expected - sum(n for key, n in flight.counts.items() if key.endswith("/actuators")))
-
-
-def _contacts(flight: Flight) -> int:
-    """How many times two bodies came to touch."""
-    number, before = 0, set()
-    for w in flight.world:
-        now = set(w.contacts)
-        number += len(now - before)
-        before = now
-    return number
+    return max(
+        0, flight.expected_commands - sum(n for key, n in flight.counts.items() if key.endswith("/actuators"))
+    )
 
 
 def summary_of(flight: Flight) -> dict[str, Any]:
@@ -186,7 +182,6 @@ def summary_of(flight: Flight) -> dict[str, Any]:
     ]
     errors = estimate_errors(flight)
     late = errors["time_s"] >= s.settling_s
-    solve_s = np.array([m.wall_solve_s for m in flight.solver if m.chasers])
     end_s = float(flight.truth["target"].time_s[-1]) if "target" in flight.truth else 0.0
     result: dict[str, Any] = {
         "scenario": s.name,
@@ -200,7 +195,7 @@ def summary_of(flight: Flight) -> dict[str, Any]:
         "events": _events(flight),
         "chasers": chasers,
         "min_distance_chasers_m": min(between) if between else None,
-        "collisions": _contacts(flight),
+        "collisions": flight.world.contacts,
         "target_estimate": {
             "position_rms_m": _rms(errors["position_m"][late]),
             "orientation_rms_rad": _rms(errors["orientation_rad"][late]),
@@ -211,13 +206,13 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             "nees_mean": float(np.mean(errors["nees"][late])) if np.any(late) else None,
         },
         "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
-        "late_commands": sum(w.late_commands for w in flight.world),
+        "late_commands": flight.world.late_commands,
         "unanswered": _unanswered(flight),
         "solver": {
-            "name": next((m.solver for m in flight.solver), s.controller.solver),
-            "solve_s": _percentiles(solve_s, {"p50": 50, "p95": 95}),
-            "failures": sum(st == "failed" for m in flight.solver for st in m.status),
-            "relaxed": sum(st == "infeasible_relaxed" for m in flight.solver for st in m.status),
+            "name": flight.solves.name or s.controller.solver,
+            "solve_s": _percentiles(flight.solves.wall_s, {"p50": 50, "p95": 95}),
+            "failures": flight.solves.statuses["failed"],
+            "relaxed": flight.solves.statuses["infeasible_relaxed"],
         },
         "messages": _messages(flight),
         "rejected": flight.rejected,

@@ -15,12 +15,12 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.log import LogError
 
 from .chase_view import Picture, Pose, Viewpoint, draw, tint
+from .columns import nanoseconds
 from .flight import Flight, Track, load_flight
 from .pictures import Pair, columns_for, shots
 from .scene import scene_of
 from .snapshot import view
 from .summary import tracking_errors
-from .traces import log_of, phases
 
 ENDINGS = (".mp4", ".webp", ".gif")
 _CODECS = {".mp4": "libx264", ".webp": "libwebp_anim", ".gif": "gif"}
@@ -37,12 +37,15 @@ def write_video(
     fps: int = 15,
     width_px: int = 1280,
     height_px: int = 720,
+    part_s: tuple[float, float] = (0.0, math.inf),
+    quality: int = 60,
     told: Callable[[float], None] = lambda time_s: None,
 ) -> int:
     """Writes the film of a log (or run folder) and returns the number of its frames.
 
-    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds a second of film; ``told`` hears of
-    each frame's simulated time. Raises LogError for a log that cannot be read or holds no motion or picture, and
+    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds a second of film; ``part_s``: the
+    simulated times of the first and last frame; ``quality``: of .webp, 0 to 100; ``told`` hears of each frame's
+    simulated time. Raises LogError for a log that cannot be read or holds no motion or picture, and
     ChaserdockError for a size or file that cannot be.
     """
     ending = out.suffix.lower()
@@ -52,7 +55,8 @@ def write_video(
         raise ChaserdockError(
             f"{width_px} x {height_px} pixels: both must be even for the film to play everywhere"
         )
-    log = log_of(log)
+    if not part_s[0] < part_s[1]:
+        raise ChaserdockError(f"a film from {part_s[0]:g} s to {part_s[1]:g} s has no length")
     flight = load_flight(log)
     if "target" not in flight.truth:
         raise LogError(f"{log}: holds no motion of the target; there is nothing to film")
@@ -66,34 +70,43 @@ def write_video(
             if ending == ".mp4":
                 stream.options = {"crf": "21", "preset": "medium", "movflags": "+faststart"}
             elif ending == ".webp":
-                stream.options = {"quality": "60", "loop": "0"}
-            for time_s, frame in frames(log, flight, speed / fps, width_px, height_px):
+                stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
+            for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
                 told(time_s)
                 picture = av.VideoFrame.from_ndarray(frame, format="bgr24")
                 picture.pts = number
                 container.mux(stream.encode(picture))
                 number += 1
-            container.mux(stream.encode())
+            if number:
+                container.mux(stream.encode())
     except OSError as error:
         raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
     if not number:
         out.unlink(missing_ok=True)
-        raise LogError(f"{log}: holds no picture; there is nothing to film")
+        begun = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
+        raise LogError(f"{log}: holds no picture{begun}; there is nothing to film")
     return number
 
 
 def frames(
-    log: Path, flight: Flight, every_s: float, width_px: int, height_px: int
+    log: Path,
+    flight: Flight,
+    every_s: float,
+    width_px: int,
+    height_px: int,
+    part_s: tuple[float, float] = (0.0, math.inf),
 ) -> Iterator[tuple[float, Picture]]:
-    """Simulated time (s) and film frame (height, width, 3), BGR, ``every_s`` of simulated time."""
+    """Simulated time (s) and film frame (height, width, 3), BGR, ``every_s`` of simulated time within ``part_s``."""
     number = len(flight.scenario.chasers)
     camera = flight.scenario.camera
     aspect = camera.width_px / camera.height_px
     columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
     rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
     side_px = columns * shot_px
-    director = _Director(flight, width_px - side_px, height_px)
-    for time_s, latest in shots(log, number, every_s):
+    director = _Director(flight, width_px - side_px, height_px, part_s)
+    for time_s, latest in shots(log, number, every_s, part_s[0]):
+        if time_s > part_s[1] + 1e-9:
+            return
         frame = np.zeros((height_px, width_px, 3), dtype=np.uint8)
         frame[:, : width_px - side_px] = director.shoot(time_s)
         top = max(0, (height_px - rows * shot_height_px) // 2)
@@ -125,7 +138,7 @@ def _camera(flight: Flight, chaser: int, pair: Pair | None, width_px: int) -> Pi
 class _Director:
     """Knows the flight and where to look at it from; one picture a time."""
 
-    def __init__(self, flight: Flight, width_px: int, height_px: int) -> None:
+    def __init__(self, flight: Flight, width_px: int, height_px: int, part_s: tuple[float, float]) -> None:
         self.flight = flight
         self.size = (width_px, height_px)
         self.scene = scene_of(flight.scenario)
@@ -137,16 +150,17 @@ class _Director:
         for i in self.numbers:
             own = flight.truth[f"chaser/{i}"]
             n = min(len(own.time_s), len(target.time_s))
-            reach = max(
-                reach, float(np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1).max())
-            )
+            shown = (own.time_s[:n] >= part_s[0]) & (own.time_s[:n] <= part_s[1])
+            away_m = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)[shown]
+            reach = max(reach, float(away_m.max(initial=0.0)))
         # Far flown strays must not make all others small.
-        self.distance_m = 3.0 * min(reach, 3.0)
+        self.distance_m = 3.5 * min(reach, 3.0)
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
-        self.phases = {i: phases(flight.references.get(i, [])) for i in self.numbers}
+        self.phases = {i: flight.told[i].phases if i in flight.told else [] for i in self.numbers}
         self.seen = {
-            i: {m.sim_time_ns for m in flight.sightings.get(i, []) if m.status == "seen"}
+            i: set(nanoseconds(s.time_s[s.seen]).tolist())
             for i in self.numbers
+            if (s := flight.sightings.get(i)) is not None
         }
 
     def shoot(self, time_s: float) -> Picture:
@@ -158,7 +172,7 @@ class _Director:
         at = _pose(target, time_s)
         look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
         time_ns = round(_time_of(target, time_s) * 1e9)
-        seeing = frozenset(i for i in self.numbers if time_ns in self.seen[i])
+        seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
         picture = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
         self._write(picture, time_s)
         return picture

@@ -9,6 +9,8 @@ import threading
 import time
 from pathlib import Path
 
+from chaserdock_agents.statuses import DONE, FAILED, STOPPED
+
 from .fly import CampaignError, Keep, Result, fly, fly_campaign
 from .page import page
 from .plan import Campaign, Run, load_campaign
@@ -18,7 +20,7 @@ from .table import Row, again, rows_of, wilson
 def direct(
     file: Path, out: Path | None, jobs: int | None, cluster: str | None, keep: Keep, only: int | None
 ) -> int:
-    """Flies the campaign of ``file``; 0 when every run has been flown, 1 when stopped before.
+    """Flies the campaign of ``file``; the exit status (``statuses``): 0 when every run has been flown.
 
     Raises ScenarioError for a file that is wrong, CampaignError when the campaign cannot go on.
     """
@@ -38,7 +40,7 @@ def direct(
             signal.signal(number, handler)
     if not flown:
         print("chaserdock: stopped before any run was over", file=sys.stderr)
-        return 1
+        return STOPPED
     rows = rows_of(flown)
     write_table(rows, folder / "results.parquet")
     (folder / "report.html").write_text(page(campaign, rows, folder), encoding="utf-8")
@@ -53,8 +55,8 @@ def direct(
             f"chaserdock: stopped, {len(campaign.runs) - len(rows)} runs left; the same command goes on",
             file=sys.stderr,
         )
-        return 1
-    return 0
+        return STOPPED
+    return DONE
 
 
 def write_table(rows: list[Row], path: Path) -> None:
@@ -76,7 +78,7 @@ def _fly_one(campaign: Campaign, folder: Path, only: int) -> int:
     print(
         f"run {only} ({run.name}): {'passed' if result.status == 0 else result.last_words}\n{result.log or 'no log'}"
     )
-    return 0 if result.status == 0 else 1
+    return DONE if result.status == 0 else FAILED
 
 
 def _stop(stop: threading.Event) -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 from chaserdock_protocol.braking import brake_wrench
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
+from chaserdock_protocol.messages import ActuatorCommand, Odometry, Tick, WrenchCommand
+from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_bodies import Body
 
 
@@ -30,15 +33,38 @@ def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now
     return None
 
 
+def stale_term(command: WrenchCommand, tick: Tick | None, last_term: int) -> str | None:
+    """Why the sender of a command does not command any more, or None.
+
+    ``tick``: the newest one known; ``last_term``: of the newest command flown. A term that is newer than both is the
+    world's word, too: its tick is still on its way.
+    """
+    known = max(last_term, tick.term if tick is not None else 0)
+    if command.term < known:
+        return f"stale term: it is of term {command.term}, and term {known} has begun"
+    if tick is None or command.term > tick.term or not tick.term:
+        return None
+    if (command.commander, command.instance) != (tick.commander, tick.instance):
+        return f"stale term: {command.commander} {command.instance} does not command term {tick.term}"
+    return None
+
+
 def brake(odometry: Odometry, body: Body, effective_ns: int, latched: bool = False) -> ActuatorCommand:
     """The command that brings a chaser to rest in WRF: see ``braking``. One that holds on to the target stays quiet."""
     wrench = np.zeros(6) if latched else brake_wrench(odometry, body)
+    return own_command(odometry, effective_ns, "brake", wrench)
+
+
+def own_command(
+    odometry: Odometry, effective_ns: int, source: Literal["plan", "brake", "hold"], wrench: Array
+) -> ActuatorCommand:
+    """A chaser's own command, of which no controller knows; ``wrench`` (6,): force and torque, body axes."""
     return ActuatorCommand(
         tick=odometry.tick,
         sim_time_ns=odometry.sim_time_ns,
         chaser=odometry.chaser,
         effective_time_ns=effective_ns,
-        source="brake",
+        source=source,
         force_N=vector(wrench[:3]),
         torque_N_m=vector(wrench[3:]),
     )
@@ -55,4 +81,5 @@ def passed_on(command: WrenchCommand) -> ActuatorCommand:
         force_N=command.force_N,
         torque_N_m=command.torque_N_m,
         latch=command.latch,
+        term=command.term,
     )

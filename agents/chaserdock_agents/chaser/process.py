@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections import deque
 from dataclasses import dataclass
 
 import cv2
 import msgspec
 from chaserdock_protocol import topics
+from chaserdock_protocol.dead_reckoning import went_on
+from chaserdock_protocol.faults import Lost, layer_of
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     DockingStatus,
@@ -17,21 +20,25 @@ from chaserdock_protocol.messages import (
     Level,
     MissionEnd,
     Odometry,
+    Plan,
     Presence,
     Sighting,
+    TargetEstimate,
     Tick,
     WrenchCommand,
 )
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
 
 from chaserdock_agents.perception import make_perception
 from chaserdock_agents.thrusters.pilot import JetPilot
 
+from .alone import Alone, LastWord, clear_m, goes_on, wrench_of
 from .eye import look, prediction_from
-from .pilot import brake, passed_on, refusal
+from .pilot import brake, own_command, passed_on, refusal, stale_term
 
 
 def main(options: ProcessOptions) -> int:
@@ -41,6 +48,7 @@ def main(options: ProcessOptions) -> int:
 
     def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
         chaser = Chaser(node, scenario_from_json(mission.scenario_json, "the world's scenario"), number)
+        node.faults = layer_of(chaser.scenario, node.name, lockstep=mission.mode == "lockstep")
         chaser.open(instance, realtime=mission.mode == "realtime")
         while not (chaser.ended or stop()):
             chaser.listen()
@@ -68,8 +76,17 @@ class Chaser:
 
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
-        self._forgotten = self._refusing = False
-        self._watched_tick = -1
+        self._forgotten = self._refusing = self._stale = False
+        self._term = 0
+        self._plan: Plan | None = None
+        self._target: TargetEstimate | None = None
+        self._last = LastWord()
+        self._heeded_tick = -1
+        self._alone: Alone | None = None
+        self._clear_m = clear_m(self.scenario, self.number)
+        self._watched_tick = self._uncommanded = -1
+        self._known_ns = 0
+        self._looked: deque[int] = deque(maxlen=64)
         self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._jets = (
             JetPilot(self.scenario, self.number) if self.scenario.chaser.actuation == "thrusters" else None
@@ -87,7 +104,9 @@ class Chaser:
         node.subscribe(topics.IMAGE, i, latest=realtime)
         node.subscribe(topics.ODOMETRY, i, latest=realtime)
         node.subscribe(topics.DOCKING, i)
-        node.subscribe(topics.WRENCH, i)
+        for topic in (topics.PLAN, topics.WRENCH):
+            node.subscribe(topic, i)
+        node.subscribe(topics.TARGET)
         node.subscribe(topics.TICK)
         node.subscribe(topics.END)
         self.teller = PresenceTeller(node, instance)
@@ -99,13 +118,17 @@ class Chaser:
             case Image() as image:
                 self._look(image)
             case Odometry() as odometry:
-                self.odometry = odometry
-                self._watch_jets()
-                self._brake_if_alone()
-                self._brake_if_forgotten(odometry)
+                self._known_ns = odometry.sim_time_ns
+                self._know(odometry)
             case DockingStatus() as docking:
                 self.docking = docking
                 self._watch_jets()
+            case Plan() as plan:
+                self._plan = plan
+                if plan.tick == self._heeded_tick:  # it came after its command
+                    self._last = LastWord(plan, self._last.target)
+            case TargetEstimate() as target:
+                self._target = target
             case WrenchCommand() as command:
                 self._fly(command)
             case Tick() as tick:
@@ -120,8 +143,58 @@ class Chaser:
                 self.teller.take(presence)
             case MissionEnd():
                 self.ended = True
+            case Lost() as lost if received is not None:
+                self._miss(received.topic, lost)
+
+    def _know(self, odometry: Odometry) -> None:
+        """Takes its own state, unless a newer one has come before it."""
+        if self.odometry is not None and odometry.tick < self.odometry.tick:
+            self.node.counts.stale += 1
+            return
+        self.odometry = odometry
+        self._watch_jets()
+        self._brake_if_alone()
+        self._brake_if_forgotten(odometry)
+
+    def _miss(self, topic: Topic, lost: Lost) -> None:
+        """In lock-step: something has been lost on its way here, and the tick must be answered nevertheless."""
+        if topic is topics.IMAGE:
+            nothing = Sighting(
+                tick=lost.tick,
+                sim_time_ns=lost.sim_time_ns,
+                chaser=self.number,
+                status="bad_picture",
+                solutions=(),
+                marker_ids=(),
+                corners_px=(),
+                rejected_ids=(),
+                detail="no picture came",
+            )
+            self.node.publish(topics.SIGHTING, nothing, self.number)
+        elif topic is topics.ODOMETRY and self.odometry is not None:
+            self._know(went_on(self.odometry, lost.tick, lost.sim_time_ns))
+        elif topic is topics.DOCKING:
+            before = self.docking
+            still = (
+                DockingStatus(chaser=self.number, contact=False, armed=False, latched=False)
+                if before is None
+                else msgspec.structs.replace(before, contact=False)
+            )
+            self.docking = msgspec.structs.replace(still, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
+            self._watch_jets()
+        elif topic is topics.WRENCH:
+            self._without_command(lost.tick)
+
+    def _without_command(self, tick: int) -> None:
+        """There is no command for a tick: the chaser answers it by itself, once it knows where it is."""
+        self._uncommanded = max(tick, self._uncommanded)
+        self._brake_if_alone()
 
     def _look(self, image: Image) -> None:
+        if image.tick in self._looked:
+            self.node.counts.stale += 1
+            return
+        self._looked.append(image.tick)
         begun_s = time.perf_counter()
         sighting = look(self._perception, image, prediction_from(self.sighting))
         took_s = time.perf_counter() - begun_s
@@ -154,10 +227,25 @@ class Chaser:
             self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
     def _fly(self, command: WrenchCommand) -> None:
+        if command.mode == "none":
+            if not self.realtime:  # there it flies on what it has, for a command's lifetime
+                self._without_command(command.tick)
+            return
         now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0
+        if stale := stale_term(command, self.tick, self._term):
+            self.node.counts.rejected["wrench:stale term"] += 1
+            if not self._stale:  # the first of a row
+                self._warn("command refused", stale, command.tick, now_ns)
+            self._stale = True
+            return
+        if command.tick == self.flown_tick and command.term > self._term:
+            return  # said again by who took over in the middle of a tick
         why_not = refusal(command, self.number, self.scenario.chaser, self.flown_tick, now_ns)
         if why_not is None:
             self.flown_ns, self._forgotten, self._refusing = command.sim_time_ns, False, False
+            self._term = command.term
+            self._stale = False
+            self._heed(command)
             if self._jets is not None:
                 self._jets.heed(command)
             self._send(passed_on(command))
@@ -167,19 +255,34 @@ class Chaser:
             self._warn("command refused", why_not, command.tick, now_ns)
         self._refusing = True
         # A tick of the world must be answered, if not with this command then with a safe one.
-        if self.odometry is not None and command.tick == self.odometry.tick > self.flown_tick:
-            self._send(self._braking(self.odometry))
+        self._without_command(command.tick)
+
+    def _heed(self, command: WrenchCommand) -> None:
+        """Keeps what came with a command, for when there are none."""
+        plan, target, self._heeded_tick = self._plan, self._target, command.tick
+        self._last = LastWord(
+            plan if plan is not None and plan.tick == command.tick else None,
+            target if target is not None and target.tick == command.tick else self._last.target,
+        )
+        if self._alone is not None:
+            self._tell("info", "commanded again", f"tick {command.tick}", command.tick, command.sim_time_ns)
+        self._alone = None
 
     def _brake_if_alone(self) -> None:
-        """Without a controller the chaser answers the open tick itself, by coming to rest."""
+        """Without a controller, or its command, the chaser answers the open tick itself."""
         tick, odometry = self.tick, self.odometry
-        if tick is None or odometry is None or tick.controller or odometry.tick != tick.tick:
+        if tick is None or odometry is None or odometry.tick != tick.tick:
+            return
+        if tick.controller and self._uncommanded < tick.tick:
             return
         if self.number in tick.chasers and tick.tick > self.flown_tick:
-            self._send(self._braking(odometry))
+            if tick.controller and not self._forgotten:
+                self._forgotten = True
+                self._warn("no command", "it was lost or refused", tick.tick, odometry.sim_time_ns)
+            self._send(self._by_itself(odometry))
 
     def _brake_if_forgotten(self, odometry: Odometry) -> None:
-        """In real time nobody waits for the controller: when its commands stop coming, the chaser comes to rest."""
+        """In real time nobody waits for the controller: when its commands stop coming, the chaser flies by itself."""
         if not self.realtime:
             return
         if self.flown_ns is None:
@@ -189,16 +292,28 @@ class Chaser:
             return
         if not self._forgotten:
             self._forgotten = True
-            self._warn(
-                "no command, braking", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns
-            )
+            self._warn("no command", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns)
         # Not noted as this tick's answer: the controller's, should it still come, is better.
-        self._actuate(self._braking(odometry))
+        self._actuate(self._by_itself(odometry))
 
-    def _braking(self, odometry: Odometry) -> ActuatorCommand:
+    def _by_itself(self, odometry: Odometry) -> ActuatorCommand:
+        """The chaser's own command: see ``alone``."""
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
+        # Whoever does not know his own motion cannot brake it.
+        lost_ns = odometry.sim_time_ns - self._known_ns
         latched = self.docking is not None and self.docking.latched
-        return brake(odometry, self.scenario.chaser, effective_ns, latched)
+        body = self.scenario.chaser
+        if latched or lost_ns > self.scenario.controller.command_lifetime_s * 1e9:
+            return brake(odometry, body, effective_ns, latched=True)
+        before, self._alone = (
+            self._alone,
+            goes_on(self._alone, odometry, effective_ns, self._last, self._clear_m),
+        )
+        if before is None or before.state != self._alone.state:
+            what = f"alone: {self._alone.state}"
+            self._warn(what, self._alone.text(), odometry.tick, odometry.sim_time_ns)
+        wrench = wrench_of(self._alone, odometry, effective_ns, self._last, body)
+        return own_command(odometry, effective_ns, self._alone.state, wrench)
 
     def _send(self, command: ActuatorCommand) -> None:
         self.flown_tick = command.tick

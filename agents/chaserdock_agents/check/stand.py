@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import msgspec
 from chaserdock_protocol import codec, presence, topics
+from chaserdock_protocol.inbox import Inbox
 from chaserdock_protocol.log import LogSource
 from chaserdock_protocol.messages import JoinReply, JoinRequest, Message, MissionEnd, Presence, encoding_of
 from chaserdock_protocol.runtime import SINGLE_THREADED
@@ -92,7 +93,7 @@ class Stand:
 
     def __init__(self, node: Node, ledger: Ledger, scenario_json: str) -> None:
         self._node, self._ledger, self._scenario_json = node, ledger, scenario_json
-        self._inbox: queue.SimpleQueue[Raw | JoinRequest | tuple[str, bool]] = queue.SimpleQueue()
+        self._inbox: Inbox[Raw | JoinRequest | tuple[str, bool]] = Inbox()
         # What this stand has sent comes back to it, too; the rest is the checked process'.
         self._sent: Counter[tuple[str, str, bytes]] = Counter()
         self._numbers: Counter[str] = Counter()
@@ -103,8 +104,8 @@ class Stand:
         self._instances = {name: presence.new_instance() for name in sorted(self._partners)}
         self._told_s = 0.0
         self._period_s = presence.EARLY_PERIOD_S
-        node.subscribe_raw("**", self._inbox.put)
-        node.watch_liveliness(lambda name, alive: self._inbox.put((name, alive)))
+        node.subscribe_raw("**", self._arrived)
+        node.watch_liveliness(self._alive_changed)
         node.answer(topics.JOIN_KEY, JoinRequest, self._joins)
         node.announce()
 
@@ -163,7 +164,7 @@ class Stand:
 
     def _joins(self, request: JoinRequest, reply: Callable[[JoinReply], None]) -> None:
         """On Zenoh's thread."""
-        self._inbox.put(request)
+        self._inbox.put(request, 0)
         right = request.process == self._ledger.process
         reply(
             JoinReply(accepted=True, reason="", run_id="check", scenario_json=self._scenario_json)
@@ -225,12 +226,18 @@ class Stand:
             self._listen(0.3 if ended else 0.02)
         return True
 
+    def _arrived(self, raw: Raw) -> None:
+        self._inbox.put(raw, len(raw.payload))
+
+    def _alive_changed(self, name: str, alive: bool) -> None:
+        self._inbox.put((name, alive), 0)
+
     def _listen(self, seconds: float) -> None:
         """Takes in one message, and all that wait behind it."""
         try:
-            self._take(self._inbox.get(timeout=seconds))
+            self._take(self._inbox.get(seconds))
             while True:
-                self._take(self._inbox.get_nowait())
+                self._take(self._inbox.get(0))
         except queue.Empty:
             return
 

@@ -69,7 +69,7 @@ class Log:
             elif "{chaser}" in topic.key:
                 keys |= {topic.key_of(i) for i in range(len(self.scenario.chasers))}
             elif "{process}" in topic.key:
-                processes = ["world", "target", "controller", "recorder", "operator"]
+                processes = ["world", "target", *topics.CONTROLLERS, "recorder", "operator"]
                 processes += [f"chaser/{i}" for i in range(len(self.scenario.chasers))]
                 keys |= {topic.key_of(process) for process in processes}
             else:

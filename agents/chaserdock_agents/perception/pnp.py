@@ -34,6 +34,8 @@ MAX_RMS_PX = 2.0
 # The second solution of a plane is kept when its -2 log likelihood is no more than this above the first's.
 _AMBIGUITY_LIMIT = 25.0
 _CANDIDATE_MARKERS = 6
+# A plane's coarse pose that fits worse than this is none.
+_PLANE_RMS_PX = 1.0
 # Of a plane's two coarse poses, one this much nearer to the refined pose than the other is that very pose.
 _SAME_POSE_SHARE = 0.25
 # A lone marker is a false id when this many others ought to be as plain to see and none is.
@@ -250,14 +252,16 @@ def _refined(seen: _Seen, pose: Pose) -> Pose | None:
 
 
 def _plane_poses(seen: _Seen) -> list[Pose]:
-    """Both IPPE poses of the target from points in the plane of the first marker."""
+    """Both IPPE poses of the target from points in the plane of the first marker (or, where IPPE fails, SQPnP's one)."""
     to_trf, origin = seen.table.rotations[seen.which[0]], seen.table.origins[seen.which[0]]
     flat = (seen.points.reshape(-1, 3) - origin) @ to_trf
     flat[:, 2] = 0.0  # IPPE wants it exactly
+    pixels, matrix = seen.pixels.reshape(-1, 2), seen.camera.matrix()
     try:
-        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-            flat, seen.pixels.reshape(-1, 2), seen.camera.matrix(), None, flags=cv2.SOLVEPNP_IPPE
-        )
+        _, rvecs, tvecs, rms_px = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+        if not np.min(np.asarray(rms_px)) < _PLANE_RMS_PX:
+            # Seen exactly from ahead, OpenCV's IPPE makes any rotation vector out of a turn by 180 degrees.
+            _, rvecs, tvecs, _ = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # degenerate corners
         return []
     poses = []

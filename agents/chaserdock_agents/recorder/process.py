@@ -8,11 +8,14 @@ from __future__ import annotations
 
 import queue
 import time
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.faults import layer_of
+from chaserdock_protocol.inbox import Inbox
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Farewell,
@@ -49,6 +52,8 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
     out = options.out / run_name(mission) if options.by_run else options.out
     recording = Recording(out, mission, options.rotation, scenario)
     try:
+        flown = scenario or scenario_from_json(mission.scenario_json, source)
+        node.faults = layer_of(flown, node.name, lockstep=mission.mode == "lockstep")
         recorder = Recorder(node, recording)
         recorder.open(instance)
         while not recorder.finished() and not (stop() and recorder.idle()):
@@ -73,10 +78,10 @@ class Recorder:
     node: Node
     recording: Recording
     ended_s: float | None = None
-    _waiting: queue.SimpleQueue[Raw] = field(default_factory=queue.SimpleQueue)
+    _waiting: Inbox[Raw] = field(default_factory=Inbox)
     _received: dict[str, int] = field(default_factory=dict)
-    _promised: dict[str, int] = field(default_factory=dict)
-    _said_goodbye: set[str] = field(default_factory=set)
+    _promised: dict[str, dict[str, int]] = field(default_factory=dict)
+    _controllers: set[str] = field(default_factory=lambda: {"controller"})
     _expected: set[str] = field(default_factory=set)
     _latest: dict[str, int] = field(default_factory=dict)
     _acked: int = -1
@@ -84,15 +89,19 @@ class Recorder:
     def open(self, instance: str) -> None:
         """Subscribes everything, then tells its presence."""
         self.node.advertise(topics.ACK)
-        self.node.subscribe_raw("**", self._waiting.put)
+        self.node.subscribe_raw("**", self._arrived)
         self.teller = PresenceTeller(self.node, instance)
+
+    def _arrived(self, raw: Raw) -> None:
+        if not self._waiting.put(raw, len(raw.payload)):
+            self.node.counts.rejected["queue full"] += 1
 
     def take_one(self, timeout_s: float) -> None:
         """Writes one message, if one comes in time."""
         while self.node.receive(0) is not None:
             pass  # presence reaches the raw subscription, too; the typed one is only for the barrier
         try:
-            raw = self._waiting.get(timeout=timeout_s)
+            raw = self._waiting.get(timeout_s)
         except queue.Empty:
             return
         found, message = topics.topic_of_key(raw.key), None
@@ -108,8 +117,11 @@ class Recorder:
             case Presence():
                 self.teller.take(message)
             case Tick() as tick:
+                if self.node.faults is not None:
+                    self.node.faults.strike(tick.tick)
                 self.teller.settled.set()
                 self._expected = {topics.ACTUATORS.key_of(i) for i in tick.chasers}
+                self._controllers = {tick.commander or "controller", *tick.standing_by}
                 if tick.controller:
                     self._expected.add(topics.SOLVER.key_of())
                 self._latest[key] = tick.tick
@@ -118,8 +130,7 @@ class Recorder:
                 self._latest[key] = message.tick
                 self._confirm()
             case Farewell(process=process, published=published):
-                self._said_goodbye.add(process)
-                self._promised.update(published)
+                self._promised[process] = published
             case MissionEnd():
                 self.ended_s = time.monotonic()
 
@@ -134,9 +145,13 @@ class Recorder:
 
     def missing(self) -> dict[str, int]:
         """Messages that were published, by their publishers' own account, and never came."""
+        # Several controllers publish on the same keys, one at a time.
+        promised: Counter[str] = Counter()
+        for published in self._promised.values():
+            promised.update(published)
         return {
             key: number - self._received.get(key, 0)
-            for key, number in self._promised.items()
+            for key, number in promised.items()
             # Presence is told from before the recorder can hear it.
             if number > self._received.get(key, 0) and not key.endswith("/presence")
         }
@@ -151,10 +166,10 @@ class Recorder:
             return False
         everyone = {
             "world",
-            "controller",
+            *self._controllers,
             *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser")),
         }
-        complete = everyone <= self._said_goodbye and not self.missing() and self.idle()
+        complete = everyone <= self._promised.keys() and not self.missing() and self.idle()
         return complete or time.monotonic() - self.ended_s > _DRAIN_S
 
 

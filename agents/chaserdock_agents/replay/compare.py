@@ -11,7 +11,7 @@ import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.log import LogSource, read_log
 
-from chaserdock_agents.analysis.flight import _NOT_IN_DIGEST, Flight, load_flight
+from chaserdock_agents.analysis.flight import NOT_IN_DIGEST, Flight, load_flight
 from chaserdock_agents.analysis.summary import summary_of
 
 from .difference import Comparison, TopicDifference, difference_lines, first_difference
@@ -71,7 +71,7 @@ def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[Top
     comparison = Comparison(tolerance)
     for pair in zip_longest(read_log(first), read_log(second)):
         for side, record in enumerate(pair):
-            if record is not None and record.topic not in _NOT_IN_DIGEST:
+            if record is not None and record.topic not in NOT_IN_DIGEST:
                 comparison.add(side, record.key, record.message)
     return comparison.finish()
 

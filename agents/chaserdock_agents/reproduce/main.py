@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
+from chaserdock_agents.statuses import DONE, STOPPED
+
 from .content import sections
 from .page import html, markdown
 from .plan import SCENARIO, Plan, make_plan
@@ -14,7 +16,7 @@ TITLE = "The paper, flown again"
 
 
 def reproduce(quick: bool, out: Path, jobs: int, keep_logs: bool) -> int:
-    """Flies what is not flown yet and writes ``reproduction.md`` and ``.html`` into ``out``; 0, or 1 if interrupted.
+    """Flies what is not flown yet and writes ``reproduction.md`` and ``.html`` into ``out``; the exit status.
 
     Raises ReproduceError or ScenarioError when something could not be flown at all.
     """
@@ -25,9 +27,9 @@ def fly_plan(plan: Plan, out: Path, jobs: int, keep_logs: bool) -> int:
     """The same for any plan."""
     runner = Runner(out, jobs, keep_logs, _say)
     try:
-        results, status = runner.fly(plan), 0
+        results, status = runner.fly(plan), DONE
     except KeyboardInterrupt:
-        results, status = runner.results(plan), 1
+        results, status = runner.results(plan), STOPPED
         _say("interrupted; the same command goes on from here")
     write_page(plan, results, out)
     return status

@@ -55,7 +55,7 @@ def explained() -> Section:
             "Baseline and falloff rows: the start. The mean is made in the first ten seconds, and how long these take "
             "depends on where and how fast the target flies meanwhile (next table). Integration, feed-forward, latency and "
             "rate move the position figure little; weights move it more, but those the paper gives (the table after that).",
-            "dt: eq. 3 sums the stage costs but counts the final cost once. A smaller dt at equal weights means more "
+            "dt: eq. 6 sums the stage costs but counts the final cost once. A smaller dt at equal weights means more "
             "stages, so less weight on the end of the horizon, and a slower approach; with the stage weights divided alike "
             "the figure comes back (ingredients: dt = 1/30 s). The paper reports the opposite trend. Its smaller dt would "
             "need a start, or a solver, other than what it tells.",

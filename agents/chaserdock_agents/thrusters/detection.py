@@ -34,6 +34,8 @@ _OWN_SCATTER = 0.1
 """How well the failed jet's own thrust is known."""
 _LOSS_SIGMA = 0.07
 """How well the lost part must be known."""
+ENOUGH = 1.0 / _LOSS_SIGMA**2
+"""Information about a jet (``JetWatch.information``) from which on its lost part is known that well."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +48,16 @@ class Verdict:
 
 
 class JetWatch:
-    """The evidence of the last ticks against the jets of one chaser; ``matrix`` (6, n) as of ``wrench_matrix``."""
+    """The evidence of the last ticks against the jets of one chaser; ``matrix`` (6, n) as of ``wrench_matrix``.
+
+    ``information`` (n,): how much the last look told of what every jet has lost of its thrust, one over variance.
+    """
 
     def __init__(self, matrix: Array, full_N: Array, least_N_s: Array) -> None:
         self._matrix, self._full_N, self._least_N_s = matrix, full_N, least_N_s
         self._on: deque[tuple[Array, Array, float]] = deque(maxlen=max(_ON_WINDOWS))
         self._off: list[deque[tuple[Array, Array, float]]] = []
+        self.information = np.zeros(len(full_N))
         self.forget()
 
     def forget(self) -> None:
@@ -73,6 +79,7 @@ class JetWatch:
         energy = float(seen @ seen)
         self._on.append((extra * along, extra**2 * squared, energy))
         fired = suspects & (asked_N_s > 0.5 * self._least_N_s)
+        self.information = np.where(fired, asked_N_s**2 * squared, 0.0)
         for jet in np.flatnonzero(fired):
             self._off[jet].append((-asked_N_s * along, asked_N_s**2 * squared, energy))
         return self._stuck_on(suspects) or self._lost(np.flatnonzero(fired).tolist(), suspects)
@@ -102,7 +109,7 @@ class JetWatch:
                     squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
                 )
                 gain = np.where(suspects, loss * along - loss**2 * squared / 2.0, -math.inf)
-                known = squared[jet] * _LOSS_SIGMA**2 >= 1.0
+                known = squared[jet] >= ENOUGH
                 if not known or loss[jet] < _NOTICEABLE or int(np.argmax(gain)) != jet:
                     continue
                 if _stands_out(gain, jet) and _explained(

@@ -35,6 +35,7 @@ class Modulator:
         self._until_ns = 0
         self._next = 0
         self._paid_N, self._paid_until_ns = np.zeros(len(thrusters)), 0
+        self.period_s = self._period_steps / timing.physics_hz
 
     def paid_ahead_N_s(self, now_ns: int) -> Array:
         """(n,): what the pulses under way give instead of thrust that will be asked for only after ``now_ns``."""
@@ -46,13 +47,17 @@ class Modulator:
         self.owed_N_s += self._asked_N * (max(held_ns, 0) * 1e-9)
         self._accounted_ns = max(self._accounted_ns, until_ns)
 
-    def pulses(self, thrusts_N: Array, can_N: Array, begin_ns: int, end_ns: int) -> list[JetPulse]:
+    def pulses(
+        self, thrusts_N: Array, can_N: Array, begin_ns: int, end_ns: int, extra_N_s: Array | None = None
+    ) -> list[JetPulse]:
         """Pulses of the periods that begin while thrusts (n,) are asked for: from ``begin_ns`` up to ``end_ns``.
 
         ``can_N`` (n,) is what the jets really give when open; a jet that gives nothing gets no pulses. Every period
-        gets its pulses once.
+        gets its pulses once. ``extra_N_s`` (n,) is asked for beside the thrusts, as soon as a period begins.
         """
         self._account(begin_ns)
+        if extra_N_s is not None:
+            self.owed_N_s += extra_N_s
         self._asked_N, self._until_ns = thrusts_N.copy(), end_ns
         able = can_N > 0.0
         self.owed_N_s[~able] = 0.0

@@ -13,12 +13,15 @@ from chaserdock_protocol.valves import Valves
 from chaserdock_protocol.wrench_set import wrench_set
 
 from .allocation import allocator_of
-from .detection import JetWatch, Verdict
+from .detection import ENOUGH, Flags, JetWatch, Verdict
 from .modulation import Modulator
-from .residual import Noise, covariance, observed_impulse
+from .proof import JetProof
+from .residual import Noise, at_rest, covariance, noise_of, observed_impulse
 
 _LEAST_SCALE = 0.02
 """Of the body's limits: what the controller may ask for even of jets that cannot give every wrench any more."""
+_MOST_LOOKS = 10
+"""A jet is tested if so many least pulses would prove that it works."""
 _FORGET_NS = 1_000_000_000
 _LONGEST_NS = 1_000_000_000
 """No carrier period is longer."""
@@ -40,7 +43,12 @@ class JetPilot:
         self._valves = Valves(body.thrusters)  # what this chaser believes of the real ones
         least = self._full_N * [t.min_on_s for t in body.thrusters]
         self._watch = JetWatch(self._matrix, self._full_N, least)
-        self._noise = noise or Noise()
+        self._noise = noise or noise_of(scenario.odometry)
+        tells = (least**2 * (self._matrix**2 / at_rest(self._noise, body)[:, None]).sum(axis=0)).min()
+        # Pulses of whole periods are no test of one jet, and neither are those that drown in noise.
+        can_tell = body.modulation.modulator == "pwm" and _MOST_LOOKS * tells >= ENOUGH
+        self._proof = JetProof(self._allocator, least, body.jet_test_s if can_tell else 0.0, ENOUGH)
+        self._may_test = False
         self._told = [f for f in scenario.jet_failure if f.told and f.chaser == chaser]
         self._failed: dict[int, Verdict] = {}
         self._wanted_shut: frozenset[int] = frozenset()
@@ -88,11 +96,17 @@ class JetPilot:
             return
         residual = observed_impulse(before, after, self._body) - self._matrix @ jets
         noise = covariance(self._noise, self._body, self._matrix, jets, before, after)
-        out = {*self._failed, *self._valves.shut_at(before.sim_time_ns), *self._trusted}
-        suspects = np.array([jet not in out for jet in range(len(self._full_N))])
         time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
+        suspects = self._suspects(before.sim_time_ns)
         if (verdict := self._watch.look(residual, noise, jets, time_s, suspects)) is not None:
             self._convict(verdict, after.sim_time_ns, "found")
+        else:
+            self._proof.heard(self._watch.information, after.sim_time_ns)
+
+    def _suspects(self, at_ns: int) -> Flags:
+        """Jets (n,) whose failure could be found: not those that are shut, known to have failed, or vouched for."""
+        out = {*self._failed, *self._valves.shut_at(at_ns), *self._trusted}
+        return np.array([jet not in out for jet in range(len(self._full_N))])
 
     def _convict(self, verdict: Verdict, at_ns: int, how: str) -> None:
         kind: FailureKind = verdict.kind
@@ -155,6 +169,8 @@ class JetPilot:
         if shut != self._wanted_shut or trusted != self._trusted:
             self._watch.forget()
         self._wanted_shut, self._trusted = shut, trusted
+        # With its latch armed it is about to touch, or does, and wants to be pushed by nothing.
+        self._may_test = command.free and command.latch != "arm"
         if not command.free:
             self._free_since_ns = None
         elif self._free_since_ns is None:
@@ -171,7 +187,11 @@ class JetPilot:
             thrusts = np.zeros(len(can_N))
         begin_ns, isolated = command.effective_time_ns, self.isolated
         end_ns = self._timing.effective_ns(command.tick + 1)
-        pulses = self._modulator.pulses(thrusts, can_N, begin_ns, end_ns)
+        test = None
+        if self._may_test and command.source == "command":
+            suspects = self._suspects(begin_ns)
+            test = self._proof.burn(begin_ns, suspects, can_N, thrusts, self._modulator.period_s)
+        pulses = self._modulator.pulses(thrusts, can_N, begin_ns, end_ns, test)
         for p in pulses:
             self._valves.pulse(p.jet, p.open_ns, p.close_ns)
         self._valves.set_shut(isolated, begin_ns)

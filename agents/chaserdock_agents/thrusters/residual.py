@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,21 +10,33 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario_bodies import Body
+from chaserdock_protocol.scenario_odometry import OdometrySection
 
 
 @dataclass(frozen=True)
 class Noise:
     """One sigma of what makes a healthy chaser's motion differ from what is expected of its jets.
 
-    ``velocity_m_s`` and ``omega_rad_s``: of its odometry, each axis. ``scatter``: of a jet's impulse, in parts of it.
+    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of its odometry, each axis. ``scatter``: of a jet's impulse, in
+    parts of it.
     ``floor_*``: of the prediction itself (attitude within a tick, rounding), each axis; N s and N m s.
     """
 
     velocity_m_s: float = 0.0
     omega_rad_s: float = 0.0
+    attitude_rad: float = 0.0
     scatter: float = 0.05
     floor_N_s: float = 1e-3
     floor_N_m_s: float = 2e-4
+
+
+def noise_of(odometry: OdometrySection) -> Noise:
+    """What is to be expected where a scenario says how good the chasers' odometry is."""
+    return Noise(
+        odometry.velocity_noise_m_s,
+        math.radians(odometry.omega_noise_deg_s),
+        math.radians(math.hypot(odometry.attitude_noise_deg, odometry.attitude_bias_deg)),
+    )
 
 
 def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
@@ -51,11 +64,15 @@ def covariance(
     The faster it turns, the less the attitude half way says: a quarter of the turn is counted as one sigma.
     """
     turned = float(np.linalg.norm(after.omega_rad_s)) * (after.sim_time_ns - before.sim_time_ns) * 1e-9
-    fixed = np.concatenate(
+    relative = noise.scatter**2 + (turned / 4.0) ** 2 + noise.attitude_rad**2
+    return np.diag(at_rest(noise, body)) + (matrix * (relative * jets_N_s**2)) @ matrix.T
+
+
+def at_rest(noise: Noise, body: Body) -> Array:
+    """Variances (6,) of the observed impulse of a body whose jets are quiet."""
+    return np.concatenate(
         [
             np.full(3, noise.floor_N_s**2 + 2.0 * (body.mass_kg * noise.velocity_m_s) ** 2),
             noise.floor_N_m_s**2 + 2.0 * (np.asarray(body.inertia) * noise.omega_rad_s) ** 2,
         ]
     )
-    relative = noise.scatter**2 + (turned / 4.0) ** 2
-    return np.diag(fixed) + (matrix * (relative * jets_N_s**2)) @ matrix.T

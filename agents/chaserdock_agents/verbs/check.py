@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from .options import JsonOpt
+
 
 def check(
     process: Annotated[str, typer.Argument(help="whose place it takes: controller, or chaser/N")],
@@ -19,13 +21,21 @@ def check(
     patience: Annotated[
         float, typer.Option("--patience-s", min=0.1, help="seconds that an answer, or its end, may take")
     ] = 10.0,
+    as_json: JsonOpt = False,
 ) -> None:
     """Run a foreign process against a recorded log; status 0 if it keeps the protocol, 1 if not."""
+    import json
+
+    import msgspec
+
     from chaserdock_agents.check.stand import check as run
 
     found = run(log, process, command, ticks, start, patience)
-    for finding in found.findings:
-        print(finding.line())
-    verdict = f"{len(found.findings)} findings" if found.findings else "keeps the protocol"
-    print(f"{process}: {verdict}; {found.ticks} ticks played, {found.messages} messages heard")
+    if as_json:
+        print(json.dumps({"kept": not found.findings, **msgspec.to_builtins(found)}, indent=2))
+    else:
+        for finding in found.findings:
+            print(finding.line())
+        verdict = f"{len(found.findings)} findings" if found.findings else "keeps the protocol"
+        print(f"{process}: {verdict}; {found.ticks} ticks played, {found.messages} messages heard")
     raise typer.Exit(1 if found.findings else 0)

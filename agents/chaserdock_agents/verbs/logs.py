@@ -9,9 +9,17 @@ from typing import Annotated
 
 import typer
 
-from .options import ConfigOpt, ConnectOpt, ListenOpt, NamespaceOpt, NetModeOpt, link_of
+from chaserdock_agents.statuses import DONE, STOPPED
 
-app = typer.Typer(help="Look into a log, repair it, export it, send it again.", no_args_is_help=True)
+from .options import ConfigOpt, ConnectOpt, JsonOpt, ListenOpt, NamespaceOpt, NetModeOpt, link_of
+from .plain import PlainGroup
+
+app = typer.Typer(
+    cls=PlainGroup,
+    rich_markup_mode=None,
+    help="Look into a log, repair it, export it, send it again.",
+    no_args_is_help=True,
+)
 
 LogArg = Annotated[
     list[Path],
@@ -32,7 +40,7 @@ def _source(log: list[Path]) -> Path | list[Path]:
 
 
 @app.command()
-def info(log: LogArg, as_json: Annotated[bool, typer.Option("--json", help="print JSON")] = False) -> None:
+def info(log: LogArg, as_json: JsonOpt = False) -> None:
     """Say what a log holds and check all of it; status 1 when it is not whole (cut off, messages missing or refused)."""
     import msgspec
 
@@ -120,4 +128,4 @@ def play(
     link = link_of(namespace, connect or [], listen, net_mode, config, 60_000)
     stop = Stop(watch_parent=False)
     print(f"{send(_source(log), link, speed, patience, stopped=stop)} messages sent")
-    raise typer.Exit(1 if stop() else 0)
+    raise typer.Exit(STOPPED if stop() else DONE)

@@ -7,10 +7,27 @@ from typing import Annotated
 
 import typer
 
-from .options import ConfigOpt, ConnectOpt, KeysOpt, ListenOpt, NamespaceOpt, NetModeOpt, fail, link_of
+from .options import (
+    ConfigOpt,
+    ConnectOpt,
+    JsonOpt,
+    KeysOpt,
+    LinesOpt,
+    ListenOpt,
+    NamespaceOpt,
+    NetModeOpt,
+    QuietOpt,
+    errors_as_lines,
+    fail,
+    link_of,
+    show_of,
+)
+from .plain import PlainGroup
 from .processes import start_process
 
-keys = typer.Typer(help="Keys and certificates of a mission.", no_args_is_help=True)
+keys = typer.Typer(
+    cls=PlainGroup, rich_markup_mode=None, help="Keys and certificates of a mission.", no_args_is_help=True
+)
 
 
 def router(
@@ -54,7 +71,7 @@ def status(
     config: ConfigOpt = None,
     keys: KeysOpt = None,
     seconds: Annotated[float, typer.Option(help="how long to look on")] = 3.0,
-    as_json: Annotated[bool, typer.Option("--json", help="as JSON, for programs")] = False,
+    as_json: JsonOpt = False,
 ) -> None:
     """Show who is there on a mission's network, the tick, and each chaser's phase; status 2 when nobody is."""
     import json
@@ -82,13 +99,16 @@ def judge(
     world_away: Annotated[
         float, typer.Option(help="seconds after which a world that is gone is lost")
     ] = 60.0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="no progress")] = False,
+    quiet: QuietOpt = False,
+    as_json: LinesOpt = False,
 ) -> None:
     """Watch a mission that others fly, wait for its log, judge it; status 0 only if it was a success."""
     from chaserdock_agents.judge import judge_mission
 
+    show = show_of(quiet, as_json)
     link = link_of(namespace, connect, None, net_mode, config, lease_ms, keys)
-    raise typer.Exit(judge_mission(out, link, patience, world_away, quiet))
+    with errors_as_lines(as_json):
+        raise typer.Exit(judge_mission(out, link, patience, world_away, show))
 
 
 @keys.command("init")

@@ -7,11 +7,20 @@ from __future__ import annotations
 
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from chaserdock_protocol.errors import ChaserdockError
+
+from chaserdock_agents.scenarios import shipped_names
+from chaserdock_agents.statuses import BAD_INPUT
+
+if TYPE_CHECKING:
+    from chaserdock_agents.progress import Show
 
 
 class Mode(StrEnum):
@@ -21,7 +30,23 @@ class Mode(StrEnum):
     realtime = "realtime"
 
 
-ScenarioArg = Annotated[str, typer.Argument(help="scenario file, or the name of one that is shipped")]
+def complete_scenario(incomplete: str) -> list[str]:
+    """Shipped scenarios and TOML files here that begin so, for the shell."""
+    folder, _, begun = incomplete.rpartition("/")
+    files = [
+        f"{folder}/{path.name}" if folder else path.name
+        for path in sorted(Path(folder or ".").glob(f"{begun}*"))
+        if path.suffix == ".toml"
+    ]
+    return [name for name in shipped_names() if name.startswith(incomplete)] + files
+
+
+ScenarioArg = Annotated[
+    str,
+    typer.Argument(
+        help="scenario file, or the name of one that is shipped", autocompletion=complete_scenario
+    ),
+]
 SetOpt = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="change a scenario value")
 ]
@@ -47,6 +72,11 @@ KeysOpt = Annotated[
 ]
 LeaseOpt = Annotated[int, typer.Option("--lease-ms", help="after that long a silent process counts as lost")]
 PatienceOpt = Annotated[float | None, typer.Option(help="seconds to wait for a world; for ever by default")]
+QuietOpt = Annotated[bool, typer.Option("--quiet", "-q", help="no progress, only the verdict")]
+LinesOpt = Annotated[
+    bool, typer.Option("--json", help="for scripts: JSON lines on standard output, see docs/cli.md")
+]
+JsonOpt = Annotated[bool, typer.Option("--json", help="print JSON")]
 WatchOpt = Annotated[bool, typer.Option("--watch-parent", hidden=True)]
 OutOpt = Annotated[Path | None, typer.Option("--out", help="folder for log and summary; runs/… by default")]
 
@@ -55,7 +85,29 @@ def fail(text: str) -> typer.Exit:
     """One line on standard error, status 2."""
     for line in text.splitlines():
         print(f"chaserdock: {line}", file=sys.stderr)
-    return typer.Exit(2)
+    return typer.Exit(BAD_INPUT)
+
+
+def show_of(quiet: bool, as_json: bool) -> Show:
+    """To whom a flight is shown."""
+    from chaserdock_agents.progress import Show
+
+    if quiet and as_json:
+        raise fail("--quiet and --json: one or the other; --json shows people nothing anyway")
+    return Show.scripts if as_json else Show.nobody if quiet else Show.people
+
+
+@contextmanager
+def errors_as_lines(as_json: bool) -> Iterator[None]:
+    """Tells an error to scripts as well, as the last JSON line of a verb that flies."""
+    try:
+        yield
+    except ChaserdockError as error:
+        if as_json:
+            from chaserdock_agents.flight_lines import Failed, line_of
+
+            print(line_of(Failed(status=BAD_INPUT, text=str(error))), flush=True)
+        raise
 
 
 def link_of(

@@ -9,14 +9,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from chaserdock_protocol.errors import ChaserdockError
 
-from chaserdock_agents.scenarios import find_scenario
+from chaserdock_agents.scenarios import find_scenario, shipped_names
 
 from .options import (
     ConfigOpt,
     ConnectOpt,
     KeysOpt,
     LeaseOpt,
+    LinesOpt,
     ListenOpt,
     Mode,
     ModeOpt,
@@ -24,12 +26,15 @@ from .options import (
     NetModeOpt,
     OutOpt,
     PatienceOpt,
+    QuietOpt,
     ScenarioArg,
     SeedOpt,
     SetOpt,
     WatchOpt,
+    errors_as_lines,
     fail,
     link_of,
+    show_of,
 )
 
 
@@ -53,8 +58,15 @@ def start_process(name: str, options) -> None:
 def _found(scenario: str) -> Path:
     path = find_scenario(scenario)
     if path is None:
-        raise fail(f"{scenario}: no such scenario file, and none of that name is shipped")
+        raise ScenarioNotFound(
+            f"{scenario}: no such scenario file, and none of that name is shipped; "
+            f"there are {', '.join(shipped_names())}"
+        )
     return path
+
+
+class ScenarioNotFound(ChaserdockError):
+    """No file of that name, and none shipped."""
 
 
 def run(
@@ -63,14 +75,18 @@ def run(
     mode: ModeOpt = Mode.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="no progress")] = False,
+    quiet: QuietOpt = False,
+    as_json: LinesOpt = False,
+    view: Annotated[bool, typer.Option("--view", help="show it in a web browser, too (see `view`)")] = False,
 ) -> None:
-    """Fly a scenario on this machine: start every process, record, judge."""
+    """Fly a scenario on this machine: start every process, record, judge; status 0 only if it was a success."""
     from chaserdock_agents.launcher import run_mission
 
-    path = _found(scenario)
-    folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
-    raise typer.Exit(run_mission(path, folder, mode.value, seed, tuple(overrides or ()), quiet))
+    show = show_of(quiet, as_json)
+    with errors_as_lines(as_json):
+        path = _found(scenario)
+        folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
+        raise typer.Exit(run_mission(path, folder, mode.value, seed, tuple(overrides or ()), show, view))
 
 
 def world(
@@ -132,6 +148,10 @@ def chaser(
 
 
 def controller(
+    standby: Annotated[
+        bool,
+        typer.Option("--standby", help="as the second one: follow, and take over when the first is lost"),
+    ] = False,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
@@ -145,8 +165,10 @@ def controller(
     """The central controller: fuses what all chasers see, plans for all of them."""
     from chaserdock_protocol.runtime import ProcessOptions
 
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, "controller")
-    start_process("controller", ProcessOptions(link=link, patience_s=patience, watch_parent=watch_parent))
+    name = "standby" if standby else "controller"
+    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, name)
+    options = ProcessOptions(link=link, patience_s=patience, watch_parent=watch_parent, standby=standby)
+    start_process("controller", options)
 
 
 def record(

@@ -56,9 +56,14 @@ def video(
     fps: Annotated[int, typer.Option(min=1, max=60, help="frames a second of film")] = 15,
     width: Annotated[int, typer.Option(min=320, max=3840, help="pixels, even")] = 1280,
     height: Annotated[int, typer.Option(min=180, max=2160, help="pixels, even")] = 720,
+    from_s: Annotated[
+        float, typer.Option("--from", min=0.0, help="simulated time of the first frame, s")
+    ] = 0.0,
+    to_s: Annotated[float, typer.Option("--to", help="simulated time of the last frame, s")] = float("inf"),
+    quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: fewer bytes to better pictures")] = 60,
 ) -> None:
     """Film a recorded flight: the mission from outside beside the cameras' pictures with what was found in them."""
     from chaserdock_agents.analysis.video import write_video
 
-    number = write_video(log, out, speed, fps, width, height)
+    number = write_video(log, out, speed, fps, width, height, (from_s, to_s), quality)
     print(f"{out}: {number} frames, {number / fps:.1f} s")

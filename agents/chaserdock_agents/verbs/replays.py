@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-JsonOpt = Annotated[bool, typer.Option("--json", help="print JSON")]
+from .options import JsonOpt
+
 ToleranceOpt = Annotated[
     float, typer.Option(min=0.0, help="numbers at most so far apart count as equal (another kind of CPU)")
 ]
@@ -28,7 +29,7 @@ def replay(
     """Feed recorded inputs to today's code and compare what it says with the log; status 1 when it differs."""
     from chaserdock_protocol.runtime import SINGLE_THREADED
 
-    os.environ |= SINGLE_THREADED  # as the processes flew; before NumPy and numba are there
+    os.environ |= SINGLE_THREADED  # as the processes flew; before NumPy is there
     import msgspec
 
     from chaserdock_agents.replay.difference import difference_lines, first_difference

@@ -6,7 +6,7 @@ from .geometry import to_world
 from .mekf import Mekf
 from .paper import PaperEstimator, PaperParameters
 from .parameters import MekfParameters
-from .types import Estimator, Measurement, PoseHypothesis, TargetEstimate
+from .types import CameraError, Estimator, Eye, Measurement, PoseHypothesis, TargetEstimate
 
 ESTIMATORS = ("mekf", "paper")
 
@@ -27,7 +27,9 @@ def make_estimator(name: str, parameters: MekfParameters | PaperParameters | Non
 
 __all__ = [
     "ESTIMATORS",
+    "CameraError",
     "Estimator",
+    "Eye",
     "Measurement",
     "Mekf",
     "MekfParameters",

@@ -1,8 +1,7 @@
 """One hypothesis of the target's state: prediction and measurement update of the error-state filter.
 
-Error state: position, velocity (WRF), dtheta, omega (TRF), then for every camera seen so far six numbers
-of calibration bias: a shift and a rotation of the target's pose, both in TRF axes, so that a measured
-pose is (p + R(q) b_p, q (x) exp(b_theta)) plus noise. Branches are values: nothing changes in place.
+Error state: position, velocity (WRF), dtheta, omega (TRF), then for every camera seen so far its seven calibration
+errors (``eyes``). Branches are values: nothing changes in place.
 Source of the error-state equations: J. Sola, "Quaternion kinematics for the error-state Kalman filter".
 """
 
@@ -15,9 +14,10 @@ from functools import lru_cache
 import numpy as np
 
 from . import motion
+from .eyes import ERRORS, NO_ERROR, pose_prior, prior, seen_by
 from .parameters import MekfParameters, chi_square_6
-from .scalar import qexp, qinv_mul, qlog, qmatrix, qmul, qnormalize, right_jacobian, skew
-from .types import Array, Measurement, PoseHypothesis
+from .scalar import qexp, qinv_mul, qlog, qmul, qnormalize, right_jacobian
+from .types import Array, Eye, Measurement, PoseHypothesis
 
 POSE = np.array([0, 1, 2, 6, 7, 8])
 _POSE_GRID = np.ix_(POSE, POSE)
@@ -28,7 +28,7 @@ _EYE3 = np.eye(3)
 class Branch:
     """State and covariance at ``time_ns``.
 
-    cameras: chaser of each bias slot; bias: (len(cameras), 6). covariance: (12 + 6 n, 12 + 6 n) with n
+    cameras: chaser of each bias slot; bias: (len(cameras), 7). covariance: (12 + 7 n, 12 + 7 n) with n
     slots. log_likelihood: of all measurements since the branch began. misses: per chaser, how
     many of its measurements were gated out in a row.
     """
@@ -83,7 +83,7 @@ def predict(branch: Branch, time_ns: int, p: MekfParameters) -> Branch:
         fade = math.exp(-dt / p.bias_time_constant_s)
         i = np.arange(12, n)
         f[i, i] = fade
-        noise[i, i] = (1.0 - fade * fade) * np.tile(_prior_bias(p).diagonal(), len(branch.cameras))
+        noise[i, i] = (1.0 - fade * fade) * np.tile(prior(p).diagonal(), len(branch.cameras))
         bias = bias * fade
     position, velocity = branch.position_m + branch.velocity_m_s * dt, branch.velocity_m_s
     if any(p.centre_of_mass_trf_m):
@@ -113,37 +113,33 @@ def with_cameras(branch: Branch, chasers: list[int], p: MekfParameters) -> Branc
     if not new:
         return branch
     n = branch.covariance.shape[0]
-    covariance = np.zeros((n + 6 * len(new), n + 6 * len(new)))
+    covariance = np.zeros((n + ERRORS * len(new), n + ERRORS * len(new)))
     covariance[:n, :n] = branch.covariance
     i = np.arange(n, covariance.shape[0])
-    covariance[i, i] = np.tile(_prior_bias(p).diagonal(), len(new))
-    bias = np.vstack([branch.bias, np.zeros((len(new), 6))])
+    covariance[i, i] = np.tile(prior(p).diagonal(), len(new))
+    bias = np.vstack([branch.bias, np.zeros((len(new), ERRORS))])
     return replace(branch, cameras=branch.cameras + new, bias=bias, covariance=covariance)
 
 
-def innovate(branch: Branch, chaser: int, h: PoseHypothesis, p: MekfParameters) -> Innovation:
+def innovate(branch: Branch, chaser: int, eye: Eye, h: PoseHypothesis, p: MekfParameters) -> Innovation:
     """How the measured pose ``h`` differs from the branch's prediction, and how much that may be.
 
-    The residual's Jacobian is exact at zero error; the camera's bias is part of the prediction.
+    The residual's Jacobian is exact at zero error; the camera's own errors are part of the prediction.
     """
     n = branch.covariance.shape[0]
     jacobian = np.zeros((6, n))
-    jacobian[0, 0] = jacobian[1, 1] = jacobian[2, 2] = 1.0
+    jacobian[3:, 6:9] = _EYE3
     residual = np.empty(6)
     if p.has_bias:
         k = branch.cameras.index(chaser)
-        b = branch.bias[k]
-        rotation = qmatrix(branch.q_wxyz)
-        turn = qexp(b[3:])
-        column = 12 + 6 * k
-        jacobian[:3, 6:9] = -rotation @ skew(b[:3])
-        jacobian[3:, 6:9] = qmatrix(turn).T
-        jacobian[:3, column : column + 3] = rotation
-        jacobian[3:, column + 3 : column + 6] = right_jacobian(b[3:])
-        residual[:3] = h.position_m - branch.position_m - rotation @ b[:3]
-        residual[3:] = qlog(qinv_mul(qmul(branch.q_wxyz, turn), h.q_wxyz))
+        expected = seen_by(eye, branch.position_m, branch.q_wxyz, branch.bias[k])
+        column = 12 + ERRORS * k
+        jacobian[:3, :3] = expected.by_position
+        jacobian[:, column : column + ERRORS] = expected.by_errors
+        residual[:3] = h.position_m - expected.position_m
+        residual[3:] = qlog(qinv_mul(expected.q_wxyz, h.q_wxyz))
     else:
-        jacobian[3:, 6:9] = _EYE3
+        jacobian[:3, :3] = _EYE3
         residual[:3] = h.position_m - branch.position_m
         residual[3:] = qlog(qinv_mul(branch.q_wxyz, h.q_wxyz))
     noise = measurement_noise(h, p)
@@ -173,14 +169,14 @@ def correct(branch: Branch, i: Innovation) -> Branch:
         velocity_m_s=branch.velocity_m_s + d[3:6],
         q_wxyz=qnormalize(qmul(branch.q_wxyz, qexp(dtheta))),
         omega_rad_s=branch.omega_rad_s + d[9:12],
-        bias=branch.bias + d[12:].reshape(-1, 6),
+        bias=branch.bias + d[12:].reshape(-1, ERRORS),
         covariance=_symmetric(covariance),
     )
 
 
 def best_innovation(branch: Branch, m: Measurement, p: MekfParameters) -> tuple[int, Innovation]:
     """Index and innovation of the likeliest hypothesis of a measurement that has at least one."""
-    found = [innovate(branch, m.chaser, h, p) for h in m.hypotheses]
+    found = [innovate(branch, m.chaser, m.eye, h, p) for h in m.hypotheses]
     best = max(range(len(found)), key=lambda k: (found[k].log_density, -k))
     return best, found[best]
 
@@ -199,7 +195,7 @@ def absorb(
     order = group
     if len(group) > 1 and _vague(branch, group, p):
         found = [best_innovation(branch, m, p) for m in group]
-        support = agreement([m.hypotheses[k] for m, (k, _) in zip(group, found, strict=True)], p)
+        support = agreement([(m.hypotheses[k], m.eye) for m, (k, _) in zip(group, found, strict=True)], p)
         ranks = sorted((-support[i], found[i][1].nis, i) for i in range(len(group)))
         order = [group[i] for _, _, i in ranks]
 
@@ -223,22 +219,28 @@ def absorb(
     return branch, tuple(sorted(accepted)), tuple(sorted(rejected))
 
 
-def agreement(poses: list[PoseHypothesis], p: MekfParameters) -> list[int]:
-    """For each pose, how many of the others agree with it within noise, floor and prior bias."""
+def agreement(poses: list[tuple[PoseHypothesis, Eye]], p: MekfParameters) -> list[int]:
+    """For each pose, how many of the others agree with it within noise, floor and the cameras' prior errors."""
     counts = [0] * len(poses)
     for i in range(len(poses)):
         for j in range(i):
-            if agree(poses[i], poses[j], p):
+            if agree(*poses[i], *poses[j], p):
                 counts[i] += 1
                 counts[j] += 1
     return counts
 
 
-def agree(a: PoseHypothesis, b: PoseHypothesis, p: MekfParameters) -> bool:
+def agree(a: PoseHypothesis, eye_a: Eye, b: PoseHypothesis, eye_b: Eye, p: MekfParameters) -> bool:
     """Whether two measured poses of the same time differ by no more than their errors explain."""
     d = np.concatenate([a.position_m - b.position_m, qlog(qinv_mul(b.q_wxyz, a.q_wxyz))])
-    s = measurement_noise(a, p) + measurement_noise(b, p) + 2.0 * _prior_bias(p)
+    s = _spread(a, eye_a, p) + _spread(b, eye_b, p)
     return float(d @ np.linalg.solve(s, d)) <= chi_square_6(p.gate_probability)
+
+
+def _spread(h: PoseHypothesis, eye: Eye, p: MekfParameters) -> Array:
+    """Covariance (6, 6) of a measured pose, its camera's unknown errors among it."""
+    noise = measurement_noise(h, p)
+    return noise + pose_prior(eye, h.position_m, h.q_wxyz, p) if p.has_bias else noise
 
 
 def start(
@@ -255,21 +257,19 @@ def start(
     covariance[np.ix_(r, r)] = rate_covariance
     covariance[_POSE_GRID] = measurement_noise(h, p) * scale
     branch = Branch(
-        time_ns, h.position_m, velocity, qnormalize(h.q_wxyz), omega, (), np.zeros((0, 6)), covariance,
+        time_ns, h.position_m, velocity, qnormalize(h.q_wxyz), omega, (), np.zeros((0, ERRORS)), covariance,
         0.0, {},
     )  # fmt: skip
     if not p.has_bias:
         return branch
     branch = with_cameras(branch, [m.chaser], p)
-    spread = np.zeros((6, 6))
-    spread[:3, :3] = qmatrix(branch.q_wxyz)
-    spread[3:, 3:] = _EYE3
-    bias = _prior_bias(p)
+    # Measured is the pose plus what the camera's errors do to it: the pose has that error, with the sign turned.
+    spread = seen_by(m.eye, branch.position_m, branch.q_wxyz, NO_ERROR).by_errors
     covariance = branch.covariance.copy()
-    covariance[_POSE_GRID] += spread @ bias @ spread.T
-    cross = -spread @ bias
-    covariance[POSE, 12:18] = cross
-    covariance[12:18, POSE] = cross.T
+    covariance[_POSE_GRID] += spread @ prior(p) @ spread.T
+    cross = -spread @ prior(p)
+    covariance[POSE, 12:] = cross
+    covariance[12:, POSE] = cross.T
     return replace(branch, covariance=_symmetric(covariance))
 
 
@@ -292,17 +292,12 @@ def _diagonal(position_m: float, attitude_rad: float) -> Array:
     return matrix
 
 
-def _prior_bias(p: MekfParameters) -> Array:
-    """Covariance (6, 6) of one camera's bias before anything is known of it."""
-    return _diagonal(p.bias_position_m, p.bias_attitude_rad)
-
-
 def _vague(branch: Branch, group: list[Measurement], p: MekfParameters) -> bool:
     """Whether the prediction is so much wider than the measurements that it can hardly judge them."""
     prior = branch.covariance.diagonal()
     for m in group:
         for h in m.hypotheses:
-            allowed = 4.0 * (measurement_noise(h, p) + _prior_bias(p)).diagonal()
+            allowed = 4.0 * _spread(h, m.eye, p).diagonal()
             if prior[0:3].sum() > allowed[:3].sum() or prior[6:9].sum() > allowed[3:].sum():
                 return True
     return False

@@ -10,14 +10,26 @@ from bisect import bisect_left, bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-from .branch import predict
+import numpy as np
+
+from .branch import POSE, predict
+from .eyes import ERRORS
 from .parameters import MekfParameters
 from .step import Event, FilterState, is_lost, mixture_covariance, process, shaken
-from .types import Matrix3, Measurement, Shock, TargetEstimate, content_key, is_usable, no_estimate
+from .types import (
+    CameraError,
+    Matrix3,
+    Measurement,
+    Shock,
+    TargetEstimate,
+    content_key,
+    is_usable,
+    no_estimate,
+)
 
 
 @dataclass
-class _Exposure:
+class Exposure:
     """The measurements of one exposure time (sorted by chaser) and what they led to.
 
     ``parameters`` hold up to it from the exposure before; ``shocks`` changed the rates after it.
@@ -45,7 +57,7 @@ class Mekf:
         self.early_dropped = 0
         self.invalid = 0
         self.duplicates = 0
-        self._buffer: list[_Exposure] = []
+        self._buffer: list[Exposure] = []
         self._base: FilterState | None = None  # the state just before the buffer
         self._pending: list[Event] = []  # events outside of the buffer, not yet drained
         self._drained: set[Event] = set()  # events of the buffer already drained
@@ -117,17 +129,30 @@ class Mekf:
             status = "tracking"
         else:
             status = "predicting"
+        covariance = mixture_covariance(branches)
+        covariance[np.ix_(POSE, POSE)] += state.frozen
         return TargetEstimate(
             time_ns,
             best.position_m.copy(),
             best.velocity_m_s.copy(),
             best.q_wxyz.copy(),
             best.omega_rad_s.copy(),
-            mixture_covariance(branches),
+            covariance,
             status,
             len(state.seen),
             state.rejected,
         )
+
+    def cameras(self) -> tuple[CameraError, ...]:
+        """What is known of the calibration errors of the cameras seen so far, at the newest exposure, by chaser."""
+        state = self._newest()
+        if state is None or not state.branches:
+            return ()
+        best, found = state.branches[0], []
+        for k, (chaser, error) in enumerate(zip(best.cameras, best.bias, strict=True)):
+            i = slice(12 + ERRORS * k, 12 + ERRORS * (k + 1))
+            found.append(CameraError(chaser, error[:3], error[3:6], float(error[6]), best.covariance[i, i]))
+        return tuple(sorted(found, key=lambda e: e.chaser))
 
     def disturb(self, shock: Shock) -> None:
         """Something has pushed the target since the newest exposure."""
@@ -166,7 +191,7 @@ class Mekf:
     def _insert(self, m: Measurement) -> bool:
         i = bisect_left(self._buffer, m.time_ns, key=lambda e: e.time_ns)
         if i == len(self._buffer) or self._buffer[i].time_ns != m.time_ns:
-            self._buffer.insert(i, _Exposure(m.time_ns, [m], self.parameters))
+            self._buffer.insert(i, Exposure(m.time_ns, [m], self.parameters))
             return True
         group = self._buffer[i].group
         if any(other.chaser == m.chaser for other in group):

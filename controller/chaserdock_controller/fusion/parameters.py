@@ -43,8 +43,11 @@ class MekfParameters:
         densities of white (angular) acceleration. The target's rates are truly constant, so these only
         say how long the filter remembers: larger follows surprises faster, smaller is smoother.
     floor_*: white noise added to every measurement, against overconfident covariances.
-    bias_*: a calibration error of each camera, constant in TRF but for a slow change with the time
-        constant, estimated with the target (first-order Gauss-Markov). Zero sigma switches it off.
+    bias_*: one sigma of each camera's calibration error (mounting, lens position, focal length; ``eyes``), constant in
+        its own axes but for a slow change with the time constant, estimated with the target (first-order
+        Gauss-Markov). Zero sigma switches one off.
+    frozen_share: what of a measurement's sigma does not average out while the view stays the same. It is not
+        estimated but considered: published covariances contain it.
     initial_*: sigma of the unknown rates at the first sight.
     single_marker_scale: factor on the sigma of a first pose that rests on one marker.
     reinitialised_*: sigma added to the rates, whose values are kept, at a re-initialisation.
@@ -67,9 +70,11 @@ class MekfParameters:
     angular_noise_rad_s2_sqrt_hz: float = 1e-4
     floor_position_m: float = 2e-4
     floor_attitude_rad: float = math.radians(0.02)
-    bias_position_m: float = 4e-3
+    bias_position_m: float = 2e-3
     bias_attitude_rad: float = math.radians(0.3)
-    bias_time_constant_s: float = 100.0
+    bias_focal_share: float = 1e-3
+    bias_time_constant_s: float = 3600.0
+    frozen_share: float = 1.5
     initial_velocity_m_s: float = 0.1
     initial_omega_rad_s: float = 0.2
     single_marker_scale: float = 3.0
@@ -89,6 +94,7 @@ class MekfParameters:
         if self.motion_model not in MODELS:
             raise ValueError(f"unknown motion model {self.motion_model!r}; known: {', '.join(MODELS)}")
         may_be_zero = ("floor_position_m", "floor_attitude_rad", "bias_position_m", "bias_attitude_rad")
+        may_be_zero += ("bias_focal_share", "frozen_share")
         may_be_zero += ("acceleration_noise_m_s2_sqrt_hz", "angular_noise_rad_s2_sqrt_hz", "buffer_s")
         for field in fields(self):
             value = getattr(self, field.name)
@@ -100,8 +106,6 @@ class MekfParameters:
             raise ValueError(f"centre_of_mass_trf_m is out of range: {self.centre_of_mass_trf_m}")
         if not 0.0 < self.gate_probability < 1.0:
             raise ValueError(f"gate_probability must lie between 0 and 1: {self.gate_probability}")
-        if (self.bias_position_m == 0.0) != (self.bias_attitude_rad == 0.0):
-            raise ValueError("bias_position_m and bias_attitude_rad: both zero (off) or neither")
         if self.single_marker_scale < 1.0:
             raise ValueError(f"single_marker_scale must be at least 1: {self.single_marker_scale}")
         inertia = np.array(self.inertia_ratios, dtype=float)
@@ -114,4 +118,4 @@ class MekfParameters:
     @property
     def has_bias(self) -> bool:
         """Whether camera biases are estimated."""
-        return self.bias_position_m > 0.0
+        return max(self.bias_position_m, self.bias_attitude_rad, self.bias_focal_share) > 0.0

@@ -7,7 +7,7 @@ put in by going back to the state before it and running the later exposures agai
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,7 +25,8 @@ class FilterState:
 
     branches: none before the first sight, two while an ambiguous start (at ``ambiguous_since_ns``) is
     open, one otherwise; the likeliest first. recent: the latest measurement of each chaser, as it came.
-    seen, rejected: chasers accepted and gated out at this exposure. The rest are counts since the start.
+    seen, rejected: chasers accepted and gated out at this exposure. frozen: covariance (6, 6) of the pose that comes of
+    what does not average out of the last accepted measurements. The rest are counts since the start.
     """
 
     time_ns: int
@@ -35,6 +36,7 @@ class FilterState:
     last_accepted_ns: int = 0
     seen: tuple[int, ...] = ()
     rejected: tuple[int, ...] = ()
+    frozen: Array = field(default_factory=lambda: np.zeros((6, 6)))
     accepted: int = 0
     gated: int = 0
     reinitialisations: int = 0
@@ -71,7 +73,19 @@ def process(
         now = found if found is not None else _absorb_all(now, seen, p, events)
         if all(_mostly_gated(b, now, p) for b in now.branches):
             now = _restart(now, seen, p, events)
+    now = replace(now, frozen=_frozen([m for m in seen if m.chaser in now.seen], p, now.frozen))
     return _choose(now, p, events), tuple(events)
+
+
+def _frozen(believed: list[Measurement], p: MekfParameters, before: Array) -> Array:
+    """Covariance (6, 6) of the part of the cameras' errors that stays while their view does: each camera's share of its
+    measurement's covariance, independent of the other cameras'; ``before`` where nothing was believed."""
+    if not believed or p.frozen_share == 0.0:
+        return before
+    information = np.zeros((6, 6))
+    for m in believed:
+        information += np.linalg.inv(m.hypotheses[0].covariance)
+    return p.frozen_share**2 * np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
 def shaken(state: FilterState, shocks: list[Shock]) -> FilterState:
@@ -177,13 +191,17 @@ def _opinions(now: FilterState) -> list[Measurement]:
     return [m for m in opinions if m.hypotheses]
 
 
-def _support(h: PoseHypothesis, chaser: int, opinions: list[Measurement], p: MekfParameters) -> int:
-    return sum(any(agree(h, other, p) for other in m.hypotheses) for m in opinions if m.chaser != chaser)
+def _support(h: PoseHypothesis, seen: Measurement, opinions: list[Measurement], p: MekfParameters) -> int:
+    return sum(
+        any(agree(h, seen.eye, other, m.eye, p) for other in m.hypotheses)
+        for m in opinions
+        if m.chaser != seen.chaser
+    )
 
 
 def _ranking(m: Measurement, opinions: list[Measurement], p: MekfParameters) -> tuple[int, bool, int, float]:
     """How good a measurement is to begin with: agreement, no ambiguity, markers, small covariance."""
-    support = max(_support(h, m.chaser, opinions, p) for h in m.hypotheses)
+    support = max(_support(h, m, opinions, p) for h in m.hypotheses)
     return support, len(m.hypotheses) == 1, m.markers, -float(np.trace(m.hypotheses[0].covariance))
 
 
@@ -198,7 +216,7 @@ def _begin(
 ) -> FilterState:
     """Branches from the camera that most others agree with; the other cameras follow as updates."""
     seed = max(seen, key=lambda m: (*_ranking(m, opinions, p), -m.chaser))
-    supports = [_support(h, seed.chaser, opinions, p) for h in seed.hypotheses]
+    supports = [_support(h, seed, opinions, p) for h in seed.hypotheses]
     kept = [h for h, s in zip(seed.hypotheses, supports, strict=True) if s == max(supports)]
     branches = tuple(start(now.time_ns, seed, h, rates, p) for h in kept)
     text = f"{verb} by chaser {seed.chaser}"

@@ -29,18 +29,42 @@ class PoseHypothesis:
 
 
 @dataclass(frozen=True, eq=False)
+class Eye:
+    """A camera at an exposure, as odometry and calibration have it: its lens (3,) in WRF, and (4,) IRF to WRF."""
+
+    position_m: Array
+    q_wxyz: Array
+
+
+@dataclass(frozen=True, eq=False)
 class Measurement:
     """What one chaser saw in one exposure.
 
     chaser: its number. time_ns: simulated time of the exposure. markers: how many markers it used.
     hypotheses: one pose, two for the planar ambiguity of a single marker (the likelier first), none
-        for "sees nothing".
+        for "sees nothing". eye: where it was seen from.
     """
 
     chaser: int
     time_ns: int
     hypotheses: tuple[PoseHypothesis, ...]
     markers: int
+    eye: Eye
+
+
+@dataclass(frozen=True, eq=False)
+class CameraError:
+    """How far a chaser's camera is from its calibration, as estimated.
+
+    turn_rad: (3,) rotation vector in the told IRF by which the true camera is turned. shift_m: (3,) of the lens, in IRF.
+    focal_share: of the focal length. covariance: (7, 7) over these, in that order.
+    """
+
+    chaser: int
+    turn_rad: Array
+    shift_m: Array
+    focal_share: float
+    covariance: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,8 +147,13 @@ def no_estimate(time_ns: int) -> TargetEstimate:
 
 
 def is_usable(measurement: Measurement) -> bool:
-    """Whether every hypothesis has the right shapes, finite numbers, a unit quaternion (to 1e-3) and a
-    symmetric, positive definite covariance."""
+    """Whether the eye and every hypothesis have the right shapes, finite numbers, a unit quaternion (to 1e-3), and the
+    hypotheses a symmetric, positive definite covariance."""
+    eye = measurement.eye
+    if eye.position_m.shape != (3,) or eye.q_wxyz.shape != (4,) or not np.isfinite(eye.position_m).all():
+        return False
+    if not abs(float(eye.q_wxyz @ eye.q_wxyz) - 1.0) < 1e-3:
+        return False
     for h in measurement.hypotheses:
         if h.position_m.shape != (3,) or h.q_wxyz.shape != (4,) or h.covariance.shape != (6, 6):
             return False
@@ -145,7 +174,8 @@ def is_usable(measurement: Measurement) -> bool:
 
 def content_key(m: Measurement) -> tuple[int, int, int, int, bytes]:
     """Total order of measurements: time, chaser, and then content, so that no order of arrival matters."""
-    content = b"".join(
+    content = m.eye.position_m.tobytes() + m.eye.q_wxyz.tobytes()
+    content += b"".join(
         h.position_m.tobytes() + h.q_wxyz.tobytes() + h.covariance.tobytes() for h in m.hypotheses
     )
     return m.time_ns, m.chaser, len(m.hypotheses), m.markers, content

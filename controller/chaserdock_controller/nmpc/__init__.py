@@ -31,4 +31,8 @@ def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int |
         from chaserdock_controller.nmpc.alm import AlpaqaSolver
 
         return AlpaqaSolver(params, n, max_iterations)
+    if name == "open":
+        from chaserdock_controller.nmpc.open_engine import OpenSolver
+
+        return OpenSolver(params, n, max_iterations)
     return plugins.load("solver", name, BACK_ENDS)(params, n, max_iterations)

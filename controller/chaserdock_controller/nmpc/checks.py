@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from chaserdock_controller.nmpc.compiled import kernel
+from chaserdock_controller.nmpc.kernels import normalize_rows, shifted, sign_of
 from chaserdock_controller.nmpc.types import Array, NmpcInput, NmpcParameters
 
 # Measured quaternions are normalized; one this far off is a mistake, not a rounding error.
@@ -21,42 +21,8 @@ def _array(name: str, value: object, shape: tuple[int, ...]) -> Array:
     return array
 
 
-@kernel
-def _normalize_rows(array, first, stop):
-    """Normalizes the quaternions in columns first..first+3 of ``array`` (K, stop) in place.
-
-    Returns 1 for a value that is not finite, 2 for a quaternion far off unit length, else 0.
-    """
-    bad = 0
-    for i in range(len(array)):
-        norm = 0.0
-        for j in range(stop):
-            if not np.isfinite(array[i, j]):
-                return 1
-        for j in range(first, first + 4):
-            norm += array[i, j] * array[i, j]
-        norm = np.sqrt(norm)
-        if abs(norm - 1.0) > QUATERNION_NORM_TOLERANCE:
-            bad = 2
-        else:
-            for j in range(first, first + 4):
-                array[i, j] /= norm
-    return bad
-
-
-@kernel
-def _smallest(array):
-    """The least value of a flat array; NaN if any value is not finite."""
-    least = np.inf
-    for value in array:
-        if not np.isfinite(value):
-            return np.nan
-        least = min(least, value)
-    return least
-
-
 def _poses(name: str, array: Array, first: int) -> None:
-    code = _normalize_rows(array.reshape(-1, array.shape[-1]), first, array.shape[-1])
+    code = normalize_rows(array, first, QUATERNION_NORM_TOLERANCE)
     if code == 1:
         raise ValueError(f"{name} holds a value that is not finite")
     if code == 2:
@@ -102,10 +68,10 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         ("target_positions", targets, True),
         ("corridors", corridors, True),
     ):
-        least = _smallest(value.ravel())
-        if math.isnan(least):
+        code = sign_of(value)
+        if code == 1:
             raise ValueError(f"{name} holds a value that is not finite")
-        if least < 0.0 and not may_be_negative:
+        if code == 2 and not may_be_negative:
             raise ValueError(f"{name} must not be negative")
     if problem.corridors is not None:
         _check_corridors(corridors)
@@ -152,10 +118,8 @@ def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
     Each new value is the mean of the old plan over its interval, so the impulse is kept; beyond the old
     horizon the last value is held.
     """
-    d = inputs.shape[-2]
     whole, part = divmod(shift_s / dt_s, 1.0)
-    first = np.minimum(np.arange(d) + int(min(whole, d)), d - 1)
-    return (1.0 - part) * inputs[..., first, :] + part * inputs[..., np.minimum(first + 1, d - 1), :]
+    return shifted(inputs, int(min(whole, inputs.shape[-2])), part)
 
 
 def warm_start(

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from chaserdock_controller.native import load
 from chaserdock_controller.nmpc.checks import check_ids, check_input, check_shift, warm_start
-from chaserdock_controller.nmpc.cost import plan_cost
-from chaserdock_controller.nmpc.kernels import RK_NODES, RK_WEIGHTS, roll
-from chaserdock_controller.nmpc.planes import plan_violation
+from chaserdock_controller.nmpc.kernels import Weights, model_of, plan_cost, plan_violation, roll
 from chaserdock_controller.nmpc.slack import SLACK_L1
 from chaserdock_controller.nmpc.types import (
     FAILED,
@@ -46,7 +45,10 @@ class Task:
 
 @dataclass
 class Frame:
-    """The parameters as arrays, and the last plan of each chaser, by identity. Raises ValueError for n_max < 1."""
+    """The parameters as arrays, and the last plan of each chaser, by identity.
+
+    Raises ValueError for n_max < 1, ImportError where the compiled kernels cannot be had.
+    """
 
     params: NmpcParameters
     n_max: int
@@ -55,14 +57,8 @@ class Frame:
     def __post_init__(self) -> None:
         if self.n_max < 1:
             raise ValueError(f"n_chasers must be at least 1, not {self.n_max}")
-        p = self.params
-        self.weights_p, self.weights_q = p.stage_weights()
-        self.weights_u = np.array([p.weight_force] * 3 + [p.weight_torque] * 3)
-        inertia = np.array(p.inertia_kg_m2, dtype=float)
-        inverse = np.ascontiguousarray(np.linalg.inv(inertia))
-        nodes, weights = RK_NODES[p.integrator], RK_WEIGHTS[p.integrator]
-        # What `kernels` asks for after the inputs.
-        self.model = (p.dt_s, nodes, weights, p.mass_kg, inertia, inverse)
+        load()  # here rather than at the first tick
+        self.model, self.weights = model_of(self.params), Weights(self.params)
 
     def begin(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None) -> Task:
         """Checks and prepares. Raises ValueError for what `check_input`, `check_ids` and `check_shift` refuse."""
@@ -75,18 +71,14 @@ class Frame:
         """States (N, D+1, 13) of inputs ``u`` (N, D, 6) through the nonlinear model."""
         x = np.empty((len(u), self.params.stages + 1, 13))
         x[:, 0] = task.problem.states
-        roll(x, u, *self.model)
+        roll(self.model, x, u)
         return x
 
     def account(self, task: Task, x: Array, u: Array) -> tuple[Array, Array]:
-        """Cost by eq. 3 (N,) and deepest violation, m (N,), of a plan."""
-        cost, violation, p = np.empty(len(u)), np.empty(len(u)), task.problem
-        plan_cost(x, u, p.references, p.u_ref, self.weights_p, self.weights_q, self.weights_u, cost)
-        plan_violation(
-            x, p.references, p.target_positions, p.min_distance_target_m, task.between,
-            self.params.max_reference_distance_m, task.corridors, violation,
-        )  # fmt: skip
-        return cost, violation
+        """Cost by eq. 6 (N,) and deepest violation, m (N,), of a plan."""
+        p = task.problem
+        cost = plan_cost(self.weights, x, u, p.references, p.u_ref)
+        return cost, plan_violation(p, x, self.params.max_reference_distance_m)
 
     def finish(self, task: Task, u: Array, status: Sequence[str], iterations: IntArray) -> NmpcPlan:
         """The plan of inputs ``u``, kept as the next warm start.

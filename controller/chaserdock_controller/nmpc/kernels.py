@@ -1,233 +1,292 @@
-"""The chaser's discrete dynamics and their Jacobians, in Numba. Held against `problem.dynamics` by the tests.
+"""What the NMPC asks of the compiled kernels (`native`): the same names, with arrays.
 
-Jacobians are taken in the 12-dimensional tangent space [dp, dv, dtheta, domega] with
-q_true = q (x) exp(dtheta): A is 12 x 12 and B 12 x 6. The first six columns of A are those of a double
-integrator (identity and dt), so only its last six, called C, are computed. They are stored beside B as M = [C B],
-12 x 12: loops over rows of twelve are what LLVM turns into vector instructions.
-
-Loops rather than written-out terms, throughout: Numba's compilation takes about 1.5 ms for each elementary
-operation in the source, whatever the processor makes of it, and is most of a cold start.
+Arrays are C-contiguous float64 (int64 where said) of the shapes given; nothing is checked here.
 """
 
 from __future__ import annotations
 
-import numpy as np
+import ctypes
+from ctypes import Structure, c_double, c_int, c_int64, c_void_p
+from dataclasses import dataclass
+from functools import cache
 
-from chaserdock_controller.nmpc.compiled import kernel, part
+import numpy as np
+from numpy.typing import NDArray
+
+from chaserdock_controller.native import address, function, memory
+from chaserdock_controller.nmpc.types import Array, IntArray, NmpcInput, NmpcParameters
 
 # Explicit Runge-Kutta tableaux with one sub-diagonal, which is all that euler and rk4 need.
-RK_NODES = {"euler": np.array([0.0]), "rk4": np.array([0.0, 0.5, 0.5, 1.0])}
-RK_WEIGHTS = {"euler": np.array([1.0]), "rk4": np.array([1.0, 2.0, 2.0, 1.0]) / 6.0}
+RK_NODES = {"euler": (0.0,), "rk4": (0.0, 0.5, 0.5, 1.0)}
+RK_WEIGHTS = {"euler": (1.0,), "rk4": (1.0 / 6.0, 2.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0)}
 
-# Scratch of a step: y (7) and its rates (10), rotation (9), I omega (3), the torque left (3), one spare.
-_STEP_WORK = 33
-
-
-@part
-def _rates(y, u, mass, inertia, inverse, k, work):
-    """k (10) = [q', omega', acceleration (WRF)] at y (7) = [q, omega]; work (15) gets R (9), I omega (3)."""
-    w0, x0, y0, z0 = y[0], y[1], y[2], y[3]
-    work[0] = 1.0 - 2.0 * (y0 * y0 + z0 * z0)
-    work[4] = 1.0 - 2.0 * (x0 * x0 + z0 * z0)
-    work[8] = 1.0 - 2.0 * (x0 * x0 + y0 * y0)
-    work[1] = 2.0 * (x0 * y0 - w0 * z0)
-    work[3] = 2.0 * (x0 * y0 + w0 * z0)
-    work[2] = 2.0 * (x0 * z0 + w0 * y0)
-    work[6] = 2.0 * (x0 * z0 - w0 * y0)
-    work[5] = 2.0 * (y0 * z0 - w0 * x0)
-    work[7] = 2.0 * (y0 * z0 + w0 * x0)
-    k[0] = 0.0
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        k[0] -= 0.5 * y[1 + i] * y[4 + i]
-        k[1 + i] = 0.5 * (w0 * y[4 + i] + y[1 + a] * y[4 + b] - y[1 + b] * y[4 + a])
-        work[9 + i] = 0.0
-        k[7 + i] = 0.0
-        for j in range(3):
-            work[9 + i] += inertia[i, j] * y[4 + j]
-            k[7 + i] += work[3 * i + j] * u[j] / mass
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        work[12 + i] = u[3 + i] - (y[4 + a] * work[9 + b] - y[4 + b] * work[9 + a])
-    for i in range(3):
-        k[4 + i] = 0.0
-        for j in range(3):
-            k[4 + i] += inverse[i, j] * work[12 + j]
+# As in native/ipm.c: codes of an answer, and the complementarity at which it stops; native/tick.c: iterations a chaser.
+FREE, CONVERGED, LIMIT, BROKEN = 0, 1, 2, 3
+MU_STOP = 1e-3
+MAX_ITERATIONS = 40
 
 
-@part
-def _runge_kutta_stage(x, u, b, c, mass, inertia, inverse, out, work):
-    """One stage: rates at x + c k, added with weight b to out (13). work (33): y (7), k (10), scratch."""
-    y, k = work[0:7], work[7:17]
-    for i in range(7):
-        y[i] = x[6 + i] + c * k[i]
-    for i in range(3):
-        out[i] += b * (x[3 + i] + c * k[7 + i])
-    _rates(y, u, mass, inertia, inverse, k, work[17:33])
-    for i in range(3):
-        out[3 + i] += b * k[7 + i]
-    for i in range(7):
-        out[6 + i] += b * k[i]
+class Model(Structure):
+    """native/base.h."""
+
+    _fields_ = [
+        ("step_s", c_double),
+        ("mass_kg", c_double),
+        ("per_mass", c_double),
+        ("inertia", c_double * 9),
+        ("inverse", c_double * 9),
+        ("nodes", c_double * 4),
+        ("weights", c_double * 4),
+        ("parts", c_int64),
+    ]
 
 
-@part
-def _normalize(out):
-    norm = 0.0
-    for i in range(6, 10):
-        norm += out[i] * out[i]
-    norm = np.sqrt(norm)
-    for i in range(6, 10):
-        out[i] /= norm
-    return norm
+def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
+    """The body and the discretization, over ``params.dt_s`` or another step."""
+    inertia = np.array(params.inertia_kg_m2, dtype=float)
+    nodes, weights = RK_NODES[params.integrator], RK_WEIGHTS[params.integrator]
+    return Model(
+        params.dt_s if step_s is None else step_s, params.mass_kg, 1.0 / params.mass_kg,
+        (c_double * 9)(*inertia.ravel()),
+        (c_double * 9)(*np.linalg.inv(inertia).ravel()), (c_double * 4)(*nodes), (c_double * 4)(*weights), len(nodes),
+    )  # fmt: skip
 
 
-@part
-def _step(x, u, h, nodes, weights, mass, inertia, inverse, out, work):
-    """One step x (13), u (6) -> out (13); the quaternion is normalized. work (_STEP_WORK,)."""
-    for i in range(13):
-        out[i] = x[i]
-    for i in range(17):
-        work[i] = 0.0
-    for s in range(len(nodes)):
-        _runge_kutta_stage(x, u, h * weights[s], h * nodes[s], mass, inertia, inverse, out, work)
-    _normalize(out)
+def normalize_rows(array: Array, first: int, tolerance: float) -> int:
+    """Normalizes the quaternions in columns first..first+3 of ``array`` (..., width) in place.
 
-
-@part
-def _rate_jacobian(y, u, mass, inertia, inverse, work, g):
-    """g (10, 7) = d[q', omega', acceleration] / d[q, omega]. work (15) as `_rates` left it.
-
-    q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = q F q* / m, whose derivative is
-    2/m [ s x F | (v . F) 1 + v F' - 2 F v' + s [F]x' ] for q = (s, v) (the terms of v v' - |v|^2 + s v x).
+    Returns 1 for a value that is not finite, 2 for a quaternion further off unit length than ``tolerance``, else 0.
     """
-    s = y[0]
-    dot = 0.0
-    for i in range(3):
-        dot += y[1 + i] * u[i]
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        # q'
-        g[0, 1 + i] = -0.5 * y[4 + i]
-        g[1 + i, 0] = 0.5 * y[4 + i]
-        g[1 + i, 1 + a] = 0.5 * y[4 + b]
-        g[1 + i, 1 + b] = -0.5 * y[4 + a]
-        g[0, 4 + i] = -0.5 * y[1 + i]
-        g[1 + i, 4 + i] = 0.5 * s
-        g[1 + i, 4 + a] = -0.5 * y[1 + b]
-        g[1 + i, 4 + b] = 0.5 * y[1 + a]
-        # acceleration
-        f = 2.0 / mass
-        g[7 + i, 0] = f * (y[1 + a] * u[b] - y[1 + b] * u[a])
-        for j in range(3):
-            g[7 + i, 1 + j] = f * (y[1 + i] * u[j] - 2.0 * u[i] * y[1 + j])
-        g[7 + i, 1 + i] += f * dot
-        g[7 + i, 1 + a] += f * s * u[b]
-        g[7 + i, 1 + b] -= f * s * u[a]
-    for j in range(3):
-        # column j of [I omega]x - [omega]x I, then I^-1 in front
-        a, b = (j + 1) % 3, (j + 2) % 3
-        for i in range(3):
-            m, n = (i + 1) % 3, (i + 2) % 3
-            work[12 + i] = y[4 + n] * inertia[m, j] - y[4 + m] * inertia[n, j]
-        work[12 + a] += work[9 + b]
-        work[12 + b] -= work[9 + a]
-        for i in range(3):
-            g[4 + i, 4 + j] = 0.0
-            for m in range(3):
-                g[4 + i, 4 + j] += inverse[i, m] * work[12 + m]
+    width = array.shape[-1]
+    return function("normalize_rows", c_int64)(
+        address(array), c_int64(array.size // width), c_int64(width), c_int64(first), c_double(tolerance)
+    )
 
 
-@part
-def _linearize(x, u, h, nodes, weights, mass, inertia, inverse, out, m_mat, work, g, sens):
-    """One step as in `_step`, with its Jacobians M = [C B] (12, 12). g (10, 7): zeros where nothing is written.
-
-    sens (28, 12), sensitivities to [dtheta, domega, force, torque]: those of [q, omega] at the step's start (7),
-    at the stage (7), of the rates (10), and their sum for q (4); the other sums lie in m_mat.
-    """
-    start, here, rate, q_sum = sens[0:7], sens[7:14], sens[14:24], sens[24:28]
-    for i in range(28):
-        for j in range(12):
-            sens[i, j] = 0.0
-    for i in range(12):
-        for j in range(12):
-            m_mat[i, j] = 0.0
-    for i in range(13):
-        out[i] = x[i]
-    for i in range(17):
-        work[i] = 0.0
-    # dq = 1/2 q (x) (0, dtheta)
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        start[0, i] = -0.5 * x[7 + i]
-        start[1 + i, i] = 0.5 * x[6]
-        start[1 + i, a] = -0.5 * x[7 + b]
-        start[1 + i, b] = 0.5 * x[7 + a]
-        start[4 + i, 3 + i] = 1.0
-        m_mat[9 + i, 3 + i] = 1.0
-    for i in range(4):
-        for j in range(3):
-            q_sum[i, j] = start[i, j]
-    for s in range(len(nodes)):
-        c, b = h * nodes[s], h * weights[s]
-        for i in range(7):
-            for j in range(12):
-                here[i, j] = start[i, j] + c * rate[i, j]
-        for i in range(3):
-            for j in range(12):
-                m_mat[i, j] += b * c * rate[7 + i, j]
-        _runge_kutta_stage(x, u, b, c, mass, inertia, inverse, out, work)
-        _rate_jacobian(work[0:7], u, mass, inertia, inverse, work[17:33], g)
-        for i in range(10):
-            for j in range(12):
-                rate[i, j] = 0.0
-            for m in range(4 if 4 <= i < 7 else 0, 7 if i < 7 else 4):
-                f = g[i, m]
-                for j in range(12):
-                    rate[i, j] += f * here[m, j]
-        for i in range(3):
-            for j in range(3):
-                rate[7 + i, 6 + j] += work[17 + 3 * i + j] / mass
-                rate[4 + i, 9 + j] += inverse[i, j]
-        for i in range(3):
-            for j in range(12):
-                m_mat[3 + i, j] += b * rate[7 + i, j]
-                m_mat[9 + i, j] += b * rate[4 + i, j]
-        for i in range(4):
-            for j in range(12):
-                q_sum[i, j] += b * rate[i, j]
-    # dtheta_next = 2 vec(q_next* (x) dq) / |q|: the projection on the tangent space, normalization included
-    scale = 2.0 / _normalize(out)
-    for i in range(3):
-        a, b = (i + 1) % 3, (i + 2) % 3
-        for j in range(12):
-            t = out[6] * q_sum[1 + i, j] - out[7 + i] * q_sum[0, j]
-            m_mat[6 + i, j] = scale * (t - (out[7 + a] * q_sum[1 + b, j] - out[7 + b] * q_sum[1 + a, j]))
+def sign_of(array: Array) -> int:
+    """1 if a value is not finite, else 2 if one is negative, else 0."""
+    return function("sign_of", c_int64)(address(array), c_int64(array.size))
 
 
-@kernel
-def roll_linearized(x, u, limits, h, nodes, weights, mass, inertia, inverse, mats):
-    """Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13); mats (N, D, 12, 12) = [C B] along the way.
-
-    B is that of the scaled inputs u / limits (N, 6): its columns are multiplied by the limits.
-    """
-    work = np.empty(_STEP_WORK)
-    g = np.zeros((10, 7))
-    sens = np.empty((28, 12))
-    for i in range(u.shape[0]):
-        for k in range(u.shape[1]):
-            m = mats[i, k]
-            _linearize(
-                x[i, k], u[i, k], h, nodes, weights, mass, inertia, inverse, x[i, k + 1], m, work, g, sens
-            )  # fmt: skip
-            for row in range(12):
-                for c in range(6):
-                    m[row, 6 + c] *= limits[i, c]
+def shifted(inputs: Array, whole: int, part: float) -> Array:
+    """Piecewise constant inputs (..., D, 6), ``whole + part`` steps later on the same grid; 0 <= part < 1."""
+    out, d = np.empty_like(inputs), inputs.shape[-2]
+    n = inputs.size // (6 * d)
+    function("shift_inputs")(
+        c_int64(n), c_int64(d), c_int64(whole), c_double(part), address(inputs), address(out)
+    )
+    return out
 
 
-@kernel
-def roll(x, u, h, nodes, weights, mass, inertia, inverse):
+def roll(model: Model, x: Array, u: Array) -> None:
     """Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13)."""
-    work = np.empty(_STEP_WORK)
-    for i in range(u.shape[0]):
-        for k in range(u.shape[1]):
-            _step(x[i, k], u[i, k], h, nodes, weights, mass, inertia, inverse, x[i, k + 1], work)
+    function("roll")(ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(x))
+
+
+def roll_linearized(model: Model, x: Array, u: Array, limits: Array, mats: Array) -> None:
+    """The same with mats (N, D, 12, 12) = [C B] along the way; B that of the inputs as shares of limits (N, 6)."""
+    function("roll_linearized")(
+        ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(limits), address(x),
+        address(mats),
+    )  # fmt: skip
+
+
+class _Weights(Structure):
+    _fields_ = [("stages", c_int64), ("position", c_void_p), ("orientation", c_void_p), ("input", c_void_p)]
+
+
+class Weights:
+    """The cost's weights: of position and orientation at each stage, each (D+1,), and of the inputs (6,)."""
+
+    def __init__(self, params: NmpcParameters) -> None:
+        self.position, self.orientation = params.stage_weights()
+        self.input = np.array([params.weight_force] * 3 + [params.weight_torque] * 3)
+        arrays = (address(a) for a in (self.position, self.orientation, self.input))
+        self.native = _Weights(params.stages, *arrays)
+
+
+def quadratic_model(
+    weights: Weights, x: Array, u: Array, refs: Array, u_ref: Array, limits: Array
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """Cost of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled inputs w = u / limits.
+
+    Returns q_pos and q_att (D+1, 3, 3), qx (D+1, 12), r_diag, r and w_bar (D, 6).
+    """
+    d = len(u)
+    out = (
+        np.empty((d + 1, 3, 3)), np.empty((d + 1, 3, 3)), np.empty((d + 1, 12)),
+        np.empty((d, 6)), np.empty((d, 6)), np.empty((d, 6)),
+    )  # fmt: skip
+    function("quadratic_model")(
+        ctypes.byref(weights.native), *(address(a) for a in (x, u, refs, u_ref, limits, *out))
+    )
+    return out
+
+
+def plan_cost(weights: Weights, x: Array, u: Array, refs: Array, u_ref: Array) -> Array:
+    """Eq. 6 for every chaser, (N,), of x (N, D+1, 13), u (N, D, 6)."""
+    cost = np.empty(len(x))
+    arrays = (address(a) for a in (x, u, refs, u_ref, cost))
+    function("plan_cost")(ctypes.byref(weights.native), c_int64(len(x)), *arrays)
+    return cost
+
+
+class _Zones(Structure):
+    _fields_ = [
+        ("n", c_int64),
+        ("stages", c_int64),
+        ("references", c_void_p),
+        ("targets", c_void_p),
+        ("to_target", c_void_p),
+        ("between", c_void_p),
+        ("corridors", c_void_p),
+        ("outer", c_double),
+    ]
+
+
+def _zones(problem: NmpcInput, outer: float) -> _Zones:
+    n, nodes, _ = problem.references.shape
+    between, corridors = problem.min_distance_chasers_m, problem.corridors
+    assert isinstance(between, np.ndarray)
+    assert corridors is not None
+    return _Zones(
+        n, nodes - 1, address(problem.references), address(problem.target_positions),
+        address(problem.min_distance_target_m), address(between), address(corridors), outer,
+    )  # fmt: skip
+
+
+class _Rows(Structure):
+    _fields_ = [
+        ("width", c_int64),
+        ("nodes", c_int64),
+        ("reach", c_void_p),
+        ("stage", c_void_p),
+        ("n_rows", c_void_p),
+        ("a", c_void_p),
+        ("c", c_void_p),
+    ]
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Half-spaces a' dp_k >= c of each chaser: stage (N, M), a (N, M, 3), c (N, M), of which n_rows (N,) count."""
+
+    stage: IntArray
+    a: Array
+    c: Array
+    n_rows: IntArray
+
+
+def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> Rows:
+    """Rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input` returns it.
+
+    reach_m (N, D+1): how far admissible inputs can move a chaser from its rollout.
+    """
+    n, nodes, _ = x.shape
+    width = (nodes - 1) * (n + 2)
+    rows = Rows(
+        np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64)
+    )  # fmt: skip
+    zones, reach = _zones(problem, outer_m), np.ascontiguousarray(reach_m)
+    native = _Rows(width, nodes, *(address(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c)))
+    function("build_rows")(ctypes.byref(zones), address(x), ctypes.byref(native))
+    return rows
+
+
+def plan_violation(problem: NmpcInput, x: Array, outer_m: float) -> Array:
+    """Deepest violation of the distances, m, (N,), by plans x (N, D+1, 13); ``problem`` as `check_input` returns it."""
+    worst, zones = np.empty(len(x)), _zones(problem, outer_m)
+    function("plan_violation")(ctypes.byref(zones), address(x), address(worst))
+    return worst
+
+
+class _Qp(Structure):
+    _fields_ = [
+        ("stages", c_int64),
+        ("n_rows", c_int64),
+        ("max_iterations", c_int64),
+        ("h", c_double),
+        ("w1", c_double),
+        ("w2", c_double),
+        *(
+            (name, c_void_p)
+            for name in ("mats", "q_pos", "q_att", "qx", "r_diag", "r", "w_bar", "stage", "a", "c")
+        ),
+    ]
+
+
+class _Answer(Structure):
+    _fields_ = [
+        ("dx", c_void_p),
+        ("dw", c_void_p),
+        ("mul", c_void_p),
+        ("residual", c_double),
+        ("mu", c_double),
+        ("iterations", c_int64),
+    ]
+
+
+@dataclass(frozen=True)
+class QpAnswer:
+    """dx (D+1, 12), dw (D, 6), multipliers (2 R + 12 D) in the order of native/ipm.c."""
+
+    code: int
+    iterations: int
+    complementarity: float
+    dx: Array
+    dw: Array
+    multipliers: Array
+
+
+def solve_qp(
+    mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float, w2: float,
+    max_iterations: int = MAX_ITERATIONS,
+) -> QpAnswer:  # fmt: skip
+    """One chaser's QP: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows (R,), (R, 3), (R,)."""
+    d, rows = len(mats), len(stage)
+    dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
+    qp = _Qp(d, rows, max_iterations, h, w1, w2, *(address(v) for v in (mats, *model, stage, a, c)))
+    answer = _Answer(address(dx), address(dw), address(mul))
+    work = memory(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))
+    code = function("solve_qp", c_int)(ctypes.byref(qp), ctypes.byref(answer), address(work))
+    return QpAnswer(code, answer.iterations, answer.mu, dx, dw, mul)
+
+
+class _Tick(Structure):
+    _fields_ = [
+        ("model", c_void_p),
+        ("weights", c_void_p),
+        ("zones", c_void_p),
+        *((name, c_void_p) for name in ("states", "u_ref", "limits", "reach", "w1", "inputs")),
+        ("w2", c_double),
+        ("budget", c_int64),
+        ("code", c_void_p),
+        ("iterations", c_void_p),
+    ]
+
+
+@cache
+def _tick_memory(n: int, d: int) -> NDArray[np.float64]:
+    return memory(function("tick_workspace", c_int64)(c_int64(n), c_int64(d)))
+
+
+def solve_tick(
+    model: Model, weights: Weights, problem: NmpcInput, inputs: Array, outer_m: float, reach_m_per_N: Array, w1: Array,
+    w2: float, budget: int,
+) -> tuple[IntArray, IntArray]:  # fmt: skip
+    """One real-time iteration for every chaser: ``inputs`` (N, D, 6), where it starts, become the answer.
+
+    ``problem`` as `check_input` returns it; reach_m_per_N (D+1,): how far a newton more or less on each axis moves a
+    chaser by each stage; w1 (N,) and w2 price the slacks; ``budget``: iterations of all together.
+    Returns code and iterations, each (N,); where the code is BROKEN the inputs are left alone.
+    """
+    n, d, _ = inputs.shape
+    zones = _zones(problem, outer_m)
+    code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
+    tick = _Tick(
+        ctypes.addressof(model), ctypes.addressof(weights.native), ctypes.addressof(zones), address(problem.states),
+        address(problem.u_ref), address(problem.input_max), address(reach_m_per_N), address(w1), address(inputs), w2, budget,
+        address(code), address(iterations),
+    )  # fmt: skip
+    function("solve_tick")(ctypes.byref(tick), address(_tick_memory(n, d)))
+    return code, iterations

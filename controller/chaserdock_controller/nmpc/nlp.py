@@ -21,7 +21,7 @@ from chaserdock_controller.nmpc.types import Array, NmpcInput, NmpcParameters, N
 MAX_ITERATIONS = 200
 # The solvers' own words for an answer that can be flown, and for the best one had when iterations ran out.
 _GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
-_LIMIT = ("Maximum_Iterations_Exceeded",)
+_LIMIT = ("Maximum_Iterations_Exceeded", "1")  # ipopt's and fatrop's
 
 
 def pack(params: NmpcParameters, task: Task) -> Array:
@@ -31,9 +31,9 @@ def pack(params: NmpcParameters, task: Task) -> Array:
     for i in range(len(p.states)):
         parts += [p.states[i], p.references[i].ravel(), p.u_ref[i].ravel()]
         parts += [p.min_distance_target_m[i], task.corridors[i].ravel()]
-    farthest_m = float(np.max(np.linalg.norm(p.states[:, :3] - p.references[:, -1, :3], axis=-1)))
+    farthest_m = np.max(np.linalg.norm(p.states[:, :3] - p.references[:, -1, :3], axis=-1), keepdims=True)
     upper = task.between[np.triu_indices(len(p.states), 1)]
-    parts += [p.target_positions.ravel(), upper, np.array([slack_l1_weight(params, farthest_m)])]
+    parts += [p.target_positions.ravel(), upper, slack_l1_weight(params, farthest_m)]
     return np.concatenate(parts)
 
 

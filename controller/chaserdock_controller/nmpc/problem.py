@@ -1,8 +1,8 @@
-"""The optimal control problem, written once, in CasADi, to be read beside the paper (section 4, eq. 3 and 4).
+"""The optimal control problem, written once, in CasADi, to be read beside the paper (section 4, eq. 6 and 7).
 
 State x = [p (3, WRF), v (3, WRF), q_wxyz (4, body to world), omega (3, body)], input u = [F (3), tau (3)] in
-body axes. Every back end solves this problem; `ipopt` this very graph, `rti` the same functions written for
-Numba, which the tests hold against these.
+body axes. Every back end solves this problem; `ipopt` this very graph, `rti` the same functions written in
+C (`native`), which the tests hold against these.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Functi
     return ca.Function("step", [x, u], [x_next], ["x", "u"], ["x_next"])
 
 
-def pose_cost(x: Any, reference: Any, weight_position: float, weight_orientation: float) -> Any:
+def pose_cost(x: Any, reference: Any, weight_position: Any, weight_orientation: Any) -> Any:
     """Q_p |p_ref - p|^2 + Q_q |vec(q (x) q_ref*)|^2; ``reference`` (7) is p, q_wxyz.
 
     The paper weights all four components of q (x) q_ref*, whose norm is always one; its vector part is what
@@ -107,14 +107,43 @@ def _norm(a: Any) -> Any:
 
 
 def _corridor(r: Any, corridor: Any) -> Any:
-    """Distance from the surface of the corridor's cone, positive inside (`planes.corridor_room`)."""
+    """Distance from the surface of the corridor's cone, positive inside (`corridor_room` in native/planes.c)."""
     axis, half_angle, apex = corridor[0:3], corridor[3], corridor[4]
     along = ca.dot(axis, r)
     return ca.sin(half_angle) * (along - apex) - ca.cos(half_angle) * _norm(r - along * axis)
 
 
-def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple") -> Nlp:
-    """Eq. 3 and 4 for ``n`` chasers. Raises ValueError for n < 1.
+def _pose_price() -> ca.Function:
+    x, reference, weights = ca.SX.sym("x", 13), ca.SX.sym("reference", 7), ca.SX.sym("weights", 2)
+    return ca.Function("pose", [x, reference, weights], [pose_cost(x, reference, weights[0], weights[1])])
+
+
+def _distances(n: int, params: NmpcParameters) -> ca.Function:
+    """Of one stage: states (13, n), positions of references (3, n), of the target (3), keep-outs (n), corridors (5, n),
+    distances of the pairs -> rooms, per chaser target, outer bound, corridor, then the pairs."""
+    pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
+    x, p_ref, target = ca.SX.sym("x", 13, n), ca.SX.sym("p_ref", 3, n), ca.SX.sym("target", 3)
+    to_target, corridors, apart = (
+        ca.SX.sym("d", n),
+        ca.SX.sym("corridor", 5, n),
+        ca.SX.sym("pair", len(pairs)),
+    )
+    out = []
+    for i in range(n):
+        r = x[0:3, i] - target
+        out.append(_norm(r) - to_target[i])
+        out.append(params.max_reference_distance_m - _norm(x[0:3, i] - p_ref[:, i]))
+        out.append(_corridor(r, corridors[:, i]))
+    for row, (i, j) in enumerate(pairs):
+        out.append(_norm(x[0:3, i] - x[0:3, j]) - apart[row])
+    return ca.Function("distances", [x, p_ref, target, to_target, corridors, apart], [ca.vertcat(*out)])
+
+
+def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple", symbol: Any = ca.SX.sym) -> Nlp:
+    """Eq. 6 and 7 for ``n`` chasers. Raises ValueError for n < 1.
+
+    ``symbol``: CasADi's kind, ``ca.SX.sym`` for one graph of scalars, ``ca.MX.sym`` for calls of one function a stage,
+    which make much shorter C.
 
     The input box (4a) is left to the variable bounds. The distances (4b to 4d) stand at stages 1..D (stage 0 cannot
     be changed) and carry a slack each in multiple shooting (``shooting`` "multiple"); in "single" shooting, for
@@ -126,48 +155,46 @@ def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple") -> Nlp
     multiple = shooting == "multiple"
     position_weight, orientation_weight = params.stage_weights()
     input_weight = ca.DM([params.weight_force] * 3 + [params.weight_torque] * 3)
-    pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
-    rows = 3 * n + len(pairs)
+    n_pairs = n * (n - 1) // 2
+    rows = 3 * n + n_pairs
 
-    x0 = [ca.SX.sym(f"x0_{i}", 13) for i in range(n)]
-    references = [ca.SX.sym(f"ref_{i}", 7, d + 1) for i in range(n)]
-    u_ref = [ca.SX.sym(f"u_ref_{i}", 6, d) for i in range(n)]
-    to_target = [ca.SX.sym(f"d_target_{i}", d + 1) for i in range(n)]
-    corridors = [ca.SX.sym(f"corridor_{i}", 5, d + 1) for i in range(n)]
-    targets = ca.SX.sym("p_tar", 3, d + 1)
-    pair_distance = ca.SX.sym("d_pair", len(pairs))
-    slack_l1 = ca.SX.sym("w1")
+    x0 = [symbol(f"x0_{i}", 13) for i in range(n)]
+    references = [symbol(f"ref_{i}", 7, d + 1) for i in range(n)]
+    u_ref = [symbol(f"u_ref_{i}", 6, d) for i in range(n)]
+    to_target = [symbol(f"d_target_{i}", d + 1) for i in range(n)]
+    corridors = [symbol(f"corridor_{i}", 5, d + 1) for i in range(n)]
+    targets = symbol("p_tar", 3, d + 1)
+    pair_distance = symbol("d_pair", n_pairs)
+    slack_l1 = symbol("w1")
+
+    price, rooms = _pose_price(), _distances(n, params)
 
     def distances(k: int, x: list[Any]) -> Any:
-        out = []
-        for i in range(n):
-            r = x[i][0:3] - targets[:, k]
-            out.append(_norm(r) - to_target[i][k])
-            out.append(params.max_reference_distance_m - _norm(x[i][0:3] - references[i][0:3, k]))
-            out.append(_corridor(r, corridors[i][:, k]))
-        for row, (i, j) in enumerate(pairs):
-            out.append(_norm(x[i][0:3] - x[j][0:3]) - pair_distance[row])
-        return ca.vertcat(*out)
+        return rooms(
+            ca.horzcat(*x), ca.horzcat(*(r[0:3, k] for r in references)), targets[:, k],
+            ca.vertcat(*(d[k] for d in to_target)), ca.horzcat(*(c[:, k] for c in corridors)), pair_distance,
+        )  # fmt: skip
 
     variables: list[Any] = []
     constraints: list[Any] = []
     sizes: list[tuple[int, int, int]] = []
     cost: Any = 0
-    x = [ca.SX.sym(f"x_{i}_0", 13) for i in range(n)] if multiple else x0
+    x = [symbol(f"x_{i}_0", 13) for i in range(n)] if multiple else x0
     for k in range(d + 1):
         here = x
         if multiple:
             variables += here
         for i in range(n):
-            cost += pose_cost(here[i], references[i][:, k], position_weight[k], orientation_weight[k])
+            weights = ca.DM([position_weight[k], orientation_weight[k]])
+            cost += price(here[i], references[i][:, k], weights)
         if k < d:
-            inputs = [ca.SX.sym(f"u_{i}_{k}", 6) for i in range(n)]
+            inputs = [symbol(f"u_{i}_{k}", 6) for i in range(n)]
             variables += inputs
             for i in range(n):
                 cost += ca.dot(input_weight, (u_ref[i][:, k] - inputs[i]) ** 2)
             x = [step(a, u) for a, u in zip(here, inputs, strict=True)]
             if multiple:
-                reached, x = x, [ca.SX.sym(f"x_{i}_{k + 1}", 13) for i in range(n)]
+                reached, x = x, [symbol(f"x_{i}_{k + 1}", 13) for i in range(n)]
                 # fatrop asks for the next state first, with a plus sign.
                 constraints += [b - a for a, b in zip(reached, x, strict=True)]
                 if k == 0:
@@ -175,7 +202,7 @@ def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple") -> Nlp
         if k > 0:
             room = distances(k, here)
             if multiple:
-                s = ca.SX.sym(f"s_{k}", rows)
+                s = symbol(f"s_{k}", rows)
                 variables.append(s)
                 cost += slack_l1 * ca.sum1(s) + 0.5 * SLACK_L2 * ca.sumsqr(s)
                 room += s

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from chaserdock_controller.nmpc.types import NmpcParameters
+import numpy as np
+
+from chaserdock_controller.nmpc.types import Array, NmpcParameters
 
 # L1 and L2 weights of the slacks of the distance constraints. The L1 weight must exceed the constraint's
 # multiplier for the penalty to be exact: at 1e3 the terminal weight pressed chasers to 0.32 m of 0.35 m.
@@ -13,7 +15,7 @@ SLACK_L2 = 1e5
 SLACK_L1_OVER_SLOPE = 10.0
 
 
-def slack_l1_weight(params: NmpcParameters, distance_m: float) -> float:
-    """L1 weight of the slacks of a chaser ``distance_m`` from its reference (of the farthest, if one for all)."""
+def slack_l1_weight(params: NmpcParameters, distance_m: Array) -> Array:
+    """L1 weight of the slacks of chasers ``distance_m`` (...) from their references (of the farthest, if one for all)."""
     slope = 2.0 * (params.weight_final_position + params.weight_position) * distance_m
-    return max(SLACK_L1, SLACK_L1_OVER_SLOPE * slope)
+    return np.maximum(SLACK_L1, SLACK_L1_OVER_SLOPE * slope)

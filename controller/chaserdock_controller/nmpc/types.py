@@ -16,8 +16,8 @@ Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[fl
 
 INTEGRATORS = ("rk4", "euler")
 
-STATUSES = ("solved", "iteration_limit", "infeasible_relaxed", "failed")
-SOLVED, ITERATION_LIMIT, INFEASIBLE_RELAXED, FAILED = STATUSES
+STATUSES = ("solved", "iteration_limit", "budget", "infeasible_relaxed", "failed")
+SOLVED, ITERATION_LIMIT, BUDGET, INFEASIBLE_RELAXED, FAILED = STATUSES
 
 # A plan that enters a keep-out ball (or leaves the outer bound) by more than this is called relaxed.
 VIOLATION_TOLERANCE_M = 1e-4
@@ -27,7 +27,7 @@ VIOLATION_TOLERANCE_M = 1e-4
 class NmpcParameters:
     """Everything about the problem that stays the same from tick to tick. SI units, radians.
 
-    The weights are those of the paper's cost (eq. 3): ``weight_position`` per m^2, ``weight_orientation``
+    The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2, ``weight_orientation``
     on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
     (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
     body axes. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
@@ -80,7 +80,7 @@ class NmpcParameters:
         return round(self.horizon_s / self.dt_s)
 
     def stage_weights(self) -> tuple[Array, Array]:
-        """Weights of position and orientation at stages 0..D, each (D+1,), the final ones included (eq. 3)."""
+        """Weights of position and orientation at stages 0..D, each (D+1,), the final ones included (eq. 6)."""
         scale = 1.0 - self.falloff * np.arange(self.stages + 1) / self.stages
         position, orientation = self.weight_position * scale, self.weight_orientation * scale
         position[-1] += self.weight_final_position
@@ -123,10 +123,11 @@ class NmpcPlan:
     """Answer for N chasers, rows in the order of the input.
 
     inputs (N, D, 6): N and N m, body axes, within ``input_max``. states (N, D+1, 13): those inputs through
-    the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point reached);
+    the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point reached in the solver's own limit);
+    "budget" (best point reached in what was allowed, whether it keeps its distances or not: see ``max_violation_m``);
     "infeasible_relaxed" (the plan enters a keep-out zone, ``max_violation_m`` deep: no input avoids it,
     or the start lies inside); "failed" (numerical breakdown: the inputs are then the shifted previous plan).
-    iterations (N,): interior-point iterations, 0 if none was needed. cost (N,): eq. 3 on ``states``.
+    iterations (N,): interior-point iterations, 0 if none was needed. cost (N,): eq. 6 on ``states``.
     """
 
     inputs: Array

@@ -59,13 +59,15 @@ def _initial(scenario: Scenario) -> Array:
     return np.array(rows)
 
 
-def fly_offline(scenario: Scenario, delay_s: Callable[[float], float] | None = None) -> Trace:
+def fly_offline(
+    scenario: Scenario, delay_s: Callable[[float], float] | None = None, actuator_gain: float = 1.0
+) -> Trace:
     """Flies ``scenario`` on perfect knowledge of the target and of the own state.
 
     ``delay_s``, if given, takes the wall-clock seconds that a solve took and returns how long after the tick
     its command takes effect, in place of the scenario's latency. The controller does not know of it, and skips
-    the ticks that pass meanwhile, as a program does that computes for longer than its period. Raises ValueError
-    for a target that is not prescribed.
+    the ticks that pass meanwhile, as a program does that computes for longer than its period. ``actuator_gain``: what
+    the actuators give of what they are asked for. Raises ValueError for a target that is not prescribed.
     """
     truth = PerfectEstimator(scenario.target)
     flight = Flight(scenario, time.perf_counter, PerfectEstimator(scenario.target))
@@ -90,7 +92,7 @@ def fly_offline(scenario: Scenario, delay_s: Callable[[float], float] | None = N
             if delay_s is not None:
                 effective_ns = busy_until_ns = now_ns + round(delay_s(took_s) * 1e9)
             command = np.array([[*out.wrenches[i].force_N, *out.wrenches[i].torque_N_m] for i in range(n)])
-            waiting.append((effective_ns, command))
+            waiting.append((effective_ns, actuator_gain * command))
         end_ns = timing.tick_time_ns(tick + 1)
         while now_ns < end_ns:
             while waiting and waiting[0][0] <= now_ns:

@@ -1,0 +1,196 @@
+"""What a tick costs with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json FILE]``.
+
+``sixteen-chasers``, or its first N. In one process (``offline.py``) the parts are timed one by one, by the thread's
+processor time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction, messages).
+Then the same mission is flown in lock-step as ``chaserdock run`` flies it: wall time a tick, and what its processes
+use of the processors. ``record`` is the recorder's; ``transport`` is what world, chasers and controller use beyond the
+parts: encoding, Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chasers`` (repeatable) chooses;
+``--parts-only`` leaves out the flights in processes.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+from chaserdock_agents.logs import open_log
+from chaserdock_protocol import topics
+from chaserdock_protocol.scenario import Scenario, load_scenario
+from offline import Offline, seeing_eye
+from results import options_of, write_json
+
+ROOT = Path(__file__).resolve().parents[1]
+SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
+WARM_TICKS = 15
+"""Left out of every figure: until the first sightings have come and every kernel has run."""
+SAMPLE_S = 0.2
+PARTS = ("render", "physics", "perceive", "fuse", "solve", "guide")
+
+
+def first(n: int) -> str:
+    """The scenario's text with its first ``n`` chasers."""
+    head, *chasers = SCENARIO.read_text(encoding="utf-8").split("[[chasers]]")
+    return "[[chasers]]".join([head, *chasers[:n]])
+
+
+class Clock:
+    """Processor time of this thread spent in wrapped functions, by part; what a part calls of another counts there."""
+
+    def __init__(self) -> None:
+        self.spent: dict[str, float] = defaultdict(float)
+        self._inside: list[float] = []
+
+    def wrap(self, owner: Any, name: str, part: str) -> None:
+        """Replaces ``owner.name`` by itself, timed."""
+        work: Callable[..., Any] = getattr(owner, name)
+
+        def timed(*args: Any, **more: Any) -> Any:
+            begun = time.thread_time()
+            self._inside.append(0.0)
+            try:
+                return work(*args, **more)
+            finally:
+                took = time.thread_time() - begun
+                self.spent[part] += took - self._inside.pop()
+                if self._inside:
+                    self._inside[-1] += took
+
+        setattr(owner, name, timed)
+
+
+def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
+    """Seconds of processor time a tick by part, in one process; medians."""
+    import chaserdock_world.cameras
+    import offline
+
+    clock = Clock()
+    kept = [(offline, "look"), (chaserdock_world.cameras.Cameras, "picture")]
+    before = [getattr(owner, name) for owner, name in kept]
+    for (owner, name), part in zip(kept, ("perceive", "render"), strict=True):
+        clock.wrap(owner, name, part)
+    flight = Offline(scenario, seeing_eye(scenario))
+    clock.wrap(flight, "fly", "physics")
+    clock.wrap(flight.flight, "step", "guide")
+    clock.wrap(flight.flight, "fuse", "fuse")
+    clock.wrap(flight.flight._solver, "solve", "solve")
+    rows = []
+    for _ in range(WARM_TICKS + ticks):
+        clock.spent.clear()
+        flight.step()
+        rows.append([clock.spent[part] for part in PARTS])
+    flight.close()
+    for (owner, name), work in zip(kept, before, strict=True):
+        setattr(owner, name, work)
+    return dict(zip(PARTS, np.median(rows[WARM_TICKS:], axis=0).tolist(), strict=True))
+
+
+def processes_of(launcher: psutil.Process) -> dict[str, float]:
+    """Processor time, s, that the mission's processes have used so far."""
+    used: dict[str, float] = {}
+    for child in launcher.children():
+        try:
+            words, times = child.cmdline(), child.cpu_times()
+        except (psutil.NoSuchProcess, psutil.AccessDenied):
+            continue
+        if "chaserdock_agents" in words:
+            name = words[words.index("chaserdock_agents") + 1]
+            used[name] = used.get(name, 0.0) + times.user + times.system
+    return used
+
+
+def fly(n: int, flown_s: float) -> dict[str, float]:
+    """The mission with ``n`` chasers in its own processes: seconds a tick of wall time, and of processor time by kind.
+
+    Raises SystemExit when it was no success.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        path, out = Path(folder) / f"{n}-chasers.toml", Path(folder) / "run"
+        path.write_text(first(n), encoding="utf-8")
+        rules = [
+            f"duration_s={flown_s}",
+            "settling_s=1.0",
+            "success.steady_position_rms_m=0.3",
+            "success.steady_orientation_rms_deg=20.0",
+        ]
+        command = [sys.executable, "-m", "chaserdock_agents", "run", str(path), "--out", str(out), "-q"]
+        command += [item for rule in rules for item in ("--set", rule)]
+        said = (Path(folder) / "said.txt").open("w+")
+        done = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)
+        launcher, samples = psutil.Process(done.pid), []
+        while done.poll() is None:
+            try:
+                samples.append((time.time_ns(), processes_of(launcher)))
+            except psutil.NoSuchProcess:
+                break
+            time.sleep(SAMPLE_S)
+        if done.wait() != 0:
+            said.seek(0)
+            raise SystemExit(f"the flight of {n} failed:\n{said.read()}")
+        sent = [record.sent_ns for record in open_log(out).records(topics.TICK)]
+    begun, ended, ticks = sent[WARM_TICKS], sent[-1], len(sent) - 1 - WARM_TICKS
+    figures = {"wall": (ended - begun) / 1e9 / ticks}
+    at = np.array([t for t, _ in samples], dtype=float)
+    for kind in ("world", "chaser", "controller", "record"):
+        # A process is gone at the end: what it had used when last seen.
+        used = np.maximum.accumulate([s.get(kind, 0.0) for _, s in samples])
+        from_s, to_s = np.interp([begun, ended], at, used)
+        figures[kind] = float(to_s - from_s) / ticks
+    return figures
+
+
+def measure(n: int, ticks: int, flown_s: float | None) -> dict[str, float]:
+    """Seconds a tick with ``n`` chasers, by part; in one process alone if ``flown_s`` is None."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scenario.toml"
+        path.write_text(first(n), encoding="utf-8")
+        out = parts_of(load_scenario(path), ticks)
+    if flown_s is None:
+        return out | {"sum": sum(out.values())}
+    flown = fly(n, flown_s)
+    processes = flown["world"] + flown["chaser"] + flown["controller"]
+    out["transport"] = processes - sum(out.values())
+    out["record"] = flown["record"]
+    out["cpu"] = processes + flown["record"]
+    out["wall"] = flown["wall"]
+    return out
+
+
+def main() -> None:
+    parser = options_of(__doc__)
+    parser.add_argument("--chasers", type=int, action="append", choices=range(1, 17), metavar="N")
+    parser.add_argument("--ticks", type=int, default=60, help="ticks timed in one process")
+    parser.add_argument("--seconds", type=float, default=12.0, help="simulated time flown in processes")
+    parser.add_argument("--parts-only", action="store_true", help="no flights in processes")
+    options = parser.parse_args()
+    sizes = options.chasers or ([1, 2, 4] if options.quick else [1, 2, 4, 8, 16])
+    flown_s = None if options.parts_only else options.seconds
+    names = (*PARTS, *(("sum",) if flown_s is None else ("transport", "record", "cpu", "wall")))
+    told = (
+        ""
+        if flown_s is None
+        else "; cpu: processor time of all processes; wall: in lock-step, on this machine"
+    )
+    print(f"ms a tick{told}")
+    print(f"{'N':>3}" + "".join(f"{name:>11}" for name in names))
+    result: dict[str, float] = {}
+    for n in sizes:
+        row = measure(n, options.ticks, flown_s)
+        print(f"{n:3d}" + "".join(f"{1e3 * row[name]:11.2f}" for name in names), flush=True)
+        result |= {f"n{n}_{name}_s": row[name] for name in names}
+    for name in names:
+        if {f"n4_{name}_s", f"n16_{name}_s"} <= result.keys():
+            result[f"{name}_16_over_4"] = result[f"n16_{name}_s"] / result[f"n4_{name}_s"]
+            print(f"{name}: 16 chasers over 4: {result[f'{name}_16_over_4']:.2f}")
+    write_json(options.json, result)
+
+
+if __name__ == "__main__":
+    main()

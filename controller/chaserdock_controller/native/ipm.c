@@ -1,0 +1,326 @@
+/* Mehrotra's predictor-corrector interior point for one chaser's QP, on top of the Riccati sweeps.
+ *
+ * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dp_k >= c (a unit normal, dp_k the change of position
+ * at stage k) is soft: with a slack s >= 0, priced w1 s + w2/2 s^2, and z = a' dp - c + s >= 0, multipliers lam (of z)
+ * and pi (of s). Slack and multipliers are eliminated row by row, so a row only adds a rank-one term to the position
+ * block of Q_k and the sparsity of the Riccati sweep stays.
+ * Method: S. Mehrotra, SIAM J. Optim. 2 (1992); Nocedal and Wright, "Numerical Optimization", sec. 16.6.
+ *
+ * Everything that must stay positive lies in one flat vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6 D); its
+ * multipliers, in that order, in mul: lam, pi, and those of the box.
+ *
+ * Most rows are far from the chaser. Only those that it comes near take part; an answer that meets the others too is
+ * the answer to the whole, and one that does not is found again with those that it came near.
+ */
+#include "base.h"
+
+/* Complementarity at which to stop, in units of cost. 1e-2 to 1e-4 fly the same closed loop. */
+#define MU_STOP 1e-3
+/* Complementarity at the start, relative to the largest slope there, and its upper end. */
+#define MU_START 0.1
+#define MU_START_MAX 1e5
+/* Stationarity at which to stop, relative to the gradient at the start. */
+#define GRADIENT_STOP 1e-6
+#define STEP_TO_BOUNDARY 0.995
+/* Rows and bounds of the plain linear-quadratic solution may be missed by this much (m, or share of a limit). */
+#define FREE_TOLERANCE 1e-9
+/* Inputs at the start keep this far within the box. */
+#define START_WITHIN 0.9
+/* Rows with less room than this take part, m. */
+#define NEAR_M 0.1
+
+enum { FREE, CONVERGED, LIMIT, BROKEN };
+
+/* One chaser's problem. mats (D, 12, 12) = [C B]; q_pos, q_att (D+1, 3, 3); qx (D+1, 12); r_diag, r, w_bar (D, 6);
+ * rows: stage (R,), a (R, 3), c (R,). */
+typedef struct {
+    int64_t stages, n_rows, max_iterations;
+    double h, w1, w2;
+    const double *mats, *q_pos, *q_att, *qx, *r_diag, *r, *w_bar;
+    const int64_t *stage;
+    const double *a, *c;
+} Qp;
+
+/* dx (D+1, 12), dw (D, 6), multipliers mul (2 R + 12 D), scaled stationarity, complementarity. */
+typedef struct {
+    double *dx, *dw, *mul, residual, mu;
+    int64_t iterations;
+} Answer;
+
+/* The rows that take part, and what an iteration works on. */
+typedef struct {
+    int64_t count, n, *stage, *index;
+    double *a, *c;
+    double *val, *mul, *d_val, *d_mul, *res, *inverse, *w;
+    double *gx, *gw, *grad_x, *grad_w, *step_x, *step_w, *r_eff, *q_eff;
+    Factor *factors;
+} Iterate;
+
+static int64_t padded(int64_t count) { return (count + 3) / 4 * 4; }
+
+static int64_t ipm_workspace(int64_t d, int64_t rows) {
+    int64_t count = padded(2 * rows + 12 * d), x = 12 * (d + 1), w = 6 * d;
+    return 20 * 8 + 6 * count + 6 * rows + 3 * x + 5 * w + 9 * (d + 1) + d * (int64_t)(sizeof(Factor) / 8);
+}
+
+static Iterate laid_out(int64_t d, int64_t rows, double *work) {
+    int64_t count = padded(2 * rows + 12 * d), x = 12 * (d + 1), w = 6 * d;
+    Iterate it = {0};
+    it.factors = (Factor *)take(&work, d * (int64_t)(sizeof(Factor) / 8));
+    double **vectors[] = {&it.val, &it.mul, &it.d_val, &it.d_mul, &it.res, &it.inverse};
+    for (int i = 0; i < 6; i++) *vectors[i] = take(&work, count);
+    double **inputs[] = {&it.w, &it.gw, &it.grad_w, &it.step_w, &it.r_eff};
+    for (int i = 0; i < 5; i++) *inputs[i] = take(&work, w);
+    double **states[] = {&it.gx, &it.grad_x, &it.step_x};
+    for (int i = 0; i < 3; i++) *states[i] = take(&work, x);
+    it.q_eff = take(&work, 9 * (d + 1));
+    it.a = take(&work, 3 * rows);
+    it.c = take(&work, rows);
+    it.stage = (int64_t *)take(&work, rows);
+    it.index = (int64_t *)take(&work, rows);
+    return it;
+}
+
+/* Of the cost: gx (D+1, 12) = Q dx + qx, gw (D, 6) = R dw + r. */
+static void gradients(const Qp *qp, const double *dx, const double *dw, double *gx, double *gw) {
+    copy(qp->qx, gx, 12 * (qp->stages + 1));
+    for (int64_t k = 0; k <= qp->stages; k++)
+        for (int i = 0; i < 3; i++) {
+            gx[12 * k + i] += dot3(qp->q_pos + 9 * k + 3 * i, dx + 12 * k);
+            gx[12 * k + 6 + i] += dot3(qp->q_att + 9 * k + 3 * i, dx + 12 * k + 6);
+        }
+    for (int64_t i = 0; i < 6 * qp->stages; i++) gw[i] = madd(qp->r_diag[i], dw[i], qp->r[i]);
+}
+
+/* Room of a row: a' dp - c. */
+static inline double room(const double *dx, int64_t stage, const double *a, double c) {
+    return dot3(a, dx + 12 * stage) - c;
+}
+
+/* Adds force along a row's normal to the gradient gx. */
+static inline void pull(double *gx, int64_t stage, const double *a, double force) {
+    for (int i = 0; i < 3; i++) gx[12 * stage + i] = madd(force, a[i], gx[12 * stage + i]);
+}
+
+static int is_free(const Qp *qp, const double *dx, const double *w) {
+    for (int64_t i = 0; i < 6 * qp->stages; i++)
+        if (!(size_of(w[i]) <= 1.0 + FREE_TOLERANCE)) return 0;
+    for (int64_t j = 0; j < qp->n_rows; j++)
+        if (!(room(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= -FREE_TOLERANCE)) return 0;
+    return 1;
+}
+
+/* Lets the rows take part that dx (D+1, 12) comes near, and those that did already. `here` marks each (R,). */
+static void gather(const Qp *qp, const double *dx, double *here, Iterate *it) {
+    it->n = 0;
+    for (int64_t j = 0; j < qp->n_rows; j++) {
+        if (!(room(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= NEAR_M)) here[j] = 1.0;
+        if (here[j] == 0.0) continue;
+        copy(qp->a + 3 * j, it->a + 3 * it->n, 3);
+        it->c[it->n] = qp->c[j];
+        it->stage[it->n] = qp->stage[j];
+        it->index[it->n++] = j;
+    }
+    it->count = 2 * it->n + 12 * qp->stages;
+}
+
+/* Whether a row that does not take part is missed. */
+static int missed(const Qp *qp, const double *dx, const double *here) {
+    for (int64_t j = 0; j < qp->n_rows; j++)
+        if (here[j] == 0.0 && !(room(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= 0.0)) return 1;
+    return 0;
+}
+
+/* Curvature of the price of row j in z, d, and in s, e, with z's slope eliminated. */
+static inline void curvature(const Iterate *it, int64_t j, double w2, double *d, double *e) {
+    *d = it->mul[j] * it->inverse[j];
+    *e = madd(it->mul[it->n + j], it->inverse[it->n + j], w2);
+}
+
+/* The start: the inputs kept a little inside the box, with centred slacks and multipliers. Returns the scale of the
+ * gradient there. */
+static double begin(const Qp *qp, Answer *answer, Iterate *it) {
+    const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
+    for (int64_t i = 0; i < inputs; i++) {
+        it->w[i] = least(most(it->w[i], -START_WITHIN), START_WITHIN);
+        answer->dw[i] = it->w[i] - qp->w_bar[i];
+        it->val[bottom + i] = 1.0 + it->w[i];
+        it->val[top + i] = 1.0 - it->w[i];
+    }
+    advance(qp->stages, qp->mats, qp->h, answer->dx, answer->dw);
+    gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
+    double scale = most(1.0, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
+    /* Rows missed at the start pull with their full price; a complementarity much below that pull starts the search
+     * next to the boundary, where steps are short (27 to 40 iterations instead of 12). */
+    for (int64_t j = 0; j < it->n; j++)
+        if (room(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]) < 0.0) pull(it->gx, it->stage[j], it->a + 3 * j, -qp->w1);
+    double slope = most(scale, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
+    double mu = least(most(MU_START * slope, MU_START), MU_START_MAX);
+    for (int64_t j = 0; j < it->n; j++) {
+        double g = room(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]);
+        double price = qp->w1 + qp->w2 * most(-g, 0.0), t = price * g;
+        double s = (2.0 * mu + (root(t * t + 4.0 * mu * mu) - t)) / (2.0 * price);
+        it->val[j] = g + s;
+        it->val[it->n + j] = s;
+        it->mul[j] = mu / it->val[j];
+        it->mul[it->n + j] = qp->w1 + qp->w2 * s - it->mul[j];
+    }
+    for (int64_t j = bottom; j < it->count; j++) it->mul[j] = mu / it->val[j];
+    for (int64_t j = it->count; j < padded(it->count); j++) {
+        it->val[j] = 1.0; /* fills the last vector: a value that never limits a step */
+        it->mul[j] = it->d_val[j] = it->d_mul[j] = it->res[j] = 0.0;
+    }
+    return scale;
+}
+
+static inline double sum4(v4 s) { return (s[0] + s[2]) + (s[1] + s[3]); }
+
+/* res = val mul, element by element; returns the mean. */
+static double complementarity(const Iterate *it) {
+    v4 sum = all(0.0);
+    for (int64_t j = 0; j < it->count; j += 4) {
+        v4 product = load(it->val + j) * load(it->mul + j);
+        store(it->res + j, product);
+        sum += product;
+    }
+    return sum4(sum) / (double)it->count;
+}
+
+/* The Newton system of the present point, factored: curvatures of rows and box added to the cost's. */
+static int factor_newton(const Qp *qp, Iterate *it) {
+    const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
+    copy(qp->q_pos, it->q_eff, 9 * (qp->stages + 1));
+    for (int64_t j = 0; j < it->n; j++) {
+        double d, e, *q = it->q_eff + 9 * it->stage[j];
+        const double *a = it->a + 3 * j;
+        curvature(it, j, qp->w2, &d, &e);
+        double f = d * e / (d + e);
+        for (int m = 0; m < 3; m++)
+            for (int n = 0; n < 3; n++) q[3 * m + n] = madd(f * a[m], a[n], q[3 * m + n]);
+    }
+    for (int64_t i = 0; i < inputs; i++)
+        it->r_eff[i] = qp->r_diag[i] + (it->mul[bottom + i] * it->inverse[bottom + i] + it->mul[top + i] * it->inverse[top + i]);
+    return factor(qp->stages, qp->mats, qp->h, it->q_eff, qp->q_att, it->r_eff, it->factors);
+}
+
+/* The step that takes the products val mul down by res, and the longest share of it that keeps all positive. */
+static double newton_step(const Qp *qp, Iterate *it) {
+    const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
+    copy(it->gx, it->grad_x, 12 * (qp->stages + 1));
+    for (int64_t j = 0; j < it->n; j++) {
+        double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
+        curvature(it, j, qp->w2, &d, &e);
+        pull(it->grad_x, it->stage[j], it->a + 3 * j, rz - d * (rs + rz) / (d + e));
+    }
+    for (int64_t i = 0; i < inputs; i++)
+        it->grad_w[i] = it->gw[i] + (it->res[bottom + i] * it->inverse[bottom + i] - it->res[top + i] * it->inverse[top + i]);
+    minimize(qp->stages, qp->mats, qp->h, it->factors, it->grad_x, it->grad_w, it->step_x, it->step_w);
+    for (int64_t j = 0; j < it->n; j++) {
+        double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
+        curvature(it, j, qp->w2, &d, &e);
+        double dg = dot3(it->a + 3 * j, it->step_x + 12 * it->stage[j]);
+        it->d_val[it->n + j] = -(rs + rz + d * dg) / (d + e);
+        it->d_val[j] = dg + it->d_val[it->n + j];
+    }
+    for (int64_t i = 0; i < inputs; i++) {
+        it->d_val[bottom + i] = it->step_w[i];
+        it->d_val[top + i] = -it->step_w[i];
+    }
+    v4 steepest = all(0.0);
+    for (int64_t j = 0; j < it->count; j += 4) {
+        v4 inverse = load(it->inverse + j), change = load(it->d_val + j), mul = load(it->mul + j);
+        v4 change_mul = -(madd4(mul, change, load(it->res + j))) * inverse;
+        store(it->d_mul + j, change_mul);
+        /* the spare places of the last vector hold a multiplier of zero */
+        v4 of_mul = -change_mul / __builtin_elementwise_max(mul, all(1e-300));
+        steepest = __builtin_elementwise_max(steepest, __builtin_elementwise_max(-change * inverse, of_mul));
+    }
+    return 1.0 / most(most(steepest[0], steepest[1]), most(steepest[2], steepest[3]));
+}
+
+/* Mean complementarity after a share alpha of the step. */
+static double after_step(const Iterate *it, double alpha) {
+    v4 sum = all(0.0);
+    for (int64_t j = 0; j < it->count; j += 4)
+        sum += madd4(all(alpha), load(it->d_val + j), load(it->val + j)) * madd4(all(alpha), load(it->d_mul + j), load(it->mul + j));
+    return sum4(sum) / (double)it->count;
+}
+
+/* Iterates to the solution for the rows that take part; at most `limit` iterations in all. */
+static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
+    const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
+    const double scale = begin(qp, answer, it);
+    for (;;) {
+        /* complementarity and stationarity of the present point */
+        double mu = complementarity(it);
+        gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
+        for (int64_t j = 0; j < it->n; j++) pull(it->gx, it->stage[j], it->a + 3 * j, -it->mul[j]);
+        for (int64_t i = 0; i < inputs; i++) it->gw[i] += it->mul[top + i] - it->mul[bottom + i];
+        answer->mu = mu;
+        answer->residual = reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w) / scale;
+        if (!(finite(mu) && finite(answer->residual))) return BROKEN;
+        if (mu <= MU_STOP && answer->residual <= GRADIENT_STOP) return CONVERGED;
+        if (answer->iterations >= qp->max_iterations) return LIMIT;
+        answer->iterations++;
+
+        for (int64_t j = 0; j < it->count; j += 4) store(it->inverse + j, all(1.0) / load(it->val + j));
+        if (!factor_newton(qp, it)) return BROKEN;
+        double after = after_step(it, least(1.0, newton_step(qp, it)));
+        /* Never far below the stopping point: smaller gains nothing and spoils the conditioning. */
+        double centre = most(after * after * after / (mu * mu), 0.1 * MU_STOP);
+        for (int64_t j = 0; j < it->count; j++) it->res[j] += it->d_val[j] * it->d_mul[j] - centre;
+        double alpha = least(1.0, STEP_TO_BOUNDARY * newton_step(qp, it));
+
+        for (int64_t j = 0; j < it->count; j++) {
+            it->val[j] = madd(alpha, it->d_val[j], it->val[j]);
+            it->mul[j] = madd(alpha, it->d_mul[j], it->mul[j]);
+        }
+        for (int64_t i = 0; i < 12 * (qp->stages + 1); i++) answer->dx[i] = madd(alpha, it->step_x[i], answer->dx[i]);
+        for (int64_t i = 0; i < inputs; i++) answer->dw[i] = madd(alpha, it->step_w[i], answer->dw[i]);
+    }
+}
+
+/* Multipliers of all rows: one that did not take part has lam = 0 and pi = w1. */
+static void spread(const Qp *qp, const Iterate *it, double *mul) {
+    for (int64_t j = 0; j < qp->n_rows; j++) {
+        mul[j] = 0.0;
+        mul[qp->n_rows + j] = qp->w1;
+    }
+    for (int64_t j = 0; j < it->n; j++) {
+        mul[it->index[j]] = it->mul[j];
+        mul[qp->n_rows + it->index[j]] = it->mul[it->n + j];
+    }
+    copy(it->mul + 2 * it->n, mul + 2 * qp->n_rows, 12 * qp->stages);
+}
+
+/* |w_bar + dw| <= 1 always holds, but for FREE, where it does within FREE_TOLERANCE. With CONVERGED and LIMIT the point
+ * lies strictly within the box; with LIMIT it is the best reached in max_iterations. Working memory: `ipm_workspace`
+ * doubles, and R more. */
+static int solve_one(const Qp *qp, Answer *answer, double *work) {
+    const int64_t inputs = 6 * qp->stages;
+    double *here = take(&work, qp->n_rows);
+    Iterate it = laid_out(qp->stages, qp->n_rows, work);
+    answer->iterations = 0;
+    answer->residual = answer->mu = 0.0;
+    if (!factor(qp->stages, qp->mats, qp->h, qp->q_pos, qp->q_att, qp->r_diag, it.factors)) return BROKEN;
+    minimize(qp->stages, qp->mats, qp->h, it.factors, qp->qx, qp->r, answer->dx, answer->dw);
+    for (int64_t i = 0; i < inputs; i++) it.w[i] = qp->w_bar[i] + answer->dw[i];
+    if (is_free(qp, answer->dx, it.w)) {
+        zero(answer->mul, 2 * qp->n_rows + 2 * inputs);
+        return FREE;
+    }
+    /* near at the rollout itself, or where the cost alone would go */
+    zero(here, qp->n_rows);
+    for (int64_t j = 0; j < qp->n_rows; j++) here[j] = -qp->c[j] < NEAR_M ? 1.0 : 0.0;
+    for (;;) {
+        gather(qp, answer->dx, here, &it);
+        int code = iterate(qp, answer, &it);
+        spread(qp, &it, answer->mul);
+        if (code != CONVERGED || !missed(qp, answer->dx, here)) return code;
+        for (int64_t i = 0; i < inputs; i++) it.w[i] = qp->w_bar[i] + answer->dw[i];
+    }
+}
+
+EXPORT int64_t NAME(qp_workspace)(int64_t stages, int64_t rows) { return ipm_workspace(stages, rows) + rows + 16; }
+
+EXPORT int NAME(solve_qp)(const Qp *qp, Answer *answer, double *work) { return solve_one(qp, answer, work); }

@@ -1,0 +1,10 @@
+/* The controller's numerical kernels, one translation unit for each instruction set (LEVEL). See base.h. */
+#include "base.h"
+#include "checks.c"
+#include "dynamics.c"
+#include "cost.c"
+#include "planes.c"
+#include "riccati.c"
+#include "ipm.c"
+#include "tick.c"
+#include "tumble.c"

@@ -1,0 +1,76 @@
+/* One tick of the real-time iteration for all chasers: roll and linearize, rows, then one QP for each chaser. */
+#include "base.h"
+
+#define MAX_ITERATIONS 40
+
+/* inputs (N, D, 6): the plan to begin with and what becomes of it; states (N, 13), limits (N, 6); reach (D+1,): how far a
+ * newton more or less on each axis moves a chaser by each stage, m; w1 (N,): price of the slacks. `budget`: iterations
+ * of all chasers together; each may take what is left, shared evenly over those to come, and at most MAX_ITERATIONS.
+ * code and iterations (N,) are written. */
+typedef struct {
+    const Model *model;
+    const Weights *weights;
+    const Zones *zones;
+    const double *states, *u_ref, *limits, *reach, *w1;
+    double *inputs;
+    double w2;
+    int64_t budget, *code, *iterations;
+} Tick;
+
+static int64_t tick_width(int64_t n, int64_t d) { return d * (n + 2); }
+
+EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d) {
+    int64_t width = tick_width(n, d);
+    return n * (14 * (d + 1) + 5 * width + 1) + 144 * n * d + (9 + 9 + 12 + 12) * (d + 1) + 4 * 6 * d + 2 * width +
+           12 * d + ipm_workspace(d, width) + width + 40 * 8;
+}
+
+EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
+    const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d);
+    double *x = take(&work, 13 * n * (d + 1)), *mats = take(&work, 144 * n * d);
+    double *reach = take(&work, n * (d + 1));
+    Rows rows = {width, d + 1, reach, 0, 0, 0, 0};
+    rows.stage = (int64_t *)take(&work, n * width);
+    rows.n_rows = (int64_t *)take(&work, n);
+    rows.a = take(&work, 3 * n * width);
+    rows.c = take(&work, n * width);
+    double *q_pos = take(&work, 9 * (d + 1)), *q_att = take(&work, 9 * (d + 1)), *qx = take(&work, 12 * (d + 1));
+    double *r_diag = take(&work, 6 * d), *r = take(&work, 6 * d), *w_bar = take(&work, 6 * d);
+    Answer answer = {take(&work, 12 * (d + 1)), take(&work, 6 * d), take(&work, 2 * width + 12 * d), 0.0, 0.0, 0};
+
+    for (int64_t i = 0; i < n; i++) {
+        const double *top = tick->limits + 6 * i, force = most(most(top[0], top[1]), top[2]);
+        for (int64_t k = 0; k <= d; k++) reach[(d + 1) * i + k] = force * tick->reach[k];
+        copy(tick->states + 13 * i, x + 13 * (d + 1) * i, 13);
+    }
+    NAME(roll_linearized)(tick->model, n, d, tick->inputs, tick->limits, x, mats);
+    NAME(build_rows)(tick->zones, x, &rows);
+    int64_t left = tick->budget;
+    for (int64_t i = 0; i < n; i++) {
+        double *u = tick->inputs + 6 * d * i;
+        const double *limits = tick->limits + 6 * i;
+        const int64_t share = (left + n - i - 1) / (n - i);
+        NAME(quadratic_model)(tick->weights, x + 13 * (d + 1) * i, u, tick->zones->references + 7 * (d + 1) * i,
+                                tick->u_ref + 6 * d * i, limits, q_pos, q_att, qx, r_diag, r, w_bar);
+        Qp qp = {d, rows.n_rows[i], share < MAX_ITERATIONS ? share : MAX_ITERATIONS, tick->model->step_s, tick->w1[i],
+                 tick->w2, mats + 144 * d * i, q_pos, q_att, qx, r_diag, r, w_bar, rows.stage + width * i,
+                 rows.a + 3 * width * i, rows.c + width * i};
+        tick->code[i] = solve_one(&qp, &answer, work);
+        tick->iterations[i] = answer.iterations;
+        left -= answer.iterations;
+        for (int64_t m = 0; m < 6 * d; m++)
+            if (!finite(answer.dw[m])) tick->code[i] = BROKEN;
+        if (tick->code[i] == BROKEN) continue;
+        for (int64_t m = 0; m < 6 * d; m++) u[m] = least(most(w_bar[m] + answer.dw[m], -1.0), 1.0) * limits[m % 6];
+    }
+}
+
+/* Piecewise constant inputs (N, D, 6) seen `whole + part` steps later on the same grid: each new value is the mean of the
+ * old plan over its interval, so the impulse is kept; beyond the old horizon the last value is held. */
+EXPORT void NAME(shift_inputs)(int64_t n, int64_t d, int64_t whole, double part, const double *inputs, double *out) {
+    for (int64_t i = 0; i < n; i++, inputs += 6 * d, out += 6 * d)
+        for (int64_t k = 0; k < d; k++) {
+            int64_t first = k + whole < d ? k + whole : d - 1, second = first + 1 < d ? first + 1 : d - 1;
+            for (int c = 0; c < 6; c++) out[6 * k + c] = (1.0 - part) * inputs[6 * first + c] + part * inputs[6 * second + c];
+        }
+}

@@ -1,0 +1,71 @@
+"""How a process reaches the others, and what comes over the wire; ``transport`` makes sessions of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from .topics import Topic
+
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+DEFAULT_NAMESPACE = "chaserdock"
+
+
+@dataclass(frozen=True)
+class Tls:
+    """PEM files for mutual TLS: the mission's authority, this process' certificate, its private key."""
+
+    ca: Path
+    certificate: Path
+    key: Path
+
+
+@dataclass(frozen=True)
+class Link:
+    """How a process reaches the others. ``lease_ms``: after that long a silent peer counts as lost.
+
+    ``access_control`` is what a router enforces (see ``rights``).
+    """
+
+    namespace: str = DEFAULT_NAMESPACE
+    connect: tuple[str, ...] = ()
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:0",)
+    mode: Literal["peer", "client", "router"] = "peer"
+    config: Path | None = None
+    lease_ms: int = 60_000
+    tls: Tls | None = None
+    access_control: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True)
+class Received:
+    """A message that passed all checks. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
+
+    topic: Topic
+    place: str | None
+    message: Any
+    sent_ns: int
+
+
+@dataclass(frozen=True)
+class Raw:
+    """What came over the wire, unopened."""
+
+    key: str
+    encoding: str
+    payload: bytes
+    sent_ns: int
+
+
+def open_error(error: Exception, link: Link) -> str:
+    """Why a session could not be opened, in one line."""
+    text = " ".join(str(error).split())
+    if link.config is not None:
+        return f"cannot open the Zenoh session of {link.config}: {text}"
+    listen, connect = ", ".join(link.listen) or "-", ", ".join(link.connect) or "-"
+    if "in use" in text.lower():
+        return (
+            f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"
+        )
+    return f"cannot open the Zenoh session (listen {listen}, connect {connect}): {text}"

@@ -1,0 +1,32 @@
+"""A small scenario that is good, for tests to spoil."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+GOOD = """
+name = "two"
+duration_s = 10.0
+seed = 3
+
+[target]
+model = "paper"
+
+[[chasers]]
+position_m = [-1.0, 0.0, 0.0]
+q_wxyz = [1.0, 0.0, 0.0, 0.0]
+
+[[chasers]]
+position_m = [1.0, 0.0, 0.0]
+q_wxyz = [0.0, 0.0, 0.0, 1.0]
+
+[[timeline]]
+at_s = 5.0
+command = "hold"
+chasers = [1]
+"""
+
+
+def good() -> dict[str, Any]:
+    return tomllib.loads(GOOD)

@@ -1,0 +1,153 @@
+"""The documentation: builds strictly, needs no network, and says nothing that the repository contradicts."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+import tomllib
+from html.parser import HTMLParser
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+from chaserdock_protocol.scenario import parse_scenario
+from harness import ROOT
+
+DOCS = ROOT / "docs"
+PAGES = sorted(DOCS.glob("*.md"))
+
+
+def _module(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+make_site: Any = _module("make_site")
+
+
+class Requests(HTMLParser):
+    """What a browser would fetch for a page by itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.urls: list[str] = []
+        self.equations = 0
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.equations += tag == "math"
+        if tag in ("script", "img", "iframe", "source", "video") and values.get("src"):
+            self.urls.append(str(values["src"]))
+        if tag == "link" and values.get("rel") not in ("canonical", "next", "prev"):
+            self.urls.append(str(values.get("href")))
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("docs") / "site"
+    made = subprocess.run(
+        [sys.executable, str(DOCS / "make_site.py"), str(out)], capture_output=True, text=True, check=False
+    )
+    assert made.returncode == 0, made.stdout + made.stderr
+    return out
+
+
+def test_every_page_is_there_and_asks_nobody_else(site: Path) -> None:
+    for page in PAGES:
+        assert (site / page.with_suffix(".html").name).is_file()
+    for page in site.rglob("*.html"):
+        seen = Requests()
+        seen.feed(page.read_text(encoding="utf-8"))
+        foreign = [url for url in seen.urls if re.match(r"(https?:)?//", url)]
+        assert foreign == [], page
+        for url in seen.urls:
+            if page.name != "404.html" and not url.startswith("data:"):
+                assert (page.parent / url.partition("?")[0].partition("#")[0]).exists(), (page, url)
+
+
+def test_mathematics_is_in_the_page_itself(site: Path) -> None:
+    for name, least in (("controller", 8), ("fusion", 4)):
+        seen = Requests()
+        text = (site / f"{name}.html").read_text(encoding="utf-8")
+        seen.feed(text)
+        assert seen.equations >= least
+        assert "\\begin" not in re.sub(r"<annotation.*?</annotation>", "", text, flags=re.S)
+
+
+def test_a_link_to_nowhere_is_an_error(tmp_path: Path) -> None:
+    stage = make_site.Stage(tmp_path / "stage")
+    with pytest.raises(make_site.SiteError, match=r"nothing\.md"):
+        stage.with_links("[gone](nothing.md)", DOCS / "index.md")
+    assert stage.with_links("[there](../examples/README.md)", DOCS / "index.md") == (
+        "[there](source/examples/README.md)"
+    )
+    assert (tmp_path / "stage" / "source" / "examples" / "README.md").is_file()
+
+
+def test_navigation_names_pages_that_are_there(tmp_path: Path) -> None:
+    with pytest.raises(make_site.SiteError, match=r"not there.*index\.md"):
+        make_site.configuration(tmp_path)
+
+
+def test_the_readmes_links_lead_somewhere() -> None:
+    for page in (ROOT / "README.md", ROOT / "examples" / "README.md"):
+        links = re.findall(r"\]\(([^)#:]+)(?:#[^)]*)?\)", page.read_text(encoding="utf-8"))
+        assert links
+        for link in links:
+            assert (page.parent / link).exists(), (page.name, link)
+
+
+def fences(language: str) -> list[tuple[str, str]]:
+    """Page and text of every fenced block of a language."""
+    found = []
+    for page in PAGES:
+        for block in re.findall(
+            rf"^ *```{language}\n(.*?)^ *```", page.read_text(encoding="utf-8"), re.M | re.S
+        ):
+            found.append((page.name, block))
+    return found
+
+
+def test_scenarios_in_the_docs_are_right() -> None:
+    """Every TOML example is TOML, and those that are a whole scenario, or sections of one, can be read as such."""
+    base = tomllib.loads((ROOT / "scenarios" / "single.toml").read_text())
+    read = 0
+    for page, block in fences("toml"):
+        values = tomllib.loads(block)
+        if (
+            page in ("tutorial.md", "howto-camera.md", "howto-body.md")
+            and not {"vary", "seeds"} & values.keys()
+        ):
+            values.get("camera", {}).pop("calibration", None)
+            jets = values.get("chaser", {}).pop("thrusters", None)
+            if jets is not None:
+                values["chaser"].pop("actuation")
+            parse_scenario(base | values, page)
+            read += 1
+    assert read >= 4
+
+
+def test_commands_in_the_docs_exist() -> None:
+    """Every ``chaserdock VERB --option`` in a shell block is one that docs/cli.md, made from the program, has."""
+    sections = re.split(
+        r"^### ", (DOCS / "cli.md").read_text(encoding="utf-8").partition("## Verbs")[2], flags=re.M
+    )
+    options = {s.partition("\n")[0]: set(re.findall(r"`(--?[a-z][a-z-]*)`", s)) for s in sections[1:]}
+    tried = 0
+    for page, block in fences("sh"):
+        for command in re.findall(r"\bchaserdock ([a-z][^\n|&#;]*)", block.replace("\\\n", " ")):
+            own = re.split(r"\s--\s", command)[0]
+            words = own.split()
+            verb = next((v for v in (" ".join(words[:2]), words[0]) if v in options), None)
+            assert verb is not None, (page, command)
+            used = set(re.findall(r"(?<=\s)(--?[a-z][a-z-]*)", own))
+            assert used <= options[verb] | {"--help"}, (page, command, used - options[verb])
+            tried += 1
+    assert tried > 30

@@ -325,6 +325,23 @@ def test_a_flush_comes_with_time_and_makes_all_before_it_readable(tmp_path: Path
     writer.close()
 
 
+def test_a_flight_faster_than_the_clock_is_flushed_by_its_own_time(tmp_path: Path) -> None:
+    path, on_disk = tmp_path / "a.mcap", []
+    writer = LogWriter(path, Clock())
+    for k in range(120):
+        record(writer, topics.ACK, None, m.RecorderAck(tick=k, sim_time_ns=k * 33_333_333), 1)
+        on_disk.append(len(list(read_log(path))) if path.stat().st_size > 8 else 0)
+    for k, held in enumerate(on_disk):
+        assert (k + 1 - held) * 33_333_333 <= 0.55e9
+    assert 6 <= len(set(on_disk)) <= 10
+    # A time that cannot be is one flush, not one a message.
+    for k in range(120, 134):
+        wrong = k == 120
+        record(writer, topics.ACK, None, m.RecorderAck(tick=k, sim_time_ns=(10**18 if wrong else k)), 1)
+    assert 121 <= len(list(read_log(path))) < 134
+    writer.close()
+
+
 def test_without_time_passing_nothing_is_flushed_and_flush_does(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path, Clock())

@@ -41,6 +41,7 @@ from .messages import encoding_of, schema_of
 from .topics import Topic
 from .upgrades import decode_logged
 
+_FLUSH_S = 0.5
 SCENARIO_ATTACHMENT = "scenario.json"
 LOCK_ATTACHMENT = "uv.lock.gz"
 VERSIONS_ATTACHMENT = "versions.json"
@@ -101,7 +102,9 @@ class _Sink:
 
 
 class LogWriter:
-    """Writes a log; flushed to the file at least once a second of ``now_s``, so a kill costs at most the last second.
+    """Writes a log; a kill costs at most the last second, be it of ``now_s`` or of the flight.
+
+    It is flushed to the file each half second of both: a flight in lock-step may be faster than the clock, or slower.
 
     Raises LogError when the file cannot be created or written; what was written until then stays readable.
     """
@@ -129,7 +132,7 @@ class LogWriter:
         )
         with self._writing():
             self._writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')}")
-        self._flushed_s = now_s()
+        self._flushed_s, self._flushed_ns = now_s(), 0
 
     @property
     def size_bytes(self) -> int:
@@ -169,7 +172,8 @@ class LogWriter:
             self.unreadable += 1
         self._add(channel, self.last_time_ns, payload, sent_ns or self.last_time_ns)
         self.messages += 1
-        if self._now_s() - self._flushed_s >= 0.5:
+        flown_ns = self.last_time_ns - self._flushed_ns
+        if self._now_s() - self._flushed_s >= _FLUSH_S or flown_ns >= _FLUSH_S * 1e9:
             self.flush()
 
     def write_view(self, topic: str, schema: tuple[str, str, bytes], payload: bytes, time_ns: int) -> None:
@@ -209,7 +213,7 @@ class LogWriter:
         """Hands everything written so far to the operating system."""
         with self._writing():
             self._writer.flush()
-        self._flushed_s = self._now_s()
+        self._flushed_s, self._flushed_ns = self._now_s(), self.last_time_ns
 
     def _register(self, key: str, encoding: str) -> int:
         found = topics.topic_of_key(key)

@@ -1,4 +1,5 @@
-"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--seconds 15] [--quick] [--json FILE]``.
+"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--seconds 15] [--only NAME] [--keep DIR] [--quick]
+[--json FILE]``.
 
 Flies ``four-chaser-docking`` in real time with ticks and pictures at 30 Hz, 640 x 480, every process on this machine, and
 measures from a picture's sending to the sending of the actuator command that answers it (both stamps are the senders').
@@ -15,14 +16,16 @@ import threading
 import time
 import uuid
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import psutil
 from chaserdock_agents.launcher import Child, Fleet, open_hub
-from chaserdock_protocol import codec, topics
-from chaserdock_protocol.messages import ActuatorCommand, Image, MissionEnd
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.transport import Node, Raw
 from results import options_of, write_json
 
@@ -32,6 +35,7 @@ CHASERS = 4
 RATE_HZ = 30
 SETTLE_S = 6.0
 LATE_S = 0.033
+LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",
     f"time.picture_hz={RATE_HZ}",
@@ -40,6 +44,17 @@ OVERRIDES = (
     "timeline=[]",
     "success.docked=[]",
 )
+
+
+class Head(msgspec.Struct):
+    """What is read of a picture or an actuator command."""
+
+    tick: int
+    chaser: int
+    source: str = ""
+
+
+_head = msgspec.msgpack.Decoder(Head)
 
 
 @dataclass
@@ -52,15 +67,14 @@ class Ear:
 
     def take(self, raw: Raw) -> None:
         """Called on Zenoh's thread."""
-        found = topics.topic_of_key(raw.key)
-        if found is None:
-            return
-        message = codec.decode(found[0].kind, raw.payload)
-        if isinstance(message, Image):
-            self.pictures[message.chaser, message.tick] = raw.sent_ns
-            self.last_tick = max(self.last_tick, message.tick)
-        elif isinstance(message, ActuatorCommand) and message.source == "command":
-            self.commands.setdefault((message.chaser, message.tick), raw.sent_ns)
+        head = _head.decode(
+            raw.payload
+        )  # no more than is needed: what is measured shares the cores with this
+        if raw.key.endswith("/image"):
+            self.pictures[head.chaser, head.tick] = raw.sent_ns
+            self.last_tick = max(self.last_tick, head.tick)
+        elif head.source == "command":
+            self.commands.setdefault((head.chaser, head.tick), raw.sent_ns)
 
 
 @dataclass(frozen=True)
@@ -96,6 +110,9 @@ def slow(recorder: psutil.Process, stop: threading.Event) -> None:
         stop.wait(0.02)
 
 
+DISTURBANCES = {"recorder": alone, "frozen_recorder": frozen, "slow_recorder": slow}
+
+
 def start(fleet: Fleet, folder: Path, seconds: float, network: list[str]) -> Child:
     """All processes of the mission; the recorder's."""
     words = folder / "processes"
@@ -110,17 +127,21 @@ def start(fleet: Fleet, folder: Path, seconds: float, network: list[str]) -> Chi
     return fleet.children[-1]
 
 
-def fly(seconds: float, disturb: Callable[[psutil.Process, threading.Event], None]) -> Flown:
-    """A flight of which ``seconds`` are measured, with the recorder disturbed meanwhile."""
+def fly(
+    seconds: float, disturb: Callable[[psutil.Process, threading.Event], None], keep: Path | None = None
+) -> Flown:
+    """A flight of which ``seconds`` are measured, with the recorder disturbed meanwhile. ``keep``: a folder for its log."""
     namespace = f"realtime-{uuid.uuid4().hex[:8]}"
-    with tempfile.TemporaryDirectory() as folder:
-        hub, endpoint = open_hub(namespace, 2000, name="observer", role="analysis")
+    if keep is not None:
+        keep.mkdir(parents=True)
+    with tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep)) as folder:
+        hub, endpoint = open_hub(namespace, LEASE_MS, name="observer", role="analysis")
         fleet, ear, stop = Fleet(), Ear(), threading.Event()
         try:
             for topic in (topics.IMAGE, topics.ACTUATORS):
                 hub.subscribe_raw(topic.key.format(chaser="*"), ear.take)
             total_s = SETTLE_S + seconds + 2.0
-            network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", "2000"]
+            network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(LEASE_MS)]
             recorder = psutil.Process(start(fleet, Path(folder), total_s, network).process.pid)
             wait_for(ear, round(SETTLE_S * RATE_HZ), fleet, hub)
             disturbing = threading.Thread(target=disturb, args=(recorder, stop))
@@ -162,11 +183,13 @@ def cpu_s(fleet: Fleet) -> dict[str, float]:
 def main() -> None:
     parser = options_of(__doc__)
     parser.add_argument("--seconds", type=float, default=15.0, help="measured in each flight")
+    parser.add_argument("--only", choices=DISTURBANCES, help="one of the flights")
+    parser.add_argument("--keep", type=Path, help="keep logs and the processes' words here")
     options = parser.parse_args()
     seconds = 5.0 if options.quick else options.seconds
     figures: dict[str, float] = {}
-    for name, disturb in (("recorder", alone), ("frozen_recorder", frozen), ("slow_recorder", slow)):
-        flown = fly(seconds, disturb)
+    for name in [options.only] if options.only else DISTURBANCES:
+        flown = fly(seconds, DISTURBANCES[name], options.keep and options.keep / name)
         late = int(np.sum(flown.latency_s > LATE_S))
         figures |= {
             f"{name}_p50_s": flown.quantile(0.5),
@@ -183,7 +206,7 @@ def main() -> None:
             f"{flown.lost} of {flown.ticks * CHASERS} lost, {late} later than 33 ms"
         )
         print(f"{'':16} CPU: {shares}  together {sum(flown.cpu_share.values()):.2f}", flush=True)
-    for name in ("frozen_recorder", "slow_recorder"):
+    for name in [n for n in DISTURBANCES if n != "recorder" and not options.only]:
         figures[f"{name}_p99_ratio"] = figures[f"{name}_p99_s"] / figures["recorder_p99_s"]
         print(f"{name}: p99 {figures[f'{name}_p99_ratio']:.2f} of that with the recorder as it is")
     write_json(options.json, figures)

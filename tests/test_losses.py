@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import msgspec
 import pytest
@@ -214,3 +214,46 @@ def test_no_tick_is_worked_out_before_its_loss_is_known(controller: Controller, 
     assert controller.done_tick == -1
     tell(controller, topics.SIGHTING, 0, lost(scenario, 1))
     assert controller.done_tick == 1
+
+
+class Clock:
+    """Wall time, set by hand (s)."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def in_real_time(scenario: Scenario) -> tuple[Controller, Clock]:
+    clock = Clock()
+    flight = Flight(scenario, lambda: 0.0)
+    made = Controller(Tape("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
+    made.teller = SilentTeller()  # type: ignore[assignment]
+    return made, clock
+
+
+def test_in_real_time_a_tick_waits_for_its_sightings_and_not_for_ever(scenario: Scenario) -> None:
+    controller, clock = in_real_time(scenario)
+    tell(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    for i in (0, 1):
+        tell(controller, topics.ODOMETRY, i, odometry(scenario, i, 1))
+    said = tell(controller, topics.SIGHTING, 0, sighting(scenario, 0, 1))
+    assert not [m for t, m in said if t is topics.WRENCH]
+    clock.now_s = 0.9 / scenario.time.rate_hz
+    controller.listen()  # nothing comes
+    commands: list[Any] = [m for t, _, m in cast(Tape, controller.node).said() if t is topics.WRENCH]
+    assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]
+    # The sighting that is late belongs to the next tick's estimate, and makes no second command.
+    said = tell(controller, topics.SIGHTING, 1, sighting(scenario, 1, 1))
+    assert not [m for t, m in said if t is topics.WRENCH]
+
+
+def test_in_real_time_the_next_ticks_odometry_does_not_cost_a_tick_its_commands(scenario: Scenario) -> None:
+    controller, _ = in_real_time(scenario)
+    tell(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    for i in (0, 1):
+        tell(controller, topics.ODOMETRY, i, odometry(scenario, i, 1))
+    said = tell(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
+    commands = [m for t, m in said if t is topics.WRENCH]
+    assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]

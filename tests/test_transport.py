@@ -6,7 +6,8 @@ import json
 from pathlib import Path
 
 import pytest
-from chaserdock_protocol.transport import Link, TransportError, zenoh_config
+from chaserdock_protocol import topics
+from chaserdock_protocol.transport import Link, Node, TransportError, zenoh_config
 
 
 def test_defaults_are_safe() -> None:
@@ -45,3 +46,31 @@ def test_a_bad_file_is_named(tmp_path: Path) -> None:
 def test_a_bad_endpoint_is_told() -> None:
     with pytest.raises(TransportError):
         zenoh_config(Link("run-1", listen=("nonsense",)))
+
+
+def congestion_of(node: Node, topic: topics.Topic, place: int | str | None = None) -> str:
+    key = node.advertise(topic, place)
+    return str(node._publishers[key].congestion_control).rpartition(".")[2]
+
+
+def test_who_waits_for_slow_readers() -> None:
+    """In lock-step everyone. In real time nobody, but for what is said once at the end."""
+    node = Node("world", "world", Link(namespace="waits"))
+    try:
+        assert congestion_of(node, topics.TICK) == "BLOCK"
+        node.waits = False
+        for topic, place in ((topics.IMAGE, 0), (topics.ODOMETRY, 0), (topics.EVENT, "world")):
+            assert congestion_of(node, topic, place) == "DROP"
+        assert congestion_of(node, topics.END) == "BLOCK"
+        assert congestion_of(node, topics.FAREWELL, "world") == "BLOCK"
+    finally:
+        node.close()
+
+
+def test_queues_are_as_long_as_can_be() -> None:
+    """What is droppable is dropped for one reader, and only when that one has not read for long."""
+    config = zenoh_config(Link())
+    sizes = json.loads(config.get_json("transport/link/tx/queue/size"))
+    assert set(sizes.values()) == {16}
+    drop = json.loads(config.get_json("transport/link/tx/queue/congestion_control/drop"))
+    assert drop == {"wait_before_drop": 2000, "max_wait_before_drop_fragments": 4000}

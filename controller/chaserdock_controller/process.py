@@ -29,7 +29,7 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
-from chaserdock_protocol.runtime import ProcessOptions, Stop
+from chaserdock_protocol.runtime import ProcessOptions, Stop, built
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node, Received
@@ -43,6 +43,8 @@ from .shadow import Shadow
 _REMEMBERED_TICKS = 256
 _IDLE = 5
 """Waits in vain after which, in lock-step, nothing more is on its way here."""
+_PATIENCE_TICKS = 0.5
+"""In real time a tick waits so much of its period for its sightings; a later one serves the next tick."""
 
 
 def no_command(chaser: int, tick: Tick) -> WrenchCommand:
@@ -69,6 +71,7 @@ def main(options: ProcessOptions) -> int:
         controller = Controller(node, scenario, flight, mission.mode == "realtime")
         node.faults = layer_of(scenario, node.name, lockstep=mission.mode == "lockstep")
         controller.open(instance)
+        built()
         while not (controller.ended or stop()):
             controller.listen()
         controller.farewell()
@@ -81,8 +84,9 @@ def main(options: ProcessOptions) -> int:
 class Controller:
     """What has come for the open tick. A tick is worked out once all that it expects is here.
 
-    In real time a tick that the next one overtakes is worked out with what is here. While another controller commands,
-    this one works out the same and keeps it to itself (``shadow``). ``replaying``: every tick is this one's to answer.
+    In real time a tick is worked out with what is here when its patience is over, by ``now_s``, or the next one's first
+    odometry overtakes it. While another controller commands, this one works out the same and keeps it to itself
+    (``shadow``). ``replaying``: every tick is this one's to answer.
     """
 
     node: Node
@@ -93,6 +97,7 @@ class Controller:
     ended: bool = False
     tick: Tick | None = None
     done_tick: int = -1
+    now_s: Callable[[], float] = time.monotonic
     _odometry: dict[int, Odometry] = field(default_factory=dict)
     _jets: dict[int, JetReport] = field(default_factory=dict)
     _docking: dict[int, DockingStatus] = field(default_factory=dict)
@@ -115,6 +120,8 @@ class Controller:
         self._given_state_to: dict[str, str] = {}
         self._idle = 0
         self._on_network = False
+        self._patience_s = _PATIENCE_TICKS / s.time.rate_hz
+        self._due_s = 0.0
 
     def open(self, instance: str) -> None:
         """Opens the topics, then tells its presence."""
@@ -133,7 +140,7 @@ class Controller:
     def listen(self) -> None:
         """Waits for one message; works the tick out when it was the last missing."""
         due = self.shadow.due(self.done_tick)
-        received = due or self.node.receive(0.2)
+        received = due or self.node.receive(self._timeout_s())
         self._idle = 0 if received is not None else self._idle + 1
         if due is not None:
             self._take(due)
@@ -144,6 +151,17 @@ class Controller:
         tick = self.tick
         if tick is not None and tick.tick > self.done_tick and self._may_work_out(tick):
             self._work_out(tick)
+
+    def _waits_for(self) -> Tick | None:
+        """In real time: the tick that is still to be worked out."""
+        tick = self.tick
+        open_ = self.realtime and not self.replaying and tick is not None and tick.tick > self.done_tick
+        return tick if open_ else None
+
+    def _timeout_s(self) -> float:
+        if self._waits_for() is None:
+            return 0.2
+        return min(0.2, max(0.0, self._due_s - self.now_s()))
 
     def _is_about_command(self, message: Any) -> bool:
         """Takes what says who commands, as soon as it comes; whether it was nothing else."""
@@ -210,6 +228,8 @@ class Controller:
             return False
         if self._complete(tick) and self.shadow.has_word(tick.tick):
             return True
+        if self._waits_for() is not None:
+            return self.now_s() >= self._due_s
         return self._idle >= _IDLE and not self.realtime and self.shadow.idle(tick.tick)
 
     def _take(self, received: Received) -> None:
@@ -217,8 +237,11 @@ class Controller:
             case Tick() as tick:
                 if self.tick is not None and tick.tick > self.tick.tick > self.done_tick:
                     self._work_out(self.tick)
-                self.tick = tick
+                self.tick, self._due_s = tick, self.now_s() + self._patience_s
             case Odometry() as odometry:
+                late = self._waits_for()
+                if late is not None and odometry.tick > late.tick:
+                    self._work_out(late)  # while its own odometry is still the newest
                 self._know(odometry)
             case DockingStatus() as docking:
                 self._docking[docking.chaser] = docking

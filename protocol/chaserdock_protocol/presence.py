@@ -72,6 +72,7 @@ def take_part(
         mission = join(node, instance, stop, options.patience_s)
         if mission is None:
             return 1
+        node.waits = mission.mode == "lockstep"
         node.announce()  # at once: while it prepares itself (compiling, say) nobody else may take its place
         return work(node, mission, instance, stop)
     except ChaserdockError as error:

@@ -45,6 +45,21 @@ _PRIORITY = {
     "command": zenoh.Priority.REAL_TIME,
     "event": zenoh.Priority.DATA_LOW,
 }
+_AT_ONCE = (topics.WRENCH, topics.ACTUATORS, topics.ACK, topics.STATE)
+"""Sent without waiting for more, with all of their priority that was published before them."""
+_NEVER_DROPPED = (topics.END, topics.FAREWELL)
+_QUEUES = (
+    "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
+)  # fmt: skip
+_PATIENT_QUEUES: dict[str, Any] = {
+    # Zenoh's largest: what is droppable is dropped for a reader only when 16 batches (1 MB) wait for it, not 2.
+    "transport/link/tx/queue/size": dict.fromkeys(_QUEUES, 16),
+    # Then the first message waits this long (us), and the others, until it reads again, not at all.
+    "transport/link/tx/queue/congestion_control/drop": {
+        "wait_before_drop": 2000,
+        "max_wait_before_drop_fragments": 4000,
+    },
+}
 
 
 class TransportError(ChaserdockError):
@@ -77,6 +92,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
             "listen/endpoints": list(link.listen) if link.mode != "client" else [],
             "connect/endpoints": list(link.connect),
             "transport/link/tx/lease": link.lease_ms,
+            **_PATIENT_QUEUES,
         }
     if link.tls is not None:
         values |= _tls_values(link.tls)
@@ -134,6 +150,9 @@ class Node:
         self.counts = Counts()
         self.faults: FaultLayer | None = None
         """What the mission's scenario does to this process' messages."""
+        self.waits = True
+        """Whether a reader that is slow or stands still holds up who publishes: in lock-step. In real time it misses
+        what it cannot take. Set before anything is published."""
         self._inbox: Inbox[tuple[Topic, str | None, Raw] | None] = Inbox()
         self._ready: deque[Received] = deque()
         self._latest: dict[str, tuple[Topic, str | None, Raw]] = {}
@@ -153,8 +172,8 @@ class Node:
 
     # -- publishing ---------------------------------------------------------------------------------------
 
-    def advertise(self, topic: Topic, place: int | str | None = None, *, droppable: bool = False) -> str:
-        """Declares a publisher; ``droppable`` lets the transport drop messages rather than wait (real time)."""
+    def advertise(self, topic: Topic, place: int | str | None = None) -> str:
+        """Declares a publisher."""
         if not topics.may_write(self.role, topic):
             raise PermissionError(f"{self.role} may not write {topic.key}")
         key = topic.key_of(place)
@@ -163,11 +182,11 @@ class Node:
                 key,
                 encoding=encoding_of(topic.kind),
                 priority=_PRIORITY[topic.qos],
-                express=topic.qos == "command",
+                express=topic in _AT_ONCE,
                 reliability=zenoh.Reliability.RELIABLE,
-                congestion_control=zenoh.CongestionControl.DROP
-                if droppable
-                else zenoh.CongestionControl.BLOCK,
+                congestion_control=zenoh.CongestionControl.BLOCK
+                if self.waits or topic in _NEVER_DROPPED
+                else zenoh.CongestionControl.DROP,
             )
         return key
 

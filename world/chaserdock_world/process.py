@@ -16,7 +16,7 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.faults import layer_of
 from chaserdock_protocol.messages import JetFaultCommand, JoinReply, JoinRequest, MissionEnd
 from chaserdock_protocol.presence import PresenceTeller, new_instance
-from chaserdock_protocol.runtime import ProcessOptions, Stop, say
+from chaserdock_protocol.runtime import ProcessOptions, Stop, built, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
 
@@ -79,6 +79,7 @@ def gather(
         scenario_json=scenario.model_dump_json(),
         instance=new_instance(),
     )
+    node.waits = options.mode == "lockstep"
     node.subscribe(topics.ACTUATORS)
     node.subscribe(topics.ACK)
     node.watch_liveliness(membership.alive_changed)
@@ -89,7 +90,7 @@ def gather(
         node.advertise(topics.ODOMETRY, i)
         if f"chaser/{i}" in physics.latches:
             node.advertise(topics.DOCKING, i)
-        node.advertise(topics.IMAGE, i, droppable=options.mode == "realtime")
+        node.advertise(topics.IMAGE, i)
     teller = PresenceTeller(node, membership.instance)
     node.announce()
     return Answers(
@@ -148,6 +149,7 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
         lambda: not answers.missing_at_start(), stop, lambda: ", ".join(answers.missing_at_start())
     )
     answers.settle()
+    built()
     reason = "flown to its end" if started else "stopped before the first tick"
     begun_s, tick = time.monotonic(), 0
 

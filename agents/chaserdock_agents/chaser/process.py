@@ -28,7 +28,7 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
-from chaserdock_protocol.runtime import ProcessOptions, Stop
+from chaserdock_protocol.runtime import ProcessOptions, Stop, built
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
@@ -50,6 +50,7 @@ def main(options: ProcessOptions) -> int:
         chaser = Chaser(node, scenario_from_json(mission.scenario_json, "the world's scenario"), number)
         node.faults = layer_of(chaser.scenario, node.name, lockstep=mission.mode == "lockstep")
         chaser.open(instance, realtime=mission.mode == "realtime")
+        built()
         while not (chaser.ended or stop()):
             chaser.listen()
         chaser.farewell()

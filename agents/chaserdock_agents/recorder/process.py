@@ -6,6 +6,7 @@ the end it waits until it has all that the others say they published.
 
 from __future__ import annotations
 
+import os
 import queue
 import time
 from collections import Counter
@@ -38,6 +39,7 @@ from .viewer import SHOWN
 
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
+_WRITING_NICE = 5
 
 
 def main(options: ProcessOptions) -> int:
@@ -56,6 +58,10 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
         node.faults = layer_of(flown, node.name, lockstep=mission.mode == "lockstep")
         recorder = Recorder(node, recording)
         recorder.open(instance)
+        if mission.mode == "realtime":
+            os.nice(
+                _WRITING_NICE
+            )  # writing gives way to those who fly; what has been heard waits in the queue
         while not recorder.finished() and not (stop() and recorder.idle()):
             recorder.take_one(0.1)
     finally:

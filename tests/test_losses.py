@@ -226,18 +226,19 @@ class Clock:
 
 
 def in_real_time(scenario: Scenario) -> tuple[Controller, Clock]:
+    """A controller that waits for the sightings of tick 1."""
     clock = Clock()
     flight = Flight(scenario, lambda: 0.0)
     made = Controller(Tape("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
     made.teller = SilentTeller()  # type: ignore[assignment]
+    tell(made, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    for i in (0, 1):
+        tell(made, topics.ODOMETRY, i, odometry(scenario, i, 1))
     return made, clock
 
 
 def test_in_real_time_a_tick_waits_for_its_sightings_and_not_for_ever(scenario: Scenario) -> None:
     controller, clock = in_real_time(scenario)
-    tell(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
-    for i in (0, 1):
-        tell(controller, topics.ODOMETRY, i, odometry(scenario, i, 1))
     said = tell(controller, topics.SIGHTING, 0, sighting(scenario, 0, 1))
     assert not [m for t, m in said if t is topics.WRENCH]
     clock.now_s = 0.9 / scenario.time.rate_hz
@@ -251,9 +252,6 @@ def test_in_real_time_a_tick_waits_for_its_sightings_and_not_for_ever(scenario: 
 
 def test_in_real_time_the_next_ticks_odometry_does_not_cost_a_tick_its_commands(scenario: Scenario) -> None:
     controller, _ = in_real_time(scenario)
-    tell(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
-    for i in (0, 1):
-        tell(controller, topics.ODOMETRY, i, odometry(scenario, i, 1))
     said = tell(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
     commands = [m for t, m in said if t is topics.WRENCH]
     assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]

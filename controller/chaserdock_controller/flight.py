@@ -151,7 +151,7 @@ class Flight:
             self._captures.join(fused, inputs.odometry)
         for key in [k for k in self._odometry if k[1] < inputs.time_ns - _ODOMETRY_KEPT_NS]:
             del self._odometry[key]
-        seen = {s.chaser for s in inputs.sightings if s.solutions and s.sim_time_ns == inputs.time_ns}
+        seen = {s.chaser for s in inputs.sightings if s.solutions}
         return fused, target_message(inputs.tick, inputs.time_ns, fused, seen, self.estimator, self._camera)
 
     def _measurements(self, sightings: tuple[Sighting, ...]) -> list[Measurement]:

@@ -31,7 +31,7 @@ def plan_message(chaser: int, tick: int, effective_ns: int, step_s: float, plan:
 def target_message(
     tick: int, time_ns: int, fused: Fused, seen: set[int], estimator: Estimator, camera: Camera
 ) -> TargetEstimate:
-    """The fused state; ``seen``: chasers that saw the target in this tick's pictures."""
+    """The fused state; ``seen``: chasers whose sightings of the target came for this tick."""
     return TargetEstimate(
         tick=tick,
         sim_time_ns=time_ns,

@@ -90,8 +90,8 @@ publishes none. A chaser copies `term` into the `ActuatorCommand` that passes a 
 commands of another term (`stale term` among the rejected). A higher `revision` of a tick may name another commander,
 which then answers that tick. Rules of succession: [redundancy.md](redundancy.md).
 
-In real time the world waits for nobody; an answer that comes late acts late. What a reader does not take in time is dropped for that reader alone:
-count the gaps in `seq`.
+In real time the world waits for nobody; an answer that comes late acts late. What a reader does not take in time is
+dropped for that reader alone: count the gaps in `seq`.
 
 ## Leaving
 At `MissionEnd` a process finishes what it has, publishes `Farewell` as its last message, with how many messages

@@ -67,9 +67,8 @@ class Ear:
 
     def take(self, raw: Raw) -> None:
         """Called on Zenoh's thread."""
-        head = _head.decode(
-            raw.payload
-        )  # no more than is needed: what is measured shares the cores with this
+        # No more than is needed: what is measured shares the cores with this.
+        head = _head.decode(raw.payload)
         if raw.key.endswith("/image"):
             self.pictures[head.chaser, head.tick] = raw.sent_ns
             self.last_tick = max(self.last_tick, head.tick)

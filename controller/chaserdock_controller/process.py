@@ -26,7 +26,6 @@ from chaserdock_protocol.messages import (
     Presence,
     Sighting,
     Tick,
-    WrenchCommand,
 )
 from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
 from chaserdock_protocol.runtime import ProcessOptions, Stop, built
@@ -39,27 +38,13 @@ from .flight import Flight, Inputs, Outputs
 from .memory import Memory, NoMemory
 from .odometry_watch import OdometryWatch
 from .shadow import Shadow
+from .telling import no_command
 
 _REMEMBERED_TICKS = 256
 _IDLE = 5
 """Waits in vain after which, in lock-step, nothing more is on its way here."""
 _PATIENCE_TICKS = 0.5
 """In real time a tick waits so much of its period for its sightings; a later one serves the next tick."""
-
-
-def no_command(chaser: int, tick: Tick) -> WrenchCommand:
-    """Tells a chaser, that may be waiting for it, that there is no command for this tick."""
-    zero = (0.0, 0.0, 0.0)
-    return WrenchCommand(
-        tick=tick.tick,
-        sim_time_ns=tick.sim_time_ns,
-        chaser=chaser,
-        effective_time_ns=tick.sim_time_ns,
-        expires_ns=tick.sim_time_ns,
-        mode="none",
-        force_N=zero,
-        torque_N_m=zero,
-    )
 
 
 def main(options: ProcessOptions) -> int:

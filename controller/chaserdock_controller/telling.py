@@ -7,7 +7,7 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.message_fields import CameraCalibration
-from chaserdock_protocol.messages import Plan, TargetEstimate
+from chaserdock_protocol.messages import Plan, TargetEstimate, Tick, WrenchCommand
 
 from .fusion import Mekf
 from .fusion.types import Estimator
@@ -73,3 +73,18 @@ def in_words(c: CameraCalibration) -> str:
     """One line for the log."""
     turn, sigma = (", ".join(f"{np.degrees(v):.3f}" for v in x) for x in (c.turn_rad, c.turn_sigma_rad))
     return f"camera calibrated: turned by ({turn}) deg in CRF, sigma ({sigma}) deg"
+
+
+def no_command(chaser: int, tick: Tick) -> WrenchCommand:
+    """Tells a chaser, that may be waiting for it, that there is no command for this tick."""
+    zero = (0.0, 0.0, 0.0)
+    return WrenchCommand(
+        tick=tick.tick,
+        sim_time_ns=tick.sim_time_ns,
+        chaser=chaser,
+        effective_time_ns=tick.sim_time_ns,
+        expires_ns=tick.sim_time_ns,
+        mode="none",
+        force_N=zero,
+        torque_N_m=zero,
+    )

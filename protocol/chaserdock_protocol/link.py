@@ -10,6 +10,18 @@ from .topics import Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_NAMESPACE = "chaserdock"
+_QUEUES = (
+    "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
+)  # fmt: skip
+PATIENT_QUEUES: dict[str, Any] = {
+    # Zenoh's largest: what is droppable is dropped for a reader only when 16 batches (1 MB) wait for it, not 2.
+    "transport/link/tx/queue/size": dict.fromkeys(_QUEUES, 16),
+    # Then the first message waits this long (us), and the others, until it reads again, not at all.
+    "transport/link/tx/queue/congestion_control/drop": {
+        "wait_before_drop": 2000,
+        "max_wait_before_drop_fragments": 4000,
+    },
+}
 
 
 @dataclass(frozen=True)

@@ -111,6 +111,11 @@ TOPICS: tuple[Topic, ...] = (
     FAREWELL,
 )
 
+AT_ONCE = (WRENCH, ACTUATORS, ACK, STATE)
+"""Sent without waiting for more, with all of their priority that was published before them."""
+NEVER_DROPPED = (END, FAREWELL)
+"""Published once, at the end, and waited for even in real time."""
+
 JOIN_KEY = "world/join"
 """Query: JoinRequest -> JoinReply."""
 OPERATE_KEY = "controller/operate"

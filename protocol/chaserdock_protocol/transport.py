@@ -23,7 +23,7 @@ from .codec import Rejected
 from .errors import ChaserdockError
 from .faults import FaultLayer
 from .inbox import Inbox
-from .link import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, Raw, Received, Tls, open_error
+from .link import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, PATIENT_QUEUES, Link, Raw, Received, Tls, open_error
 from .messages import Message, encoding_of
 from .topics import Role, Topic
 
@@ -44,21 +44,6 @@ _PRIORITY = {
     "state": zenoh.Priority.DATA_HIGH,
     "command": zenoh.Priority.REAL_TIME,
     "event": zenoh.Priority.DATA_LOW,
-}
-_AT_ONCE = (topics.WRENCH, topics.ACTUATORS, topics.ACK, topics.STATE)
-"""Sent without waiting for more, with all of their priority that was published before them."""
-_NEVER_DROPPED = (topics.END, topics.FAREWELL)
-_QUEUES = (
-    "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
-)  # fmt: skip
-_PATIENT_QUEUES: dict[str, Any] = {
-    # Zenoh's largest: what is droppable is dropped for a reader only when 16 batches (1 MB) wait for it, not 2.
-    "transport/link/tx/queue/size": dict.fromkeys(_QUEUES, 16),
-    # Then the first message waits this long (us), and the others, until it reads again, not at all.
-    "transport/link/tx/queue/congestion_control/drop": {
-        "wait_before_drop": 2000,
-        "max_wait_before_drop_fragments": 4000,
-    },
 }
 
 
@@ -92,7 +77,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
             "listen/endpoints": list(link.listen) if link.mode != "client" else [],
             "connect/endpoints": list(link.connect),
             "transport/link/tx/lease": link.lease_ms,
-            **_PATIENT_QUEUES,
+            **PATIENT_QUEUES,
         }
     if link.tls is not None:
         values |= _tls_values(link.tls)
@@ -151,8 +136,7 @@ class Node:
         self.faults: FaultLayer | None = None
         """What the mission's scenario does to this process' messages."""
         self.waits = True
-        """Whether a reader that is slow or stands still holds up who publishes: in lock-step. In real time it misses
-        what it cannot take. Set before anything is published."""
+        """Whether a slow reader holds up who publishes (lock-step) or misses what it cannot take. Set before publishing."""
         self._inbox: Inbox[tuple[Topic, str | None, Raw] | None] = Inbox()
         self._ready: deque[Received] = deque()
         self._latest: dict[str, tuple[Topic, str | None, Raw]] = {}
@@ -182,10 +166,10 @@ class Node:
                 key,
                 encoding=encoding_of(topic.kind),
                 priority=_PRIORITY[topic.qos],
-                express=topic in _AT_ONCE,
+                express=topic in topics.AT_ONCE,
                 reliability=zenoh.Reliability.RELIABLE,
                 congestion_control=zenoh.CongestionControl.BLOCK
-                if self.waits or topic in _NEVER_DROPPED
+                if self.waits or topic in topics.NEVER_DROPPED
                 else zenoh.CongestionControl.DROP,
             )
         return key

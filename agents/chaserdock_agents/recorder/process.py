@@ -59,9 +59,8 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
         recorder = Recorder(node, recording)
         recorder.open(instance)
         if mission.mode == "realtime":
-            os.nice(
-                _WRITING_NICE
-            )  # writing gives way to those who fly; what has been heard waits in the queue
+            # Writing gives way to those who fly; what has been heard waits in the queue.
+            os.nice(_WRITING_NICE)
         while not recorder.finished() and not (stop() and recorder.idle()):
             recorder.take_one(0.1)
     finally:

@@ -14,7 +14,15 @@ from chaserdock_agents.reproduce.content import sections
 from chaserdock_agents.reproduce.main import fly_plan
 from chaserdock_agents.reproduce.page import Section, Table, html, markdown
 from chaserdock_agents.reproduce.paper import PAPER_S, ROWS
-from chaserdock_agents.reproduce.plan import QUICK_S, SCENARIO, Mission, Plan, make_plan, table_group
+from chaserdock_agents.reproduce.plan import (
+    INFERRED,
+    QUICK_S,
+    SCENARIO,
+    Mission,
+    Plan,
+    make_plan,
+    table_group,
+)
 from chaserdock_agents.reproduce.runner import Results, Runner, scenario_of, scenario_path
 from chaserdock_agents.reproduce.tables import (
     errors_of_study,
@@ -53,14 +61,16 @@ def test_every_run_of_the_plan_is_a_valid_scenario_and_has_its_own_name(quick: b
         load_scenario(Path(case.scenario), case.overrides)
 
 
-def test_the_full_plan_has_nine_rows_three_times_and_the_baseline_from_the_other_start() -> None:
+def test_the_full_plan_has_nine_rows_three_times_and_the_papers_baseline_from_the_others() -> None:
     groups = [m.group for m in plan(False).missions]
+    studies = {c.name for c in plan(False).studies}
     for column in ("paper", "default"):
         for row in ROWS:
-            assert groups.count(table_group("receding", column, row.name)) == 3
-            times = 3 if row.name == "baseline" else 0
-            assert groups.count(table_group("closing", column, row.name)) == times
-            assert table_group("closing", column, row.name) in {c.name for c in plan(False).studies}
+            assert groups.count(table_group(INFERRED, column, row.name)) == 3
+            times = 3 if row.name == "baseline" and column == "paper" else 0
+            for start in ("closing", "receding"):
+                assert groups.count(table_group(start, column, row.name)) == times
+                assert table_group(start, column, row.name) in studies
     missions = {m.group for m in plan(False).missions if m.group.startswith("mission/")}
     assert len(missions) == 6  # three missions in both settings
 
@@ -69,7 +79,7 @@ def test_paper_settings_are_the_papers() -> None:
     """Against shared/paper/reference.toml, as written there."""
     wanted = {m.group: scenario_of(m)[1] for m in plan(False).missions}
     for row in ROWS:
-        s = wanted[table_group("receding", "paper", row.name)]
+        s = wanted[table_group(INFERRED, "paper", row.name)]
         assert (s.controller.horizon_s, s.controller.dt_s, s.controller.falloff) == (
             row.horizon_s,
             row.dt_s,
@@ -89,14 +99,16 @@ def test_paper_settings_are_the_papers() -> None:
         )
         assert (s.chaser.mass_kg, s.chaser.force_max_N, s.chaser.torque_max_N_m) == (30.0, 2.0, 0.05)
         assert (s.chasers[0].start_offset_m, s.chasers[0].start_rotation_rad) == (
-            (-0.85, 0, 0),
-            (0.575, 0, 0),
+            (0.85, 0, 0),
+            (0.42, 0, -0.3927),
         )
+        assert s.chasers[0].position_m == (1.0, 0.0, 0.0)
+        assert math.hypot(0.42, 0.3927) == pytest.approx(0.575, abs=1e-4)
 
 
 def test_default_settings_are_those_of_a_scenario_that_says_nothing() -> None:
     wanted = {m.group: scenario_of(m)[1] for m in plan(False).missions}
-    ours = wanted[table_group("receding", "default", "baseline")]
+    ours = wanted[table_group(INFERRED, "default", "baseline")]
     plain = load_scenario(Path(PATH).with_name("single.toml"))
     assert ours.controller == plain.controller
     assert ours.time.model_copy(update={"latency_s": plain.time.latency_s}) == plain.time
@@ -182,11 +194,11 @@ def test_a_run_without_figures_does_not_count_as_perfect() -> None:
 
 def test_a_group_that_is_not_all_flown_has_no_figure() -> None:
     p = plan(False)
-    results, group = complete(p), table_group("receding", "paper", "baseline")
+    results, group = complete(p), table_group(INFERRED, "paper", "baseline")
     assert flown(p, results, group) is not None
     del results.missions[f"{group}/1"]
     assert flown(p, results, group) is None
-    assert requirements(p, results, "receding") is None
+    assert requirements(p, results, INFERRED) is None
     assert requirements(p, results, "closing") is not None
 
 
@@ -195,7 +207,7 @@ def test_a_group_that_is_not_all_flown_has_no_figure() -> None:
 )
 def test_baseline_is_held_to_fifteen_percent(factor: float, met: bool) -> None:
     p = plan(False)
-    held = requirements(p, complete(p, factor), "receding")
+    held = requirements(p, complete(p, factor), INFERRED)
     assert held is not None
     assert [r.met for r in held if r.what.startswith("baseline")] == [met, met]
 
@@ -203,7 +215,7 @@ def test_baseline_is_held_to_fifteen_percent(factor: float, met: bool) -> None:
 def test_other_rows_may_be_better_but_not_35_percent_worse() -> None:
     p = plan(False)
     for factor, met in ((0.1, True), (1.1, True), (1.2, False)):
-        held = requirements(p, complete(p, factor), "receding")
+        held = requirements(p, complete(p, factor), INFERRED)
         assert held is not None
         # 1.42 e-2 is the least that the paper has: 1.64 of it is a ratio of 1.155
         assert next(r.met for r in held if r.what.startswith("dt=1/30: position")) is met
@@ -217,10 +229,10 @@ def test_default_is_held_to_the_floor() -> None:
         (1.64e-2 * 120 / 1.21, False),
     ):
         results = complete(p)
-        name = table_group("receding", "paper", "baseline")
+        name = table_group(INFERRED, "paper", "baseline")
         case = results.studies[name].case
         results.studies[name] = study_result(case, 1.64e-2, 3.94e-3, floor_m2_s)
-        held = requirements(p, results, "receding")
+        held = requirements(p, results, INFERRED)
         assert held is not None
         assert held[-1].met is met
         assert floor_of_study(results.studies[name]) == pytest.approx(floor_m2_s / 120)
@@ -354,7 +366,7 @@ def test_bad_input_is_one_clear_line(tmp_path: Path) -> None:
 def test_a_cut_down_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two missions with small pictures and two studies; a second call flies nothing and writes the same page."""
     small = ("duration_s=25.0", "camera.width_px=480", "camera.height_px=270", "time.rate_hz=15")
-    group = table_group("receding", "paper", "baseline")
+    group = table_group(INFERRED, "paper", "baseline")
     runs = tuple(
         Mission(f"{group}/{seed}", group, SCENARIO, seed, (*small, "time.picture_hz=15")) for seed in range(2)
     )

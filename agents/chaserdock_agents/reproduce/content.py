@@ -7,7 +7,7 @@ from chaserdock_protocol.study import StudyResult
 from .cells import NONE, cell, orientation_text, position_text, study_errors, study_floor
 from .page import Section, Table
 from .paper import ROWS, Row
-from .plan import DELAYED_HORIZONS_S, DELAYS_S, STARTS, Plan, table_group
+from .plan import DELAYED_HORIZONS_S, DELAYS_S, INFERRED, STARTS, Plan, table_group
 from .runner import Results
 from .tables import Requirement, errors_of_study, flown, requirements, steady_requirements
 from .whole_missions import other_runs, whole_missions
@@ -42,12 +42,12 @@ def _required(plan: Plan, results: Results) -> Section:
     for start in STARTS:
         show(f"from the {start} start", requirements(plan, results, start))
     show("steady state", steady_requirements(plan, results))
-    receding, closing = (study_floor(results, table_group(s, "paper", "baseline")) for s in STARTS)
-    if receding is not None and closing is not None:
+    floors = {s: study_floor(results, table_group(s, "paper", "baseline")) for s in STARTS}
+    told = [f"{position_text(f)}e-2 m^2 from the {s} start" for s, f in floors.items() if f is not None]
+    if told:
         best = min(row.position_mse_m2 for row in ROWS)
         parts.append(
-            f"The least possible position MSE is {position_text(receding)}e-2 m^2 from the receding start and "
-            f"{position_text(closing)}e-2 m^2 from the closing one; the paper's baseline is "
+            f"The least possible position MSE is {', '.join(told)}; the paper's baseline is "
             f"{position_text(ROWS[0].position_mse_m2)}e-2, its best row {position_text(best)}e-2. Where the paper's "
             "figure is below the least possible, no controller that turns as ours does can have flown it from that start: "
             "the paper started elsewhere, nearer, or with other limits. The tables on the start and on the ingredients say "
@@ -165,14 +165,14 @@ def _starts(results: Results) -> Section:
         "over the paper's",
     )
     text = (
-        "Baseline row, paper's settings, perfect knowledge. Every further line differs from the receding start in what it "
-        "says. This is the first ten seconds: what follows adds next to nothing."
+        "Baseline row, paper's settings, perfect knowledge. Lines from the fourth on differ from the inferred start in what "
+        "they say. This is the first ten seconds: what follows adds next to nothing."
     )
     return Section("How the figure moves with the start", (text, Table(header, tuple(rows))))
 
 
 def _ingredients(results: Results) -> Section:
-    base = study_errors(results, table_group("receding", "paper", "baseline"))
+    base = study_errors(results, table_group(INFERRED, "paper", "baseline"))
     rows = []
     for name in (n for n in results.studies if n.startswith("ingredient/")):
         errors = study_errors(results, name)
@@ -189,7 +189,7 @@ def _ingredients(results: Results) -> Section:
             )
         )
     header = ("changed", "position, 1e-2 m^2", "change", "orientation, 1e-3 rad^2", "change", "steady, m^2")
-    text = "Baseline row from the receding start, perfect knowledge; one thing changed at a time in the paper's settings."
+    text = "Baseline row from the inferred start, perfect knowledge; one thing changed at a time in the paper's settings."
     return Section("How the figure moves with each ingredient", (text, Table(header, tuple(rows))))
 
 
@@ -219,7 +219,7 @@ def _real_time(results: Results) -> Section:
         (
             "In simulated time no horizon fails. Here the command acts only when the solver would be done, on a plan for "
             "the state at the beginning; nothing is predicted ahead, and the ticks that pass meanwhile are "
-            "missed. Receding start, paper's settings, perfect knowledge.",
+            "missed. Inferred start, paper's settings, perfect knowledge.",
             Table(tuple(header), tuple(rows)),
             "With the solve time as measured on this machine in place of a fixed delay (it depends on the machine and on "
             "its load; 30 s flown):",

@@ -7,7 +7,7 @@ from typing import Any
 
 from .cells import NONE, cell, orientation_text, position_text
 from .page import Section, Table
-from .plan import Plan, table_group
+from .plan import INFERRED, Plan, table_group
 from .runner import Results
 from .tables import flown
 
@@ -16,9 +16,9 @@ def other_runs(plan: Plan, results: Results) -> Section:
     """The baseline row with the paper's estimator, and our default on either target."""
     rows = []
     for label, group in (
-        ("paper's settings, mekf", table_group("receding", "paper", "baseline")),
+        ("paper's settings, mekf", table_group(INFERRED, "paper", "baseline")),
         ("paper's settings, the paper's estimator", "estimator/paper"),
-        ("our default", table_group("receding", "default", "baseline")),
+        ("our default", table_group(INFERRED, "default", "baseline")),
         ("our default, target servicer", "target/servicer"),
     ):
         e = flown(plan, results, group)
@@ -34,7 +34,7 @@ def other_runs(plan: Plan, results: Results) -> Section:
             )
         )
     header = (
-        "baseline row, receding start",
+        "baseline row, inferred start",
         "position, 1e-2 m^2",
         "orientation, 1e-3 rad^2",
         "steady position, m^2",

@@ -24,10 +24,14 @@ def how_measured(plan: Plan, results: Results) -> Section:
         if not plan.quick
         else f"Length. The paper's runs took {PAPER_S:g} s, the single-chaser runs here {plan.duration_s:g} s: what follows "
         "counts as their steady state (20 s to the end). One seed each.",
-        "Start. The paper does not give it. Inferred: 0.85 m straight back from the reference pose, rolled by 0.575 rad "
-        "about the body's X, at rest in the world frame. As the target moves, it matters which way: it flies away from "
-        "a chaser that waits behind it (receding: reference pose of the paper's chaser 0) and towards one that waits "
-        "in front of it (closing: its chaser 3). Both are shown.",
+        "Start. The paper does not give it. Inferred from its figures: 0.85 m straight back from the reference pose, turned "
+        "by 33 degrees (0.575 rad), at rest in the world frame. That leaves two things open. Which way: the target flies "
+        "away from a chaser that waits behind it (receding: reference pose of the paper's chaser 0) and towards one that "
+        "waits in front of it (closing: its chaser 3). And about which axis the chaser is turned. The inferred start is in "
+        "front of the target, rolled and yawed together (rotation vector 0.42, 0, -0.3927 rad; the target is still in the "
+        "picture), because there both figures of the baseline come out: these two are fitted, the other rows are not. "
+        "Beside it stand two starts that are rolled alone (0.575 rad about the body's X), closing and receding; further "
+        "ones are in the table on the start.",
         "With pictures: a world process renders 1280 x 720 pictures, a chaser process sees the markers, a controller "
         "process estimates and plans (`chaserdock run`). Perfect knowledge: the same flight code in one process with "
         "the target's true state in place of the estimate (`chaserdock study`).",
@@ -53,12 +57,14 @@ def explained() -> Section:
         "What explains the differences",
         (
             "Baseline and falloff rows: the start. The mean is made in the first ten seconds, and how long these take "
-            "depends on where and how fast the target flies meanwhile (next table). Integration, feed-forward, latency and "
-            "rate move the position figure little; weights move it more, but those the paper gives (the table after that).",
+            "depends on where and how fast the target flies meanwhile, and on how the chaser is turned, as its limits are "
+            "those of its own axes (next table). Integration, feed-forward, latency and rate move the position figure "
+            "little; weights move it more, but those the paper gives (the table after that).",
             "dt: eq. 6 sums the stage costs but counts the final cost once. A smaller dt at equal weights means more "
             "stages, so less weight on the end of the horizon, and a slower approach; with the stage weights divided alike "
             "the figure comes back (ingredients: dt = 1/30 s). The paper reports the opposite trend. Its smaller dt would "
-            "need a start, or a solver, other than what it tells.",
+            "need a start, or a solver, other than what it tells: from none of the three starts is its figure below "
+            "the baseline's.",
             "T = 0.5: the horizon is shorter than braking takes, so the chaser oscillates about its reference and does not "
             "settle. No run fails by our count; the steady column shows what it is.",
             "T = 10: flies like the others as long as the plan is there in time; the table on real time shows from which "

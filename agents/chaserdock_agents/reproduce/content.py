@@ -7,7 +7,16 @@ from chaserdock_protocol.study import StudyResult
 from .cells import NONE, cell, orientation_text, position_text, study_errors, study_floor
 from .page import Section, Table
 from .paper import ROWS, Row
-from .plan import DELAYED_HORIZONS_S, DELAYS_S, INFERRED, STARTS, Plan, table_group
+from .plan import (
+    DELAYED_HORIZONS_S,
+    DELAYS_S,
+    INFERRED,
+    STARTS,
+    Plan,
+    has_alpaqa,
+    measured_solvers,
+    table_group,
+)
 from .runner import Results
 from .tables import Requirement, errors_of_study, flown, requirements, steady_requirements
 from .whole_missions import other_runs, whole_missions
@@ -209,7 +218,7 @@ def _real_time(results: Results) -> Section:
         header += [f"T = {horizon_s:g} s: position, 1e-2 m^2", "orientation, 1e-3 rad^2"]
     measured = []
     for horizon_s in DELAYED_HORIZONS_S:
-        for solver in ("rti", "ipopt"):
+        for solver in measured_solvers():
             found = results.studies.get(f"measured/{horizon_s:g}/{solver}")
             if found is not None:
                 measured.append(_measured(f"{solver}, T = {horizon_s:g} s", found))
@@ -222,7 +231,9 @@ def _real_time(results: Results) -> Section:
             "missed. Inferred start, paper's settings, perfect knowledge.",
             Table(tuple(header), tuple(rows)),
             "With the solve time as measured on this machine in place of a fixed delay (it depends on the machine and on "
-            "its load; 30 s flown):",
+            "its load; 30 s flown). rti is ours, ipopt converges, alpaqa is PANOC with an augmented Lagrangian in single "
+            "shooting, as the paper's OpEn"
+            + (":" if has_alpaqa() else " (the extra `alpaqa` is not installed here: left out):"),
             Table(columns, tuple(measured)),
         ),
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 
 from chaserdock_protocol.study import StudyCase
 
@@ -130,6 +131,7 @@ _INGREDIENTS: dict[str, tuple[str, ...]] = {
         ),
     ),
     "solved to convergence (ipopt)": ("controller.solver='ipopt'",),
+    "the paper's kind of solver (alpaqa: PANOC)": ("controller.solver='alpaqa'",),
 }
 
 _STARTS: dict[str, tuple[str, ...]] = {
@@ -153,6 +155,17 @@ _STARTS: dict[str, tuple[str, ...]] = {
         "chasers.0.start_rotation_rad=[0.0, 0.0, 0.0]",
     ),
 }
+
+
+def has_alpaqa() -> bool:
+    """Whether the extra ``alpaqa`` is installed: what it would fly is left out otherwise, and the page says so."""
+    return find_spec("alpaqa") is not None
+
+
+def measured_solvers() -> tuple[str, ...]:
+    """The solvers whose solve time is measured: ours, one that converges, and one of the paper's kind if it is there."""
+    return ("rti", "ipopt", "alpaqa") if has_alpaqa() else ("rti", "ipopt")
+
 
 DELAYS_S = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
 DELAYED_HORIZONS_S = (3.0, 10.0)
@@ -183,15 +196,17 @@ def studies(scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
     for name, changed in _STARTS.items():
         add(f"start/{name}", *changed, floor=True)
     for name, changed in _INGREDIENTS.items():
-        # Converging takes a hundred times as long: ipopt flies the transient alone.
-        short = ("duration_s=30.0",) if "ipopt" in name else ()
+        if "alpaqa" in name and not has_alpaqa():
+            continue
+        # Converging takes ten to a hundred times as long: these fly the transient alone.
+        short = ("duration_s=30.0",) if "controller.solver" in changed[0] else ()
         case = StudyCase(name=f"ingredient/{name}", scenario=scenario, overrides=(*changed, length, *short))
         out.append(case)
     for horizon_s in DELAYED_HORIZONS_S:
         changed = f"controller.horizon_s={horizon_s}"
         for delay_s in DELAYS_S:
             add(f"delay/{horizon_s:g}/{delay_s:g}", changed, delay_s=delay_s)
-        for solver in ("rti", "ipopt"):
+        for solver in measured_solvers():
             overrides = (changed, f"controller.solver='{solver}'", "duration_s=30.0")
             name = f"measured/{horizon_s:g}/{solver}"
             out.append(StudyCase(name=name, scenario=scenario, overrides=overrides, delay_measured=True))

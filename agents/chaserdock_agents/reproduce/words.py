@@ -68,7 +68,7 @@ def explained() -> Section:
             "T = 0.5: the horizon is shorter than braking takes, so the chaser oscillates about its reference and does not "
             "settle. No run fails by our count; the steady column shows what it is.",
             "T = 10: flies like the others as long as the plan is there in time; the table on real time shows from which "
-            "delay on it does not.",
+            "delay on it does not, and which solvers keep up.",
             "Steady state: with u_ref = 0 the input cost pulls against the constant force that following a tumbling "
             "reference takes; the feed-forward removes that.",
         ),

@@ -9,7 +9,7 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface  # pyright: ignore[reportMissingImports]
 
-_NATIVE = "controller/chaserdock_controller/native"
+_NATIVE = "protocol/chaserdock_protocol/native"
 
 
 class KernelsHook(BuildHookInterface):

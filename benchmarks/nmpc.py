@@ -23,7 +23,6 @@ from pathlib import Path
 
 import numpy as np
 from acados_peer import KINDS, AcadosPeer
-from chaserdock_controller.native.build import compile_kernels
 from chaserdock_controller.nmpc import (
     BACK_ENDS,
     NmpcInput,
@@ -39,6 +38,7 @@ from chaserdock_controller.reference import (
     reference_trajectory,
 )
 from chaserdock_protocol import rotations
+from chaserdock_protocol.native.build import compile_kernels
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
 from numpy.typing import NDArray
 from results import options_of, write_json

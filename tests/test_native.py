@@ -5,13 +5,18 @@ from __future__ import annotations
 import ctypes
 import shutil
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
-from chaserdock_controller import native
-from chaserdock_controller.native.build import X86_64, source_digest
+from chaserdock_agents.perception import corners, refine
 from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
+from chaserdock_protocol import native
+from chaserdock_protocol.camera import Camera
+from chaserdock_protocol.native.build import X86_64, source_digest
 from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap
+from numpy.typing import NDArray
 
 LEVELS = [number for number, _ in X86_64]
 
@@ -44,6 +49,82 @@ def test_every_instruction_set_gives_the_same_bits(number: int, monkeypatch: pyt
     monkeypatch.setattr(kernels, "function", lambda name, result=None: own(name, result, number))
     states, _ = flown()
     np.testing.assert_array_equal(states, expected)
+
+
+@pytest.mark.parametrize("number", LEVELS)
+@pytest.mark.parametrize("distortion", [(), (-0.18, 0.05, 0.0006, -0.0004)])
+def test_every_instruction_set_sees_the_same_bits(
+    number: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Corners of large markers and of such with a narrow border, and a pose from a start far off."""
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+    rng = np.random.default_rng(3)
+    camera = Camera.from_hfov(320, 240, 1.0, distortion=distortion)
+    noise = rng.integers(0, 255, (240, 320), dtype=np.uint8)
+    image = np.asarray(cv2.GaussianBlur(noise, (7, 7), 1.5), dtype=np.uint8)
+    quads = np.array([[40, 40], [90, 45], [88, 95], [38, 90]]) + rng.uniform(0, 120, (12, 1, 2))
+    margin = rng.uniform(0.02, 0.2, 12)
+    points = rng.uniform(-0.3, 0.3, (8, 3))
+    truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
+    pixels = camera.project_ideal(points @ truth.rotation.T + truth.position) + rng.normal(0.0, 0.1, (8, 2))
+    start = pose_at([0.0, 0.0, 1.2], [0.0, -1.6, 0.5])
+
+    def seen() -> list[NDArray[Any]]:
+        found = corners.refine(image, camera, quads, 6, margin)
+        pose = refine.refine(camera.matrix(), points, pixels, np.ones(16), start)
+        assert pose is not None
+        np.testing.assert_allclose(pose.rotation, truth.rotation, atol=0.01)
+        return [found.corners_px, found.good, found.relative_sigma, pose.position, pose.rotation]
+
+    expected = seen()
+    assert 0 < expected[1].sum() < 12
+    own = native.function
+    for module in (corners, refine):
+        monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, number))
+    for ours, theirs in zip(seen(), expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("corner", [np.nan, np.inf, -np.inf, 1e300, -1e9])
+def test_corners_that_lie_nowhere_are_not_good(corner: float) -> None:
+    image = np.full((48, 64), 200, dtype=np.uint8)
+    quads = np.array([[[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]]])
+    quads[0, 2, 0] = corner
+    found = corners.refine(image, Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
+    assert not found.good.any()
+    np.testing.assert_array_equal(found.corners_px, quads)
+    with pytest.raises(ValueError, match="has no corners"):
+        corners.refine(image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
+
+
+def pose_at(position: list[float], rotation_vector: list[float]) -> refine.Pose:
+    return refine.Pose(np.array(position), refine.rotation_matrix(rotation_vector))
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 0.3, 2.0])
+def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
+    """The gradient by OpenCV's projection, which the kernel does not use; a start off by ``turn`` rad comes back."""
+    rng = np.random.default_rng(5)
+    matrix = np.array([[600.0, 0.0, 320.0], [0.0, 590.0, 240.0], [0.0, 0.0, 1.0]])
+    points = rng.uniform(-0.3, 0.3, (8, 3))
+    truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
+    at = points @ truth.rotation.T + truth.position
+    pixels = at[:, :2] / at[:, 2:] * [600.0, 590.0] + [320.0, 240.0] + rng.normal(0.0, 0.2, (8, 2))
+    weight = np.repeat(rng.uniform(0.5, 1.0, 8), 2)
+    start = refine.Pose(truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation)
+    pose = refine.refine(matrix, points, pixels, weight, start)
+    assert pose is not None
+    np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14)
+    found = refine.residual_of(matrix, points, pixels, weight, pose)
+    assert found is not None
+    residual, jacobian = found
+    step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+    assert np.abs(step).max() < 1e-5
+    assert (
+        refine.refine(matrix, points - [0.0, 0.0, 50.0], pixels, weight, pose_at([0, 0, 1], [0, 0, 0]))
+        is None
+    )
 
 
 def copied(folder: Path) -> Path:

@@ -10,10 +10,9 @@ from ctypes import c_double, c_int64
 from dataclasses import dataclass, fields
 
 import numpy as np
+from chaserdock_protocol.native import address, function
 from chaserdock_protocol.rotations import cross, normalize, rotate, to_matrix
 from numpy.typing import ArrayLike, NDArray
-
-from chaserdock_controller.native import address, function
 
 Array = NDArray[np.float64]
 

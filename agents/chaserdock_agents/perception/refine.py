@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import math
+from ctypes import c_double, c_int64
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from chaserdock_protocol.native import address, function
 from chaserdock_protocol.rotations import Array
 
-# Refinement ends when a step has lowered the squared error by no more than the first share of it, or promises
-# to lower it by no more than the second.
-_LEAST_GAIN, _LEAST_PROMISE = 1e-5, 2e-6
 _ZERO = np.zeros(3)
 
 
@@ -47,34 +45,9 @@ def residual_of(
 
 def refine(matrix: Array, points: Array, pixels: Array, weight: Array, pose: Pose) -> Pose | None:
     """The pose of least weighted squared error near ``pose``; None when that has points behind the camera.
-    Arguments as for `residual_of`."""
-    found = residual_of(matrix, points, pixels, weight, pose)
-    cost = math.inf if found is None else float(found[0] @ found[0])
-    if found is None or not math.isfinite(cost):
-        return None
-    residual, jacobian = found
-    damping = 1e-7
-    for _ in range(20):
-        gradient = residual @ jacobian
-        information = jacobian.T @ jacobian
-        information.ravel()[::7] = information.diagonal() * (1.0 + damping) + 1e-12
-        step = -np.linalg.solve(information, gradient)
-        trial = Pose(pose.position + step[3:], rotation_matrix(step[:3]) @ pose.rotation)
-        # The gain that the linear model promises. A step, not one shortened by damping, that promises next to
-        # nothing is the last one, and too short to be wrong: it need not be tried.
-        if damping < 1e-3 and -float(step @ gradient) <= _LEAST_PROMISE * cost + 1e-12:
-            return trial
-        found = residual_of(matrix, points, pixels, weight, trial)
-        new_cost = math.inf if found is None else float(found[0] @ found[0])
-        if found is not None and new_cost <= cost:
-            gain = cost - new_cost
-            pose, cost = trial, new_cost
-            residual, jacobian = found
-            damping = max(damping * 0.1, 1e-9)
-            if gain <= _LEAST_GAIN * cost + 1e-12:
-                break
-        else:
-            damping *= 100.0
-            if damping > 1e9:
-                break
-    return pose
+    Arguments as for `residual_of`; the arithmetic is a kernel (native/pose.c)."""
+    lens = (c_double * 4)(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
+    given = [np.array(a, dtype=float) for a in (points, pixels, weight)]
+    out = np.concatenate([pose.position, pose.rotation.ravel()])
+    refined = function("refine_pose", c_int64)(lens, *map(address, given), c_int64(len(points)), address(out))
+    return Pose(out[:3], out[3:].reshape(3, 3)) if refined else None

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from chaserdock_protocol.native import load
 
-from chaserdock_controller.native import load
 from chaserdock_controller.nmpc.checks import check_ids, check_input, check_shift, warm_start
 from chaserdock_controller.nmpc.kernels import Weights, model_of, plan_cost, plan_violation, roll
 from chaserdock_controller.nmpc.slack import SLACK_L1

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
+from chaserdock_protocol.native import address, function, memory
 from numpy.typing import NDArray
 
-from chaserdock_controller.native import address, function, memory
 from chaserdock_controller.nmpc.types import Array, IntArray, NmpcInput, NmpcParameters
 
 # Explicit Runge-Kutta tableaux with one sub-diagonal, which is all that euler and rk4 need.

@@ -1,4 +1,4 @@
-"""Compiles the kernels: ``python controller/chaserdock_controller/native/build.py``; the package's build does it by itself.
+"""Compiles the kernels: ``python protocol/chaserdock_protocol/native/build.py``; the package's build does it by itself.
 
 The compiler is zig's (a Clang), from the wheel `ziglang`, so that a machine needs no compiler of its own. Nothing is
 taken from that machine: neither its headers nor a C library, nor the kind of its processor.

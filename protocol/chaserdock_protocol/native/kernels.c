@@ -1,5 +1,6 @@
-/* The controller's numerical kernels, one translation unit for each instruction set (LEVEL). See base.h. */
+/* The numerical kernels, one translation unit for each instruction set (LEVEL). See base.h. */
 #include "base.h"
+#include "elementary.c"
 #include "checks.c"
 #include "dynamics.c"
 #include "cost.c"
@@ -8,3 +9,5 @@
 #include "ipm.c"
 #include "tick.c"
 #include "tumble.c"
+#include "corners.c"
+#include "pose.c"

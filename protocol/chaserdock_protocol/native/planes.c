@@ -83,25 +83,6 @@ static double side(double *n, double *want, double d, int *held, double *last, d
     return length;
 }
 
-/* Sine and cosine of an angle from 0 to pi / 2 to 2e-16: the series at a quarter of it, doubled twice. The C library's
- * differ from version to version, and from processor to processor. */
-static void sine_cosine(double angle, double *sine, double *cosine) {
-    double x = 0.25 * angle, y = x * x, s = 0.0, c = 0.0;
-    for (int i = 15; i >= 3; i -= 2) {
-        s = y / (i * (i - 1)) * (1.0 - s);
-        c = y / ((i - 1) * (i - 2)) * (1.0 - c);
-    }
-    s = x * (1.0 - s);
-    c = 1.0 - c;
-    for (int i = 0; i < 2; i++) {
-        double twice = 2.0 * s * c;
-        c = 1.0 - 2.0 * s * s;
-        s = twice;
-    }
-    *sine = s;
-    *cosine = c;
-}
-
 /* Distance from the surface of the corridor's cone, m, positive inside; n (3) gets the normal inwards. r (3): position
  * from the target; corridor (5): axis (unit), half angle, distance of the apex from the target. */
 static double corridor_room(const double *r, const double *corridor, double *n) {

@@ -1,4 +1,4 @@
-"""The numerical kernels, in C: compiled when the package is built, loaded here.
+"""The numerical kernels of perception and control, in C: compiled when the package is built, loaded here.
 
 The sources beside this file say what each function does. The one shared library holds a copy of every function for
 each instruction set (on x86-64: SSE4, and AVX2 with FMA); the processor decides which one runs, and all give the same bits.
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chaserdock_controller.native.build import LIBRARY, source_digest
+from chaserdock_protocol.native.build import LIBRARY, source_digest
 
 _INSTALL = "install chaserdock again (in a clone: pip install --no-deps -e .), which compiles it"
 

@@ -1,0 +1,99 @@
+/* The pose of least weighted reprojection error: Gauss-Newton with Levenberg's damping. */
+#include "base.h"
+
+/* A refinement ends when a step has lowered the squared error by no more than the first share of it, or promises to lower
+ * it by no more than the second. */
+#define LEAST_GAIN 1e-5
+#define LEAST_PROMISE 2e-6
+
+typedef struct {
+    double cost, gradient[6], information[36];
+} Normal;
+
+/* Squared weighted error of a pose (position (3), rotation (3, 3)), its gradient and Gauss-Newton's matrix by a turn phi in
+ * the camera's axes, R_true = exp([phi]x) R, and by position; 0 for points behind the camera. */
+static int normal_of(const double *lens, const double *points, const double *pixels, const double *weight, int64_t n,
+                     const double *pose, Normal *out) {
+    out->cost = 0.0;
+    zero(out->gradient, 6);
+    zero(out->information, 36);
+    for (int64_t i = 0; i < n; i++) {
+        double turned[3], row[2][6], residual[2];
+        times3(pose + 3, points + 3 * i, turned);
+        double x = turned[0] + pose[0], y = turned[1] + pose[1], z = turned[2] + pose[2];
+        if (!(z > 1e-6)) return 0;
+        double u = x / z, v = y / z;
+        double by[2][3] = {{lens[0] / z, 0.0, -lens[0] * u / z}, {0.0, lens[1] / z, -lens[1] * v / z}};
+        residual[0] = lens[0] * u + lens[2] - pixels[2 * i];
+        residual[1] = lens[1] * v + lens[3] - pixels[2 * i + 1];
+        for (int k = 0; k < 2; k++) {
+            double w = weight[2 * i + k];
+            cross3(turned, by[k], row[k]);
+            for (int j = 0; j < 3; j++) row[k][3 + j] = by[k][j];
+            for (int j = 0; j < 6; j++) row[k][j] *= w;
+            residual[k] *= w;
+            out->cost += residual[k] * residual[k];
+        }
+        for (int a = 0; a < 6; a++) {
+            out->gradient[a] += row[0][a] * residual[0] + row[1][a] * residual[1];
+            for (int b = 0; b <= a; b++) out->information[6 * a + b] += row[0][a] * row[0][b] + row[1][a] * row[1][b];
+        }
+    }
+    for (int a = 0; a < 6; a++)
+        for (int b = a + 1; b < 6; b++) out->information[6 * a + b] = out->information[6 * b + a];
+    return 1;
+}
+
+/* out = exp([phi]x) R (Rodrigues' formula). */
+static void turned_by(const double *phi, const double *rotation, double *out) {
+    double angle = root(dot3(phi, phi)), axis[3] = {0.0, 0.0, 0.0}, s, c;
+    if (angle > 2.2e-16)
+        for (int i = 0; i < 3; i++) axis[i] = phi[i] / angle;
+    else
+        angle = 0.0;
+    sine_cosine(angle, &s, &c);
+    for (int j = 0; j < 3; j++) {
+        double column[3] = {rotation[j], rotation[3 + j], rotation[6 + j]}, across[3];
+        cross3(axis, column, across);
+        double along = (1.0 - c) * dot3(axis, column);
+        for (int i = 0; i < 3; i++) out[3 * i + j] = (c * column[i] + along * axis[i]) + s * across[i];
+    }
+}
+
+/* Moves ``pose`` (position (3), then rotation (3, 3), TRF -> IRF) to the nearest least error. ``lens``: fx, fy, cx, cy;
+ * ``points`` (n, 3) TRF, ``pixels`` (n, 2) ideal, ``weight`` (n, 2). 1 when it is there, 0 where there is none. */
+EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const double *pixels, const double *weight,
+                                int64_t n, double *pose) {
+    Normal now, then;
+    if (!normal_of(lens, points, pixels, weight, n, pose, &now) || !finite(now.cost)) return 0;
+    double damping = 1e-7;
+    for (int turn = 0; turn < 20; turn++) {
+        double matrix[36], step[6], trial[12], promise = 0.0;
+        copy(now.information, matrix, 36);
+        for (int i = 0; i < 6; i++) {
+            matrix[7 * i] = matrix[7 * i] * (1.0 + damping) + 1e-12;
+            step[i] = -now.gradient[i];
+        }
+        if (!solve_rows(matrix, step, 6)) return 0;
+        for (int i = 0; i < 6; i++) promise -= step[i] * now.gradient[i];
+        for (int i = 0; i < 3; i++) trial[i] = pose[i] + step[3 + i];
+        turned_by(step, pose + 3, trial + 3);
+        /* The gain that the linear model promises. A step, not one shortened by damping, that promises next to nothing is
+         * the last one, and too short to be wrong: it need not be tried. */
+        if (damping < 1e-3 && promise <= LEAST_PROMISE * now.cost + 1e-12) {
+            copy(trial, pose, 12);
+            return 1;
+        }
+        if (normal_of(lens, points, pixels, weight, n, trial, &then) && then.cost <= now.cost) {
+            double gain = now.cost - then.cost;
+            copy(trial, pose, 12);
+            now = then;
+            damping = most(damping * 0.1, 1e-9);
+            if (gain <= LEAST_GAIN * now.cost + 1e-12) break;
+        } else {
+            damping *= 100.0;
+            if (damping > 1e9) break;
+        }
+    }
+    return 1;
+}

@@ -94,6 +94,8 @@ BREACHES: list[tuple[str, Callable[[Raw], list[Raw]], str, str]] = [
     ("controller/chaser/1/wrench", lambda r: [changed(r, effective_time_ns=1)], "", "wrong effective_time_ns"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, chaser=0)], "", "another one's than the key's"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, force_N=(1e3, 0.0, 0.0))], "", "the chaser refuses"),
+    ("controller/chaser/1/wrench", lambda r: [changed(r, term=7)], "", "not the tick's term"),
+    ("controller/chaser/1/wrench", lambda r: [changed(r, instance="another")], "", "not the tick's term"),
     ("controller/target", lambda r: [r, dataclasses.replace(r, key="chaser/0/actuators")], "chaser/0/actuators",
      "must not write"),
     ("controller/target", lambda r: [r, dataclasses.replace(r, key="truth/world")], "truth/world", "must not write"),

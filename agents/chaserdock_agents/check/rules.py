@@ -188,6 +188,9 @@ class Ledger:
             if message.effective_time_ns != effective_ns:
                 self.find(key, "wrong effective_time_ns", f"{message.effective_time_ns}, not {effective_ns}")
         if isinstance(message, WrenchCommand):
+            given, told = ((m.term, m.commander, m.instance) for m in (message, turn.tick))
+            if given != told:
+                self.find(key, "not the tick's term, commander and instance", f"{given}, not {told}")
             why = refusal(message, message.chaser, self.scenario.chaser, message.tick - 1, time_ns)
             if why is not None:
                 self.find(key, "a command that the chaser refuses", why)

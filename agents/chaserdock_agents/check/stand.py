@@ -24,7 +24,7 @@ from chaserdock_protocol.transport import Node, Raw
 from chaserdock_agents.launcher import open_hub
 
 from .rules import Finding, Ledger
-from .turns import CheckError, Turn, read_turns
+from .turns import CheckError, Turn, named, read_turns
 
 SILENT_TICKS = 3
 """After so many ticks without an answer the check gives up."""
@@ -138,7 +138,8 @@ class Stand:
     def _play(self, child: subprocess.Popen[bytes], turns: list[Turn], patience_s: float) -> int:
         ledger, silent = self._ledger, 0
         first = () if ledger.role == "controller" else (topics.ACTUATORS,)
-        for k, turn in enumerate(turns):
+        for k, recorded in enumerate(turns):
+            turn = named(recorded, ledger.process, ledger.instance or "")
             ledger.open(turn)
             for raw in turn.opening:
                 self._send(raw)

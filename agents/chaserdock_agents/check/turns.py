@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
+import msgspec
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.log import LogSource, read_log, read_scenario
@@ -31,6 +32,16 @@ class Turn:
     opening: list[Raw] = field(default_factory=list)
     answers: list[Raw] = field(default_factory=list)
     exposure_ns: int | None = None
+
+
+def named(turn: Turn, process: str, instance: str) -> Turn:
+    """The turn with ``instance`` for the start of ``process`` that the recorded tick gives the command to, if it does."""
+    if turn.tick.commander != process:
+        return turn
+    tick = msgspec.structs.replace(turn.tick, instance=instance)
+    payload = codec.encode(tick)
+    opening = [replace(raw, payload=payload) if raw.key == topics.TICK.key else raw for raw in turn.opening]
+    return replace(turn, tick=tick, opening=opening)
 
 
 @dataclass(frozen=True)

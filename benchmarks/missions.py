@@ -264,7 +264,7 @@ def tracking_seen(length_s: float) -> dict[str, float]:
 
 
 def table(length_s: float, quick: bool) -> dict[str, float]:
-    """Every row of the paper's table, from both starts and in both columns of ``chaserdock reproduce``."""
+    """Every row of the paper's table, from every start and in both columns of ``chaserdock reproduce``."""
     out: dict[str, float] = {}
     failed = rows = 0
     print(

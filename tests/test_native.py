@@ -15,6 +15,9 @@ from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
 from chaserdock_protocol import native
 from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.native.build import X86_64, source_digest
+from chaserdock_protocol.targets import target_model
+from chaserdock_world import faces
+from chaserdock_world.render import Renderer, chaser_boxes
 from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap
 from numpy.typing import NDArray
 
@@ -84,6 +87,26 @@ def test_every_instruction_set_sees_the_same_bits(
         monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, number))
     for ours, theirs in zip(seen(), expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("number", LEVELS)
+def test_every_instruction_set_draws_the_same_picture(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+    renderer = Renderer(Camera.from_hfov(320, 240, 1.0), target_model("servicer"))
+    rng = np.random.default_rng(7)
+    views = [(rng.uniform(-0.4, 0.4, 3), rng.normal(size=4)) for _ in range(6)]
+
+    def drawn() -> list[NDArray[np.uint8]]:
+        eye, ahead = np.array([0.0, 0.0, -1.2]), np.array([1.0, 0.0, 0.0, 0.0])
+        other = (chaser_boxes(), np.array([0.3, 0.1, 0.2]), ahead)
+        return [renderer.render(eye, ahead, p, q / np.linalg.norm(q), [other]) for p, q in views]
+
+    expected = drawn()
+    assert all(picture.max() > 60 for picture in expected)
+    own = native.function
+    monkeypatch.setattr(faces, "function", lambda name, result=None: own(name, result, number))
+    np.testing.assert_array_equal(drawn(), expected)
 
 
 @pytest.mark.parametrize("corner", [np.nan, np.inf, -np.inf, 1e300, -1e9])

@@ -7,7 +7,7 @@ from chaserdock_protocol import rotations
 from chaserdock_protocol.camera import Camera
 from chaserdock_protocol.targets import Box, TargetModel, target_model
 from chaserdock_world.effects import NO_EFFECTS, CameraEffects, Effects
-from chaserdock_world.occlusion import PlacedBox, hides, paint_order
+from chaserdock_world.faces import SeenBox, hides, paint_order
 from chaserdock_world.render import Renderer, chaser_boxes
 from chaserdock_world.sky import Light
 from chaserdock_world.textures import finest_texture, marker_cells
@@ -199,23 +199,27 @@ def test_painted_order_agrees_with_ray_casting(seed):
     assert np.mean(seen[~inside] > 60) < 0.05
 
 
-def placed(centre, half, rotation=None):
-    return PlacedBox(
-        np.array(centre), np.eye(3) if rotation is None else rotation, np.array(half), np.zeros(2), np.ones(2)
-    )
+def placed(*boxes):
+    """Boxes (centre, half edges), as seen from the origin, whose pictures overlap."""
+    out = np.zeros(len(boxes), dtype=SeenBox)
+    for row, (centre, half) in zip(out, boxes, strict=True):
+        row["centre"], row["half"], row["rotation"], row["high_px"] = centre, half, np.eye(3), 1.0
+    return out
 
 
 def test_a_wide_near_box_is_in_front_though_its_centre_is_farther():
-    wide = placed([3.0, 0.0, 1.0], [4.0, 0.5, 0.1])
-    small = placed([-0.5, 0.0, 1.3], [0.1, 0.1, 0.1])
-    assert np.linalg.norm(wide.centre_m) > np.linalg.norm(small.centre_m)
-    assert hides([wide, small], [(0, 1), (1, 0)]) == [1, -1]
-    assert paint_order([wide, small]) == [1, 0]
+    wide, small = ([3.0, 0.0, 1.0], [4.0, 0.5, 0.1]), ([-0.5, 0.0, 1.3], [0.1, 0.1, 0.1])
+    assert np.linalg.norm(wide[0]) > np.linalg.norm(small[0])
+    boxes = placed(wide, small)
+    assert (hides(boxes, 0, 1), hides(boxes, 1, 0)) == (1, -1)
+    assert paint_order(boxes) == [1, 0]
+    # Two boxes apart in the picture wait for nothing: the farther one first.
+    boxes["low_px"][1], boxes["high_px"][1] = 5.0, 6.0
+    assert paint_order(boxes) == [0, 1]
 
 
 def test_boxes_on_either_side_of_the_eye_hide_nothing():
-    before, behind = (placed([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in (2.0, -2.0))
-    assert hides([before, behind], [(0, 1)]) == [0]
+    assert hides(placed(*(([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in (2.0, -2.0))), 0, 1) == 0
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])

@@ -1,22 +1,24 @@
-"""Which faces of which boxes a camera sees, and where in its picture.
+"""Which faces of which boxes a camera sees, where in its picture, and in which order they are painted.
 
-All boxes at once: with many bodies in view, a call of NumPy for each would be most of a picture's time.
+The arithmetic is a kernel (native/scene.c): a picture shows a dozen faces, too few for as many calls into NumPy.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from ctypes import Structure, byref, c_double, c_int64
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.camera import Camera
+from chaserdock_protocol.native import address, function
 from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.targets import Box, face_rotation
 from numpy.typing import ArrayLike, NDArray
 
-from chaserdock_world.sky import Light
+from chaserdock_world.textures import FINEST_TEXEL_M
 
 NEAR_M = 0.01
 """Nothing nearer to the camera's plane than this is drawn."""
@@ -24,53 +26,57 @@ NEAR_M = 0.01
 Obstacle = tuple[Sequence[Box], ArrayLike, ArrayLike]
 """Boxes in the axes of a body, its position (3,) in WRF and its attitude (4,), body -> WRF."""
 
+Shape = np.dtype(
+    [
+        ("body", float),
+        ("position", float, 3),
+        ("rotation", float, (3, 3)),
+        ("half", float, 3),
+        ("radius", float),
+    ]
+)
+"""native/scene.c: a box by itself, in its body's axes, metres; ``half`` edges, ``radius`` of the bounding sphere."""
 
-@dataclass(frozen=True)
-class Face:
-    """One visible face, in IRF: ``centre`` (3,) in metres, unit vectors ``right`` and ``up``, width and height; grey
-    level at reflectance 1 and reflectance; the clipped outline (n, 2) in pixels of the canvas, and whether all of it
-    lies in front. ``body`` (0: the target), ``box`` in the body and ``side`` of the box say which it is."""
+SeenBox = np.dtype(
+    [
+        ("shape", float), ("centre", float, 3), ("rotation", float, (3, 3)), ("half", float, 3),
+        ("low_px", float, 2), ("high_px", float, 2),
+    ]
+)  # fmt: skip
+"""native/scene.c: a box of which something is seen: which shape, in IRF, and the pixels that bound its outline."""
 
-    centre: Array
-    right: Array
-    up: Array
-    width_m: float
-    height_m: float
-    level: float
-    shade: float
-    outline_px: Array
-    in_front: bool
-    body: int
-    box: int
-    side: int
+Face = np.dtype(
+    [
+        ("box", float), ("side", float), ("in_front", float), ("width_m", float), ("height_m", float),
+        ("centre", float, 3), ("right", float, 3), ("up", float, 3), ("normal", float, 3),
+        ("count", float), ("outline_px", float, (10, 2)),
+    ]
+)  # fmt: skip
+"""native/scene.c: a visible face in IRF: of which seen box, which ``side`` of it, whether all of it lies ``in_front``, and
+its clipped outline, ``count`` points in pixels of the canvas."""
+
+_FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
 
 
-@dataclass(frozen=True)
-class SeenBox:
-    """A box of which something is seen: ``centre_m`` (3,) and ``rotation`` (3, 3) in IRF, ``half_m`` (3,) edges."""
+class _Frustum(Structure):
+    """native/scene.c."""
 
-    centre_m: Array
-    rotation: Array
-    half_m: Array
-    faces: list[Face]
-
-    def bounds_px(self) -> tuple[Array, Array]:
-        """Least and greatest pixel (2,) of the canvas that its outline reaches."""
-        outline = np.concatenate([face.outline_px for face in self.faces])
-        return outline.min(axis=0), outline.max(axis=0)
+    _fields_ = [
+        ("planes", c_double * 20), ("borders", c_double * 12),
+        ("fx", c_double), ("fy", c_double), ("cx", c_double), ("cy", c_double),
+        ("origin", c_double * 2), ("near_m", c_double),
+    ]  # fmt: skip
 
 
 class Frustum:
     """What of space a canvas shows: the picture of ``camera`` from pixel ``origin_px`` (2,), ``size_px`` wide and high."""
 
     def __init__(self, camera: Camera, origin_px: Array, size_px: Sequence[int]):
-        self.camera = camera
-        self.origin_px = origin_px
         # Planes n x + d >= 0 (n_x, n_y, n_z, d) within which a point is in front and on the canvas, with a
         # pixel to spare; and, of the canvas' borders, unit normals into it.
         left, top = (origin_px - 1.0 - (camera.cx_px, camera.cy_px)).tolist()
         right, bottom = left + size_px[0] + 1.0, top + size_px[1] + 1.0
-        self.planes = np.array(
+        planes = np.array(
             [
                 [0.0, 0.0, 1.0, -NEAR_M],
                 [camera.fx_px, 0.0, -left, 0.0],
@@ -79,144 +85,97 @@ class Frustum:
                 [0.0, -camera.fy_px, bottom, 0.0],
             ]
         )
-        borders = self.planes[1:, :3] - [0.0, 0.0, 0.5]
-        self._borders = borders / np.linalg.norm(borders, axis=1, keepdims=True)
-
-    def reaches(self, centres: Array, radii: Array) -> NDArray[np.bool_]:
-        """Which of the spheres (n, 3), (n,) may be seen: not behind the near plane, not beside the field of view."""
-        beside = (centres @ self._borders.T < -radii[:, None]).any(axis=1)
-        return ~beside & (centres[:, 2] + radii >= NEAR_M)
-
-    def project(self, points: Array) -> Array:
-        """Pixels (..., 2) of the canvas for points (..., 3) in IRF, without lens distortion."""
-        return self.camera.project_ideal(points) - self.origin_px
-
-    def clip(self, corners: Array, outside: NDArray[np.bool_]) -> Array:
-        """The part (n, 3) of a face (4, 3) that is in front and on the canvas (Sutherland-Hodgman);
-        ``outside`` (4, 5): which corners lie outside of which planes."""
-        polygon = corners
-        for plane in self.planes[outside.any(axis=0)]:
-            distance = polygon @ plane[:3] + plane[3]
-            kept: list[Array] = []
-            for i in range(len(polygon)):
-                d0, d1 = distance[i - 1], distance[i]
-                if (d0 < 0.0) != (d1 < 0.0):
-                    kept.append(polygon[i - 1] + (polygon[i] - polygon[i - 1]) * (d0 / (d0 - d1)))
-                if d1 >= 0.0:
-                    kept.append(polygon[i])
-            if len(kept) < 3:
-                return corners[:0]
-            polygon = np.array(kept)
-        return polygon
-
-
-def visible_boxes(
-    frustum: Frustum,
-    bodies: Sequence[Obstacle],
-    camera_position_w_m: Array,
-    camera_q_w_irf_wxyz: Array,
-    to_sun_irf: Array,
-    light: Light,
-) -> list[SeenBox]:
-    """The boxes of which something is seen, in the order of ``bodies``; the first of them is the target.
-
-    ``camera_position_w_m`` (3,), ``camera_q_w_irf_wxyz`` (4,): see `Camera.irf_pose_in_world`; ``to_sun_irf`` (3,) a
-    unit vector.
-    """
-    q_irf_w = rotations.conjugate(camera_q_w_irf_wxyz)
-    shapes = [_shapes(tuple(boxes)) for boxes, _, _ in bodies]
-    q_irf_body = rotations.multiply(q_irf_w, np.array([q for _, _, q in bodies], dtype=float))
-    r_body = rotations.to_matrix(q_irf_body)
-    p_body = np.array([p for _, p, _ in bodies], dtype=float) - camera_position_w_m
-    p_body = p_body @ rotations.to_matrix(q_irf_w).T
-
-    counts = [len(shape.radius) for shape in shapes]
-    body = np.repeat(np.arange(len(bodies)), counts)
-    number = np.concatenate([np.arange(n) for n in counts])
-    at = np.concatenate([shape.position for shape in shapes])
-    centres = p_body[body] + (r_body[body] @ at[..., None])[..., 0]
-    radii = np.concatenate([shape.radius for shape in shapes])
-    kept = np.flatnonzero(frustum.reaches(centres, radii))
-    if not len(kept):
-        return []
-    body, number, centres = body[kept], number[kept], centres[kept]
-    turned = r_body[body] @ np.concatenate([shape.rotation for shape in shapes])[kept]
-    extents = np.concatenate([shape.extents for shape in shapes])[kept]
-    halves = np.concatenate([shape.half for shape in shapes])[kept]
-    shades = np.concatenate([shape.shade for shape in shapes])[kept]
-
-    # Faces (box, side): rows right, up, normal of each; those that turn their back are not seen.
-    axes = (turned[:, None] @ _FACE_AXES).swapaxes(-1, -2)
-    middles = centres[:, None] + extents[..., 2:] * axes[..., 2, :]
-    which, side = np.nonzero((axes[..., 2, :] * middles).sum(axis=-1) < 0.0)
-    axes, middles, sizes = axes[which, side], middles[which, side], extents[which, side, :2]
-    offsets = _CORNERS * sizes[:, None]
-    corners = middles[:, None] + offsets @ axes[:, :2]
-    outside: NDArray[np.bool_] = corners @ frustum.planes[:, :3].T + frustum.planes[:, 3] < 0.0
-    cut: NDArray[np.bool_] = np.any(outside, axis=(1, 2))
-    beyond: NDArray[np.bool_] = np.any(
-        np.all(outside, axis=1), axis=1
-    )  # all four corners on the wrong side of one plane
-    in_front: NDArray[np.bool_] = np.all(corners[..., 2] >= NEAR_M, axis=1)
-    pixels = frustum.project(corners)
-    cosines = (axes[:, 2] @ to_sun_irf).tolist()
-
-    found: dict[int, list[Face]] = {}
-    for k in np.flatnonzero(~beyond).tolist():
-        outline = pixels[k]
-        if cut[k]:
-            polygon = frustum.clip(corners[k], outside[k])
-            if len(polygon) < 3:
-                continue
-            outline = frustum.project(polygon)
-        i = int(which[k])
-        face = Face(
-            centre=middles[k],
-            right=axes[k, 0],
-            up=axes[k, 1],
-            width_m=float(sizes[k, 0]),
-            height_m=float(sizes[k, 1]),
-            level=light.level(cosines[k], -middles[k], axes[k, 2]),
-            shade=float(shades[i]),
-            outline_px=outline,
-            in_front=bool(in_front[k]),
-            body=int(body[i]),
-            box=int(number[i]),
-            side=int(side[k]),
-        )
-        found.setdefault(i, []).append(face)
-    return [SeenBox(centres[i], turned[i], halves[i], faces) for i, faces in found.items()]
-
-
-_FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
-_CORNERS = np.array([[-0.5, 0.5], [0.5, 0.5], [0.5, -0.5], [-0.5, -0.5]])
+        borders = planes[1:, :3] - [0.0, 0.0, 0.5]
+        borders = borders / np.linalg.norm(borders, axis=1, keepdims=True)
+        self.native = _Frustum(
+            (c_double * 20)(*planes.ravel()), (c_double * 12)(*borders.ravel()),
+            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px,
+            (c_double * 2)(*origin_px.tolist()), NEAR_M,
+        )  # fmt: skip
 
 
 @dataclass(frozen=True)
-class _Shapes:
-    """What the boxes of a body give by themselves: ``position`` (n, 3), ``rotation`` (n, 3, 3), ``half`` edges (n, 3),
-    ``radius`` (n,) of the bounding sphere, ``shade`` (n,), and ``extents`` (n, 6, 3) of the faces: width, height and
-    distance from the centre; metres."""
+class Shapes:
+    """The boxes of several bodies: ``table`` (n,) of Shape, and of each the number of its body, its own number in
+    that, and its reflectance."""
 
-    position: Array
-    rotation: Array
-    half: Array
-    radius: Array
-    shade: Array
-    extents: Array
+    table: NDArray[np.void]
+    bodies: list[int]
+    numbers: list[int]
+    shades: list[float]
 
 
-@lru_cache(maxsize=1024)
-def _shapes(boxes: tuple[Box, ...]) -> _Shapes:
-    size = np.array([box.size_m for box in boxes])
-    x, y, z = size.T
-    # As `targets.face_extent`, without its general rotation: faces come in pairs along x, y and z.
-    pairs = np.stack([[y, z, x / 2.0], [x, z, y / 2.0], [x, y, z / 2.0]]).transpose(2, 0, 1)
-    return _Shapes(
-        np.array([box.position_m for box in boxes]),
-        np.array([rotations.to_matrix(box.q_wxyz) for box in boxes]),
-        size / 2.0,
-        0.5 * np.linalg.norm(size, axis=1),
-        np.array([box.shade for box in boxes]),
-        np.repeat(pairs, 2, axis=1),
+@lru_cache(maxsize=256)
+def shapes_of(bodies: tuple[tuple[Box, ...], ...]) -> Shapes:
+    """The table of these bodies' boxes, in their order."""
+    boxes = [(body, number, box) for body, own in enumerate(bodies) for number, box in enumerate(own)]
+    table = np.zeros(len(boxes), dtype=Shape)
+    for row, (body, _, box) in zip(table, boxes, strict=True):
+        half = np.array(box.size_m) / 2.0
+        row["body"], row["position"], row["half"], row["radius"] = (
+            body,
+            box.position_m,
+            half,
+            np.linalg.norm(half),
+        )
+        row["rotation"] = rotations.to_matrix(box.q_wxyz)
+    return Shapes(
+        table, [b for b, _, _ in boxes], [n for _, n, _ in boxes], [box.shade for _, _, box in boxes]
     )
+
+
+def see_faces(
+    frustum: Frustum, shapes: Shapes, eye: Array, poses: Array
+) -> tuple[NDArray[np.void], NDArray[np.void]]:
+    """Boxes of which something is seen (b,) and their faces that are seen (f,), in the order of ``shapes`` and sides.
+
+    ``eye`` (7,): position in WRF and attitude IRF -> WRF of the camera; ``poses`` (bodies, 7): theirs, body -> WRF.
+    """
+    n = len(shapes.table)
+    seen, faces, counts = np.empty(n, SeenBox), np.empty(6 * n, Face), np.zeros(2, np.int64)
+    function("see_faces")(
+        byref(frustum.native), address(eye), address(poses), c_int64(n), address(shapes.table),
+        address(_FACE_AXES), address(seen), address(faces), address(counts),
+    )  # fmt: skip
+    return seen[: counts[0]], faces[: counts[1]]
+
+
+def paint_order(boxes: NDArray[np.void]) -> list[int]:
+    """Indices of ``boxes`` (n,) of SeenBox in the order in which to paint them: nothing before what it hides.
+
+    Boxes that hide one another in a circle (long thin ones can) leave no such order; of those the farthest
+    is painted first.
+    """
+    n = len(boxes)
+    hidden, order = np.empty(n * n, np.uint8), np.empty(n, np.int64)
+    function("paint_order")(c_int64(n), address(boxes), address(hidden), address(order))
+    return order.tolist()
+
+
+def hides(boxes: NDArray[np.void], a: int, b: int) -> int:
+    """1 when box ``a`` of ``boxes`` (n,) of SeenBox is in front of ``b`` as seen from the origin, -1 when behind, 0
+    when neither can hide the other."""
+    return int(function("hides", c_int64)(address(boxes[a : a + 1]), address(boxes[b : b + 1])))
+
+
+def texture_place(
+    frustum: Frustum,
+    face: NDArray[np.void],
+    at: tuple[int, int, int],
+    patch: tuple[int, ...],
+    finest: tuple[int, ...],
+) -> tuple[list[int], list[int], Array] | None:
+    """Where the texture of ``face`` (1,) goes on a patch (rows, columns) of the canvas that has ``at[0]`` samples a
+    pixel from pixel ``at[1:]`` on; None where that is nowhere.
+
+    The region of the patch (left, top, right, bottom); how often the texture's width and height, ``finest`` (rows,
+    columns) at textures.FINEST_TEXEL_M, are halved so that a texel is about a sample in the middle of the outline; and
+    the matrix (3, 3) from the region's samples to texels.
+    """
+    sizes = np.array([patch[1], patch[0], finest[1], finest[0]], dtype=np.int64)
+    out, matrix = np.empty(6, dtype=np.int64), np.empty((3, 3))
+    there = function("place_texture", c_int64)(
+        byref(frustum.native), address(face), *map(c_double, at), address(sizes[:2]), address(sizes[2:]),
+        c_double(FINEST_TEXEL_M), address(out[:4]), address(out[4:]), address(matrix),
+    )  # fmt: skip
+    return (out[:4].tolist(), out[4:].tolist(), matrix) if there else None

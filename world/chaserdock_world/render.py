@@ -7,6 +7,7 @@ camera's side of it can hide the other and is painted later.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -17,9 +18,8 @@ from chaserdock_protocol.targets import Box, TargetModel
 from numpy.typing import ArrayLike, NDArray
 
 from chaserdock_world import textures
-from chaserdock_world.faces import Face, Frustum, Obstacle, visible_boxes
+from chaserdock_world.faces import Frustum, Obstacle, Shapes, paint_order, see_faces, shapes_of, texture_place
 from chaserdock_world.lens import Lens
-from chaserdock_world.occlusion import PlacedBox, paint_order
 from chaserdock_world.patches import Rectangle, patches
 from chaserdock_world.sky import Earth, Light, Sky
 
@@ -43,6 +43,17 @@ def chaser_boxes(
     length = probe_reach_m - front
     probe = Box((length, 0.012, 0.012), (front + length / 2.0, 0.0, 0.0), shade=0.45)
     return (Box(size_m, shade=0.3), probe)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is to be painted: seen boxes by the number of their shape, their ``faces``, and the grey level of each face at
+    reflectance 1."""
+
+    shapes: Shapes
+    of_box: list[int]
+    faces: NDArray[np.void]
+    levels: list[float]
 
 
 class Renderer:
@@ -86,22 +97,34 @@ class Renderer:
         to_sun = rotations.rotate_inverse(q_w_irf, light.direction_w)
 
         bodies: list[Obstacle] = [(self.model.boxes, target_p_w_m, target_q_w_trf_wxyz), *obstacles]
-        seen = visible_boxes(self._frustum, bodies, position, q_w_irf, to_sun, light)
-        placed = [PlacedBox(box.centre_m, box.rotation, box.half_m, *box.bounds_px()) for box in seen]
-        covered = [self._covered(box.low_px, box.high_px) for box in placed]
+        shapes = shapes_of(tuple(tuple(boxes) for boxes, _, _ in bodies))
+        poses = np.array([np.concatenate([p, q]) for _, p, q in bodies], dtype=float)
+        seen, faces = see_faces(self._frustum, shapes, np.concatenate([position, q_w_irf]), poses)
         canvas = self._sky.background(q_w_irf, light)
-        order = paint_order(placed) if placed else []
-        for patch, members in patches(covered):
-            self._paint(canvas, patch, [face for i in order if i in members for face in seen[i].faces])
+        if not len(seen):
+            return self._lens.distorted(canvas)
+        levels = [
+            light.level(cosine, -centre, normal)
+            for cosine, centre, normal in zip(
+                (faces["normal"] @ to_sun).tolist(), faces["centre"], faces["normal"], strict=True
+            )
+        ]
+        of_box: list[list[int]] = [[] for _ in range(len(seen))]
+        for k, box in enumerate(faces["box"].tolist()):
+            of_box[int(box)].append(k)
+        order = paint_order(seen)
+        scene = _Scene(shapes, seen["shape"].astype(int).tolist(), faces, levels)
+        for patch, members in patches(self._covered(seen["low_px"], seen["high_px"])):
+            self._paint(canvas, patch, scene, [k for i in order if i in members for k in of_box[i]])
         return self._lens.distorted(canvas)
 
-    def _covered(self, low: Array, high: Array) -> Rectangle:
-        """The pixels of the canvas that an outline between ``low`` and ``high`` (2,) can touch."""
-        x0, y0 = np.maximum(np.floor(low).astype(int) - 1, 0).tolist()
-        x1, y1 = np.minimum(np.ceil(high).astype(int) + 2, self._size).tolist()
-        return x0, y0, x1, y1
+    def _covered(self, low: Array, high: Array) -> list[Rectangle]:
+        """The pixels of the canvas that outlines between ``low`` and ``high`` (n, 2) can touch."""
+        least = np.maximum(np.floor(low).astype(int) - 1, 0).tolist()
+        most = np.minimum(np.ceil(high).astype(int) + 2, self._size).tolist()
+        return [(x0, y0, x1, y1) for (x0, y0), (x1, y1) in zip(least, most, strict=True)]
 
-    def _paint(self, canvas: NDArray[np.uint8], patch: Rectangle, faces: list[Face]) -> None:
+    def _paint(self, canvas: NDArray[np.uint8], patch: Rectangle, scene: _Scene, faces: list[int]) -> None:
         """Paints faces, back to front, onto a supersampled copy of the ``patch`` of the canvas that they cover."""
         x0, y0, x1, y1 = patch
         if x1 <= x0 or y1 <= y0:
@@ -110,64 +133,50 @@ class Renderer:
         samples = next((n for n, limit in _SAMPLES if n * n * view.size <= limit), 1)
         size = (samples * (x1 - x0), samples * (y1 - y0))
         fine = np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
-        # Ideal pixel of the camera -> sample of the fine patch; pixel centres are integers in both.
-        shift = (samples - 1) / 2.0 - samples * (self._origin + np.array([x0, y0]))
-        to_patch = np.array([[samples, 0.0, shift[0]], [0.0, samples, shift[1]], [0.0, 0.0, 1.0]])
-        for face in faces:
-            outline = (face.outline_px - (x0, y0)) * samples + (samples - 1) / 2.0
-            if face.body == 0 and self._texture(face.box, face.side, 0, 0) is not None:
-                self._paint_texture(fine, face, to_patch, outline)
+        for k in faces:
+            face, shape = scene.faces[k], scene.of_box[int(scene.faces["box"][k])]
+            # Ideal pixel of the camera -> sample of the fine patch; pixel centres are integers in both.
+            outline = (face["outline_px"][: int(face["count"])] - (x0, y0)) * samples + (samples - 1) / 2.0
+            side, number = int(face["side"]), scene.shapes.numbers[shape]
+            if scene.shapes.bodies[shape] == 0 and self._texture(number, side, 0, 0) is not None:
+                self._paint_texture(fine, scene, k, number, (samples, x0, y0), outline)
             else:
-                value = min(255, round(face.level * face.shade))
+                value = min(255, round(scene.levels[k] * scene.shapes.shades[shape]))
                 fixed = np.rint(outline * 16.0).astype(np.int32)
                 cv2.fillConvexPoly(fine, fixed, value, cv2.LINE_8, 4)
         cv2.resize(fine, (x1 - x0, y1 - y0), dst=view, interpolation=cv2.INTER_AREA)
 
-    def _paint_texture(self, patch: NDArray[np.uint8], face: Face, to_patch: Array, outline: Array) -> None:
-        low = np.maximum(np.floor(outline.min(axis=0)).astype(int) - 2, 0)
-        high = np.minimum(np.ceil(outline.max(axis=0)).astype(int) + 3, (patch.shape[1], patch.shape[0]))
-        if np.any(high <= low):
+    def _paint_texture(
+        self,
+        patch: NDArray[np.uint8],
+        scene: _Scene,
+        k: int,
+        box: int,
+        at: tuple[int, int, int],
+        outline: Array,
+    ) -> None:
+        """Face ``k``, of the target's ``box``, onto the ``patch`` that has ``at[0]`` samples a pixel from ``at[1:]`` on."""
+        face, finest = scene.faces[k], self._texture(box, int(scene.faces["side"][k]), 0, 0)
+        assert finest is not None
+        place = texture_place(self._frustum, scene.faces[k : k + 1], at, patch.shape, finest.shape)
+        if place is None:
             return
-        to_patch = to_patch @ self.camera.matrix()
-        texture = self._texture_for(face, to_patch, outline)
-        rows, columns = texture.shape
-        # Texel (column, row, 1) -> point of the face in IRF -> sample of the patch.
-        texel = np.array([[1.0, 0.0, 0.5 - columns / 2.0], [0.0, -1.0, rows / 2.0 - 0.5], [0.0, 0.0, 1.0]])
-        basis = np.stack(
-            [face.right * face.width_m / columns, face.up * face.height_m / rows, face.centre], axis=-1
-        )
-        to_roi = np.array([[1.0, 0.0, -low[0]], [0.0, 1.0, -low[1]], [0.0, 0.0, 1.0]]) @ to_patch
-        homography = np.linalg.inv(to_roi @ basis @ texel)
-        homography /= np.abs(homography).max()
-        roi = patch[low[1] : high[1], low[0] : high[0]]
-        size = (roi.shape[1], roi.shape[0])
-        lit = cv2.convertScaleAbs(texture, alpha=face.level / 255.0)
+        (x0, y0, x1, y1), halved, homography = place
+        texture = self._texture(box, int(face["side"]), *halved)
+        assert texture is not None
+        roi = patch[y0:y1, x0:x1]
+        size = (x1 - x0, y1 - y0)
+        lit = cv2.convertScaleAbs(texture, alpha=scene.levels[k] / 255.0)
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-        if face.in_front:
+        if face["in_front"]:
             # A transparent border blends over half a texel on either side of the face's edge.
             cv2.warpPerspective(lit, homography, size, roi, flags, cv2.BORDER_TRANSPARENT)
             return
         # Part of the face is behind the camera, where the homography mirrors it: paint the rest alone.
         warped = cv2.warpPerspective(lit, homography, size, None, flags, cv2.BORDER_REPLICATE)
         mask = np.zeros(roi.shape, dtype=np.uint8)
-        cv2.fillConvexPoly(mask, np.rint((outline - low) * 16.0).astype(np.int32), 255, cv2.LINE_8, 4)
+        cv2.fillConvexPoly(mask, np.rint((outline - (x0, y0)) * 16.0).astype(np.int32), 255, cv2.LINE_8, 4)
         cv2.copyTo(warped, mask, roi)
-
-    def _texture_for(self, face: Face, to_patch: Array, outline: Array) -> NDArray[np.uint8]:
-        """The texture whose texels are, at the middle of the visible part, about a sample wide and high."""
-        # Ray through the middle of the outline, cut with the face's plane.
-        ray = np.linalg.solve(to_patch, np.append(outline.mean(axis=0), 1.0))
-        normal = rotations.cross(face.right, face.up)
-        point = ray * (normal @ face.centre) / (normal @ ray)
-        level = []
-        for axis in (face.right, face.up):
-            moved = to_patch @ axis  # derivative of homogeneous sample coordinates per metre
-            at = to_patch @ point
-            samples_per_m = np.linalg.norm((moved[:2] - at[:2] / at[2] * moved[2]) / at[2])
-            level.append(max(0, round(-float(np.log2(max(samples_per_m, 1.0) * textures.FINEST_TEXEL_M)))))
-        texture = self._texture(face.box, face.side, level[0], level[1])
-        assert texture is not None
-        return texture
 
     def _texture(self, box_index: int, face: int, level_x: int, level_y: int) -> NDArray[np.uint8] | None:
         key = (box_index, face, level_x, level_y)

@@ -11,3 +11,4 @@
 #include "tumble.c"
 #include "corners.c"
 #include "pose.c"
+#include "scene.c"

@@ -6,10 +6,12 @@ the chaser and the number of the picture alone.
 
 from __future__ import annotations
 
+from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from chaserdock_protocol.native import address, function
 from numpy.typing import NDArray
 
 # The noise bank is larger than a picture by these (coprime) numbers of pixels: as many different offsets.
@@ -44,10 +46,7 @@ NO_EFFECTS = Effects(1.0, 0.0, 0.0, 0.0)
 
 
 class CameraEffects:
-    """Applies ``effects`` to pictures of one size; ``seed`` fixes all noise it will ever give.
-
-    Keeps scratch memory: not for several threads at once.
-    """
+    """Applies ``effects`` to pictures of one size; ``seed`` fixes all noise it will ever give."""
 
     def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
         self.effects = effects
@@ -67,7 +66,6 @@ class CameraEffects:
             steps = 2.0 ** min(np.floor(np.log2(32767.0 / sigma.max())), 64.0)
             self._sigma = np.rint(sigma * steps).astype(np.int16)
             self._to_levels = 1.0 / (_NOISE_STEPS * steps)
-            self._work = np.empty(self._shape, dtype=np.int16)
 
     def apply(self, image: NDArray[np.uint8], chaser: int, picture: int) -> NDArray[np.uint8]:
         """Picture ``picture`` of chaser ``chaser`` (both from 0), as the camera gives it (h, w), uint8.
@@ -90,11 +88,10 @@ class CameraEffects:
             noise = self._bank[row : row + self._shape[0], column : column + self._shape[1]]
             sign = 1.0 if seeds[2] & 1 else -1.0
             # Grey levels are whole, so noise rounded to whole ones before it is added is no loss.
-            work = self._work
-            cv2.LUT(out, self._sigma, dst=work)
-            cv2.multiply(work, noise, dst=work, scale=sign * self._to_levels)
-            np.clip(work, -255, 255, out=work)  # so that the sum stays within 16 bits
-            work += out
-            np.clip(work, 0, 255, out=work)
-            return work.astype(np.uint8)
+            out, noisy = np.ascontiguousarray(out), np.empty(self._shape, dtype=np.uint8)
+            function("add_noise")(
+                c_void_p(out.ctypes.data), c_void_p(noise.ctypes.data), c_int64(noise.strides[0] // noise.itemsize),
+                address(self._sigma), c_double(sign * self._to_levels), *map(c_int64, self._shape), address(noisy),
+            )  # fmt: skip
+            return noisy
         return np.array(out, dtype=np.uint8) if out is image else np.asarray(out, dtype=np.uint8)

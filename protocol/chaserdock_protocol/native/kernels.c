@@ -12,3 +12,4 @@
 #include "corners.c"
 #include "pose.c"
 #include "scene.c"
+#include "noise.c"

@@ -15,12 +15,13 @@ from typing import Any
 import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.rotations import Array
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from .figures_seen import cameras, consistency, estimate, latency, solver
-from .flight import Flight, load_flight
+from .flight import Flight, Track, load_flight
 from .plots import (
     AXES_XYZ,
     FAINT,
@@ -50,26 +51,30 @@ def flown(flight: Flight) -> list[int]:
     return numbers
 
 
+def _path(own: Track, target: Track) -> tuple[Array, Array]:
+    """A chaser's positions as many as are drawn, the last among them: WRF, and in the target's axes from its centre."""
+    n = min(len(own.time_s), len(target.time_s))
+    rows = np.unique(np.append(np.arange(n)[few(n)], n - 1))
+    position = own.position_m[rows]
+    return position, rotations.rotate_inverse(target.q_wxyz[rows], position - target.position_m[rows])
+
+
 def trajectories(flight: Flight, _: Traces) -> Figure:
     numbers = flown(flight)
     target = flight.truth["target"]
+    paths = {i: _path(flight.truth[f"chaser/{i}"], target) for i in numbers}
     figure = Figure(figsize=(9.6, 4.6))
     for place, title in enumerate(("In the world (WRF)", "Relative to the target, in its axes (TRF)")):
         axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
-        paths = [flight.truth[f"chaser/{i}"].position_m for i in numbers]
         if place:
-            n = [min(len(p), len(target.time_s)) for p in paths]
-            paths = [
-                rotations.rotate_inverse(target.q_wxyz[:k], p[:k] - target.position_m[:k])
-                for k, p in zip(n, paths, strict=True)
-            ]
             axes.scatter(0.0, 0.0, 0.0, color=FAINT, marker="s", s=28, label="target")
         else:
             axes.plot(
                 *target.position_m[few(len(target.time_s))].T, color=FAINT, linewidth=1.6, label="target"
             )
-        for i, p in zip(numbers, paths, strict=True):
-            axes.plot(*p[few(len(p))].T, color=colour(i), label=f"chaser {i}")
+        for i in numbers:
+            p = paths[i][place]
+            axes.plot(*p.T, color=colour(i), label=f"chaser {i}")
             axes.scatter(*p[0], color=colour(i), marker="o", s=14)
             axes.scatter(*p[-1], color=colour(i), marker="^", s=22)
         axes.set_title(title)

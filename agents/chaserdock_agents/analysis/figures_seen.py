@@ -43,10 +43,7 @@ def component_errors(flight: Flight) -> tuple[Array, Array, Array]:
         ],
         axis=1,
     )
-    # The diagonal of the packed upper triangle; the covariance's order is position, velocity, attitude, rate.
-    pose, rates = flight.pose_covariance[a][:, [0, 6, 11, 15, 18, 20]], flight.rate_variance[a]
-    variances = np.concatenate([pose[:, :3], rates[:, :3], pose[:, 3:], rates[:, 3:]], axis=1)
-    return e.time_s[a], errors, np.sqrt(np.maximum(variances, 0.0))
+    return e.time_s[a], errors, np.sqrt(np.maximum(flight.variances(a), 0.0))
 
 
 def estimate(flight: Flight, _: Traces) -> Figure:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter, defaultdict
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,6 +48,24 @@ class Track:
     velocity_m_s: Array
     q_wxyz: Array
     omega_rad_s: Array
+
+
+class Tracks(Mapping[str, Track]):
+    """Tracks by name. A long one is in memory only while it is held: ask again rather than keep it."""
+
+    def __init__(self, motions: dict[str, Columns]) -> None:
+        self._motions = motions
+
+    def __getitem__(self, name: str) -> Track:
+        t = self._motions[name].table()
+        # Times by themselves: whoever keeps them for an axis must not keep all of the motion.
+        return Track(t[:, 0].copy(), t[:, 1:4], t[:, 4:7], t[:, 7:11], t[:, 11:14])
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._motions)
+
+    def __len__(self) -> int:
+        return len(self._motions)
 
 
 @dataclass
@@ -102,23 +121,21 @@ class World:
 
 @dataclass
 class Flight:
-    """What a log holds, without the pictures. Dictionaries by body name or chaser.
+    """What a log holds, without the pictures. Mappings by body name or chaser.
 
-    ``estimate_known`` (K,): whether the target was known; ``pose_covariance`` (K, 21): upper triangle, row by row, of
-    position (WRF) and attitude (TRF); ``rate_variance`` (K, 6): of velocity (WRF) and rate (TRF).
+    ``estimates`` has the fused estimate's motion as ``target``; ``estimate_known`` (K,): whether the target was known.
     ``expected_commands``: how many actuator commands all ticks together waited for.
     """
 
     scenario: Scenario
     run: dict[str, str]
-    truth: dict[str, Track]
+    truth: Tracks
     absolute_impulse_N_s: dict[str, float]
     jet_impulse_N_s: dict[str, float]
     propellant_kg: dict[str, float]
-    estimate: Track
+    estimates: Tracks
     estimate_known: NDArray[np.bool_]
-    pose_covariance: Array
-    rate_variance: Array
+    covariances: Columns
     told: dict[int, Told]
     sightings: dict[int, Seen]
     solves: Solves
@@ -133,8 +150,23 @@ class Flight:
     wall_time_s: float
     digest: str
 
+    @property
+    def estimate(self) -> Track:
+        """Motion of the target as the fusion took it to be."""
+        return self.estimates["target"]
 
-def unpacked(upper: Array) -> Array:
+    def pose_covariance(self, rows: NDArray[np.intp]) -> Array:
+        """Covariances (K, 6, 6) of position (WRF) and attitude (TRF) at these rows (K,) of the estimate."""
+        return _unpacked(self.covariances.table()[rows, :21])
+
+    def variances(self, rows: NDArray[np.intp]) -> Array:
+        """Variances (K, 12) of position and velocity (WRF), attitude and rate (TRF) at these rows of the estimate."""
+        table = self.covariances.table()[rows]
+        pose, rates = table[:, :21][:, [0, 6, 11, 15, 18, 20]], table[:, 21:]
+        return np.concatenate([pose[:, :3], rates[:, :3], pose[:, 3:], rates[:, 3:]], axis=1)
+
+
+def _unpacked(upper: Array) -> Array:
     """Symmetric matrices (K, 6, 6) from their upper triangles (K, 21)."""
     out = np.empty((len(upper), 6, 6))
     out[:, _UPPER[0], _UPPER[1]] = upper
@@ -254,14 +286,9 @@ def _add_motion(table: Columns, message: BodyTruth | TargetEstimate) -> None:
     table.add((m.sim_time_ns / 1e9,), m.position_m, m.velocity_m_s, m.q_wxyz, m.omega_rad_s)
 
 
-def _track(motion: Columns) -> Track:
-    t = motion.table()
-    return Track(t[:, 0], t[:, 1:4], t[:, 4:7], t[:, 7:11], t[:, 11:14])
-
-
 def _seen(columns: Columns) -> Seen:
     t = columns.table()
-    return Seen(t[:, 0], t[:, 1] > 0.0, t[:, 2].astype(np.intp))
+    return Seen(t[:, 0].copy(), t[:, 1] > 0.0, t[:, 2].astype(np.intp))
 
 
 def load_flight(log: LogSource) -> Flight:
@@ -277,21 +304,20 @@ def load_flight(log: LogSource) -> Flight:
     rejected: Counter[str] = Counter()
     for health in c.health.values():
         rejected.update(health.rejected)
-    covariance, solves = c.covariance.table(), c.solves.table()
+    solves = c.solves.table()
     return Flight(
         scenario=scenario,
         run=run,
-        truth={name: _track(motion) for name, motion in c.bodies.items()},
+        truth=Tracks(dict(c.bodies)),
         absolute_impulse_N_s=dict(c.impulse),
         jet_impulse_N_s=dict(c.jet_impulse),
         propellant_kg=dict(c.propellant),
-        estimate=_track(c.target),
+        estimates=Tracks({"target": c.target}),
         estimate_known=np.frombuffer(c.known, dtype=np.bool_),
-        pose_covariance=covariance[:, :21],
-        rate_variance=covariance[:, 21:],
+        covariances=c.covariance,
         told={i: told.finish() for i, told in c.told.items()},
         sightings={i: _seen(columns) for i, columns in c.sightings.items()},
-        solves=Solves(c.solver, solves[:, 0], solves[:, 1], solves[:, 2] > 0.0, c.statuses),
+        solves=Solves(c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses),
         world=c.world,
         events=c.events,
         replies=c.replies,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,10 @@ from numpy.typing import NDArray
 
 from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
 from .columns import nanoseconds, rows_since
-from .flight import Flight, Track, load_flight, unpacked
+from .flight import Flight, Track, load_flight
 from .reached import not_reached, reached_time
 
-_PART = 1 << 14  # rows whose covariances are taken apart at a time
+_PART = 1 << 14  # rows that are worked on at a time
 
 
 def summarize(log: Path) -> dict[str, Any]:
@@ -27,38 +28,45 @@ def summarize(log: Path) -> dict[str, Any]:
     return summary_of(load_flight(log))
 
 
-def true_reference(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
-    """Times (K,), reference positions (K, 3) WRF and attitudes (K, 4) that a chaser should have had.
+def true_reference(flight: Flight, chaser: int, rows: slice, target: Track) -> tuple[Array, Array]:
+    """Positions (K, 3) WRF and attitudes (K, 4) that a chaser should have had, at these rows of the target's truth.
 
     The commanded offset on the *true* target, so that errors of estimation count as errors of tracking. Before
     the controller names an offset it is the scenario's.
     """
-    scenario, target = flight.scenario, flight.truth["target"]
-    c = scenario.chasers[chaser]
-    offsets = told_offsets(flight, chaser, np.array(c.position_m))
-    positions = target.position_m + rotations.rotate(target.q_wxyz, offsets)
+    c = flight.scenario.chasers[chaser]
+    offsets = told_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
+    positions = target.position_m[rows] + rotations.rotate(target.q_wxyz[rows], offsets)
     q_off = np.array(c.q_wxyz)
     if flight.scenario.approach.face_target:
         q_off = facing_attitudes(c.position_m, q_off, offsets)
-    return target.time_s, positions, rotations.multiply(target.q_wxyz, q_off)
+    return positions, rotations.multiply(target.q_wxyz[rows], q_off)
 
 
-def told_offsets(flight: Flight, chaser: int, before: Array) -> Array:
-    """The offset (K, 3) that a chaser was told, TRF, at each time of the target's truth; ``before`` the first one, (3,)."""
-    told, target = flight.told.get(chaser), flight.truth["target"]
+def told_offsets(flight: Flight, chaser: int, before: Array, time_s: Array) -> Array:
+    """The offset (K, 3) that a chaser was told, TRF, at the times (K,); ``before`` the first one, (3,)."""
+    told = flight.told.get(chaser)
     if told is None:
-        return np.broadcast_to(before, (len(target.time_s), 3))
-    row = rows_since(nanoseconds(told.time_s), nanoseconds(target.time_s))
+        return np.broadcast_to(before, (len(time_s), 3))
+    row = rows_since(nanoseconds(told.time_s), nanoseconds(time_s))
     return np.vstack([before, told.offset_m])[row + 1]
+
+
+def parts(number: int) -> Iterator[slice]:
+    """``number`` rows, a part at a time: what is computed on the way must not need the memory of a whole long flight."""
+    return (slice(k, min(k + _PART, number)) for k in range(0, number, _PART))
 
 
 def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
     """Times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from its true reference."""
-    time_s, positions, attitudes = true_reference(flight, chaser)
-    own = flight.truth[f"chaser/{chaser}"]
-    n = min(len(time_s), len(own.time_s))
-    position = np.linalg.norm(own.position_m[:n] - positions[:n], axis=1)
-    return time_s[:n], position, rotations.angle_between(attitudes[:n], own.q_wxyz[:n])
+    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
+    n = min(len(target.time_s), len(own.time_s))
+    position, angle = np.empty(n), np.empty(n)
+    for rows in parts(n):
+        positions, attitudes = true_reference(flight, chaser, rows, target)
+        position[rows] = np.linalg.norm(own.position_m[rows] - positions, axis=1)
+        angle[rows] = rotations.angle_between(attitudes, own.q_wxyz[rows])
+    return target.time_s[:n], position, angle
 
 
 def known_estimates(flight: Flight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -79,21 +87,22 @@ def estimate_errors(flight: Flight) -> dict[str, Array]:
     a, b = known_estimates(flight)
     truth = flight.truth.get("target", flight.estimate)  # without a truth there are no rows
     e = flight.estimate
-    position = truth.position_m[b] - e.position_m[a]
-    angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
-    pose = np.concatenate([position, angle], axis=1)
-    nees = np.empty(len(a))
-    for part in (slice(k, k + _PART) for k in range(0, len(a), _PART)):
-        weighed = np.linalg.solve(unpacked(flight.pose_covariance[a[part]]), pose[part, :, None])[:, :, 0]
-        nees[part] = np.einsum("ki,ki->k", pose[part], weighed)
-    return {
-        "time_s": e.time_s[a],
-        "position_m": np.linalg.norm(position, axis=1),
-        "orientation_rad": np.linalg.norm(angle, axis=1),
-        "velocity_m_s": np.linalg.norm(truth.velocity_m_s[b] - e.velocity_m_s[a], axis=1),
-        "omega_rad_s": np.linalg.norm(truth.omega_rad_s[b] - e.omega_rad_s[a], axis=1),
-        "nees": nees,
+    errors = {
+        name: np.empty(len(a))
+        for name in ("position_m", "orientation_rad", "velocity_m_s", "omega_rad_s", "nees")
     }
+    for rows in parts(len(a)):
+        i, j = a[rows], b[rows]
+        position = truth.position_m[j] - e.position_m[i]
+        angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[i]), truth.q_wxyz[j]))
+        pose = np.concatenate([position, angle], axis=1)
+        weighed = np.linalg.solve(flight.pose_covariance(i), pose[:, :, None])[:, :, 0]
+        errors["position_m"][rows] = np.linalg.norm(position, axis=1)
+        errors["orientation_rad"][rows] = np.linalg.norm(angle, axis=1)
+        errors["velocity_m_s"][rows] = np.linalg.norm(truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1)
+        errors["omega_rad_s"][rows] = np.linalg.norm(truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1)
+        errors["nees"][rows] = np.einsum("ki,ki->k", pose, weighed)
+    return {"time_s": e.time_s[a], **errors}
 
 
 def _rms(x: Array) -> float | None:
@@ -128,7 +137,7 @@ def dock_time(flight: Flight, chaser: int) -> float | None:
     """
     approach = flight.scenario.approach
     time_s, position, angle = tracking_errors(flight, chaser)
-    away = np.linalg.norm(told_offsets(flight, chaser, np.full(3, math.inf))[: len(time_s)], axis=1)
+    away = np.linalg.norm(told_offsets(flight, chaser, np.full(3, math.inf), time_s), axis=1)
     reached = np.abs(away - approach.dock_distance_m) < 1e-6
     limit = math.radians(approach.docked_angle_deg)
     inside = reached & (position <= approach.docked_position_m) & (angle <= limit)

@@ -145,10 +145,10 @@ class _Director:
         sun = np.array(flight.scenario.camera.sun_direction)
         self.sun = sun / np.linalg.norm(sun)
         self.numbers = [i for i in range(len(flight.scenario.chasers)) if f"chaser/{i}" in flight.truth]
-        target = flight.truth["target"]
+        self.target = target = flight.truth["target"]
+        self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
         reach = 0.3
-        for i in self.numbers:
-            own = flight.truth[f"chaser/{i}"]
+        for own in self.chasers.values():
             n = min(len(own.time_s), len(target.time_s))
             shown = (own.time_s[:n] >= part_s[0]) & (own.time_s[:n] <= part_s[1])
             away_m = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)[shown]
@@ -165,13 +165,12 @@ class _Director:
 
     def shoot(self, time_s: float) -> Picture:
         """The mission from outside at a simulated time, with clock and phases."""
-        target = self.flight.truth["target"]
-        chasers = {i: _pose(self.flight.truth[f"chaser/{i}"], time_s) for i in self.numbers}
-        paths: dict[int | None, Any] = {None: _trail(target, time_s)}
-        paths |= {i: _trail(self.flight.truth[f"chaser/{i}"], time_s) for i in self.numbers}
-        at = _pose(target, time_s)
+        chasers = {i: _pose(own, time_s) for i, own in self.chasers.items()}
+        paths: dict[int | None, Any] = {None: _trail(self.target, time_s)}
+        paths |= {i: _trail(own, time_s) for i, own in self.chasers.items()}
+        at = _pose(self.target, time_s)
         look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
-        time_ns = round(_time_of(target, time_s) * 1e9)
+        time_ns = round(_time_of(self.target, time_s) * 1e9)
         seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
         picture = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
         self._write(picture, time_s)

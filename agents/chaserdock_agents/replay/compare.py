@@ -77,10 +77,10 @@ def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[Top
 
 
 def _apart(a: Flight, b: Flight) -> dict[str, Apart]:
-    tracks = {name: (a.truth[name], b.truth[name]) for name in a.truth if name in b.truth}
-    tracks["target estimate"] = (a.estimate, b.estimate)
     out = {}
-    for name, (one, other) in tracks.items():
+    for name in [*(n for n in a.truth if n in b.truth), "target estimate"]:
+        estimate = name == "target estimate"
+        one, other = (f.estimate if estimate else f.truth[name] for f in (a, b))
         _, k, m = np.intersect1d(one.time_s, other.time_s, return_indices=True)
         if not len(k):
             continue

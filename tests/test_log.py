@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgpack
 import pytest
-from chaserdock_protocol import codec, topics
+from chaserdock_protocol import codec, log, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.log import (
     LOCK_ATTACHMENT,
@@ -49,6 +49,23 @@ def test_what_is_written_is_read_in_order(tmp_path: Path) -> None:
     for r in records:
         assert r.topic.key_of(r.place) == r.key
         assert type(r.message) is r.topic.kind
+
+
+def test_chunk_indexes_are_kept_small_and_the_file_is_the_librarys(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(path: Path) -> tuple[bytes, int]:
+        writer = LogWriter(path)
+        for topic, place, message in flight(30):
+            record(writer, topic, place, message, 5)
+            writer.flush()
+        writer.close()
+        return path.read_bytes(), len(vars(writer._writer)["_Writer__chunk_indices"])
+
+    ours, number = made(tmp_path / "ours.mcap")
+    assert number == len(list(flight(30)))
+    monkeypatch.setattr(log, "_ChunkIndexes", list)
+    assert made(tmp_path / "theirs.mcap") == (ours, number)
 
 
 def test_keys_select_and_counts_count(tmp_path: Path) -> None:

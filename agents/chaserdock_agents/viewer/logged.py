@@ -71,9 +71,10 @@ class LoggedMission:
         self.truth = False
         self._chunks: list[tuple[Path, int]] = []
         self._channels: dict[Path, dict[int, Channel]] = {}
-        self._index: dict[str, tuple[array[int], array[int], array[int]]] = defaultdict(
-            lambda: (array("q"), array("l"), array("l"))
-        )
+        # By key, of each chunk that holds some of its messages: time of the first of them, and the chunk's number. An
+        # entry a message would be half a gigabyte after ten hours.
+        self._index: dict[str, tuple[array[int], array[int]]] = defaultdict(lambda: (array("q"), array("l")))
+        self._latest: dict[str, int] = defaultdict(int)
         self._shown = {topic.key_of(): topic for topic in OF_ALL}
         self._shown |= {topic.key_of(i): topic for topic in OF_CHASERS for i in range(self.chasers)}
         bodies = ("target", *(f"chaser/{i}" for i in range(self.chasers)))
@@ -94,11 +95,11 @@ class LoggedMission:
             channels |= {record.id: record for record in inside if isinstance(record, Channel)}
             number = len(self._chunks)
             self._chunks.append((path, state.place))
-            for place, record in enumerate(inside):
+            for record in inside:
                 if isinstance(record, McapMessage):
-                    self._note(channels[record.channel_id], record, number, place)
+                    self._note(channels[record.channel_id], record, number)
 
-    def _note(self, channel: Channel, stored: McapMessage, chunk: int, place: int) -> None:
+    def _note(self, channel: Channel, stored: McapMessage, chunk: int) -> None:
         key = channel.topic
         if key.startswith(VIEWER_PREFIX):
             return
@@ -107,11 +108,12 @@ class LoggedMission:
             return
         topic = found[0]
         if key in self._shown:
-            times, chunks, places = self._index[key]
+            times, chunks = self._index[key]
             # A log's order is that of arrival; of one key it is that of time but for what came late.
-            times.append(max(stored.log_time, times[-1] if times else 0))
-            chunks.append(chunk)
-            places.append(place)
+            self._latest[key] = max(stored.log_time, self._latest[key])
+            if not chunks or chunks[-1] != chunk:
+                times.append(self._latest[key])
+                chunks.append(chunk)
         if topic is topics.IMAGE:
             try:
                 seen = _exposure.decode(stored.data)
@@ -130,23 +132,35 @@ class LoggedMission:
         except Rejected:
             return None
 
-    def _read_chunk(self, number: int) -> list[Any]:
+    def _read_chunk(self, number: int) -> dict[str, list[tuple[Channel, McapMessage]]]:
+        """A chunk's messages by key."""
         path, place = self._chunks[number]
         try:
-            return chunk_records(record_at(path, place))
+            inside = chunk_records(record_at(path, place))
         except DAMAGE as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
+        out: dict[str, list[tuple[Channel, McapMessage]]] = defaultdict(list)
+        for record in inside:
+            if isinstance(record, McapMessage):
+                channel = self._channels[path][record.channel_id]
+                out[channel.topic].append((channel, record))
+        return out
 
     def at(self, time_s: float) -> Now:
         """The mission at a simulated time: of every key its latest message up to then. Raises LogError."""
         now, until = Now.of(self.chasers), round(time_s * 1e9) + 1
         for key, topic in self._shown.items():
-            times, chunks, places = self._index[key]
+            times, chunks = self._index[key]
             last = bisect_right(times, until) - 1
             if last < 0:
                 continue
-            stored = self._chunk(chunks[last])[places[last]]
-            channel = self._channels[self._chunks[chunks[last]][0]][stored.channel_id]
+            # The first one of the chunk is early enough, whatever its own time: others before it were later.
+            first, *more = self._chunk(chunks[last])[key]
+            channel, stored = first
+            for later in more:
+                if later[1].log_time > until:
+                    break
+                channel, stored = later
             message = self._open(topic, channel, stored)
             if message is not None:
                 now.take(topic, message)

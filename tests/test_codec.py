@@ -9,12 +9,13 @@ from typing import Any
 import msgpack
 import msgspec
 import pytest
-from chaserdock_protocol import codec
+from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.codec import Rejected
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from message_samples import BY_TYPE, EYE6, EYE12, SAMPLES, SOLUTION
+from msgspec import inspect
 
 quick = settings(derandomize=True, deadline=None, max_examples=100)
 
@@ -282,3 +283,24 @@ def test_without_wall_time_leaves_out_wall_fields_only() -> None:
     assert codec.without_wall_time(slower) == codec.without_wall_time(sample)
     fields = set(type(sample).__struct_fields__)
     assert fields - set(codec.without_wall_time(sample)) == {"wall_solve_s", "wall_tick_s"}
+
+
+def test_every_float_of_every_message_is_looked_at() -> None:
+    for topic in topics.TOPICS:
+        for field in inspect.type_info(topic.kind).fields:  # type: ignore[attr-defined]
+            codec.holds_floats(field.type)  # raises for a type that would be passed over
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, 2e15, -1e300])
+@pytest.mark.parametrize("place", [0, 1, 38])
+def test_a_bad_number_is_found_wherever_it_stands_in_a_long_list(bad: float, place: int) -> None:
+    plan = BY_TYPE[m.Plan]
+    values = [0.5] * 39
+    values[place] = bad
+    with pytest.raises(codec.Rejected, match="positions_m") as refusal:
+        codec.check_numbers(msgspec.structs.replace(plan, positions_m=tuple(values)))
+    assert refusal.value.reason == ("range" if math.isfinite(bad) else "not_finite")
+
+
+def test_many_large_numbers_are_no_bad_one() -> None:
+    codec.check_numbers(msgspec.structs.replace(BY_TYPE[m.Plan], positions_m=(0.9e15,) * 60))

@@ -7,7 +7,7 @@ from functools import lru_cache
 from typing import Any, TypeVar
 
 import msgspec
-from msgspec import Struct
+from msgspec import Struct, inspect
 
 from .messages import Message, encoding_of
 
@@ -61,23 +61,54 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 def check_numbers(message: Struct) -> None:
     """Raises Rejected unless every float is finite and within ``GREATEST_NUMBER``, every ``q_wxyz`` of unit length and
     no variance negative."""
-    for name in message.__struct_fields__:
+    for name in _fields_with_floats(type(message)):
         value = getattr(message, name)
         if isinstance(value, float):
             if not -GREATEST_NUMBER <= value <= GREATEST_NUMBER:
                 raise _bad_number(name, value)
-        elif isinstance(value, tuple):
-            for item in value:
-                if isinstance(item, float):
+        elif value and isinstance(value, tuple):
+            if isinstance(value[0], Struct):
+                for item in value:
+                    check_numbers(item)
+                continue
+            # Long ones (a plan has hundreds) at the speed of C: NaN and infinity come through, and no part is greater.
+            length = math.hypot(*value)
+            if not length <= GREATEST_NUMBER:
+                for item in value:
                     if not -GREATEST_NUMBER <= item <= GREATEST_NUMBER:
                         raise _bad_number(name, item)
-                elif isinstance(item, Struct):
-                    check_numbers(item)
             if name == "q_wxyz":
-                if abs(math.hypot(*value) - 1.0) > UNIT_QUATERNION_TOLERANCE:
-                    raise Rejected("not_unit_quaternion", f"{name} has length {math.hypot(*value)}")
+                if abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
+                    raise Rejected("not_unit_quaternion", f"{name} has length {length}")
             elif name == "covariance":
                 _check_covariance(value)
+
+
+@lru_cache
+def _fields_with_floats(kind: type[Struct]) -> tuple[str, ...]:
+    info: Any = inspect.type_info(kind)
+    return tuple(field.name for field in info.fields if holds_floats(field.type))
+
+
+def holds_floats(kind: inspect.Type) -> bool:
+    """Whether a field of this type may hold floats, in itself or in structures. Raises TypeError for one that
+    ``check_numbers`` does not go through."""
+    match kind:
+        case inspect.FloatType() | inspect.StructType():
+            return True
+        case inspect.UnionType(types=parts):
+            return any(holds_floats(part) for part in parts)
+        case inspect.VarTupleType(item_type=item):
+            return holds_floats(item)
+        case inspect.TupleType(item_types=items):
+            held = {holds_floats(item) for item in items}
+            if len(held) > 1:
+                raise TypeError(f"floats beside others in a tuple: {items}")
+            return held == {True}
+        case inspect.DictType(value_type=value) if holds_floats(value):
+            raise TypeError("floats in a dictionary")
+        case _:
+            return False
 
 
 def _bad_number(name: str, value: float) -> Rejected:

@@ -20,7 +20,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import breakup_chunk
+from mcap.stream_reader import get_chunk_data_stream
 from mcap.writer import MCAP0_MAGIC
 
 from .errors import ChaserdockError
@@ -39,6 +39,7 @@ RECOVERED = "chaserdock.recovered"
 MAX_RECORD_BYTES = 1 << 27
 _HEAD = struct.Struct("<BQ")
 _CRC = struct.Struct("<I")
+_MESSAGE = struct.Struct("<HIQQ")
 # What the parsers of a damaged record raise.
 DAMAGE = (McapError, ValueError, KeyError, EOFError, struct.error, zstandard.ZstdError)
 
@@ -141,8 +142,24 @@ def record_at(path: Path, place: int) -> bytes:
 
 def chunk_records(content: bytes) -> list[McapMessage | Channel | Schema]:
     """Channels, schemas and messages of a chunk record, its checksum held; raises one of ``DAMAGE``."""
-    chunk = Chunk.read(ReadDataStream(BytesIO(content)))
-    return breakup_chunk(chunk, validate_crc=True)  # type: ignore[return-value]
+    stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
+    data, place = stream.read(size), 0
+    out: list[McapMessage | Channel | Schema] = []
+    # Messages are most of a log, and the library reads them field by field.
+    while place < size:
+        opcode, length = _HEAD.unpack_from(data, place)
+        begin, place = place + _HEAD.size, place + _HEAD.size + length
+        if place > size or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
+            raise ValueError("a record runs over its end")
+        if opcode == Opcode.MESSAGE:
+            channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, begin)
+            payload = data[begin + _MESSAGE.size : place]
+            out.append(McapMessage(channel_id, log_time, payload, publish_time, sequence))
+        elif opcode == Opcode.CHANNEL:
+            out.append(Channel.read(ReadDataStream(BytesIO(data[begin:place]))))
+        elif opcode == Opcode.SCHEMA:
+            out.append(Schema.read(ReadDataStream(BytesIO(data[begin:place]))))
+    return out
 
 
 def attachment_of(content: bytes) -> Attachment:

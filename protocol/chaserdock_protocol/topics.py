@@ -7,6 +7,7 @@ process to its own branch. ``truth/**`` is the world's, and no process that flie
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal, get_args
 
 from msgspec import Struct
@@ -126,6 +127,7 @@ LIVE_KEY = "live/{process}"
 """Liveliness token of a process."""
 
 
+@lru_cache(maxsize=4096)
 def topic_of_key(key: str) -> tuple[Topic, str | None] | None:
     """The topic a concrete key belongs to and what stands in its place, or None for a foreign key."""
     for topic in TOPICS:

@@ -109,26 +109,22 @@ class _ChunkIndexes:
     """
 
     def __init__(self) -> None:
-        self._written: list[bytes] = []
+        self._written, self._number = bytearray(), 0
 
     def append(self, index: ChunkIndex) -> None:
         builder = RecordBuilder()
         index.write(builder)
-        self._written.append(builder.end())
+        self._written += builder.end()
+        self._number += 1
 
-    def __iter__(self) -> Iterator[_Written]:
-        return map(_Written, self._written)
+    def __iter__(self) -> Iterator[_ChunkIndexes]:
+        return iter((self,))  # the writer asks each to write itself
 
     def __len__(self) -> int:
-        return len(self._written)
-
-
-@dataclass(frozen=True)
-class _Written:
-    data: bytes
+        return self._number
 
     def write(self, stream: RecordBuilder) -> None:
-        stream.write(self.data)
+        stream.write(bytes(self._written))
 
 
 class LogWriter:

@@ -46,7 +46,7 @@ def repeat(log: Path, out: Path, hours: float) -> int:
     scenario = msgspec.json.decode(text)
     period_ns = round(ticks * 1e9 / scenario["time"]["rate_hz"])
     times = max(1, round(hours * 3.6e12 / period_ns))
-    scenario["duration_s"] = times * period_ns / 1e9
+    scenario["duration_s"] = (times * ticks - 1) / scenario["time"]["rate_hz"]  # the first tick is at zero
     writer = LogWriter(out)
     writer.describe(msgspec.json.encode(scenario).decode(), {k: v for k, v in run.items() if k != "crc32"})
     seq: dict[str, int] = {}

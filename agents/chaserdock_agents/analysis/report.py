@@ -157,7 +157,7 @@ def _chasers(flight: Flight, result: dict[str, Any]) -> str:
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
             _shown(c["position_mse_m2"], "m²"),
             _shown(c["orientation_mse_rad2"], "rad²"),
-            _shown(c["dock_time_s"], "s", digits=4) if c["docked"] else "no",
+            f"{c['dock_time_s']:.2f} s" if c["docked"] else "no",
             _shown(c["min_distance_target_m"], "m"),
             _shown(c["impulse_N_s"], "N s"),
         )

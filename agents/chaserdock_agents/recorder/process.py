@@ -6,6 +6,7 @@ the end it waits until it has all that the others say they published.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import queue
 import time
@@ -40,11 +41,27 @@ from .viewer import SHOWN
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
 _WRITING_NICE = 5
+# glibc's malloc.h
+_M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
+_MAPPED_FROM_BYTES = 1 << 18
 
 
 def main(options: ProcessOptions) -> int:
     """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
+    _give_memory_back()
     return take_part("recorder", "recorder", options, lambda *member: record(options, *member))
+
+
+def _give_memory_back() -> None:
+    """Large pieces (pictures, chunks, a part's index) go back to the system when they are done with, for days on end.
+
+    Left to itself glibc keeps pieces as large as the largest one freed so far, in a heap for each thread, and a
+    recorder grows for hours (``benchmarks/endurance.py``). Elsewhere there is nothing to set.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(_M_MMAP_THRESHOLD, _MAPPED_FROM_BYTES)
+        mallopt(_M_ARENA_MAX, 2)
 
 
 def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, cast
@@ -149,7 +150,9 @@ class Flight:
         fused = self.estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
         if fused.status in ("tracking", "predicting"):
             self._captures.join(fused, inputs.odometry)
-        for key in [k for k in self._odometry if k[1] < inputs.time_ns - _ODOMETRY_KEPT_NS]:
+        oldest_ns = inputs.time_ns - _ODOMETRY_KEPT_NS
+        # They came in the order of their times.
+        for key in list(itertools.takewhile(lambda k: k[1] < oldest_ns, self._odometry)):
             del self._odometry[key]
         seen = {s.chaser for s in inputs.sightings if s.solutions}
         return fused, target_message(inputs.tick, inputs.time_ns, fused, seen, self.estimator, self._camera)
@@ -271,41 +274,37 @@ class Flight:
         p, s = self._parameters, self.scenario
         times_s = np.arange(p.stages + 1, dtype=float) * p.dt_s
         nodes, middles = self._captures.path(ahead, p.dt_s, p.stages)
-        states, references, u_ref = [], [], []
+        states = []
         for i in ids:
-            when_s = effective_ns / 1e9 + times_s
-            offset = self.guidance.chasers[i].move.at(when_s)
-            q_off = self._attitudes(i, offset[0], when_s)
             coming = self._jets.coming(i, inputs.tick)
             if coming is None:
                 state = predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser)
             else:
                 state = predict_state_with_impulse(inputs.odometry[i], coming, effective_ns, s.chaser)
             states.append(state)
-            references.append(reference.references_on(nodes.positions_m, nodes.q_wxyz, offset[0], q_off))
-            if s.controller.feed_forward:
-                held = self.guidance.chasers[i].move.at(when_s[:-1] + p.dt_s / 2)
-                u_ref.append(
-                    reference.feed_forward(
-                        middles.omega_rad_s,
-                        *held,
-                        self._attitudes(i, held[0], when_s[:-1] + p.dt_s / 2),
-                        s.chaser.mass_kg,
-                        np.diag(s.chaser.inertia),
-                        middles.alpha_rad_s2,
-                        middles.acceleration_m_s2,
-                    )
-                )
-            else:
-                u_ref.append(np.zeros((p.stages, 6)))
+        when_s = effective_ns / 1e9 + times_s
+        (offsets, _, _), q_off = self._offsets(ids, when_s)
+        references = reference.references_on(nodes.positions_m, nodes.q_wxyz, offsets, q_off)
+        u_ref = np.zeros((len(ids), p.stages, 6))
+        if s.controller.feed_forward:
+            held, q_off = self._offsets(ids, when_s[:-1] + p.dt_s / 2)
+            u_ref = reference.feed_forward(
+                middles.omega_rad_s,
+                *held,
+                q_off,
+                s.chaser.mass_kg,
+                np.diag(s.chaser.inertia),
+                middles.alpha_rad_s2,
+                middles.acceleration_m_s2,
+            )
         limits = np.array([self._jets.limits(i) for i in ids])
         for row, i in enumerate(ids):
             if self._is_held(i):  # it gives nobody room: no more than what follows the target's motion
                 limits[row] = np.minimum(limits[row], 1.2 * np.abs(u_ref[row]).max(axis=0) + 1e-3)
         return NmpcInput(
             states=np.array(states),
-            references=np.array(references),
-            u_ref=np.array(u_ref),
+            references=references,
+            u_ref=u_ref,
             target_positions=nodes.positions_m,
             min_distance_target_m=np.array([self.guidance.min_distance_target_m(i) for i in ids])
             + self._margin_m(ahead),
@@ -313,6 +312,16 @@ class Flight:
             input_max=limits,
             corridors=corridor_rows([self.guidance.corridor(i) for i in ids], nodes.q_wxyz),
         )
+
+    def _offsets(self, ids: tuple[int, ...], times_s: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        """Where n chasers are to be in TRF at times (K,): offsets, their velocities and accelerations, each (n, K, 3),
+        and attitudes, body to TRF, (n, K, 4)."""
+        moves = [self.guidance.chasers[i].move.at(times_s) for i in ids]
+        q_off = np.empty((len(ids), len(times_s), 4))
+        for row, i in enumerate(ids):
+            q_off[row] = rotations.normalize(self._attitudes(i, moves[row][0], times_s))
+        positions, velocities, accelerations = (np.array(part) for part in zip(*moves, strict=True))
+        return (positions, velocities, accelerations), q_off
 
     def _attitudes(self, i: int, offsets: Array, times_s: Array) -> Array:
         """Attitude of a chaser's reference, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or (4,) where it

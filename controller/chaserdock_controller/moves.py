@@ -8,7 +8,9 @@ Acceleration is continuous throughout, so that the feed-forward is.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -30,6 +32,18 @@ class Part:
 
     duration_s: float
     coefficients: Array
+
+    @cached_property
+    def _rests(self) -> dict[int, Array]:
+        return {}
+
+    def rest(self, count: int) -> Array:
+        """Where it ends, (count, 3): the last row of its powers, as often, times its coefficients."""
+        found = self._rests.get(count)
+        if found is None:
+            powers = np.vander(np.full(count, self.duration_s), 6, increasing=True)
+            found = self._rests[count] = powers @ self.coefficients
+        return found
 
 
 @dataclass(frozen=True)
@@ -53,7 +67,11 @@ class Move:
         """Positions, velocities, accelerations (K, 3) at times (K,); at rest before and after."""
         t = np.asarray(times_s, dtype=float) - self.start_s
         position, velocity, acceleration = np.zeros((3, len(t), 3))
+        earliest_s = float(t.min(initial=math.inf))
         for part in self.parts:
+            if earliest_s > part.duration_s:  # a chaser that holds, most of the time
+                position += part.rest(len(t))
+                continue
             inside = ((t >= 0.0) & (t <= part.duration_s))[:, None]
             c = part.coefficients
             powers = np.vander(np.clip(t, 0.0, part.duration_s), 6, increasing=True)

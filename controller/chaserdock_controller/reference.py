@@ -45,20 +45,20 @@ def reference_trajectory(
     body to TRF. p_ref = p_tar + q_tar p_off q_tar*, q_ref = q_tar q_off (paper, section 4.1).
     """
     positions, attitudes = predict_target(position_m, velocity_m_s, q_wxyz, omega_rad_s, times_s)
-    return references_on(positions, attitudes, offset_position_m, q_off_wxyz)
+    return references_on(positions, attitudes, offset_position_m, normalize(q_off_wxyz))
 
 
 def references_on(
     positions_m: Array, attitudes_wxyz: Array, offset_position_m: ArrayLike, q_off_wxyz: ArrayLike
 ) -> Array:
-    """Reference poses (K, 7) on a target at ``positions_m`` (K, 3), WRF, and ``attitudes_wxyz`` (K, 4).
+    """Reference poses (..., K, 7) on a target at ``positions_m`` (K, 3), WRF, and ``attitudes_wxyz`` (K, 4).
 
-    As `reference_trajectory`, for any motion of the target.
+    As `reference_trajectory`, for any motion of the target and, with leading axes, for several chasers; ``q_off_wxyz``
+    is of unit length.
     """
-    offsets = np.broadcast_to(np.asarray(offset_position_m, dtype=float), positions_m.shape)
     return np.concatenate(
-        [positions_m + rotate(attitudes_wxyz, offsets), multiply(attitudes_wxyz, normalize(q_off_wxyz))],
-        axis=1,
+        [positions_m + rotate(attitudes_wxyz, offset_position_m), multiply(attitudes_wxyz, q_off_wxyz)],
+        axis=-1,
     )
 
 
@@ -99,11 +99,12 @@ def feed_forward(
     alpha_rad_s2: ArrayLike = (0.0, 0.0, 0.0),
     origin_acceleration_m_s2: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Array:
-    """Force and torque (K, 6), N and N m in chaser body axes, that following the reference takes.
+    """Force and torque (..., K, 6), N and N m in chaser body axes, that following the reference takes.
 
     omega, alpha (its derivative) and the acceleration of TRF's origin: each (3,) or (K, 3), in TRF axes. Offset
-    position, velocity and acceleration (K, 3) in TRF, one row per instant (for an input held over a stage, give the
-    stage's middle); q_off_wxyz (4,) or (K, 4) chaser body to TRF, whose own turning is taken as slow: it adds no torque.
+    position, velocity and acceleration (..., K, 3) in TRF, one row per instant (for an input held over a stage, give the
+    stage's middle), leading axes for several chasers; q_off_wxyz, unit, (4,) or (..., K, 4) chaser body to TRF, whose
+    own turning is taken as slow: it adds no torque.
     Acceleration in a rotating frame, a = a_0 + p'' + alpha x p + 2 omega x p' + omega x (omega x p) (Goldstein,
     "Classical Mechanics", eq. 4.91), turned into body axes; torque I alpha_b + omega_b x I omega_b. The
     target's position, velocity and attitude do not enter: in body axes the wrench is the same anywhere.
@@ -120,8 +121,8 @@ def feed_forward(
     alpha, inertia = np.asarray(alpha_rad_s2, dtype=float), np.asarray(inertia_kg_m2, dtype=float)
     acceleration = a + 2.0 * cross(omega, v) + cross(omega, cross(omega, p))
     acceleration = acceleration + cross(alpha, p) + np.asarray(origin_acceleration_m_s2, dtype=float)
-    q_off = normalize(q_off_wxyz)
+    q_off = np.asarray(q_off_wxyz, dtype=float)
     omega_body = rotate_inverse(q_off, omega)
     torque = cross(omega_body, omega_body @ inertia.T) + rotate_inverse(q_off, alpha) @ inertia.T
     force = mass_kg * rotate_inverse(q_off, acceleration)
-    return np.concatenate([force, np.broadcast_to(torque, force.shape)], axis=1)
+    return np.concatenate([force, np.broadcast_to(torque, force.shape)], axis=-1)

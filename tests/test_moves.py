@@ -96,6 +96,17 @@ def test_stop_comes_to_rest_a_little_further_on(a: Any, b: Any, share: float) ->
     assert stopping.duration_s <= 3.0
 
 
+def test_one_that_has_ended_is_where_one_about_to_end_goes() -> None:
+    move = move_to(stay([0.3, -0.2, 0.7], 2.0), [0.6, 0.1, 0.5], 2.0, 0.03)
+    end_s = move.start_s + move.duration_s
+    for count in (1, 16):
+        later = np.linspace(1e-6, 5.0, count) + end_s
+        # One time on the way: then nothing is taken from what a part remembers.
+        both = [part[1:] for part in move.at(np.array([end_s - 1.0, *later]))]
+        for held, told in zip(move.at(later), both, strict=True):
+            np.testing.assert_allclose(held, told, rtol=0, atol=1e-15)
+
+
 def test_moves_take_their_time() -> None:
     # The quintic's peak is 15/8 of its mean speed.
     assert move_to(stay([0, 0, 0], 0.0), [0.6, 0, 0], 0.0, 0.03).duration_s == pytest.approx(37.5)

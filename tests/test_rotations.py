@@ -304,10 +304,17 @@ def test_arrays_give_bit_for_bit_what_single_ones_give(shape: tuple[int, ...]) -
         close(rotations.to_matrix(a)[place], rotations.to_matrix(a[place]), 0)
         close(rotations.cross(v, a[..., 1:])[place], rotations.cross(v[place], a[place][1:]), 0)
         close(rotations.skew(v)[place], rotations.skew(v[place]), 0)
-        # Norms of arrays and of single ones may round differently.
-        close(rotations.exp(v)[place], rotations.exp(v[place]), 1e-15)
-        close(rotations.log(a)[place], rotations.log(a[place]), 1e-15)
-        close(rotations.angle_between(a, b)[place], rotations.angle_between(a[place], b[place]), 1e-15)
+        close(rotations.exp(v)[place], rotations.exp(v[place]), 0)
+        close(rotations.log(a)[place], rotations.log(a[place]), 0)
+        close(rotations.angle_between(a, b)[place], rotations.angle_between(a[place], b[place]), 0)
+
+
+@quick
+@given(rotation_vectors(), quaternions)
+def test_exp_and_log_of_one_are_bit_for_bit_those_of_many(phi: Array, q: Array) -> None:
+    close(rotations.exp(phi), rotations.exp(phi[None])[0], 0)
+    for turn in (q, -q, rotations.exp(phi)):
+        close(rotations.log(turn), rotations.log(turn[None])[0], 0)
 
 
 def test_one_rotation_turns_many_vectors_and_many_rotations_one() -> None:

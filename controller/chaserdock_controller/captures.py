@@ -128,11 +128,12 @@ class Captures:
             fine = tumble(self.body, *state, step_s / 2, 2 * steps)
             return fine.every(0), fine.every(1)
         times_s = np.arange(steps + 1) * step_s
-        middles_s = times_s[:-1] + step_s / 2
-        nodes, middles = (reference.predict_target(*state, t) for t in (times_s, middles_s))
+        both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
+        positions, attitudes = reference.predict_target(*state, both_s)
         still = np.zeros((steps + 1, 3))
-        rates = still + ahead.omega_rad_s
-        return TargetPath(*nodes, rates, still, still), TargetPath(*middles, rates[1:], still[1:], still[1:])
+        rates, k = still + ahead.omega_rad_s, steps + 1
+        nodes = TargetPath(positions[:k], attitudes[:k], rates, still, still)
+        return nodes, TargetPath(positions[k:], attitudes[k:], rates[1:], still[1:], still[1:])
 
     def senses(self, i: int, fused: Fused, odometry: Odometry, told: DockingStatus | None) -> Senses | None:
         """What guidance wants to know of a chaser at its port; None where it has none."""

@@ -17,6 +17,9 @@ _SETTLED_M_S, _SETTLED_RAD_S = 0.01, 0.02
 
 def settled(fused: Fused) -> bool:
     """Whether the target's rates are known well enough to fly by."""
+    sums = [float(fused.covariance.diagonal()[i : i + 3].sum()) for i in (3, 9)]
+    if sums[0] < _SETTLED_M_S**2 and sums[1] < _SETTLED_RAD_S**2:
+        return True  # no eigenvalue is larger than the sum of all
     largest = [float(np.linalg.eigvalsh(fused.covariance[i : i + 3, i : i + 3])[-1]) for i in (3, 9)]
     return largest[0] < _SETTLED_M_S**2 and largest[1] < _SETTLED_RAD_S**2
 

@@ -8,6 +8,7 @@ the leading axes. Formulae: J. Sola, "Quaternion kinematics for the error-state 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -140,7 +141,8 @@ def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
     turned = log(multiply(conjugate(a), b))
     if turned.ndim == 1:
         x, y, z = turned.tolist()
-        return np.float64(math.sqrt(x * x + y * y + z * z))
+        angle: Any = np.float64(math.sqrt(x * x + y * y + z * z))
+        return angle
     return np.linalg.norm(turned, axis=-1)
 
 

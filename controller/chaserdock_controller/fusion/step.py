@@ -108,6 +108,9 @@ def shaken(state: FilterState, shocks: list[Shock]) -> FilterState:
 
 def is_lost(branch: Branch, p: MekfParameters) -> bool:
     """Whether the branch is too uncertain to be of use."""
+    x, y, z, _, _, _, a, b, c = branch.covariance.diagonal()[:9].tolist()
+    if x + y + z <= p.lost_position_m**2 and a + b + c <= p.lost_attitude_rad**2:
+        return False  # no eigenvalue is larger than the sum of all
     position, attitude = pose_sigmas(branch.covariance)
     return position > p.lost_position_m or attitude > p.lost_attitude_rad
 

@@ -291,7 +291,7 @@ def _plane_poses(seen: _Seen) -> list[Pose]:
     pixels, matrix = seen.pixels.reshape(-1, 2), seen.camera.matrix()
     try:
         _, rvecs, tvecs, rms_px = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
-        if not np.min(np.asarray(rms_px)) < _PLANE_RMS_PX:
+        if not np.asarray(rms_px).min() < _PLANE_RMS_PX:
             # Seen exactly from ahead, OpenCV's IPPE makes any rotation vector out of a turn by 180 degrees.
             _, rvecs, tvecs, _ = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # degenerate corners
@@ -300,9 +300,13 @@ def _plane_poses(seen: _Seen) -> list[Pose]:
     for rvec, tvec in zip(rvecs, tvecs, strict=True):
         rotation = rotation_matrix(rvec) @ to_trf.T
         position = np.asarray(tvec, dtype=float).ravel() - rotation @ origin
-        if np.all(np.isfinite(rotation)) and np.all(np.isfinite(position)):
+        if _all_finite(rotation) and _all_finite(position):
             poses.append(Pose(position, rotation))
     return poses
+
+
+def _all_finite(values: Array) -> bool:
+    return all(map(math.isfinite, values.ravel().tolist()))
 
 
 def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:

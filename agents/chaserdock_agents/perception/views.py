@@ -20,11 +20,12 @@ def marker_errors(
 ) -> list[float]:
     """Distance (n,) in pixels of each marker's worst corner; infinite if behind or seen from behind.
 
-    ``points_trf_m`` (n, 4, 3): corners; ``normals_trf`` (n, 3); ``pixels`` (n, 4, 2): ideal, C-contiguous.
+    ``points_trf_m`` (n, 4, 3): corners; ``normals_trf`` (n, 3); ``pixels`` (n, 4, 2): ideal.
     """
     to_irf, n = pose.rotation.T, len(points_trf_m)
     at = points_trf_m.reshape(-1, 3) @ to_irf
     at += pose.position
+    pixels = np.ascontiguousarray(pixels, dtype=float)
     outwards, error = normals_trf @ to_irf, np.empty(n)
     function("marker_errors")(
         _lens(camera), address(at), address(pixels), address(outwards), c_int64(n), address(error)

@@ -124,8 +124,9 @@ def region_of(
 ) -> Region | None:
     """Where in the picture a target with this predicted pose is; None for "look at all of it"."""
     turn = rotations.to_matrix(q_irf_trf_wxyz)
-    points = (_CUBE * model.size_m) @ turn.T + np.asarray(position_irf_m)
-    if not np.all(np.isfinite(points)) or np.any(points[:, 2] < 0.02):
+    points = _box(model.size_m) @ turn.T + np.asarray(position_irf_m)
+    # Infinity or NaN anywhere makes the sum of all one of them.
+    if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
         return None
     x_px, y_px = camera.project(points).T.tolist()
     across, down = _grown(x_px, camera.width_px), _grown(y_px, camera.height_px)
@@ -137,6 +138,12 @@ def region_of(
     if (right - left) * (bottom - top) > _REGION_LIMIT * camera.width_px * camera.height_px:
         return None
     return left, top, right, bottom
+
+
+@lru_cache
+def _box(size_m: tuple[float, float, float]) -> Array:
+    """Corners (8, 3) of a box about the origin."""
+    return _CUBE * size_m
 
 
 def _grown(px: list[float], end: int) -> tuple[int, int] | None:

@@ -22,7 +22,7 @@ from chaserdock_protocol.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
 from chaserdock_agents.perception.refine import Pose, refine, residual_of, rotation_matrix
-from chaserdock_agents.perception.views import marker_errors, plain_markers
+from chaserdock_agents.perception.views import marker_errors, plain_markers, squared_errors
 
 Indices = NDArray[np.intp]
 
@@ -206,10 +206,11 @@ def pose_covariance(
         return None
     variance = max(floor_px**2, rss / (len(residual) - 6))
     # Metres and radians are scaled to comparable size before the condition is judged.
-    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
-    scale = scale * scale[:, None]
+    each = [1.0 / math.sqrt(max(d, 1e-300)) for d in information.diagonal().tolist()]
+    scale = np.array([[a * b for b in each] for a in each])
     values, vectors = np.linalg.eigh(information * scale)
-    if not values[0] > 1e-12 * values[-1]:
+    least, *_, largest = values.tolist()
+    if not least > 1e-12 * largest:
         return None
     inverse = (vectors / values) @ vectors.T * scale
     return variance * 0.5 * (inverse + inverse.T), rss
@@ -219,15 +220,14 @@ def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
     """Root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
-    error = camera.project_ideal(points_trf_m @ rotation.T + position) - pixels
-    return float(np.sqrt((error**2).sum(axis=-1).mean()))
+    squares = squared_errors(camera, points_trf_m, pixels, Pose(position, rotation))
+    return math.sqrt(float(squares.sum()) / len(squares))
 
 
 def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
     """The pose on which the most markers agree, refined, and which of ``seen`` these are, in ascending order."""
     which: list[int] = seen.which.tolist()
-    best: tuple[int, float] | None = None
-    pose, error = Pose(np.zeros(3), np.eye(3)), list[float]()
+    best: tuple[tuple[int, float], Pose, list[float]] | None = None
     for candidate in _candidates(seen):
         candidate_error = _marker_errors(seen, candidate)
         # Not the number of detections: two of one id cannot both be right.
@@ -235,13 +235,14 @@ def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
         support = len(set(near))
         if support == 0:
             continue
-        score = (support, -float(np.minimum(candidate_error, _COARSE_GATE_PX).sum()))
-        if best is None or score > best:
-            best, pose, error = score, candidate, candidate_error
+        score = support, -float(np.minimum(candidate_error, _COARSE_GATE_PX).sum())
+        if best is None or score > best[0]:
+            best = score, candidate, candidate_error
         if support == len(which) and max(candidate_error) < _FINE_GATE_PX:
             break  # all agree: no other candidate is needed
     if best is None:
         return None
+    _, pose, error = best
     used = _one_of_each(which, error, _COARSE_GATE_PX)
     for _ in range(3):
         refined = _refined(seen.part(used), pose)
@@ -263,16 +264,18 @@ def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
 
 def _candidates(seen: _Seen) -> Iterator[Pose]:
     """Coarse poses to choose from, the likeliest first."""
-    if len(seen.which) > 1:
-        points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-        try:
-            _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-                points, pixels, seen.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP
-            )
-        except cv2.error:  # degenerate corners
-            rvecs, tvecs = (), ()
-        for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
-            yield Pose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
+    if len(seen.which) == 1:
+        yield from seen.plane_poses
+        return
+    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
+    try:
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+            points, pixels, seen.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # degenerate corners
+        rvecs, tvecs = (), ()
+    for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
+        yield Pose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
     size = np.abs(seen.pixels[:, (1, 2, 3, 0)] - seen.pixels).sum(axis=-1).min(axis=-1)
     for i in np.argsort(-size, kind="stable")[:_CANDIDATE_MARKERS].tolist():
         yield from seen.part([i]).plane_poses

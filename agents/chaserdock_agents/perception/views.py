@@ -33,6 +33,16 @@ def marker_errors(
     return error.tolist()
 
 
+def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: Pose) -> Array:
+    """Squared distance (n,), ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2); NaN for points not in
+    front of the camera."""
+    at, n = points_trf_m @ pose.rotation.T, len(points_trf_m)
+    at += pose.position
+    pixels, square = np.ascontiguousarray(pixels, dtype=float), np.empty(n)
+    function("squared_errors")(_lens(camera), address(at), address(pixels), c_int64(n), address(square))
+    return square
+
+
 def plain_markers(
     camera: Camera, surface_trf: Array, row: int, pose: Pose, frame_margin_px: float
 ) -> tuple[int, float]:

@@ -8,6 +8,17 @@ static inline int project(const double *lens, const double *at, double *px) {
     return 1;
 }
 
+/* Squared distance (n), pixels, of points ``at`` (n, 3) in IRF from ``pixels`` (n, 2), ideal; NaN for points not in front. */
+EXPORT void NAME(squared_errors)(const double *lens, const double *at, const double *pixels, int64_t n, double *square) {
+    for (int64_t i = 0; i < n; i++) {
+        double px[2];
+        square[i] = __builtin_nan("");
+        if (!project(lens, at + 3 * i, px)) continue;
+        double x = px[0] - pixels[2 * i], y = px[1] - pixels[2 * i + 1];
+        square[i] = x * x + y * y;
+    }
+}
+
 /* Distance (n) in pixels of each marker's worst corner from ``pixels`` (n, 4, 2), ideal; infinite for a marker behind the
  * camera or seen from behind. ``at`` (n, 4, 3): corners in IRF, m; ``outwards`` (n, 3): normals in IRF. */
 EXPORT void NAME(marker_errors)(const double *lens, const double *at, const double *pixels, const double *outwards, int64_t n,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -69,7 +70,19 @@ class Camera:
 
     def matrix(self) -> Array:
         """Camera matrix (3, 3)."""
+        return self._matrix.copy()
+
+    @cached_property
+    def _matrix(self) -> Array:
         return np.array([[self.fx_px, 0.0, self.cx_px], [0.0, self.fy_px, self.cy_px], [0.0, 0.0, 1.0]])
+
+    @cached_property
+    def _focal(self) -> Array:
+        return np.array([self.fx_px, self.fy_px])
+
+    @cached_property
+    def _centre(self) -> Array:
+        return np.array([self.cx_px, self.cy_px])
 
     def project(self, points_irf_m: ArrayLike) -> Array:
         """Pixels (..., 2), with lens distortion, of points (..., 3) in IRF; NaN for points not in front."""
@@ -79,14 +92,14 @@ class Camera:
         """Ideal pixels (..., 2) of points (..., 3) in IRF; NaN for points not in front of the camera."""
         points = np.asarray(points_irf_m, dtype=float)
         z = np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
-        return points[..., :2] / z * (self.fx_px, self.fy_px) + (self.cx_px, self.cy_px)
+        return points[..., :2] / z * self._focal + self._centre
 
     def distort(self, ideal_px: ArrayLike) -> Array:
         """Ideal pixels (..., 2) to pixels in the distorted picture (..., 2)."""
         ideal_px = np.asarray(ideal_px, dtype=float)
         if not self.distortion:
             return ideal_px.copy()
-        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        focal, centre = self._focal, self._centre
         return self._distort_normalized((ideal_px - centre) / focal) * focal + centre
 
     def undistort(self, px: ArrayLike) -> Array:
@@ -98,7 +111,7 @@ class Camera:
         px = np.asarray(px, dtype=float)
         if not self.distortion:
             return px.copy()
-        focal, centre = np.array([self.fx_px, self.fy_px]), np.array([self.cx_px, self.cy_px])
+        focal, centre = self._focal, self._centre
         goal = (px - centre) / focal
         x = goal.copy()
         tolerance = 1e-9 / self.fx_px

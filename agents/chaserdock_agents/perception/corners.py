@@ -72,6 +72,10 @@ class Refined:
     good: NDArray[np.bool_]
     relative_sigma: Array
 
+    def part(self, which: NDArray[np.bool_]) -> Refined:
+        """Those ``which`` (n,)."""
+        return Refined(self.corners_px[which], self.good[which], self.relative_sigma[which])
+
     def with_others(self, which: NDArray[np.bool_], others: Refined) -> Refined:
         """These, with ``others`` in the place of the markers ``which`` (n,)."""
         corners, good, sigma = self.corners_px.copy(), self.good.copy(), self.relative_sigma.copy()
@@ -103,7 +107,7 @@ def refine(
     """
     corners = np.array(corners_ideal_px, dtype=float, order="C")
     n = len(corners)
-    image, margin = np.ascontiguousarray(image), np.array(margin_share, dtype=float)
+    image, margin = np.ascontiguousarray(image), np.array(margin_share, dtype=float, order="C")
     if min(image.shape) < 2:
         raise ValueError(f"a picture of {image.shape} has no corners")
     good, sigma = np.zeros(n, dtype=np.uint8), np.ones(n)
@@ -114,4 +118,4 @@ def refine(
         lens, c_int64(bool(k.distortion)), byref(_SETTINGS), c_double(cells),
         c_int64(n), address(margin), address(corners), address(good), address(sigma),
     )  # fmt: skip
-    return Refined(corners, good.astype(bool), sigma)
+    return Refined(corners, good.view(np.bool_), sigma)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import NamedTuple
 
 import cv2
@@ -92,19 +94,25 @@ def detect(
     return Detections(found.ids, found.corners_px + np.array([left, top]))
 
 
-def _detect(part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: _Windows) -> Detections:
+@lru_cache(maxsize=4096)
+def _detector(dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: int) -> cv2.aruco.ArucoDetector:
+    """OpenCV's detector for pictures whose longer side has so many pixels; kept, as a flight meets few sizes."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = windows.least_px
     parameters.adaptiveThreshWinSizeMax = windows.most_px
     parameters.adaptiveThreshWinSizeStep = windows.step_px
     parameters.minMarkerDistanceRate = windows.distance_rate
     # A rate of the size of the picture passed in, so it differs between a region and the whole.
-    parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / max(part.shape)
+    parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_px
     # The rate counts from the longer side too; a marker that fills the picture must pass.
     parameters.maxMarkerPerimeterRate = 8.0
     parameters.maxErroneousBitsInBorderRate = 0.15
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(part)
+    return cv2.aruco.ArucoDetector(dictionary, parameters)
+
+
+def _detect(part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: _Windows) -> Detections:
+    corners, ids, _ = _detector(dictionary, windows, max(part.shape)).detectMarkers(part)
     if ids is None or len(ids) == 0:
         return NOTHING
     px = np.array(corners, dtype=float).reshape(-1, 4, 2)
@@ -116,18 +124,32 @@ def region_of(
 ) -> Region | None:
     """Where in the picture a target with this predicted pose is; None for "look at all of it"."""
     turn = rotations.to_matrix(q_irf_trf_wxyz)
-    points = (_CUBE * model.size_m) @ turn.T + np.asarray(position_irf_m)
-    if not np.all(np.isfinite(points)) or np.any(points[:, 2] < 0.02):
+    points = _box(model.size_m) @ turn.T + np.asarray(position_irf_m)
+    # Infinity or NaN anywhere makes the sum of all one of them.
+    if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
         return None
-    px = camera.project(points)
-    low, high = px.min(axis=0), px.max(axis=0)
-    grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX
-    left, top = np.maximum(np.floor(low - grow), 0).astype(int).tolist()
-    right, bottom = (
-        np.minimum(np.ceil(high + grow) + 1, (camera.width_px, camera.height_px)).astype(int).tolist()
-    )
+    x_px, y_px = camera.project(points).T.tolist()
+    across, down = _grown(x_px, camera.width_px), _grown(y_px, camera.height_px)
+    if across is None or down is None:
+        return None
+    (left, right), (top, bottom) = across, down
     if right - left < 16 or bottom - top < 16:
         return None
     if (right - left) * (bottom - top) > _REGION_LIMIT * camera.width_px * camera.height_px:
         return None
     return left, top, right, bottom
+
+
+@lru_cache
+def _box(size_m: tuple[float, float, float]) -> Array:
+    """Corners (8, 3) of a box about the origin."""
+    return _CUBE * size_m
+
+
+def _grown(px: list[float], end: int) -> tuple[int, int] | None:
+    """Where along one axis of the picture, ``end`` pixels long, these coordinates and a margin are; None for nowhere."""
+    low, high = min(px), max(px)
+    grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX
+    if not math.isfinite(grow):
+        return None
+    return math.floor(max(low - grow, 0.0)), min(math.ceil(min(high + grow, end)) + 1, end)

@@ -89,9 +89,9 @@ class Perception:
         self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
     ) -> Sighting:
         found = detect.detect(image, self._dictionary, region, thorough, self._enough)
-        rows = np.array([self._rows.get(int(i), -1) for i in found.ids], dtype=np.intp)
-        px = self.camera.undistort(found.corners_px[rows >= 0])
-        rows = rows[rows >= 0]
+        rows = np.array([self._rows.get(i, -1) for i in found.ids.tolist()], dtype=np.intp)
+        known = rows >= 0
+        px, rows = self.camera.undistort(found.corners_px[known]), rows[known]
         cells = self._dictionary.markerSize + 2
         margin = self._table.margin_share[rows]
         refined = corners.refine(image, self.camera, px, cells, margin)
@@ -102,8 +102,8 @@ class Perception:
             refined = refined.with_others(
                 lost, corners.refine(image, self.camera, inner, cells, margin[lost])
             )
-        rows, px = rows[refined.good], refined.corners_px[refined.good]
-        sigma = refined.relative_sigma[refined.good]
+            refined, rows = refined.part(refined.good), rows[refined.good]
+        px, sigma = refined.corners_px, refined.relative_sigma
         solutions, used = pnp.solve(self.camera, self._table, rows, px, sigma)
         return self._sighting(found.ids, solutions, self._table.ids[rows[used]], px[used])
 

@@ -8,8 +8,10 @@ sigma^2 (J'J)^-1 as covariance. OpenCV's EPnP is left alone: it fails on coplana
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -20,6 +22,7 @@ from chaserdock_protocol.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
 from chaserdock_agents.perception.refine import Pose, refine, residual_of, rotation_matrix
+from chaserdock_agents.perception.views import marker_errors, plain_markers, squared_errors
 
 Indices = NDArray[np.intp]
 
@@ -69,6 +72,16 @@ class MarkerTable:
     rotations: Array
     margin_share: Array
 
+    @cached_property
+    def normals(self) -> Array:
+        """Unit vectors (m, 3) in TRF, out of the marked faces."""
+        return np.ascontiguousarray(self.rotations[:, :, 2])
+
+    @cached_property
+    def surface(self) -> Array:
+        """Corners (4 m, 3), then origins (m, 3), then normals (m, 3): what a rotation turns at once."""
+        return np.concatenate([self.corners.reshape(-1, 3), self.origins, self.normals])
+
     @classmethod
     def of(cls, model: TargetModel) -> MarkerTable:
         """The table of a model's markers, in their order."""
@@ -94,7 +107,22 @@ class _Seen:
     pixels: Array
     sigma: Array
 
-    def part(self, of: Indices) -> _Seen:
+    @cached_property
+    def normals(self) -> Array:
+        """Unit vectors (n, 3) in TRF, out of the marked faces."""
+        return self.table.normals[self.which]
+
+    @cached_property
+    def weight(self) -> Array:
+        """Of each number (8 n,) among the pixels."""
+        return np.repeat(1.0 / self.sigma, 8)
+
+    @cached_property
+    def plane_poses(self) -> list[Pose]:
+        """As `_plane_poses`, which of a lone marker are both its candidates and its two poses."""
+        return _plane_poses(self)
+
+    def part(self, of: list[int]) -> _Seen:
         if len(of) == len(self.which):  # indices are ascending and distinct: all of them
             return self
         return _Seen(
@@ -117,35 +145,37 @@ def solve(
     nothing: tuple[tuple[PoseSolution, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
     if not len(which):
         return nothing
-    seen = _Seen(camera, table, which, table.corners[which], np.asarray(corners_ideal_px), relative_sigma)
+    seen = _Seen(
+        camera,
+        table,
+        which,
+        table.corners[which],
+        np.array(corners_ideal_px, dtype=float, order="C"),
+        relative_sigma,
+    )
     found = _consensus(seen)
     if found is None:
         return nothing
     pose, used = found
     if len(which) >= 2 * len(used):
-        others = np.delete(np.arange(len(which)), used)
-        rival = _consensus(seen.part(others))
+        others = set(range(len(which))).difference(used)
+        rival = _consensus(seen.part(sorted(others)))
         if rival is not None and len(rival[1]) >= len(used):
             return nothing
 
     seen = seen.part(used)
     poses = [pose]
-    first = table.rotations[seen.which[0]][:, 2] if len(used) else np.zeros(3)
-    if np.ptp(seen.points @ first) < 1e-6:  # all in one plane: there may be a second pose
-        poses += _other_than(pose, _plane_poses(seen))
+    # All in one plane, as those of one marker are: there may be a second pose.
+    if len(used) == 1 or np.ptp(seen.points @ seen.normals[0]) < 1e-6:
+        poses += _other_than(pose, seen.plane_poses)
     floor = SIGMA_FLOOR_SINGLE_PX if len(used) == 1 else SIGMA_FLOOR_PX
     solutions = _solutions(seen, poses, floor)
     if not solutions or solutions[0].reprojection_rms_px > MAX_RMS_PX:
         return nothing
     if len(used) == 1:
         row = int(seen.which[0])
-        solutions = [
-            s
-            for s in solutions
-            if _view_cosines(table, s)[row] >= MIN_SINGLE_COSINE
-            and _missing(camera, table, row, s) < _MAX_MISSING
-        ]
-    return (tuple(solutions), used) if solutions else nothing
+        solutions = [s for s in solutions if _may_stand_alone(camera, table, row, s)]
+    return (tuple(solutions), np.array(used, dtype=np.intp)) if solutions else nothing
 
 
 def pose_covariance(
@@ -176,10 +206,11 @@ def pose_covariance(
         return None
     variance = max(floor_px**2, rss / (len(residual) - 6))
     # Metres and radians are scaled to comparable size before the condition is judged.
-    scale = 1.0 / np.sqrt(np.maximum(information.diagonal(), 1e-300))
-    scale = scale * scale[:, None]
+    each = [1.0 / math.sqrt(max(d, 1e-300)) for d in information.diagonal().tolist()]
+    scale = np.array([[a * b for b in each] for a in each])
     values, vectors = np.linalg.eigh(information * scale)
-    if not values[0] > 1e-12 * values[-1]:
+    least, *_, largest = values.tolist()
+    if not least > 1e-12 * largest:
         return None
     inverse = (vectors / values) @ vectors.T * scale
     return variance * 0.5 * (inverse + inverse.T), rss
@@ -189,29 +220,30 @@ def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
     """Root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
-    error = camera.project_ideal(points_trf_m @ rotation.T + position) - pixels
-    return float(np.sqrt((error**2).sum(axis=-1).mean()))
+    squares = squared_errors(camera, points_trf_m, pixels, Pose(position, rotation))
+    return math.sqrt(float(squares.sum()) / len(squares))
 
 
-def _consensus(seen: _Seen) -> tuple[Pose, Indices] | None:
-    """The pose on which the most markers agree, refined, and which of ``seen`` these are."""
-    best: tuple[int, float] | None = None
-    pose, error = Pose(np.zeros(3), np.eye(3)), np.zeros(0)
+def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
+    """The pose on which the most markers agree, refined, and which of ``seen`` these are, in ascending order."""
+    which: list[int] = seen.which.tolist()
+    best: tuple[tuple[int, float], Pose, list[float]] | None = None
     for candidate in _candidates(seen):
         candidate_error = _marker_errors(seen, candidate)
-        near = candidate_error < _COARSE_GATE_PX
         # Not the number of detections: two of one id cannot both be right.
-        support = len(set(seen.which[near].tolist()))
+        near = [row for row, e in zip(which, candidate_error, strict=True) if e < _COARSE_GATE_PX]
+        support = len(set(near))
         if support == 0:
             continue
-        score = (support, -float(np.minimum(candidate_error, _COARSE_GATE_PX).sum()))
-        if best is None or score > best:
-            best, pose, error = score, candidate, candidate_error
-        if support == len(near) and bool(np.all(candidate_error < _FINE_GATE_PX)):
+        score = support, -float(np.minimum(candidate_error, _COARSE_GATE_PX).sum())
+        if best is None or score > best[0]:
+            best = score, candidate, candidate_error
+        if support == len(which) and max(candidate_error) < _FINE_GATE_PX:
             break  # all agree: no other candidate is needed
     if best is None:
         return None
-    used = _one_of_each(seen.which, error, _COARSE_GATE_PX)
+    _, pose, error = best
+    used = _one_of_each(which, error, _COARSE_GATE_PX)
     for _ in range(3):
         refined = _refined(seen.part(used), pose)
         if refined is None:
@@ -219,11 +251,12 @@ def _consensus(seen: _Seen) -> tuple[Pose, Indices] | None:
         pose, error = refined, _marker_errors(seen, refined)
         gate = 2.0 * _FINE_GATE_PX
         if len(used) > 2:
-            gate = min(max(_FINE_GATE_PX, _FINE_GATE_SIGMAS * float(np.median(error[used]))), _COARSE_GATE_PX)
-        kept = _one_of_each(seen.which, error, gate)
-        if len(kept) == 0:
+            sigmas = _FINE_GATE_SIGMAS * statistics.median(error[k] for k in used)
+            gate = min(max(_FINE_GATE_PX, sigmas), _COARSE_GATE_PX)
+        kept = _one_of_each(which, error, gate)
+        if not kept:
             return None
-        if np.array_equal(kept, used):
+        if kept == used:
             break
         used = kept
     return pose, used
@@ -231,24 +264,26 @@ def _consensus(seen: _Seen) -> tuple[Pose, Indices] | None:
 
 def _candidates(seen: _Seen) -> Iterator[Pose]:
     """Coarse poses to choose from, the likeliest first."""
-    if len(seen.which) > 1:
-        points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-        try:
-            _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
-                points, pixels, seen.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP
-            )
-        except cv2.error:  # degenerate corners
-            rvecs, tvecs = (), ()
-        for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
-            yield Pose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
+    if len(seen.which) == 1:
+        yield from seen.plane_poses
+        return
+    points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
+    try:
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(
+            points, pixels, seen.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP
+        )
+    except cv2.error:  # degenerate corners
+        rvecs, tvecs = (), ()
+    for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
+        yield Pose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
     size = np.abs(seen.pixels[:, (1, 2, 3, 0)] - seen.pixels).sum(axis=-1).min(axis=-1)
-    for i in np.argsort(-size, kind="stable")[:_CANDIDATE_MARKERS]:
-        yield from _plane_poses(seen.part(np.array([i])))
+    for i in np.argsort(-size, kind="stable")[:_CANDIDATE_MARKERS].tolist():
+        yield from seen.part([i]).plane_poses
 
 
 def _refined(seen: _Seen, pose: Pose) -> Pose | None:
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
-    return refine(seen.camera.matrix(), points, pixels, np.repeat(1.0 / seen.sigma, 8), pose)
+    return refine(seen.camera.matrix(), points, pixels, seen.weight, pose)
 
 
 def _plane_poses(seen: _Seen) -> list[Pose]:
@@ -259,7 +294,7 @@ def _plane_poses(seen: _Seen) -> list[Pose]:
     pixels, matrix = seen.pixels.reshape(-1, 2), seen.camera.matrix()
     try:
         _, rvecs, tvecs, rms_px = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
-        if not np.min(np.asarray(rms_px)) < _PLANE_RMS_PX:
+        if not np.asarray(rms_px).min() < _PLANE_RMS_PX:
             # Seen exactly from ahead, OpenCV's IPPE makes any rotation vector out of a turn by 180 degrees.
             _, rvecs, tvecs, _ = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # degenerate corners
@@ -268,9 +303,13 @@ def _plane_poses(seen: _Seen) -> list[Pose]:
     for rvec, tvec in zip(rvecs, tvecs, strict=True):
         rotation = rotation_matrix(rvec) @ to_trf.T
         position = np.asarray(tvec, dtype=float).ravel() - rotation @ origin
-        if np.all(np.isfinite(rotation)) and np.all(np.isfinite(position)):
+        if _all_finite(rotation) and _all_finite(position):
             poses.append(Pose(position, rotation))
     return poses
+
+
+def _all_finite(values: Array) -> bool:
+    return all(map(math.isfinite, values.ravel().tolist()))
 
 
 def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:
@@ -278,9 +317,9 @@ def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:
     of two, the one several times nearer to it than the other."""
     if len(candidates) != 2:
         return candidates
-    near, far = sorted(candidates, key=lambda candidate: _angle(candidate.rotation, pose.rotation))
-    if _angle(near.rotation, pose.rotation) < _SAME_POSE_SHARE * _angle(far.rotation, pose.rotation):
-        return [far]
+    a, b = (_angle(candidate.rotation, pose.rotation) for candidate in candidates)
+    if min(a, b) < _SAME_POSE_SHARE * max(a, b):
+        return candidates[1:] if a < b else candidates[:1]
     return candidates
 
 
@@ -316,40 +355,21 @@ def _solutions(seen: _Seen, poses: list[Pose], floor_px: float) -> list[PoseSolu
     return [solution for rss, solution in found if (rss - least) / variance <= _AMBIGUITY_LIMIT]
 
 
-def _one_of_each(which: Indices, error: Array, gate_px: float) -> Indices:
+def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[int]:
     """Indices, in order, of the detections within the gate: of several of one marker, that of least error."""
     kept: dict[int, int] = {}
-    for k in np.argsort(error, kind="stable").tolist():
+    for k in sorted(range(len(error)), key=error.__getitem__):
         if error[k] < gate_px:
-            kept.setdefault(int(which[k]), k)
-    return np.array(sorted(kept.values()), dtype=np.intp)
+            kept.setdefault(which[k], k)
+    return sorted(kept.values())
 
 
-def _marker_errors(seen: _Seen, pose: Pose) -> Array:
-    """Distance (n,) in pixels of each marker's worst corner; infinite if behind or seen from behind."""
-    at = seen.points @ pose.rotation.T + pose.position
-    error = np.sqrt(((seen.camera.project_ideal(at) - seen.pixels) ** 2).sum(axis=-1)).max(axis=-1)
-    outwards = seen.table.rotations[seen.which][:, :, 2] @ pose.rotation.T
-    facing = (outwards * at[:, 0]).sum(axis=-1) < 0.0
-    return np.where(np.isfinite(error) & facing, error, np.inf)
+def _marker_errors(seen: _Seen, pose: Pose) -> list[float]:
+    return marker_errors(seen.camera, seen.points, seen.normals, seen.pixels, pose)
 
 
-def _view_cosines(table: MarkerTable, solution: PoseSolution) -> Array:
-    """Cosine (m,) of the angle at which each marker is seen: 1 from straight ahead, negative from behind."""
-    rotation = rotations.to_matrix(solution.q_irf_trf_wxyz)
-    centres = table.origins @ rotation.T + solution.position_irf_m
-    normals = table.rotations[:, :, 2] @ rotation.T
-    return -(normals * centres).sum(axis=1) / np.linalg.norm(centres, axis=1)
-
-
-def _missing(camera: Camera, table: MarkerTable, row: int, solution: PoseSolution) -> int:
-    """How many markers other than ``row`` should be as plain to see as that one, if the pose were right."""
-    at = table.corners @ rotations.to_matrix(solution.q_irf_trf_wxyz).T + solution.position_irf_m
-    px = camera.project_ideal(at)
-    size = np.abs(px[:, (1, 2, 3, 0)] - px).max(axis=-1).min(axis=-1)
-    frame = np.array([camera.width_px, camera.height_px]) - 1.0 - _FRAME_MARGIN_PX
-    inside = ((px > _FRAME_MARGIN_PX) & (px < frame)).all(axis=(1, 2))
-    cosines = _view_cosines(table, solution)
-    plain = inside & (size >= 0.6 * size[row]) & (cosines >= max(0.3, 0.7 * float(cosines[row])))
-    plain[row] = False
-    return int(plain.sum())
+def _may_stand_alone(camera: Camera, table: MarkerTable, row: int, solution: PoseSolution) -> bool:
+    """Whether the pose of a single marker says enough, and shows that one alone."""
+    pose = Pose(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
+    missing, cosine = plain_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)
+    return cosine >= MIN_SINGLE_COSINE and missing < _MAX_MISSING

@@ -47,7 +47,8 @@ def refine(matrix: Array, points: Array, pixels: Array, weight: Array, pose: Pos
     """The pose of least weighted squared error near ``pose``; None when that has points behind the camera.
     Arguments as for `residual_of`; the arithmetic is a kernel (native/pose.c)."""
     lens = (c_double * 4)(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
-    given = [np.array(a, dtype=float) for a in (points, pixels, weight)]
-    out = np.concatenate([pose.position, pose.rotation.ravel()])
+    given = [np.ascontiguousarray(a, dtype=float) for a in (points, pixels, weight)]
+    out = np.empty(12)
+    out[:3], out[3:] = pose.position, pose.rotation.ravel()
     refined = function("refine_pose", c_int64)(lens, *map(address, given), c_int64(len(points)), address(out))
     return Pose(out[:3], out[3:].reshape(3, 3)) if refined else None

@@ -11,5 +11,6 @@
 #include "tumble.c"
 #include "corners.c"
 #include "pose.c"
+#include "views.c"
 #include "scene.c"
 #include "noise.c"

@@ -1,0 +1,74 @@
+/* What the markers of a target look like from a pose: how far from where they were seen, which ones are plain to see. */
+#include "base.h"
+
+/* Ideal pixel of a point in IRF; 0, and nothing written, for one that is not in front. ``lens``: fx, fy, cx, cy. */
+static inline int project(const double *lens, const double *at, double *px) {
+    if (!(at[2] > 0.0)) return 0;
+    for (int k = 0; k < 2; k++) px[k] = at[k] / at[2] * lens[k] + lens[2 + k];
+    return 1;
+}
+
+/* Squared distance (n), pixels, of points ``at`` (n, 3) in IRF from ``pixels`` (n, 2), ideal; NaN for points not in front. */
+EXPORT void NAME(squared_errors)(const double *lens, const double *at, const double *pixels, int64_t n, double *square) {
+    for (int64_t i = 0; i < n; i++) {
+        double px[2];
+        square[i] = __builtin_nan("");
+        if (!project(lens, at + 3 * i, px)) continue;
+        double x = px[0] - pixels[2 * i], y = px[1] - pixels[2 * i + 1];
+        square[i] = x * x + y * y;
+    }
+}
+
+/* Distance (n) in pixels of each marker's worst corner from ``pixels`` (n, 4, 2), ideal; infinite for a marker behind the
+ * camera or seen from behind. ``at`` (n, 4, 3): corners in IRF, m; ``outwards`` (n, 3): normals in IRF. */
+EXPORT void NAME(marker_errors)(const double *lens, const double *at, const double *pixels, const double *outwards, int64_t n,
+                               double *error) {
+    for (int64_t m = 0; m < n; m++) {
+        double worst = 0.0;
+        int seen = dot3(outwards + 3 * m, at + 12 * m) < 0.0;
+        for (int64_t i = 4 * m; i < 4 * m + 4 && seen; i++) {
+            double px[2];
+            seen = project(lens, at + 3 * i, px);
+            if (!seen) break;
+            double x = px[0] - pixels[2 * i], y = px[1] - pixels[2 * i + 1], square = x * x + y * y;
+            seen = finite(square);
+            worst = most(worst, square);
+        }
+        error[m] = seen ? root(worst) : __builtin_inf();
+    }
+}
+
+/* ``surface`` (6 m, 3), turned into the axes of IRF: the 4 corners of each of m markers, then their centres, m, then their
+ * normals; moved to ``position`` here, the normals left. Writes the cosine (m) of the angle at which each is seen: 1 from
+ * straight ahead, negative from behind. Returns how many markers other than ``row`` are as plain to see as that one:
+ * ``frame_px`` (left and top, right, bottom) around all corners, about its size, about its angle. */
+EXPORT int64_t NAME(plain_markers)(const double *lens, const double *frame_px, const double *surface, const double *position,
+                                  int64_t markers, int64_t row, double *size, double *cosine) {
+    const double *centres = surface + 12 * markers, *normals = surface + 15 * markers;
+    for (int64_t m = 0; m < markers; m++) {
+        double px[4][2], centre[3];
+        int inside = 1;
+        for (int k = 0; k < 3; k++) centre[k] = centres[3 * m + k] + position[k];
+        cosine[m] = -dot3(normals + 3 * m, centre) / root(dot3(centre, centre));
+        for (int i = 0; i < 4 && inside; i++) {
+            double at[3];
+            for (int k = 0; k < 3; k++) at[k] = surface[12 * m + 3 * i + k] + position[k];
+            inside = project(lens, at, px[i]);
+        }
+        /* Not in front: no size, which is no less and no more than any. */
+        size[m] = __builtin_nan("");
+        if (!inside) continue;
+        for (int i = 0; i < 4; i++) {
+            const double *a = px[i], *b = px[(i + 1) % 4];
+            double side = most(size_of(b[0] - a[0]), size_of(b[1] - a[1]));
+            size[m] = i ? least(size[m], side) : side;
+            inside &= a[0] > frame_px[0] && a[0] < frame_px[1] && a[1] > frame_px[0] && a[1] < frame_px[2];
+        }
+        if (!inside && m != row) size[m] = __builtin_nan("");
+    }
+    int64_t count = 0;
+    double near = 0.6 * size[row], ahead = 0.7 * cosine[row];
+    if (!(ahead > 0.3)) ahead = 0.3;
+    for (int64_t m = 0; m < markers; m++) count += m != row && size[m] >= near && cosine[m] >= ahead;
+    return count;
+}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import sys
 from collections.abc import Callable
@@ -78,12 +77,12 @@ def changed(raw: Raw, **fields: Any) -> Raw:
     found = topics.topic_of_key(raw.key)
     assert found is not None
     message = msgspec.structs.replace(codec.decode(found[0].kind, raw.payload), **fields)
-    return dataclasses.replace(raw, payload=codec.encode(message))
+    return msgspec.structs.replace(raw, payload=codec.encode(message))
 
 
 BREACHES: list[tuple[str, Callable[[Raw], list[Raw]], str, str]] = [
-    ("controller/target", lambda r: [dataclasses.replace(r, encoding="application/msgpack")], "", "wrong encoding"),
-    ("controller/target", lambda r: [dataclasses.replace(r, payload=b"\xff")], "", "not of the message's type"),
+    ("controller/target", lambda r: [msgspec.structs.replace(r, encoding="application/msgpack")], "", "wrong encoding"),
+    ("controller/target", lambda r: [msgspec.structs.replace(r, payload=b"\xff")], "", "not of the message's type"),
     ("controller/target", lambda r: [changed(r, position_m=(math.nan, 0.0, 0.0))], "", "not finite"),
     ("controller/target", lambda r: [changed(r, q_wxyz=(1.0, 1.0, 0.0, 0.0))], "", "not of unit length"),
     ("controller/target", lambda r: [], "", "no answer within"),
@@ -96,10 +95,10 @@ BREACHES: list[tuple[str, Callable[[Raw], list[Raw]], str, str]] = [
     ("controller/chaser/1/wrench", lambda r: [changed(r, force_N=(1e3, 0.0, 0.0))], "", "the chaser refuses"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, term=7)], "", "not the tick's term"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, instance="another")], "", "not the tick's term"),
-    ("controller/target", lambda r: [r, dataclasses.replace(r, key="chaser/0/actuators")], "chaser/0/actuators",
+    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="chaser/0/actuators")], "chaser/0/actuators",
      "must not write"),
-    ("controller/target", lambda r: [r, dataclasses.replace(r, key="truth/world")], "truth/world", "must not write"),
-    ("controller/target", lambda r: [r, dataclasses.replace(r, key="my/own")], "my/own", "does not have"),
+    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="truth/world")], "truth/world", "must not write"),
+    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="my/own")], "my/own", "does not have"),
     ("controller/presence", lambda r: [changed(r, process="chaser/0")], "", "another process' presence"),
     ("controller/farewell", lambda r: [], "", "no farewell"),
     ("controller/farewell", lambda r: [changed(r, published={})], "", "not what was published"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
 
@@ -304,3 +305,43 @@ def test_a_bad_number_is_found_wherever_it_stands_in_a_long_list(bad: float, pla
 
 def test_many_large_numbers_are_no_bad_one() -> None:
     codec.check_numbers(msgspec.structs.replace(BY_TYPE[m.Plan], positions_m=(0.9e15,) * 60))
+
+
+BAD = [math.nan, math.inf, -math.inf, 1e15, 1.1e15, -1e16, 1.7e308, -1.0, 0.0, 1.0 + 2e-6]
+
+
+def with_number(message: msgspec.Struct, at: int, value: float) -> tuple[msgspec.Struct, int]:
+    """The message with its ``at``-th float replaced, as it may be decoded; how many it has left to count."""
+    for name in message.__struct_fields__:
+        held = getattr(message, name)
+        parts = held if isinstance(held, tuple) else (held,)
+        for k, part in enumerate(parts):
+            changed = part
+            if isinstance(part, msgspec.Struct):
+                changed, at = with_number(part, at, value)
+            elif isinstance(part, float):
+                changed, at = (value if at == 0 else part), at - 1
+            if changed is not part:
+                new = (*parts[:k], changed, *parts[k + 1 :]) if isinstance(held, tuple) else changed
+                return msgspec.structs.replace(message, **{name: new}), at
+    return message, at
+
+
+@pytest.mark.parametrize("kind", list(BY_TYPE), ids=lambda kind: kind.__name__)
+def test_the_quick_look_at_the_numbers_says_what_the_close_one_does(kind: type[msgspec.Struct]) -> None:
+    """Any of its floats bad: the whole check refuses with the words of the one that goes field by field, or neither does."""
+
+    def refusal(check: Callable[[msgspec.Struct], None], message: msgspec.Struct) -> str | None:
+        try:
+            check(message)
+        except codec.Rejected as refused:
+            return str(refused)
+        return None
+
+    at = 0
+    while with_number(BY_TYPE[kind], at, math.pi)[1] < 0:
+        for value in BAD:
+            message, _ = with_number(BY_TYPE[kind], at, value)
+            assert refusal(codec.check_numbers, message) == refusal(codec._check_one_by_one, message)
+        at += 1
+    assert refusal(codec.check_numbers, BY_TYPE[kind]) is None

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from msgspec import Struct
+
 from .topics import Topic
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
@@ -50,8 +52,7 @@ class Link:
     access_control: dict[str, Any] | None = None
 
 
-@dataclass(frozen=True)
-class Received:
+class Received(Struct, frozen=True):
     """A message that passed all checks. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
 
     topic: Topic
@@ -60,8 +61,7 @@ class Received:
     sent_ns: int
 
 
-@dataclass(frozen=True)
-class Raw:
+class Raw(Struct, frozen=True):
     """What came over the wire, unopened."""
 
     key: str

@@ -20,13 +20,12 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import msgspec
-from mcap.data_stream import RecordBuilder
-from mcap.records import Channel, ChunkIndex
+from mcap.records import Channel
 from mcap.records import Message as McapMessage
-from mcap.writer import CompressionType, Writer
 
 from . import provenance, topics
 from .codec import Rejected
+from .log_chunks import LeanWriter
 from .log_scan import (
     METADATA,
     VIEWER_PREFIX,
@@ -77,6 +76,14 @@ class _Header(msgspec.Struct):
 _header = msgspec.msgpack.Decoder(_Header)
 
 
+@dataclass(slots=True)
+class _Written:
+    """A channel of the file, and how many messages of it are there."""
+
+    channel: int
+    messages: int = 0
+
+
 class _Sink:
     """The file under the MCAP writer, which hands over whole records: one that does not fit is taken back."""
 
@@ -102,31 +109,6 @@ class _Sink:
         """Nothing is held back."""
 
 
-class _ChunkIndexes:
-    """The MCAP writer's list of chunk indexes, as the bytes that they become in the file.
-
-    As objects they take about ten kilobytes a chunk with sixty channels, in a flight of ten hours a gigabyte.
-    """
-
-    def __init__(self) -> None:
-        self._written, self._number = bytearray(), 0
-
-    def append(self, index: ChunkIndex) -> None:
-        builder = RecordBuilder()
-        index.write(builder)
-        self._written += builder.end()
-        self._number += 1
-
-    def __iter__(self) -> Iterator[_ChunkIndexes]:
-        return iter((self,))  # the writer asks each to write itself
-
-    def __len__(self) -> int:
-        return self._number
-
-    def write(self, stream: RecordBuilder) -> None:
-        stream.write(bytes(self._written))
-
-
 class LogWriter:
     """Writes a log; a kill costs at most the last second, be it of ``now_s`` or of the flight.
 
@@ -142,8 +124,7 @@ class LogWriter:
         self.last_time_ns = 0
         self._now_s = now_s
         self._broken = False
-        self._channels: dict[tuple[str, str], int] = {}
-        self._sequence: dict[int, int] = {}
+        self._channels: dict[tuple[str, str], _Written] = {}
         self._schemas: dict[str, int] = {}
         try:
             self._file = path.open("xb", buffering=0)
@@ -152,12 +133,7 @@ class LogWriter:
         except OSError as error:
             raise LogError(f"{path}: cannot be created: {error.strerror or error}") from None
         self._sink: Any = _Sink(self._file)
-        # Small chunks: what a reader holds in memory, and what an unclean end may cost inside the flush period.
-        self._writer = Writer(
-            self._sink, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True
-        )
-        # No setting of the library's does this; tests/test_log.py tells should its name there change.
-        vars(self._writer)["_Writer__chunk_indices"] = _ChunkIndexes()
+        self._writer = LeanWriter(self._sink)
         with self._writing():
             self._writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')}")
         self._flushed_s, self._flushed_ns = now_s(), 0
@@ -187,15 +163,19 @@ class LogWriter:
         with self._writing():
             self._writer.add_metadata(name, seal(data))
 
-    def write(self, key: str, encoding: str, payload: bytes, sent_ns: int) -> None:
-        """Appends one message, whatever it holds."""
+    def write(
+        self, key: str, encoding: str, payload: bytes, sent_ns: int, time_ns: int | None = None
+    ) -> None:
+        """Appends one message, whatever it holds. ``time_ns`` is its ``sim_time_ns``, where the caller has opened it."""
         channel = self._channels.get((key, encoding))
         if channel is None:
             with self._writing():
-                channel = self._channels[key, encoding] = self._register(key, encoding)
+                channel = self._channels[key, encoding] = _Written(self._register(key, encoding))
         try:
+            if time_ns is None:
+                time_ns = max(0, _header.decode(payload).sim_time_ns)
             # Zero: a message without a time of its own (presence), which belongs where it arrived.
-            self.last_time_ns = max(0, _header.decode(payload).sim_time_ns) or self.last_time_ns
+            self.last_time_ns = time_ns or self.last_time_ns
         except (msgspec.DecodeError, OverflowError, RecursionError, UnicodeDecodeError):
             self.unreadable += 1
         self._add(channel, self.last_time_ns, payload, sent_ns or self.last_time_ns)
@@ -217,25 +197,35 @@ class LogWriter:
             with self._writing():
                 if name not in self._schemas:
                     self._schemas[name] = self._writer.register_schema(name, encoding, data)
-                channel = self._writer.register_channel(topic, encoding, self._schemas[name])
+                channel = _Written(self._writer.register_channel(topic, encoding, self._schemas[name]))
             self._channels[topic, name] = channel
         self._add(channel, time_ns, payload, time_ns)
 
-    def _add(self, channel: int, time_ns: int, payload: bytes, sent_ns: int) -> None:
-        number = self._sequence.get(channel, 0)
-        with self._writing():
-            self._writer.add_message(channel, time_ns, payload, sent_ns, number)
-        self._sequence[channel] = number + 1
+    def _add(self, written: _Written, time_ns: int, payload: bytes, sent_ns: int) -> None:
+        # As ``_writing``, which would be a third of what a small message costs.
+        if self._broken:
+            raise self._not_continued()
+        try:
+            self._writer.add_message(written.channel, time_ns, payload, sent_ns, written.messages)
+        except OSError as error:
+            raise self._broken_by(error) from None
+        written.messages += 1
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         if self._broken:
-            raise LogError(f"{self.path}: could not be written before, and is not continued")
+            raise self._not_continued()
         try:
             yield
         except OSError as error:
-            self._broken = True
-            raise LogError(f"{self.path}: cannot be written: {error.strerror or error}") from None
+            raise self._broken_by(error) from None
+
+    def _not_continued(self) -> LogError:
+        return LogError(f"{self.path}: could not be written before, and is not continued")
+
+    def _broken_by(self, error: OSError) -> LogError:
+        self._broken = True
+        return LogError(f"{self.path}: cannot be written: {error.strerror or error}")
 
     def flush(self) -> None:
         """Hands everything written so far to the operating system."""

@@ -15,6 +15,7 @@ Units SI, radians; frames in the names: WRF world, CRF chaser body, TRF target b
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Annotated, Literal
 
 import msgspec
@@ -377,7 +378,12 @@ VERSION: dict[type[Struct], int] = {
 
 def encoding_of(kind: type[Struct]) -> str:
     """Zenoh encoding of a message type, such as ``application/msgpack;chaserdock.Odometry.v1``."""
-    return f"application/msgpack;chaserdock.{kind.__name__}.v{VERSION[kind]}"
+    return _encoding(kind, VERSION[kind])
+
+
+@cache
+def _encoding(kind: type[Struct], number: int) -> str:
+    return f"application/msgpack;chaserdock.{kind.__name__}.v{number}"
 
 
 def schema_of(kind: type[Struct]) -> bytes:

@@ -25,9 +25,9 @@ _WATCHERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "vie
 _KNOW_THE_TRUTH: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Topic:
-    """A key with one ``{chaser}`` or ``{process}`` place at most, and what goes over it.
+    """A key with one ``{chaser}`` or ``{process}`` place at most, and what goes over it. There is one of each.
 
     ``rate`` is per tick (``tick``), per tick with pictures (``picture``), once a second of simulated time
     (``second``), of wall time (``presence``), or when something happens (``event``).
@@ -42,13 +42,18 @@ class Topic:
 
     def key_of(self, place: int | str | None = None) -> str:
         """The concrete key, for a chaser's number or a process' name where the key has a place."""
-        if "{" not in self.key:
-            if place is not None:
-                raise ValueError(f"topic {self.key} has no place for {place!r}")
-            return self.key
-        if place is None:
-            raise ValueError(f"topic {self.key} needs a chaser or process")
-        return self.key.format(chaser=place, process=place)
+        return _key_of(self, place)
+
+
+@lru_cache(maxsize=4096, typed=True)
+def _key_of(topic: Topic, place: int | str | None) -> str:
+    if "{" not in topic.key:
+        if place is not None:
+            raise ValueError(f"topic {topic.key} has no place for {place!r}")
+        return topic.key
+    if place is None:
+        raise ValueError(f"topic {topic.key} needs a chaser or process")
+    return topic.key.format(chaser=place, process=place)
 
 
 def _topic(key, kind, writer, readers, rate, qos) -> Topic:

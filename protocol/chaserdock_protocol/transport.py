@@ -107,10 +107,10 @@ def _tls_values(tls: Tls) -> dict[str, Any]:
     }
 
 
-def _raw(sample: zenoh.Sample) -> Raw:
+def _raw(sample: zenoh.Sample, key: str) -> Raw:
     stamp = sample.timestamp
     sent_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
-    return Raw(str(sample.key_expr), str(sample.encoding), sample.payload.to_bytes(), sent_ns)
+    return Raw(key, str(sample.encoding), sample.payload.to_bytes(), sent_ns)
 
 
 @dataclass
@@ -177,12 +177,11 @@ class Node:
     def publish(self, topic: Topic, message: Message, place: int | str | None = None) -> None:
         """Numbers, encodes and sends a message."""
         key = topic.key_of(place)
-        if key not in self._publishers:
-            self.advertise(topic, place)
+        publisher = self._publishers.get(key) or self._publishers[self.advertise(topic, place)]
         for said in (message,) if self.faults is None else self.faults.outgoing(topic, place, message):
             payload = codec.encode(msgspec.structs.replace(said, seq=self._numbers[key]))
             self._numbers[key] += 1
-            self._publishers[key].put(payload, timestamp=self._session.new_timestamp())
+            publisher.put(payload, timestamp=self._session.new_timestamp())
 
     def publish_raw(self, raw: Raw) -> None:
         """Sends a recorded message as it was, with a new time stamp: for analysis alone."""
@@ -223,7 +222,7 @@ class Node:
             if found is None or found[0] is not topic:
                 self.counts.rejected["key"] += 1
                 return
-            raw = _raw(sample)
+            raw = _raw(sample, key)
             if latest:
                 with self._latest_lock:
                     waiting = key in self._latest
@@ -243,15 +242,14 @@ class Node:
         Of all that comes only the newest ``depth`` are kept. Zenoh itself drops the others, so that a reader who is
         slow or stands still costs the publishers nothing.
         """
-        ring = self._session.declare_subscriber(
-            self._readable(topic, place), zenoh.handlers.RingChannel(depth)
-        )
+        newest = zenoh.handlers.RingChannel(depth)
+        ring = self._session.declare_subscriber(self._readable(topic, place), newest)
         self._declared.append(ring)
 
         def take() -> list[Received]:
             out: list[Received] = []
             while (sample := ring.try_recv()) is not None and len(out) < depth:
-                raw = _raw(sample)
+                raw = _raw(sample, str(sample.key_expr))
                 found = topics.topic_of_key(raw.key)
                 received = self._checked(topic, found[1], raw) if found and found[0] is topic else None
                 if received is not None:
@@ -274,7 +272,7 @@ class Node:
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def callback(sample: zenoh.Sample) -> None:
-            arrived(_raw(sample))
+            arrived(_raw(sample, str(sample.key_expr)))
 
         self._declared.append(self._session.declare_subscriber(expression, callback))
 
@@ -286,6 +284,8 @@ class Node:
         """
         if self._ready:
             return self._ready.popleft()
+        if timeout_s == 0 and self._inbox.empty():
+            return None  # without an exception, for who looks often
         try:
             item = self._inbox.get(timeout_s)
         except queue.Empty:

@@ -40,7 +40,10 @@ def named(turn: Turn, process: str, instance: str) -> Turn:
         return turn
     tick = msgspec.structs.replace(turn.tick, instance=instance)
     payload = codec.encode(tick)
-    opening = [replace(raw, payload=payload) if raw.key == topics.TICK.key else raw for raw in turn.opening]
+    opening = [
+        msgspec.structs.replace(raw, payload=payload) if raw.key == topics.TICK.key else raw
+        for raw in turn.opening
+    ]
     return replace(turn, tick=tick, opening=opening)
 
 

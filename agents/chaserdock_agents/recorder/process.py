@@ -127,7 +127,7 @@ class Recorder:
         except queue.Empty:
             return
         found, message = topics.topic_of_key(raw.key), None
-        if found is not None and (found[0] in _READ or found[0] in SHOWN):
+        if found is not None and found[0] in _OPENED:
             with suppress(Rejected):
                 message = codec.decode(found[0].kind, raw.payload, raw.encoding)
         self.recording.write(raw, message)
@@ -195,4 +195,7 @@ class Recorder:
         return complete or time.monotonic() - self.ended_s > _DRAIN_S
 
 
-_READ = (topics.TICK, topics.ACTUATORS, topics.SOLVER, topics.PRESENCE, topics.FAREWELL, topics.END)
+_OPENED = SHOWN | {
+    topics.TICK, topics.ACTUATORS, topics.SOLVER, topics.PRESENCE, topics.FAREWELL, topics.END
+}  # fmt: skip
+"""Topics whose messages are opened: those shown, and those that ``_note`` reads."""

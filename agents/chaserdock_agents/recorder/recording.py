@@ -51,12 +51,13 @@ class Recording:
         self._from_ns = None
 
     def write(self, raw: Raw, message: Any) -> None:
-        """Appends what came over the wire; ``message`` is the same opened, or None if the viewers need not see it."""
+        """Appends what came over the wire; ``message`` is the same opened, or None if nobody here needs it."""
         if self._rotation.wanted and self._is_full():
             self._writer.close()
             self._part += 1
             self._open()
-        self._writer.write(raw.key, raw.encoding, raw.payload, raw.sent_ns)
+        time_ns = None if message is None else message.sim_time_ns
+        self._writer.write(raw.key, raw.encoding, raw.payload, raw.sent_ns, time_ns)
         if self._from_ns is None:
             self._from_ns = self._writer.last_time_ns
         if self._viewer is not None and message is not None:

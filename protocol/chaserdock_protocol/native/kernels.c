@@ -13,3 +13,5 @@
 #include "pose.c"
 #include "scene.c"
 #include "noise.c"
+#include "blur.c"
+#include "samples.c"

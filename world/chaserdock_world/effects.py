@@ -79,7 +79,7 @@ class CameraEffects:
             raise ValueError(f"expected a uint8 picture of {self._shape}, got {image.dtype} {image.shape}")
         out = image
         if self.effects.gain != 1.0:
-            out = cv2.convertScaleAbs(out, alpha=self.effects.gain)
+            out = np.asarray(cv2.convertScaleAbs(out, alpha=self.effects.gain), dtype=np.uint8)
         if self.effects.point_spread_px > 0.0:
             out = blurred(out, self.effects.point_spread_px)
         if self._bank is not None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -18,6 +19,8 @@ from numpy.typing import NDArray
 _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
 # Fixed-point steps a unit of white noise: 16 bits hold eight standard deviations.
 _NOISE_STEPS = 4096.0
+# Pixels of a block in native/pixels.h: the farthest that native/blur.c reaches.
+_BLOCK_PX = 32
 
 
 @dataclass(frozen=True)
@@ -76,11 +79,9 @@ class CameraEffects:
             raise ValueError(f"expected a uint8 picture of {self._shape}, got {image.dtype} {image.shape}")
         out = image
         if self.effects.gain != 1.0:
-            out = cv2.convertScaleAbs(out, alpha=self.effects.gain)
+            out = np.asarray(cv2.convertScaleAbs(out, alpha=self.effects.gain), dtype=np.uint8)
         if self.effects.point_spread_px > 0.0:
-            sigma = self.effects.point_spread_px
-            width = 2 * int(np.ceil(3.0 * sigma)) + 1
-            out = cv2.GaussianBlur(out, (width, width), sigma, borderType=cv2.BORDER_REPLICATE)
+            out = blurred(out, self.effects.point_spread_px)
         if self._bank is not None:
             # The 1 keeps these streams apart from the bank's own.
             seeds = np.random.SeedSequence([self.seed, 1, chaser, picture]).generate_state(3)
@@ -90,8 +91,46 @@ class CameraEffects:
             # Grey levels are whole, so noise rounded to whole ones before it is added is no loss.
             out, noisy = np.ascontiguousarray(out), np.empty(self._shape, dtype=np.uint8)
             function("add_noise")(
-                c_void_p(out.ctypes.data), c_void_p(noise.ctypes.data), c_int64(noise.strides[0] // noise.itemsize),
+                c_void_p(out.ctypes.data), c_void_p(noise.ctypes.data), c_int64(self._bank.shape[1]),
                 address(self._sigma), c_double(sign * self._to_levels), *map(c_int64, self._shape), address(noisy),
             )  # fmt: skip
             return noisy
         return np.array(out, dtype=np.uint8) if out is image else np.asarray(out, dtype=np.uint8)
+
+
+@cache
+def blur_taps(sigma_px: float) -> NDArray[np.uint16]:
+    """Weights (2 r + 1,) of a Gaussian blur, in 256ths, of sum 256; r: three sigma, rounded up.
+
+    As OpenCV has them for 8-bit pictures: rounded from the outside inwards, each error passed on to the next weight.
+    """
+    radius = int(np.ceil(3.0 * sigma_px))
+    exact = 256.0 * cv2.getGaussianKernel(2 * radius + 1, sigma_px).ravel()
+    taps, error = np.zeros(2 * radius + 1, dtype=np.uint16), 0.0
+    for i, weight in enumerate(exact[:radius].tolist()):
+        taps[i] = taps[-1 - i] = whole = round(weight + error)
+        error += weight - whole
+    taps[radius] = 256 - 2 * int(taps[:radius].sum())
+    return taps
+
+
+def blurred(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
+    """The picture (h, w) with a Gaussian blur of ``sigma_px``, beyond its borders as at them: to the bit what
+    cv2.GaussianBlur gives, but quick where a picture is even, as most of space is."""
+    taps = blur_taps(sigma_px)
+    (rows, columns), width = image.shape, len(taps)
+    if width // 2 > _BLOCK_PX:  # the kernel looks no farther; such a blur is rare
+        out = cv2.GaussianBlur(image, (width, width), sigma_px, borderType=cv2.BORDER_REPLICATE)
+        return np.asarray(out, dtype=np.uint8)
+    image, out = np.ascontiguousarray(image), np.empty((rows, columns), dtype=np.uint8)
+    blocks = -(-columns // _BLOCK_PX)
+    sums = np.empty((width, blocks, _BLOCK_PX), dtype=np.float32)
+    levels, made = (
+        np.empty((width + 4, blocks + 2), dtype=np.int32),
+        np.empty((width, blocks), dtype=np.int32),
+    )
+    function("blur")(
+        c_void_p(image.ctypes.data), c_int64(rows), c_int64(columns), address(taps), c_int64(width // 2),
+        address(sums), address(levels), address(made), address(out),
+    )  # fmt: skip
+    return out

@@ -89,7 +89,7 @@ class Physics:
 
     def _set_velocity(self, body: int, state: BodyState) -> None:
         omega_world = rotations.rotate(state.q_wxyz, state.omega_rad_s)
-        self._bullet.resetBaseVelocity(body, state.velocity_m_s.tolist(), omega_world.tolist())
+        pybullet.resetBaseVelocity(body, state.velocity_m_s.tolist(), omega_world.tolist(), self._client)
 
     def _add_target(self, scenario: Scenario) -> int:
         target, model = scenario.target, scenario.target_model()
@@ -136,12 +136,16 @@ class Physics:
         if name == TARGET and self._prescribed:
             return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
         body = self._bodies[name]
-        return _state_of(self._bullet.getBasePositionAndOrientation(body), self._bullet.getBaseVelocity(body))
+        client = self._client
+        return _state_of(
+            pybullet.getBasePositionAndOrientation(body, client), pybullet.getBaseVelocity(body, client)
+        )
 
     def place(self, name: str, state: BodyState) -> None:
         """Puts a body into a state, touching or not: for tests and for what starts in the middle of a mission."""
         body = self._bodies[name]
-        self._bullet.resetBasePositionAndOrientation(body, state.position_m.tolist(), _xyzw(state.q_wxyz))
+        position, attitude = state.position_m.tolist(), _xyzw(state.q_wxyz)
+        pybullet.resetBasePositionAndOrientation(body, position, attitude, self._client)
         self._set_velocity(body, state)
 
     def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:

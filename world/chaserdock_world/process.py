@@ -10,6 +10,7 @@ import time
 import uuid
 from collections.abc import Callable, Mapping
 
+import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.errors import ChaserdockError
@@ -33,6 +34,8 @@ from .publish import publish_docking, publish_odometry, publish_truth
 
 def main(options: ProcessOptions) -> int:
     """Runs the world of ``options.scenario``; 0 when it was flown to its end, 1 when not, 2 for bad input."""
+    # Other processes need the cores, and OpenCV's idle threads spin between a picture's many short calls.
+    cv2.setNumThreads(1)
     node: Node | None = None
     try:
         scenario = load_world_scenario(options)

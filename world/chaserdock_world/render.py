@@ -21,6 +21,7 @@ from chaserdock_world import textures
 from chaserdock_world.faces import Frustum, Obstacle, Shapes, paint_order, see_faces, shapes_of, texture_place
 from chaserdock_world.lens import Lens
 from chaserdock_world.patches import Rectangle, patches
+from chaserdock_world.samples import spread, take_means
 from chaserdock_world.sky import Earth, Light, Sky
 
 # Samples a pixel along each axis: the most that keep the samples of the painted patch below the limit.
@@ -131,8 +132,7 @@ class Renderer:
             return
         view = canvas[y0:y1, x0:x1]
         samples = next((n for n, limit in _SAMPLES if n * n * view.size <= limit), 1)
-        size = (samples * (x1 - x0), samples * (y1 - y0))
-        fine = np.asarray(cv2.resize(view, size, interpolation=cv2.INTER_NEAREST), dtype=np.uint8)
+        fine = spread(view, samples) if samples > 1 else view
         for k in faces:
             face, shape = scene.faces[k], scene.of_box[int(scene.faces["box"][k])]
             # Ideal pixel of the camera -> sample of the fine patch; pixel centres are integers in both.
@@ -144,7 +144,8 @@ class Renderer:
                 value = min(255, round(scene.levels[k] * scene.shapes.shades[shape]))
                 fixed = np.rint(outline * 16.0).astype(np.int32)
                 cv2.fillConvexPoly(fine, fixed, value, cv2.LINE_8, 4)
-        cv2.resize(fine, (x1 - x0, y1 - y0), dst=view, interpolation=cv2.INTER_AREA)
+        if samples > 1:
+            take_means(fine, samples, view)
 
     def _paint_texture(
         self,

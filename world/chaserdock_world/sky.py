@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from ctypes import c_int64
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
 from chaserdock_protocol import rotations
 from chaserdock_protocol.camera import Camera
+from chaserdock_protocol.native import address, function
 from chaserdock_protocol.rotations import Array
 from numpy.typing import NDArray
 
@@ -45,10 +48,12 @@ class Light:
         if not (np.isfinite(length) and length > 0.0):
             raise ValueError("the light needs a direction other than zero")
 
-    @property
+    @cached_property
     def direction_w(self) -> Array:
-        """Unit vector (3,) in WRF, to the sun."""
-        return np.array(self.to_sun_w) / np.linalg.norm(self.to_sun_w)
+        """Unit vector (3,) in WRF, to the sun; read-only."""
+        direction = np.array(self.to_sun_w) / np.linalg.norm(self.to_sun_w)
+        direction.setflags(write=False)
+        return direction
 
     def level(self, cosine: float, to_camera: Array, normal: Array) -> float:
         """Grey level of a white face with the sun at ``cosine`` from its normal; ``to_camera`` (3,), metres,
@@ -79,6 +84,9 @@ class Sky:
         stars = generator.standard_normal((_STARS, 3))
         self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)
         self._star_levels = (30.0 + 150.0 * generator.random(_STARS) ** 3).astype(np.uint8)
+        # As Camera.project_ideal: focal lengths, centre, and the canvas' first pixel.
+        lens = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *origin_px.tolist())
+        self._lens = np.array(lens)
         if earth is not None:
             self._albedo = _albedo_map(generator)
             self._rays = _rays(camera, origin_px, size_px, _EARTH_STEP_PX)
@@ -89,10 +97,10 @@ class Sky:
         canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
         turn = rotations.to_matrix(q_w_irf_wxyz)
         directions = self._stars @ turn
-        front = directions[:, 2] > 0.1
-        px = np.rint(self._camera.project_ideal(directions[front]) - self._origin).astype(int)
-        inside = (px[:, 0] >= 0) & (px[:, 0] < width) & (px[:, 1] >= 0) & (px[:, 1] < height)
-        canvas[px[inside, 1], px[inside, 0]] = self._star_levels[front][inside]
+        function("draw_stars")(
+            address(directions), address(self._star_levels), c_int64(_STARS), address(self._lens),
+            c_int64(width), c_int64(height), address(canvas),
+        )  # fmt: skip
         if self._earth is not None:
             self._draw_earth(canvas, turn, self._earth, light or Light())
         return canvas

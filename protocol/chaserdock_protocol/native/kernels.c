@@ -14,3 +14,5 @@
 #include "views.c"
 #include "scene.c"
 #include "noise.c"
+#include "blur.c"
+#include "samples.c"

@@ -295,3 +295,19 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
     for (int i = 0; i < 9; i++) matrix[i] /= largest;
     return 1;
 }
+
+/* Stars in directions (count, 3) of IRF, each a pixel of its level, on a canvas (height, width); none nearer to the camera's
+ * plane than a tenth. ``lens``: fx, fy, cx, cy, the canvas' first pixel. */
+EXPORT void NAME(draw_stars)(const double *directions, const uint8_t *levels, int64_t count, const double *lens, int64_t width,
+                            int64_t height, uint8_t *canvas) {
+    for (int64_t i = 0; i < count; i++) {
+        const double *d = directions + 3 * i;
+        if (!(d[2] > 0.1)) continue;
+        double x = d[0] / d[2] * lens[0] + lens[2] - lens[4], y = d[1] / d[2] * lens[1] + lens[3] - lens[5];
+        /* Added and taken away again, 1.5 * 2^52 rounds to the nearest whole number, halves to even. */
+        if (!(x > -1.0 && y > -1.0 && x < (double)width && y < (double)height)) continue;
+        int64_t column = (int64_t)((x + 6755399441055744.0) - 6755399441055744.0);
+        int64_t row = (int64_t)((y + 6755399441055744.0) - 6755399441055744.0);
+        if (column >= 0 && column < width && row >= 0 && row < height) canvas[row * width + column] = levels[i];
+    }
+}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from itertools import groupby
 from typing import Any, cast
 
@@ -44,7 +43,7 @@ def _named_once(recorded: Iterable[Received]) -> Iterator[tuple[str, list[Receiv
         yield (
             last.commander,
             [
-                replace(r, message=msgspec.structs.replace(r.message, **names))
+                msgspec.structs.replace(r, message=msgspec.structs.replace(r.message, **names))
                 if r.topic is topics.TICK
                 else r
                 for r in came

@@ -70,7 +70,9 @@ class Fleet:
                 stdout=out,
                 stderr=subprocess.STDOUT,
                 env={**os.environ, **SINGLE_THREADED},
-                start_new_session=True,
+                # Ctrl-C is the launcher's to pass on. Not a session of its own: Linux would share the cores between
+                # sessions ("autogroup") whatever the processes' priorities, and who woke up last would wait longest.
+                process_group=0,
             )
         self.children.append(Child(name, process, words))
 

@@ -40,7 +40,7 @@ from .viewer import SHOWN
 
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
-_WRITING_NICE = 5
+_WRITING_NICE = 19
 # glibc's malloc.h
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
 _MAPPED_FROM_BYTES = 1 << 18

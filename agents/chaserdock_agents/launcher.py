@@ -52,6 +52,11 @@ class Child:
         return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: ended without a word"
 
 
+# Of Zenoh's two receiving threads the second mostly wakes up in vain: with one, seven processes on two cores answer in two
+# thirds of the time (benchmarks/realtime.py). Not for a router, where one that waits for a slow reader would hold up all.
+_ZENOH_THREADS = "(rx: (worker_threads: 1))"
+
+
 @dataclass
 class Fleet:
     """All processes of a run."""
@@ -69,7 +74,7 @@ class Fleet:
                 stdin=subprocess.PIPE,
                 stdout=out,
                 stderr=subprocess.STDOUT,
-                env={**os.environ, **SINGLE_THREADED},
+                env={"ZENOH_RUNTIME": _ZENOH_THREADS, **os.environ, **SINGLE_THREADED},
                 # Ctrl-C is the launcher's to pass on. Not a session of its own: Linux would share the cores between
                 # sessions ("autogroup") whatever the processes' priorities, and who woke up last would wait longest.
                 process_group=0,

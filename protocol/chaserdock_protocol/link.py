@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -10,10 +9,6 @@ from typing import Any, Literal
 from msgspec import Struct
 
 from .topics import Topic
-
-# Zenoh reads this at its first session. Of two receiving threads the second mostly wakes up in vain: with one, seven
-# processes on two cores answer in two thirds of the time (benchmarks/realtime.py).
-os.environ.setdefault("ZENOH_RUNTIME", "(rx: (worker_threads: 1))")
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_NAMESPACE = "chaserdock"

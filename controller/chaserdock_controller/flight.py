@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Literal, cast
@@ -150,9 +149,7 @@ class Flight:
         fused = self.estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
         if fused.status in ("tracking", "predicting"):
             self._captures.join(fused, inputs.odometry)
-        oldest_ns = inputs.time_ns - _ODOMETRY_KEPT_NS
-        # They came in the order of their times.
-        for key in list(itertools.takewhile(lambda k: k[1] < oldest_ns, self._odometry)):
+        for key in [k for k in self._odometry if k[1] < inputs.time_ns - _ODOMETRY_KEPT_NS]:
             del self._odometry[key]
         seen = {s.chaser for s in inputs.sightings if s.solutions}
         return fused, target_message(inputs.tick, inputs.time_ns, fused, seen, self.estimator, self._camera)

@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from itertools import takewhile
 from typing import Any
 
 import msgspec
@@ -333,9 +332,7 @@ class Controller:
         self._answered = (tick, out, took_s)
         self._sightings.clear()
         self._seen = {key for key in self._seen if key[0] > tick.tick}
-        # They came in the order of their ticks, or nearly.
-        for key in list(takewhile(lambda k: k[0] <= tick.tick - _REMEMBERED_TICKS, self._used)):
-            del self._used[key]
+        self._used = {key: used for key, used in self._used.items() if key[0] > tick.tick - _REMEMBERED_TICKS}
         self._missed = {missed for missed in self._missed if missed[2] > tick.tick}
         self.done_tick = tick.tick
         if commands_it:

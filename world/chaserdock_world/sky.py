@@ -79,7 +79,7 @@ class Sky:
     def __init__(
         self, camera: Camera, origin_px: Array, size_px: tuple[int, int], earth: Earth | None = None
     ):
-        self._camera, self._origin, self._size, self._earth = camera, origin_px, size_px, earth
+        self._size, self._earth = size_px, earth
         generator = np.random.Generator(np.random.PCG64(20230619))
         stars = generator.standard_normal((_STARS, 3))
         self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)

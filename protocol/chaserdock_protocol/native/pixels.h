@@ -8,12 +8,9 @@
 
 typedef uint8_t u8x16 __attribute__((vector_size(16), aligned(1), may_alias));
 typedef uint8_t u8x32 __attribute__((vector_size(32), aligned(1), may_alias));
-typedef int16_t i16x32 __attribute__((vector_size(64), aligned(2), may_alias));
 typedef uint16_t u16x16 __attribute__((vector_size(32), aligned(2), may_alias));
 typedef int32_t i32x16 __attribute__((vector_size(64), aligned(4), may_alias));
-typedef int32_t i32x32 __attribute__((vector_size(128), aligned(4), may_alias));
 typedef float f32x16 __attribute__((vector_size(64), aligned(4), may_alias));
-typedef float f32x32 __attribute__((vector_size(128), aligned(4), may_alias));
 typedef uint64_t word __attribute__((aligned(1), may_alias));
 
 /* The level that all pixels of a block have, or -1. */

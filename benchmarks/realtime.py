@@ -1,21 +1,24 @@
-"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--seconds 15] [--only NAME] [--keep DIR] [--quick]
-[--json FILE]``.
+"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--flights 1] [--only SUBJECT] [--seconds 5]
+[--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
 
 Flies ``four-chaser-docking`` in real time with ticks and pictures at 30 Hz, 640 x 480, every process on this machine, and
 measures from a picture's sending to the sending of the actuator command that answers it (both stamps are the senders').
-Three flights: with the recorder as it is, with one that is frozen (SIGSTOP) while it is measured, and with one that
-runs a tenth of the time. ``lost``: ticks of a chaser without any command from the controller; ``missed``: commands later
-than 33 ms. Also each process' CPU time. Wall-clock figures: nothing else should run beside it.
+A flight for each subject, ``recorder`` and ``viewer`` (the recorder runs in both; the viewer is asked for by one client that
+reads all it gets). In windows of ``--seconds`` that take turns in the same flight, the subject is left as it is, frozen
+(SIGSTOP), left as it is, and slow (runs for a tenth of the time): what the machine does meanwhile touches all of them.
+``lost``: ticks of a chaser without any command from the controller; ``missed``: commands later than 33 ms; ``ratio``: the
+99th percentile over that of the windows as it is. Also each process' share of a core. Wall-clock figures: nothing else
+should run beside it.
 """
 
 from __future__ import annotations
 
+import asyncio
 import signal
 import tempfile
 import threading
 import time
 import uuid
-from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,18 +26,24 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import psutil
-from chaserdock_agents.launcher import Child, Fleet, open_hub
+import viser
+import websockets
+from chaserdock_agents.launcher import Fleet, free_port, open_hub
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.transport import Node, Raw
 from results import options_of, write_json
+from websockets.asyncio.client import connect
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "four-chaser-docking.toml"
 CHASERS = 4
 RATE_HZ = 30
 SETTLE_S = 6.0
+PAUSE_S = 1.0
+"""Between windows: whoever was stopped catches up."""
 LATE_S = 0.033
+SUBJECTS = ("recorder", "viewer")
 LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",
@@ -77,8 +86,18 @@ class Ear:
 
 
 @dataclass(frozen=True)
+class Window:
+    """One condition for a while: ticks of which all answers count, and each process' share of a core."""
+
+    condition: str
+    first: int
+    last: int
+    cpu_share: dict[str, float]
+
+
+@dataclass(frozen=True)
 class Flown:
-    """One flight: latencies of all commands (s), and how many ticks of chasers had none."""
+    """All windows of one condition: latencies of all commands (s), and how many ticks of chasers had none."""
 
     latency_s: np.ndarray
     ticks: int
@@ -88,32 +107,37 @@ class Flown:
     def quantile(self, q: float) -> float:
         return float(np.quantile(self.latency_s, q)) if len(self.latency_s) else float("nan")
 
+    @property
+    def missed(self) -> int:
+        return int(np.sum(self.latency_s > LATE_S))
 
-def alone(recorder: psutil.Process, stop: threading.Event) -> None:
-    """The recorder as it is."""
+
+def as_it_is(subject: psutil.Process, stop: threading.Event) -> None:
+    """Not touched."""
 
 
-def frozen(recorder: psutil.Process, stop: threading.Event) -> None:
+def frozen(subject: psutil.Process, stop: threading.Event) -> None:
     """Stopped until the end."""
-    recorder.send_signal(signal.SIGSTOP)
+    subject.send_signal(signal.SIGSTOP)
     stop.wait()
-    recorder.send_signal(signal.SIGCONT)
+    subject.send_signal(signal.SIGCONT)
 
 
-def slow(recorder: psutil.Process, stop: threading.Event) -> None:
+def slow(subject: psutil.Process, stop: threading.Event) -> None:
     """It runs for 20 ms of every 200."""
     while not stop.is_set():
-        recorder.send_signal(signal.SIGSTOP)
+        subject.send_signal(signal.SIGSTOP)
         stop.wait(0.18)
-        recorder.send_signal(signal.SIGCONT)
+        subject.send_signal(signal.SIGCONT)
         stop.wait(0.02)
 
 
-DISTURBANCES = {"recorder": alone, "frozen_recorder": frozen, "slow_recorder": slow}
+CONDITIONS = {"as_it_is": as_it_is, "frozen": frozen, "slow": slow}
+ROUND = ("as_it_is", "frozen", "as_it_is", "slow")
 
 
-def start(fleet: Fleet, folder: Path, seconds: float, network: list[str]) -> Child:
-    """All processes of the mission; the recorder's."""
+def start(fleet: Fleet, folder: Path, seconds: float, network: list[str], subject: str) -> None:
+    """All processes of the mission, and the viewer where it is the subject."""
     words = folder / "processes"
     words.mkdir()
     sets = [part for o in (*OVERRIDES, f"duration_s={seconds}") for part in ("--set", o)]
@@ -123,50 +147,84 @@ def start(fleet: Fleet, folder: Path, seconds: float, network: list[str]) -> Chi
     for i in range(CHASERS):
         fleet.start(f"chaser/{i}", ["chaser", str(i), *network, "--patience", "120"], words)
     fleet.start("recorder", ["record", "--out", str(folder), *network, "--patience", "120"], words)
-    return fleet.children[-1]
+    if subject == "viewer":
+        port = free_port()
+        fleet.start("viewer", ["view", *network, "--port", str(port)], words)
+        threading.Thread(target=lambda: asyncio.run(look(port)), daemon=True).start()
 
 
-def fly(
-    seconds: float, disturb: Callable[[psutil.Process, threading.Event], None], keep: Path | None = None
-) -> Flown:
-    """A flight of which ``seconds`` are measured, with the recorder disturbed meanwhile. ``keep``: a folder for its log."""
+async def look(port: int) -> None:
+    """A client of the viewer that takes whatever it is sent, as a browser elsewhere would."""
+    offered = [websockets.Subprotocol(f"viser-v{viser.__version__}")]
+    while True:
+        try:
+            async with connect(f"ws://127.0.0.1:{port}", subprotocols=offered, max_size=None) as socket:
+                async for _ in socket:
+                    pass
+        except (OSError, websockets.WebSocketException):
+            await asyncio.sleep(0.2)  # the viewer is not there yet
+
+
+def measured(
+    ear: Ear, fleet: Fleet, hub: Node, subject: psutil.Process, condition: str, seconds: float
+) -> Window:
+    """One window, with the subject in that condition."""
+    stop = threading.Event()
+    disturbing = threading.Thread(target=CONDITIONS[condition], args=(subject, stop))
+    disturbing.start()
+    try:
+        first = ear.last_tick + 3  # sent after the condition began
+        before, begun_s = cpu_s(fleet), time.monotonic()
+        wait_for(ear, first + round(seconds * RATE_HZ), fleet, hub)
+        after, took_s = cpu_s(fleet), time.monotonic() - begun_s
+        last = ear.last_tick - 5  # whose answers have had their time
+    finally:
+        stop.set()
+        disturbing.join()
+    share = {name: (after[name] - before[name]) / took_s for name in after if name in before}
+    return Window(condition, first, last, share)
+
+
+def fly(subject: str, seconds: float, rounds: int, keep: Path | None = None) -> dict[str, Flown]:
+    """One flight, by condition of the subject. ``keep``: a folder for its log."""
     namespace = f"realtime-{uuid.uuid4().hex[:8]}"
     if keep is not None:
         keep.mkdir(parents=True)
+    windows: list[Window] = []
     with tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep)) as folder:
         hub, endpoint = open_hub(namespace, LEASE_MS, name="observer", role="analysis")
-        fleet, ear, stop = Fleet(), Ear(), threading.Event()
+        fleet, ear = Fleet(), Ear()
         try:
+            hub.subscribe(topics.END)
             for topic in (topics.IMAGE, topics.ACTUATORS):
                 hub.subscribe_raw(topic.key.format(chaser="*"), ear.take)
-            total_s = SETTLE_S + seconds + 2.0
+            total_s = SETTLE_S + rounds * len(ROUND) * (seconds + PAUSE_S) + 5.0
             network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(LEASE_MS)]
-            recorder = psutil.Process(start(fleet, Path(folder), total_s, network).process.pid)
+            start(fleet, Path(folder), total_s, network, subject)
+            touched = psutil.Process(next(c.process.pid for c in fleet.children if c.name == subject))
             wait_for(ear, round(SETTLE_S * RATE_HZ), fleet, hub)
-            disturbing = threading.Thread(target=disturb, args=(recorder, stop))
-            disturbing.start()
-            before, begun_s = cpu_s(fleet), time.monotonic()
-            first = ear.last_tick + 5
-            wait_for(ear, first + round(seconds * RATE_HZ), fleet, hub)
-            after, took_s = cpu_s(fleet), time.monotonic() - begun_s
-            last = ear.last_tick - 10  # whose answers have had their time
-            stop.set()
-            disturbing.join()
+            for condition in ROUND * rounds:
+                windows.append(measured(ear, fleet, hub, touched, condition, seconds))
+                wait_for(ear, ear.last_tick + round(PAUSE_S * RATE_HZ), fleet, hub)
         finally:
-            stop.set()
             fleet.end()
             hub.close()
-    sent = [key for key in ear.pictures if first <= key[1] <= last]
-    latency = [(ear.commands[k] - ear.pictures[k]) / 1e9 for k in sent if k in ear.commands]
-    expected = (last - first + 1) * CHASERS
-    had = sum((i, tick) in ear.commands for i in range(CHASERS) for tick in range(first, last + 1))
-    share = {name: (after[name] - before[name]) / took_s for name in after if name in before}
-    return Flown(np.array(latency), last - first + 1, expected - had, share)
+    return {name: together([w for w in windows if w.condition == name], ear) for name in CONDITIONS}
+
+
+def together(windows: list[Window], ear: Ear) -> Flown:
+    """What the ear heard in these windows."""
+    keys = [(i, tick) for w in windows for tick in range(w.first, w.last + 1) for i in range(CHASERS)]
+    latency = [
+        (ear.commands[k] - ear.pictures[k]) / 1e9 for k in keys if k in ear.commands and k in ear.pictures
+    ]
+    share = {name: float(np.mean([w.cpu_share[name] for w in windows])) for name in windows[0].cpu_share}
+    lost = sum(k not in ear.commands for k in keys)
+    return Flown(np.array(latency), len(keys) // CHASERS, lost, share)
 
 
 def wait_for(ear: Ear, tick: int, fleet: Fleet, hub: Node) -> None:
     """Waits until a tick's pictures have been sent; raises SystemExit when a process ends before."""
-    hub.subscribe(topics.END)
     while ear.last_tick < tick:
         received = hub.receive(0.05)
         dead = [c.last_words() for c in fleet.children if c.process.poll() is not None]
@@ -179,36 +237,54 @@ def cpu_s(fleet: Fleet) -> dict[str, float]:
     return {name: t.user + t.system for name, t in times.items()}
 
 
+def show(subject: str, condition: str, flown: Flown) -> dict[str, float]:
+    """Prints and returns the figures of one condition."""
+    name = f"{condition.replace('_', ' ')} {subject}" if condition != "as_it_is" else f"{subject} as it is"
+    shares = "  ".join(f"{process} {share:.2f}" for process, share in flown.cpu_share.items())
+    p50, p99, most = (1e3 * flown.quantile(q) for q in (0.5, 0.99, 1.0))
+    print(
+        f"{name:18} exposure to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {most:.1f} ms; "
+        f"{flown.lost} of {flown.ticks * CHASERS} lost, {flown.missed} later than 33 ms"
+    )
+    print(f"{'':18} CPU: {shares}  together {sum(flown.cpu_share.values()):.2f}", flush=True)
+    return {
+        f"{subject}_{condition}_p50_s": flown.quantile(0.5),
+        f"{subject}_{condition}_p99_s": flown.quantile(0.99),
+        f"{subject}_{condition}_max_s": flown.quantile(1.0),
+        f"{subject}_{condition}_lost": flown.lost,
+        f"{subject}_{condition}_missed": flown.missed,
+        f"{subject}_{condition}_commands": len(flown.latency_s),
+    }
+
+
 def main() -> None:
     parser = options_of(__doc__)
-    parser.add_argument("--seconds", type=float, default=15.0, help="measured in each flight")
-    parser.add_argument("--only", choices=DISTURBANCES, help="one of the flights")
+    parser.add_argument("--flights", type=int, default=1, help="of each subject")
+    parser.add_argument("--only", choices=SUBJECTS, help="this subject alone")
+    parser.add_argument("--seconds", type=float, default=5.0, help="of each window")
+    parser.add_argument("--rounds", type=int, default=3, help="of four windows each")
     parser.add_argument("--keep", type=Path, help="keep logs and the processes' words here")
     options = parser.parse_args()
-    seconds = 5.0 if options.quick else options.seconds
-    figures: dict[str, float] = {}
-    for name in [options.only] if options.only else DISTURBANCES:
-        flown = fly(seconds, DISTURBANCES[name], options.keep and options.keep / name)
-        late = int(np.sum(flown.latency_s > LATE_S))
-        figures |= {
-            f"{name}_p50_s": flown.quantile(0.5),
-            f"{name}_p99_s": flown.quantile(0.99),
-            f"{name}_max_s": flown.quantile(1.0),
-            f"{name}_lost": flown.lost,
-            f"{name}_missed": late,
-            f"{name}_commands": len(flown.latency_s),
-        }
-        shares = "  ".join(f"{process} {share:.2f}" for process, share in flown.cpu_share.items())
-        p50, p99, most = (1e3 * flown.quantile(q) for q in (0.5, 0.99, 1.0))
+    rounds = 1 if options.quick else options.rounds
+    flights: list[dict[str, float]] = []
+    for number in range(1 if options.quick else options.flights):
+        figures: dict[str, float] = {}
+        for subject in [options.only] if options.only else SUBJECTS:
+            keep = options.keep and options.keep / f"{subject}-{number}"
+            flown = fly(subject, options.seconds, rounds, keep)
+            for condition, one in flown.items():
+                figures |= show(subject, condition, one)
+            for condition in ("frozen", "slow"):
+                ratio = flown[condition].quantile(0.99) / flown["as_it_is"].quantile(0.99)
+                figures[f"{subject}_{condition}_p99_ratio"] = ratio
+                print(f"{condition} {subject}: p99 {ratio:.2f} of that with the {subject} as it is")
+        flights.append(figures)
+    medians = {name: float(np.median([f[name] for f in flights])) for name in flights[0]}
+    if len(flights) > 1:
         print(
-            f"{name:16} exposure to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {most:.1f} ms; "
-            f"{flown.lost} of {flown.ticks * CHASERS} lost, {late} later than 33 ms"
+            f"medians of {len(flights)} flights:", {name: round(value, 4) for name, value in medians.items()}
         )
-        print(f"{'':16} CPU: {shares}  together {sum(flown.cpu_share.values()):.2f}", flush=True)
-    for name in [n for n in DISTURBANCES if n != "recorder" and not options.only]:
-        figures[f"{name}_p99_ratio"] = figures[f"{name}_p99_s"] / figures["recorder_p99_s"]
-        print(f"{name}: p99 {figures[f'{name}_p99_ratio']:.2f} of that with the recorder as it is")
-    write_json(options.json, figures)
+    write_json(options.json, medians)
 
 
 if __name__ == "__main__":

@@ -152,6 +152,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     # What was on its way when the router died is lost, and the recorder says so; the flight itself is a success.
     assert statuses.pop("recorder") in (0, 1), said_by
     assert set(statuses.values()) == {0}, said_by
+    assert "denied" not in said_by["router"]  # nobody of a mission tries what it may not
     summary = json.loads((logs[0].parent / "summary.json").read_text())
     assert summary["success"]
     assert summary["sim_time_s"] == 15.0

@@ -2,7 +2,9 @@
 [--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
 
 Flies ``four-chaser-docking`` in real time with ticks and pictures at 30 Hz, 640 x 480, every process on this machine, and
-measures from a picture's sending to the sending of the actuator command that answers it (both stamps are the senders').
+measures from a picture's sending to the sending of the actuator command that answers it (both stamps are the senders');
+the pictures of a tick are sent together, as cameras do that expose at once. Beside it, from the tick's sending, when
+the pictures have still to be drawn, to that command.
 A flight for each subject, ``recorder`` and ``viewer`` (the recorder runs in both; the viewer is asked for by one client that
 reads all it gets). In windows of ``--seconds`` that take turns in the same flight, the subject is left as it is, frozen
 (SIGSTOP), left as it is, and slow (runs for a tenth of the time): what the machine does meanwhile touches all of them.
@@ -56,10 +58,10 @@ OVERRIDES = (
 
 
 class Head(msgspec.Struct):
-    """What is read of a picture or an actuator command."""
+    """What is read of a tick, a picture or an actuator command."""
 
     tick: int
-    chaser: int
+    chaser: int = -1
     source: str = ""
 
 
@@ -68,8 +70,9 @@ _head = msgspec.msgpack.Decoder(Head)
 
 @dataclass
 class Ear:
-    """When pictures and commands were sent, by chaser and tick (wall clock, ns)."""
+    """When ticks, pictures and commands were sent, by tick or by chaser and tick (wall clock, ns)."""
 
+    ticks: dict[int, int] = field(default_factory=dict)
     pictures: dict[tuple[int, int], int] = field(default_factory=dict)
     commands: dict[tuple[int, int], int] = field(default_factory=dict)
     last_tick: int = -1
@@ -78,7 +81,9 @@ class Ear:
         """Called on Zenoh's thread."""
         # No more than is needed: what is measured shares the cores with this.
         head = _head.decode(raw.payload)
-        if raw.key.endswith("/image"):
+        if raw.key == topics.TICK.key:
+            self.ticks.setdefault(head.tick, raw.sent_ns)
+        elif raw.key.endswith("/image"):
             self.pictures[head.chaser, head.tick] = raw.sent_ns
             self.last_tick = max(self.last_tick, head.tick)
         elif head.source == "command":
@@ -97,15 +102,20 @@ class Window:
 
 @dataclass(frozen=True)
 class Flown:
-    """All windows of one condition: latencies of all commands (s), and how many ticks of chasers had none."""
+    """All windows of one condition: latencies of all commands from picture and from tick (s), how many ticks of chasers had
+    no command."""
 
     latency_s: np.ndarray
+    from_tick_s: np.ndarray
     ticks: int
     lost: int
     cpu_share: dict[str, float]
 
     def quantile(self, q: float) -> float:
         return float(np.quantile(self.latency_s, q)) if len(self.latency_s) else float("nan")
+
+    def quantile_from_tick(self, q: float) -> float:
+        return float(np.quantile(self.from_tick_s, q)) if len(self.from_tick_s) else float("nan")
 
     @property
     def missed(self) -> int:
@@ -196,7 +206,7 @@ def fly(subject: str, seconds: float, rounds: int, keep: Path | None = None) -> 
         fleet, ear = Fleet(), Ear()
         try:
             hub.subscribe(topics.END)
-            for topic in (topics.IMAGE, topics.ACTUATORS):
+            for topic in (topics.TICK, topics.IMAGE, topics.ACTUATORS):
                 hub.subscribe_raw(topic.key.format(chaser="*"), ear.take)
             total_s = SETTLE_S + rounds * len(ROUND) * (seconds + PAUSE_S) + 5.0
             network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(LEASE_MS)]
@@ -220,7 +230,10 @@ def together(windows: list[Window], ear: Ear) -> Flown:
     ]
     share = {name: float(np.mean([w.cpu_share[name] for w in windows])) for name in windows[0].cpu_share}
     lost = sum(k not in ear.commands for k in keys)
-    return Flown(np.array(latency), len(keys) // CHASERS, lost, share)
+    since_tick = [
+        (ear.commands[k] - ear.ticks[k[1]]) / 1e9 for k in keys if k in ear.commands and k[1] in ear.ticks
+    ]
+    return Flown(np.array(latency), np.array(since_tick), len(keys) // CHASERS, lost, share)
 
 
 def wait_for(ear: Ear, tick: int, fleet: Fleet, hub: Node) -> None:
@@ -246,11 +259,15 @@ def show(subject: str, condition: str, flown: Flown) -> dict[str, float]:
         f"{name:18} exposure to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {most:.1f} ms; "
         f"{flown.lost} of {flown.ticks * CHASERS} lost, {flown.missed} later than 33 ms"
     )
+    tick50, tick99 = (1e3 * flown.quantile_from_tick(q) for q in (0.5, 0.99))
+    print(f"{'':18} tick to command: p50 {tick50:.1f} ms, p99 {tick99:.1f} ms")
     print(f"{'':18} CPU: {shares}  together {sum(flown.cpu_share.values()):.2f}", flush=True)
     return {
         f"{subject}_{condition}_p50_s": flown.quantile(0.5),
         f"{subject}_{condition}_p99_s": flown.quantile(0.99),
         f"{subject}_{condition}_max_s": flown.quantile(1.0),
+        f"{subject}_{condition}_tick_p50_s": flown.quantile_from_tick(0.5),
+        f"{subject}_{condition}_tick_p99_s": flown.quantile_from_tick(0.99),
         f"{subject}_{condition}_lost": flown.lost,
         f"{subject}_{condition}_missed": flown.missed,
         f"{subject}_{condition}_commands": len(flown.latency_s),

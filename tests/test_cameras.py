@@ -9,7 +9,7 @@ from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.scenario_text import ScenarioError
 from chaserdock_world.cameras import Cameras
 from chaserdock_world.imperfect import Navigation, true_camera
-from chaserdock_world.physics import TARGET, BodyState, prescribed_state
+from chaserdock_world.physics import TARGET, BodyState, Physics, prescribed_state
 
 SINGLE = Path(__file__).resolve().parents[1] / "scenarios" / "single.toml"
 BARE = (
@@ -35,6 +35,16 @@ def states_of(scenario, target_omega=(0.0, 0.0, 0.0)):
 def taken(*changes, omega=(0.0, 0.0, 0.0), time_ns=0):
     scenario = scenario_with(*changes)
     return Cameras(scenario).taken(0, 0, time_ns, states_of(scenario, omega)).astype(float)
+
+
+@pytest.mark.parametrize("renderer", ["exact", "pybullet"])
+def test_pictures_taken_at_once_are_those_taken_one_by_one(renderer):
+    scenario = load_scenario(SINGLE.with_name("four-chaser-docking.toml"), (f"camera.renderer='{renderer}'",))
+    physics, cameras = Physics(scenario), Cameras(scenario)
+    states = {name: physics.state(name) for name in physics.bodies}
+    for chasers in ((0, 1, 2, 3), (1, 2, 3), (2,), ()):
+        one_by_one = [cameras.picture(i, 7, 7, 70_000_000, states) for i in chasers]
+        assert cameras.pictures(chasers, 7, 7, 70_000_000, states) == one_by_one
 
 
 def test_blur_is_the_mean_of_the_pictures_of_the_exposure():

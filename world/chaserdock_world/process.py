@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import cv2
 from chaserdock_protocol import topics
@@ -23,7 +23,7 @@ from chaserdock_protocol.transport import Node, TransportError
 
 from .actuators import Actuators, fly_to
 from .answers import Answers
-from .cameras import Cameras
+from .cameras import Cameras, States
 from .imperfect import Navigation
 from .jet_actuators import actuators_of
 from .jet_faults import JetFaultDesk
@@ -113,6 +113,26 @@ def gather(
 Contacts = set[tuple[str, str]]
 
 
+def expose(
+    node: Node,
+    cameras: Cameras,
+    chasers: Sequence[int],
+    tick: int,
+    timing: Timing,
+    states: States,
+    *,
+    at_once: bool,
+) -> None:
+    """Takes and sends the pictures of a tick: each when it is drawn, or all at once, as cameras do that expose at once."""
+    exposure = (tick // timing.ticks_per_picture, tick, timing.tick_time_ns(tick), states)
+    if at_once:
+        for picture in cameras.pictures(chasers, *exposure):
+            node.publish(topics.IMAGE, picture, picture.chaser)
+        return
+    for i in chasers:
+        node.publish(topics.IMAGE, cameras.picture(i, *exposure), i)
+
+
 def pass_lockstep(
     tick: int, answers: Answers, stop: Stop, timing: Timing, fly_to_step: Callable[[int], Contacts]
 ) -> Contacts:
@@ -171,9 +191,8 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
         answers.open(tick, pictures)
         for what, detail in faults.decide(tick, timing):
             answers.warn(what, detail)
-        for i in answers.chasers if pictures else ():
-            number = tick // timing.ticks_per_picture
-            node.publish(topics.IMAGE, cameras.picture(i, number, tick, timing.tick_time_ns(tick), states), i)
+        if pictures:
+            expose(node, cameras, answers.chasers, tick, timing, states, at_once=options.mode == "realtime")
         if options.mode == "lockstep":
             contacts = pass_lockstep(tick, answers, stop, timing, fly_to_step)
         else:

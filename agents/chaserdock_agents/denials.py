@@ -13,6 +13,7 @@ import re
 import threading
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 TARGET = "zenoh::net::routing::interceptor::access_control"
@@ -73,6 +74,11 @@ class Reader:
     _names: dict[str, str] = field(default_factory=dict)
     _caching: set[str] = field(default_factory=set)
 
+    @property
+    def is_amid(self) -> bool:
+        """Whether decisions in advance are still to come: then every line counts."""
+        return bool(self._caching)
+
     def read(self, line: str) -> Denial | None:
         """What a line says was denied, or None."""
         if (caching := _CACHING.match(line)) is not None:
@@ -86,6 +92,8 @@ class Reader:
             return None
         thread, client, what = decision["thread"], decision["client"], decision["what"]
         if (named := _NAME.search(decision["subject"] or "")) is not None:
+            if len(self._names) >= MOST_NAMED:
+                self._names.clear()  # each connection is another client; until it is named again its id must do
             self._names[client] = named["name"]
         if thread in self._caching and not decision["cached"]:
             if what == _LAST_CACHED:
@@ -98,9 +106,8 @@ class Reader:
     def _shown(self, key: str) -> str:
         """A key as it may be told: clients choose them, and may choose any length and character."""
         key = key.removeprefix(f"{self.namespace}/")
-        return "".join(c if c.isprintable() else "?" for c in key[:_LONGEST_KEY]) + "..." * (
-            len(key) > _LONGEST_KEY
-        )
+        cut = "..." if len(key) > _LONGEST_KEY else ""
+        return "".join(c if c.isprintable() else "?" for c in key[:_LONGEST_KEY]) + cut
 
 
 @dataclass
@@ -145,7 +152,10 @@ class ZenohLog:
         self._lock = threading.Lock()
         self._output = os.dup(1)
         self._lines, writer = os.pipe()
-        fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
+        with suppress(
+            OSError, AttributeError
+        ):  # where that is not to be had, Zenoh waits a little more often
+            fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         os.dup2(writer, 1)
         os.close(writer)
         self._thread = threading.Thread(target=self._run, name="zenoh-log", daemon=True)
@@ -168,9 +178,8 @@ class ZenohLog:
         while piece := os.read(self._lines, _PIPE_BYTES):
             whole, end, rest = (rest + piece).rpartition(b"\n")
             # Nearly always every line allows something: seen at one glance, as there may be thousands a second.
-            if any(word in whole for word in _TELLING) or whole.count(_ALLOWED) != whole.count(b"\n") + len(
-                end
-            ):
+            dull = whole.count(_ALLOWED) == whole.count(b"\n") + len(end)
+            if not dull or self._reader.is_amid or any(word in whole for word in _TELLING):
                 for line in whole.split(b"\n") if end else ():
                     self._sort(line)
             time.sleep(_EVERY_S)
@@ -178,7 +187,10 @@ class ZenohLog:
 
     def _sort(self, line: bytes) -> None:
         if not any(target in line for target in _TARGETS):
-            os.write(self._output, line + b"\n")
+            with suppress(
+                OSError
+            ):  # nobody reads that any more: no reason to stop, which would stop the router
+                os.write(self._output, line + b"\n")
             return
         denial = self._reader.read(line.decode("utf-8", "replace"))
         if denial is not None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import subprocess
+import sys
 import time
 from collections import Counter
 from collections.abc import Iterator
@@ -76,6 +78,32 @@ def test_repetitions_are_told_ever_more_rarely_and_memory_is_bounded() -> None:
         account.add(Denial("chaser-1", "publish on", f"k/{i}"))
     assert len(account.counts) == MOST_NAMED
     assert account.total == 1000 + 2 * MOST_NAMED
+
+
+def test_the_log_is_read_however_it_is_cut_and_other_lines_are_passed_on() -> None:
+    block = [
+        f"{HEAD} ACL (ingress): caching permissions for `rights/k` ...",
+        f"{HEAD} 4fc8 {WHO} is unauthorized to Put (ingress) on rights/k",
+        f"{HEAD} 4fc8 {WHO} is authorized to Declare Liveliness Subscriber (ingress) on rights/k",
+        f"{HEAD} 4fc8 {WHO} is authorized to Put (ingress) on rights/mine",
+        "another line",
+        f"{HEAD} 4fc8 {WHO} is unauthorized to Put (ingress) on rights/real",
+    ]
+    text = "\n".join(block) + "\n"
+    cuts = [0, text.index("`rights"), text.index(block[2]), text.index("mine"), len(text)]
+    pieces = [text[a:b] for a, b in itertools.pairwise(cuts)]
+    code = (
+        "import os, sys, time\n"
+        "from chaserdock_agents.denials import ZenohLog\n"
+        "log = ZenohLog('rights')\n"
+        f"for piece in {pieces!r}:\n"
+        "    os.write(1, piece.encode())\n"
+        "    time.sleep(0.1)\n"
+        "log.close()\n"
+        "print(*log.take())\n"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout
+    assert out == "another line\nchaser-1 may not publish on real\n"
 
 
 # -- a router as a process ------------------------------------------------------------------------------------

@@ -18,6 +18,7 @@ from chaserdock_protocol.scenario import (
     scenario_from_json,
 )
 from chaserdock_protocol.scenario_bodies import cuboid_inertia
+from chaserdock_protocol.scenario_fields import unit
 from chaserdock_protocol.targets import target_model
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -119,6 +120,28 @@ def test_inertia_defaults_to_the_cuboids() -> None:
     assert cuboid_inertia(12.0, (1.0, 2.0, 3.0)) == (13.0, 10.0, 5.0)
     given_one = parse_scenario(changed("chaser.inertia_kg_m2", [1.0, 2.0, 2.5]), "x").chaser
     assert given_one.inertia == (1.0, 2.0, 2.5)
+
+
+@given(st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3), st.floats(-9e-4, 9e-4))
+def test_a_unit_quaternion_stays_the_same_when_told_again(
+    q: tuple[float, float, float, float], error: float
+) -> None:
+    w, x, y, z = (part / math.hypot(*q) * (1.0 + error) for part in q)
+    once = unit((w, x, y, z))
+    assert unit(once) == once
+    assert abs(math.hypot(*once) - 1.0) < 1e-15
+
+
+@pytest.mark.parametrize(
+    "q",  # found by benchmarks/fuzz.py
+    [
+        (0.7071067811865476, 0.0, 0.0, 0.707105476),
+        (0.5392993294557796, -0.19975267097334765, -0.13347041596982093, -0.8071197965525293),
+    ],
+)
+def test_a_quaternion_whose_last_bit_does_not_settle_at_once(q: tuple[float, float, float, float]) -> None:
+    assert unit(unit(q)) == unit(q)
+    assert np.abs(np.array(unit(q)) - rotations.normalize(np.array(q))).max() < 3e-16
 
 
 def test_nearly_unit_quaternions_become_unit_ones() -> None:

@@ -22,8 +22,11 @@ def unit(q: tuple[float, float, float, float]) -> tuple[float, float, float, flo
         raise ValueError(
             f"must be a quaternion (w, x, y, z) of unit length; this one has length {length:.6g}"
         )
-    w, x, y, z = rotations.normalize(q).tolist()
-    return (w, x, y, z)
+    # Once more may change a last bit, and processes that are told of a scenario load it again: until it settles.
+    settled: list[tuple[float, float, float, float]] = []
+    while (q := tuple(rotations.normalize(q).tolist())) not in settled:
+        settled.append(q)
+    return min(settled[settled.index(q) :])
 
 
 Number = Annotated[float, AfterValidator(finite)]

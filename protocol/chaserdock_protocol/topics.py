@@ -165,7 +165,15 @@ def is_process_name(name: str) -> bool:
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)
-    return slash == "" and head in {"world", "target", *CONTROLLERS, "recorder", "operator", "viewer", "router"}
+    return slash == "" and head in {
+        "world",
+        "target",
+        *CONTROLLERS,
+        "recorder",
+        "operator",
+        "viewer",
+        "router",
+    }
 
 
 def may_read(role: Role, topic: Topic) -> bool:

@@ -162,6 +162,37 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert ticks[-1].controller
 
 
+def test_one_machine_flies_with_rights_when_asked_for(tmp_path: Path) -> None:
+    """The flight is the same to the bit; the router says that it held everyone to his rights, and denied nothing."""
+    keys = make_keys(tmp_path / "keys")
+    digests = []
+    for name, asked in (("with", ["--keys", str(keys)]), ("without", [])):
+        out = tmp_path / name
+        run = ["run", "two-chaser-tracking", "-q", *sets(*SHORT, "duration_s=3.0"), "--out", str(out), *asked]
+        status, said = finished(*run, timeout_s=240.0)
+        assert status in (0, 1), said
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["sim_time_s"] == 3.0, said
+        digests.append(summary["digest"])
+    assert digests[0] == digests[1]
+    words = (tmp_path / "with" / "processes" / "router.txt").read_text()
+    assert "TLS, with access rules" in words
+    assert "denied" not in words
+    assert not (tmp_path / "without" / "processes" / "router.txt").exists()
+
+
+def test_a_run_without_the_keys_it_is_told_of_says_so(tmp_path: Path) -> None:
+    run = ["run", "two-chaser-tracking", "--keys", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
+    status, said = finished(*run)
+    assert status == 2
+    assert "there are none; make a mission's keys with `chaserdock keys init" in said
+    assert len(said.strip().splitlines()) == 1
+    four = make_keys(tmp_path / "three")  # of three chasers
+    status, said = finished("run", "four-chaser-docking", "--keys", str(four), "--out", str(tmp_path / "out"))
+    assert (status, "those of chaser-3 are missing" in said) == (2, True)
+    assert not (tmp_path / "out").exists()
+
+
 # -- a container's main process ---------------------------------------------------------------------------
 
 

@@ -11,6 +11,7 @@ import sys
 import time
 import uuid
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
 
@@ -24,8 +25,10 @@ from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, TransportError
 
+from . import member
 from .flight_lines import Failed, Result, Start
 from .progress import Show, Teller
+from .router import NAME as ROUTER
 from .statuses import DONE, FAILED, STOPPED
 from .viewer.address import DEFAULT_HOST, url_of
 from .viewer.address import free_port as free_page_port
@@ -68,13 +71,14 @@ class Fleet:
     def start(self, name: str, arguments: list[str], folder: Path) -> None:
         """Starts one; it ends by itself when this launcher dies, however that happens (its stdin closes)."""
         words = folder / f"{name.replace('/', '-')}.txt"
+        threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
         with words.open("wb") as out:
             process = subprocess.Popen(
                 [sys.executable, "-m", "chaserdock_agents", *arguments, "--watch-parent"],
                 stdin=subprocess.PIPE,
                 stdout=out,
                 stderr=subprocess.STDOUT,
-                env={"ZENOH_RUNTIME": _ZENOH_THREADS, **os.environ, **SINGLE_THREADED},
+                env={**threads, **os.environ, **SINGLE_THREADED},
                 # Ctrl-C is the launcher's to pass on. Not a session of its own: Linux would share the cores between
                 # sessions ("autogroup") whatever the processes' priorities, and who woke up last would wait longest.
                 process_group=0,
@@ -142,6 +146,33 @@ def open_hub(
     raise TransportError("no free port")
 
 
+def check_keys(keys: Path, chasers: int) -> None:
+    """Raises RunError unless a mission's keys are there for so many chasers, and hold."""
+    from .keys import why_not_usable  # the cryptography takes its time to load
+
+    if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
+        raise RunError(f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`")
+
+
+def meet_at_router(
+    onlookers: Fleet, words: Path, namespace: str, lease_ms: int, keys: Path
+) -> tuple[Node, list[str]]:
+    """Starts a router that holds everyone to the rights of the mission's ``keys``; a launcher's own node, as its client, and
+    how the processes reach it. Raises RunError when the router does not come up."""
+    from .keys import tls_files
+
+    port = free_port()
+    endpoint, common = f"tls/127.0.0.1:{port}", ["--namespace", namespace, "--keys", str(keys)]
+    onlookers.start(ROUTER, ["router", "-l", endpoint, "--lease-ms", str(lease_ms), *common], words)
+    router, deadline = onlookers.children[-1], time.monotonic() + _PATIENCE_S
+    while not member.router_there("127.0.0.1", port):
+        if router.process.poll() is not None or time.monotonic() > deadline:
+            raise RunError(f"the router does not listen: {router.last_words()}")
+        time.sleep(0.05)
+    link = Link(namespace, (endpoint,), (), "client", lease_ms=lease_ms, tls=tls_files(keys, "operator"))
+    return Node("operator", "operator", link), ["-e", endpoint, "--lease-ms", str(lease_ms), *common]
+
+
 def run_mission(
     path: Path,
     folder: Path,
@@ -150,15 +181,18 @@ def run_mission(
     overrides: tuple[str, ...],
     show: Show,
     view: bool = False,
+    keys: Path | None = None,
 ) -> int:
     """Flies a scenario; log, summary and the processes' words go to ``folder``. The exit status (``statuses``).
 
-    ``view``: with the viewer's page beside it, to the end of the flight. Raises ViewError, RunError, ScenarioError or
-    TransportError when it cannot be started at all.
+    ``view``: with the viewer's page beside it, to the end of the flight. ``keys``: through a router, over TLS, each process
+    held to its rights. Raises ViewError, RunError, ScenarioError or TransportError when it cannot be started at all.
     """
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
     words = folder / "processes"
+    if keys is not None:
+        check_keys(keys, len(scenario.chasers))
     if (folder / LOG_NAME).exists():
         raise RunError(
             f"{folder} holds a mission.mcap already; a log is never overwritten, choose another --out"
@@ -170,11 +204,14 @@ def run_mission(
     namespace = f"run-{uuid.uuid4().hex[:12]}"
     # A silent peer is given up after the lease; in lock-step a stopped process is waited for instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
-    hub, endpoint = open_hub(namespace, lease_ms)
+    fleet, onlookers, hub = Fleet(), Fleet(), None
     stop = _Stop()
-    fleet, onlookers = Fleet(), Fleet()
     try:
-        network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(lease_ms)]
+        if keys is not None:
+            hub, network = meet_at_router(onlookers, words, namespace, lease_ms, keys.resolve())
+        else:
+            hub, endpoint = open_hub(namespace, lease_ms)
+            network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(lease_ms)]
         if view:
             start_viewer(onlookers, words, network)
         start_all(fleet, scenario, path, folder, mode, overrides, network)
@@ -195,8 +232,9 @@ def run_mission(
             teller.close()
     finally:
         fleet.end()
+        if hub is not None:
+            hub.close()
         onlookers.end()
-        hub.close()
         stop.restore()
     return judge(fleet, folder, failure, teller, stopped=stop.asked)
 
@@ -214,9 +252,8 @@ def start_all(
     words = folder / "processes"
     patient = ["--patience", str(_PATIENCE_S)]
     sets = [item for override in overrides for item in ("--set", override)]
-    fleet.start(
-        "world", ["world", str(path), "--mode", mode, *sets, *network, "-l", "tcp/127.0.0.1:0"], words
-    )
+    listen = [] if "--keys" in network else ["-l", "tcp/127.0.0.1:0"]
+    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, *listen], words)
     fleet.start("controller", ["controller", *network, *patient], words)
     if scenario.controller.standby:
         fleet.start("standby", ["controller", "--standby", *network, *patient], words)

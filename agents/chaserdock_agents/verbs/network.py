@@ -17,6 +17,7 @@ from .options import (
     NamespaceOpt,
     NetModeOpt,
     QuietOpt,
+    WatchOpt,
     errors_as_lines,
     fail,
     link_of,
@@ -41,6 +42,7 @@ def router(
     until: Annotated[
         str | None, typer.Option(metavar="PROCESS", help="end when this process has come and gone")
     ] = None,
+    watch_parent: WatchOpt = False,
 ) -> None:
     """The router that a mission's processes connect to, as clients; with --keys it holds each to its rights."""
     from chaserdock_protocol.runtime import ProcessOptions
@@ -61,7 +63,7 @@ def router(
         )
     tls = tls_of(keys, "router") if keys is not None else None
     link = Link(namespace, (), endpoints, "router", config, lease_ms, tls)
-    start_process("router", ProcessOptions(link=link, until=until))
+    start_process("router", ProcessOptions(link=link, until=until, watch_parent=watch_parent))
 
 
 def status(

@@ -78,6 +78,15 @@ def run(
     quiet: QuietOpt = False,
     as_json: LinesOpt = False,
     view: Annotated[bool, typer.Option("--view", help="show it in a web browser, too (see `view`)")] = False,
+    keys: Annotated[
+        Path | None,
+        typer.Option(
+            "--keys",
+            envvar="CHASERDOCK_KEYS",
+            metavar="DIR",
+            help="a mission's keys (see `keys init`): through a router, over TLS, each process held to its rights",
+        ),
+    ] = None,
 ) -> None:
     """Fly a scenario on this machine: start every process, record, judge; status 0 only if it was a success."""
     from chaserdock_agents.launcher import run_mission
@@ -86,7 +95,8 @@ def run(
     with errors_as_lines(as_json):
         path = _found(scenario)
         folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
-        raise typer.Exit(run_mission(path, folder, mode.value, seed, tuple(overrides or ()), show, view))
+        changes = tuple(overrides or ())
+        raise typer.Exit(run_mission(path, folder, mode.value, seed, changes, show, view, keys))
 
 
 def world(

@@ -111,15 +111,13 @@ class Flown:
     lost: int
     cpu_share: dict[str, float]
 
-    def quantile(self, q: float) -> float:
-        return float(np.quantile(self.latency_s, q)) if len(self.latency_s) else float("nan")
-
-    def quantile_from_tick(self, q: float) -> float:
-        return float(np.quantile(self.from_tick_s, q)) if len(self.from_tick_s) else float("nan")
-
     @property
     def missed(self) -> int:
         return int(np.sum(self.latency_s > LATE_S))
+
+
+def quantile(values_s: np.ndarray, q: float) -> float:
+    return float(np.quantile(values_s, q)) if len(values_s) else float("nan")
 
 
 def as_it_is(subject: psutil.Process, stop: threading.Event) -> None:
@@ -254,20 +252,20 @@ def show(subject: str, condition: str, flown: Flown) -> dict[str, float]:
     """Prints and returns the figures of one condition."""
     name = f"{condition.replace('_', ' ')} {subject}" if condition != "as_it_is" else f"{subject} as it is"
     shares = "  ".join(f"{process} {share:.2f}" for process, share in flown.cpu_share.items())
-    p50, p99, most = (1e3 * flown.quantile(q) for q in (0.5, 0.99, 1.0))
+    p50, p99, most = (1e3 * quantile(flown.latency_s, q) for q in (0.5, 0.99, 1.0))
     print(
         f"{name:18} exposure to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {most:.1f} ms; "
         f"{flown.lost} of {flown.ticks * CHASERS} lost, {flown.missed} later than 33 ms"
     )
-    tick50, tick99 = (1e3 * flown.quantile_from_tick(q) for q in (0.5, 0.99))
+    tick50, tick99 = (1e3 * quantile(flown.from_tick_s, q) for q in (0.5, 0.99))
     print(f"{'':18} tick to command: p50 {tick50:.1f} ms, p99 {tick99:.1f} ms")
     print(f"{'':18} CPU: {shares}  together {sum(flown.cpu_share.values()):.2f}", flush=True)
     return {
-        f"{subject}_{condition}_p50_s": flown.quantile(0.5),
-        f"{subject}_{condition}_p99_s": flown.quantile(0.99),
-        f"{subject}_{condition}_max_s": flown.quantile(1.0),
-        f"{subject}_{condition}_tick_p50_s": flown.quantile_from_tick(0.5),
-        f"{subject}_{condition}_tick_p99_s": flown.quantile_from_tick(0.99),
+        f"{subject}_{condition}_p50_s": quantile(flown.latency_s, 0.5),
+        f"{subject}_{condition}_p99_s": quantile(flown.latency_s, 0.99),
+        f"{subject}_{condition}_max_s": quantile(flown.latency_s, 1.0),
+        f"{subject}_{condition}_tick_p50_s": quantile(flown.from_tick_s, 0.5),
+        f"{subject}_{condition}_tick_p99_s": quantile(flown.from_tick_s, 0.99),
         f"{subject}_{condition}_lost": flown.lost,
         f"{subject}_{condition}_missed": flown.missed,
         f"{subject}_{condition}_commands": len(flown.latency_s),
@@ -292,7 +290,9 @@ def main() -> None:
             for condition, one in flown.items():
                 figures |= show(subject, condition, one)
             for condition in ("frozen", "slow"):
-                ratio = flown[condition].quantile(0.99) / flown["as_it_is"].quantile(0.99)
+                ratio = quantile(flown[condition].latency_s, 0.99) / quantile(
+                    flown["as_it_is"].latency_s, 0.99
+                )
                 figures[f"{subject}_{condition}_p99_ratio"] = ratio
                 print(f"{condition} {subject}: p99 {ratio:.2f} of that with the {subject} as it is")
         flights.append(figures)

@@ -22,8 +22,7 @@ def make_keys(folder: Path) -> Path:
 
 
 def tls_of(keys: Path, process: str) -> Tls:
-    folder = keys / common_name(process)
-    return Tls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")
+    return Tls.in_folder(keys / common_name(process))
 
 
 def client(keys: Path, process: str, endpoint: str) -> Link:

@@ -94,7 +94,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
     endpoint = f"tls/127.0.0.1:{free_port()}"
     reach = ["-e", endpoint, "--lease-ms", "10000"]
-    short = sets(*SHORT, "duration_s=15.0")
+    short = sets(*SHORT, "duration_s=60.0")  # `status` looks on meanwhile, for some seconds
     processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(name: str, *arguments: str) -> None:
@@ -155,7 +155,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert "denied" not in said_by["router"]  # nobody of a mission tries what it may not
     summary = json.loads((logs[0].parent / "summary.json").read_text())
     assert summary["success"]
-    assert summary["sim_time_s"] == 15.0
+    assert summary["sim_time_s"] == 60.0
     assert "</html>" in (logs[0].parent / "report.html").read_text()
     ticks = [r.message for r in read_log(logs[0], ["world/tick"])]
     assert ticks[-1].chasers == (0, 1)

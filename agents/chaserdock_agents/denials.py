@@ -29,9 +29,7 @@ _DECISION = re.compile(
     rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: (?P<cached>Using cached result: )?(?P<client>[0-9a-f]+)"
     r"(?: on (?P<subject>\S+))? is (?P<un>un)?authorized to (?P<what>[\w /]+) \((?P<flow>ingress|egress)\) on (?P<key>.*)"
 )
-_CACHING = re.compile(
-    rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: ACL \((?P<flow>\w+)\): caching permissions"
-)
+_CACHING = re.compile(rf"\S+ +TRACE (?P<thread>.*ThreadId\(\d+\)) {TARGET}: ACL \(\w+\): caching permissions")
 _STRANGER = re.compile(rf".*{TARGET}: (?P<client>[0-9a-f]+) did not match any configured ACL subject")
 _REFUSED = re.compile(
     rf".*{TLS_TARGET}: (?P<why>peer sent no certificates|invalid peer certificate: \w+|received fatal alert: \w+)"
@@ -152,9 +150,8 @@ class ZenohLog:
         self._lock = threading.Lock()
         self._output = os.dup(1)
         self._lines, writer = os.pipe()
-        with suppress(
-            OSError, AttributeError
-        ):  # where that is not to be had, Zenoh waits a little more often
+        # Where that is not to be had, Zenoh waits a little more often.
+        with suppress(OSError, AttributeError):
             fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, _PIPE_BYTES)
         os.dup2(writer, 1)
         os.close(writer)
@@ -187,9 +184,8 @@ class ZenohLog:
 
     def _sort(self, line: bytes) -> None:
         if not any(target in line for target in _TARGETS):
-            with suppress(
-                OSError
-            ):  # nobody reads that any more: no reason to stop, which would stop the router
+            # Nobody reads that any more: no reason to stop, which would stop the router.
+            with suppress(OSError):
                 os.write(self._output, line + b"\n")
             return
         denial = self._reader.read(line.decode("utf-8", "replace"))

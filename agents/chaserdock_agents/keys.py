@@ -12,8 +12,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.link import Tls
-from chaserdock_protocol.rights import common_name, identities
+from chaserdock_protocol.rights import identities
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
@@ -78,12 +77,6 @@ def why_not_usable(folder: Path, chasers: int, now: datetime) -> str | None:
         if end < now + timedelta(hours=1):
             return f"those of {name} end at {end:%Y-%m-%d %H:%M} UTC"
     return None
-
-
-def tls_files(folder: Path, process: str) -> Tls:
-    """What a process shows and trusts, out of the folder of all keys of a mission."""
-    ca, certificate, key = (folder / common_name(process) / file for file in _FILES)
-    return Tls(ca, certificate, key)
 
 
 def remove_keys(folder: Path, chasers: int) -> None:

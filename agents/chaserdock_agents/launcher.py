@@ -23,7 +23,7 @@ from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.runtime import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Role
-from chaserdock_protocol.transport import Link, Node, TransportError
+from chaserdock_protocol.transport import Link, Node, Tls, TransportError
 
 from . import member
 from .flight_lines import Failed, Result, Start
@@ -159,8 +159,6 @@ def meet_at_router(
 ) -> tuple[Node, list[str]]:
     """Starts a router that holds everyone to the rights of the mission's ``keys``; a launcher's own node, as its client, and
     how the processes reach it. Raises RunError when the router does not come up."""
-    from .keys import tls_files
-
     port = free_port()
     endpoint, common = f"tls/127.0.0.1:{port}", ["--namespace", namespace, "--keys", str(keys)]
     onlookers.start(ROUTER, ["router", "-l", endpoint, "--lease-ms", str(lease_ms), *common], words)
@@ -169,7 +167,7 @@ def meet_at_router(
         if router.process.poll() is not None or time.monotonic() > deadline:
             raise RunError(f"the router does not listen: {router.last_words()}")
         time.sleep(0.05)
-    link = Link(namespace, (endpoint,), (), "client", lease_ms=lease_ms, tls=tls_files(keys, "operator"))
+    link = Link(namespace, (endpoint,), (), "client", lease_ms=lease_ms, tls=Tls.in_folder(keys / "operator"))
     return Node("operator", "operator", link), ["-e", endpoint, "--lease-ms", str(lease_ms), *common]
 
 

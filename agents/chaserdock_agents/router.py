@@ -16,7 +16,7 @@ from chaserdock_protocol.rights import access_control
 from chaserdock_protocol.runtime import ProcessOptions, Stop, say
 from chaserdock_protocol.transport import Node
 
-from .denials import Account, Denial, ZenohLog
+from .denials import Account, ZenohLog
 
 NAME = "router"
 MOST_CHASERS = 256
@@ -38,7 +38,8 @@ def main(options: ProcessOptions) -> int:
     except ChaserdockError as error:
         say(NAME, str(error))
         return 2
-    stop, last, clerk = Stop(options.watch_parent), _Guest(options.until or ""), _Clerk(node)
+    stop, last = Stop(options.watch_parent), _Guest(options.until or "")
+    clerk = _Clerk(node, log) if log is not None else None
     try:
         if options.until is not None:
             node.watch_liveliness(last.changed)
@@ -46,30 +47,29 @@ def main(options: ProcessOptions) -> int:
         say(NAME, f"listens on {', '.join(link.listen)} {how}")
         while not (stop() or last.gone_for_s() > AFTERWARDS_S):
             time.sleep(LOOK_S)
-            if log is not None:
-                clerk.note(log.take())
+            if clerk is not None:
+                clerk.note()
     finally:
         node.close()
-        if log is not None:
-            log.close()
-            clerk.sum_up(log.take())
+        if clerk is not None:
+            clerk.sum_up()
     return 0
 
 
 class _Clerk:
     """Tells denials, with the tick and simulated time of the mission under way, as far as the router hears of one."""
 
-    def __init__(self, node: Node) -> None:
-        self._node = node
+    def __init__(self, node: Node, log: ZenohLog) -> None:
+        self._node, self._log = node, log
         self._account = Account()
         self._ticks = node.follow(topics.TICK, 1)
         self._tick, self._time_ns = 0, 0
 
-    def note(self, denials: list[Denial]) -> None:
+    def note(self) -> None:
         """Tells what is told (``Account``): on standard error, and to the recorder."""
         for tick in self._ticks():
             self._tick, self._time_ns = tick.message.tick, tick.message.sim_time_ns
-        for text in filter(None, map(self._account.add, denials)):
+        for text in filter(None, map(self._account.add, self._log.take())):
             say(NAME, f"denied: {text}")
             event = Event(
                 tick=self._tick,
@@ -81,9 +81,10 @@ class _Clerk:
             )
             self._node.publish(topics.EVENT, event, NAME)
 
-    def sum_up(self, denials: list[Denial]) -> None:
+    def sum_up(self) -> None:
         """After the last session: how many there were."""
-        for denial in denials:
+        self._log.close()
+        for denial in self._log.take():
             self._account.add(denial)
         if self._account.total:
             say(NAME, f"denied {self._account.total} messages and declarations in all")

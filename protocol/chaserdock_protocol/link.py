@@ -34,6 +34,11 @@ class Tls:
     certificate: Path
     key: Path
 
+    @classmethod
+    def in_folder(cls, folder: Path) -> Tls:
+        """Those of one process, as ``chaserdock keys init`` lays them down."""
+        return cls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")
+
 
 @dataclass(frozen=True)
 class Link:

@@ -85,7 +85,7 @@ def role_of(process: str) -> Role:
 
 
 def _process(name: str) -> str:
-    if not topics.is_process_name(name) or name in ("target", "operator", "router"):
+    if not topics.is_member_name(name) or name == "operator":
         raise ValueError(
             f"{name!r} is no process of a mission; such are world, controller, standby, chaser/0, recorder"
         )

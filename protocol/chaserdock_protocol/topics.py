@@ -165,15 +165,16 @@ def is_process_name(name: str) -> bool:
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)
-    return slash == "" and head in {
-        "world",
-        "target",
-        *CONTROLLERS,
-        "recorder",
-        "operator",
-        "viewer",
-        "router",
-    }
+    members = {"world", *CONTROLLERS, "recorder", "operator", "viewer"}
+    return slash == "" and head in members | _NO_MEMBERS
+
+
+_NO_MEMBERS = {"target", "router"}
+
+
+def is_member_name(name: str) -> bool:
+    """Whether ``name`` is one of ours that takes part in a mission: no body, nor the router."""
+    return is_process_name(name) and name not in _NO_MEMBERS
 
 
 def may_read(role: Role, topic: Topic) -> bool:

@@ -74,12 +74,10 @@ class Cameras:
         """``picture`` of several chasers, of one moment, in their order: drawn on two threads."""
         if self._beside is None:
             return [self.picture(i, number, tick, time_ns, states) for i in chasers]
-        others = [self._beside.submit(self.picture, i, number, tick, time_ns, states) for i in chasers[1::2]]
-        taken: list[Image] = []
-        for k, i in enumerate(chasers[::2]):
-            taken.append(self.picture(i, number, tick, time_ns, states))
-            taken += [other.result() for other in others[k : k + 1]]
-        return taken
+        exposure = (number, tick, time_ns, states)
+        beside = {i: self._beside.submit(self.picture, i, *exposure) for i in chasers[1::2]}
+        here = {i: self.picture(i, *exposure) for i in chasers[::2]}
+        return [here[i] if i in here else beside[i].result() for i in chasers]
 
     def picture(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
         """Picture ``number`` of chaser ``chaser`` of the bodies ``states``, exposed about ``time_ns``."""

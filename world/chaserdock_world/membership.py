@@ -59,7 +59,7 @@ class Membership:
 
     def _objection(self, request: JoinRequest) -> str:
         name = request.process
-        if not topics.is_process_name(name) or name in ("target", "router"):
+        if not topics.is_member_name(name):
             return f"{name!r} is no process of a mission"
         if name == "world":
             return "this mission has its world already; choose another --namespace for a second one"

@@ -125,12 +125,9 @@ def expose(
 ) -> None:
     """Takes and sends the pictures of a tick: each when it is drawn, or all at once, as cameras do that expose at once."""
     exposure = (tick // timing.ticks_per_picture, tick, timing.tick_time_ns(tick), states)
-    if at_once:
-        for picture in cameras.pictures(chasers, *exposure):
-            node.publish(topics.IMAGE, picture, picture.chaser)
-        return
-    for i in chasers:
-        node.publish(topics.IMAGE, cameras.picture(i, *exposure), i)
+    one_by_one = (cameras.picture(i, *exposure) for i in chasers)
+    for picture in cameras.pictures(chasers, *exposure) if at_once else one_by_one:
+        node.publish(topics.IMAGE, picture, picture.chaser)
 
 
 def pass_lockstep(

@@ -152,10 +152,11 @@ def tls_of(keys: Path, process: str):
 
     name = common_name(process)
     folder = keys / name if (keys / name).is_dir() else keys
-    for file in ("ca.pem", "cert.pem", "key.pem"):
-        if not os.access(folder / file, os.R_OK):
+    tls = Tls.in_folder(folder)
+    for file in (tls.ca, tls.certificate, tls.key):
+        if not os.access(file, os.R_OK):
             raise fail(
-                f"--keys {keys}: {folder / file} is not there or may not be read; "
+                f"--keys {keys}: {file} is not there or may not be read; "
                 f"make a mission's keys with `chaserdock keys init {keys}`, and give {name} its folder"
             )
-    return Tls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")
+    return tls

@@ -4,6 +4,7 @@ COPY docker/build-requirements.txt /src/docker/
 RUN pip install --no-cache-dir --require-hashes -r /src/docker/build-requirements.txt
 COPY pyproject.toml README.md LICENSE build_hook.py /src/
 COPY scenarios /src/scenarios
+COPY chaserdock /src/chaserdock
 COPY protocol /src/protocol
 COPY world /src/world
 COPY agents /src/agents
@@ -32,5 +33,5 @@ RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=
       --set success.steady_position_rms_m=0.2 --set success.steady_orientation_rms_deg=10.0 \
     && rm -rf /tmp/warm
 WORKDIR /tmp
-ENTRYPOINT ["python", "-m", "chaserdock_agents.member"]
+ENTRYPOINT ["python", "-m", "chaserdock.launch.container"]
 HEALTHCHECK --interval=5s --timeout=60s --start-period=60s --retries=3 CMD ["healthy"]

@@ -1,4 +1,4 @@
-"""Hatchling's hook: the kernels in C are compiled whenever the package is built or installed for editing."""
+"""Hatchling build hook: compile the C kernels whenever the package is built or installed for editing."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface  # pyright: ignore[reportMissingImports]
 
-_NATIVE = "protocol/chaserdock_protocol/native"
+_BUILD = "protocol/chaserdock_models/native/build.py"
 
 
 class KernelsHook(BuildHookInterface):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
-        runpy.run_path(str(Path(self.root) / _NATIVE / "build.py"))["compile_kernels"]()
-        build_data["artifacts"].append(f"/{_NATIVE}/kernels.so")
+        root = Path(self.root)
+        for library in runpy.run_path(str(root / _BUILD))["compile_all"](root):
+            build_data["artifacts"].append(f"/{library.relative_to(root)}")
         # Machine code, but none that depends on Python or on a C library.
         build_data["pure_python"] = False
         platform = sysconfig.get_platform().replace("-", "_").replace(".", "_")

@@ -17,10 +17,10 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from chaserdock_controller.nmpc.frame import Frame, Task, worded
 from chaserdock_controller.nmpc.problem import dynamics, multiply
 from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
 from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
+from chaserdock_controller.nmpc.warm_start import Frame, Task, worded
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]

@@ -40,7 +40,7 @@ POLL_S = 0.2
 
 
 def command(file: Path, *arguments: str) -> list[str]:
-    return [sys.executable, "-m", "chaserdock_agents", "campaign", str(file), *arguments]
+    return [sys.executable, "-m", "chaserdock", "campaign", str(file), *arguments]
 
 
 def results(folder: Path) -> dict[Path, int]:

@@ -8,23 +8,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from chaserdock_agents.chaser.pilot import passed_on
-from chaserdock_agents.thrusters.pilot import JetPilot
-from chaserdock_controller.flight import Flight, Inputs
-from chaserdock_protocol import rotations
+from chaserdock_agents.chaser.command_gate import passed_on
+from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_controller.core import Flight, Inputs
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import (
-    ActuatorCommand,
-    JetReport,
-    Odometry,
-    PoseSolution,
-    Sighting,
-)
-from chaserdock_protocol.rotations import Array
+from chaserdock_protocol.messages import ActuatorCommand, JetReport, Odometry, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.actuators import fly_to
-from chaserdock_world.jet_actuators import actuators_of
-from chaserdock_world.physics import BodyState, Physics
+from chaserdock_world.actuators.ideal import fly_to
+from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.physics.simulation import BodyState, Physics
 
 _SIGMA_M, _SIGMA_RAD = 1e-4, 1e-4
 

@@ -20,7 +20,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from chaserdock_protocol.log import LogError, read_log
+from chaserdock_protocol.recording.log import LogError, read_log
 from results import options_of, write_json
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -121,7 +121,7 @@ def crash(container: str) -> None:
         "import os,glob\n"
         "for f in glob.glob('/proc/[0-9]*/cmdline'):\n"
         "    words = open(f, 'rb').read().split(b'\\0')\n"
-        "    if b'chaserdock_agents' in words: os.kill(int(f.split('/')[2]), 9)\n"
+        "    if b'chaserdock' in words: os.kill(int(f.split('/')[2]), 9)\n"
     )
     docker("exec", container, "python", "-c", code)
 

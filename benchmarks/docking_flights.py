@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.captures import target_body
-from chaserdock_protocol import rotations
+from chaserdock_controller.guidance.composite_body import target_body
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import OperatorCommand, ProbeTouch
-from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_world.physics import TARGET
+from chaserdock_world.physics.simulation import TARGET
 from offline import Eye, Offline, momentum
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,11 +16,12 @@ import uuid
 from pathlib import Path
 
 import psutil
-from chaserdock_agents.launcher import Fleet, open_hub
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd, Tick
 from chaserdock_protocol.transport import Node
 from results import options_of, write_json
+
+from chaserdock.launch.launcher import Fleet, open_hub
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "endurance.toml"

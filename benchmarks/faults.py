@@ -21,10 +21,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
-from chaserdock_agents.analysis.flight import load_flight
-from chaserdock_agents.analysis.summary import summary_of
-from chaserdock_protocol.scenario_faults import FaultKind
+from chaserdock_protocol.scenario.faults import FaultKind
 from results import options_of, write_json
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summary_of
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = "fault-drill"
@@ -106,7 +107,7 @@ def fly(number: int, mode: str) -> Result:
     fault = drawn_fault(number)
     with tempfile.TemporaryDirectory() as folder:
         out, begun_s = Path(folder) / "run", time.monotonic()
-        command = [sys.executable, "-m", "chaserdock_agents", "run", SCENARIO, "--out", str(out), "-q"]
+        command = [sys.executable, "-m", "chaserdock", "run", SCENARIO, "--out", str(out), "-q"]
         command += ["--mode", mode, "--set", f"fault=[{toml(fault)}]"]
         process = subprocess.Popen(
             command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True

@@ -21,8 +21,8 @@ from pathlib import Path
 
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.log import LogWriter, read_log, read_scenario
 from chaserdock_protocol.messages import MissionEnd, encoding_of
+from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from results import options_of, write_json
 
 _TIMES = ("sim_time_ns", "effective_time_ns", "expires_ns")
@@ -68,7 +68,7 @@ def repeat(log: Path, out: Path, hours: float) -> int:
 def cost_of(*arguments: str) -> Cost:
     """Runs the program to its end and measures it; SystemExit when it did not do its work."""
     begun_s = time.perf_counter()
-    command = [sys.executable, "-m", "chaserdock_agents", *arguments]
+    command = [sys.executable, "-m", "chaserdock", *arguments]
     pid = os.posix_spawn(
         sys.executable,
         command,

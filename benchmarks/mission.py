@@ -28,7 +28,7 @@ def fly(overrides: tuple[str, ...]) -> dict[str, Any]:
         command = [
             sys.executable,
             "-m",
-            "chaserdock_agents",
+            "chaserdock",
             "run",
             "four-chaser-docking",
             "--out",

@@ -26,17 +26,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from chaserdock_agents.reproduce.paper import ROWS
-from chaserdock_agents.reproduce.plan import COLUMNS, SCENARIO, STARTS
-from chaserdock_controller.study.loop import Trace, fly_offline
-from chaserdock_controller.study.perfect import PerfectEstimator
-from chaserdock_protocol import rotations
-from chaserdock_protocol.facing import facing_attitudes
-from chaserdock_protocol.rotations import Array
+from chaserdock_controller.evaluation.closed_loop import Trace, fly_offline
+from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_models import rotations
+from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_world.physics import TARGET
+from chaserdock_world.physics.simulation import TARGET
 from offline import Eye, Offline, seeing_eye, statistical_eye
 from results import options_of, write_json
+
+from chaserdock.reproduce.paper import ROWS
+from chaserdock.reproduce.plan import COLUMNS, SCENARIO, STARTS
 
 ROOT = Path(__file__).resolve().parents[1]
 SYMMETRIC_EVERY = 4

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -23,6 +24,12 @@ from pathlib import Path
 
 import numpy as np
 from acados_peer import KINDS, AcadosPeer
+from chaserdock_controller.guidance.reference import (
+    feed_forward,
+    predict_target,
+    reference_state,
+    reference_trajectory,
+)
 from chaserdock_controller.nmpc import (
     BACK_ENDS,
     NmpcInput,
@@ -30,16 +37,11 @@ from chaserdock_controller.nmpc import (
     NmpcSolver,
     kernels,
     make_solver,
+    native,
 )
-from chaserdock_controller.reference import (
-    feed_forward,
-    predict_target,
-    reference_state,
-    reference_trajectory,
-)
-from chaserdock_protocol import rotations
-from chaserdock_protocol.native.build import compile_kernels
-from chaserdock_protocol.scenario_bodies import cuboid_inertia
+from chaserdock_models import rotations
+from chaserdock_models.native.build import compile_kernels
+from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from numpy.typing import NDArray
 from results import options_of, write_json
 
@@ -189,10 +191,11 @@ def start(solver: str) -> float:
 
 
 def compilation() -> float:
-    """Seconds to compile the kernels from nothing, as the package's build does, with an empty cache."""
+    """Seconds to compile the NMPC's kernels from nothing, as the package's build does, with an empty cache."""
     begun = time.perf_counter()
     with tempfile.TemporaryDirectory() as folder:
-        compile_kernels(Path(folder) / "kernels.so")
+        sources = shutil.copytree(native.LIBRARY.path.parent, Path(folder) / "native")
+        compile_kernels(sources)
     return time.perf_counter() - begun
 
 

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from chaserdock_controller.fusion.eyes import ERRORS, NO_ERROR, seen_by
-from chaserdock_controller.fusion.motion import constant_rates
-from chaserdock_controller.fusion.types import Eye
-from chaserdock_controller.looking import CALIBRATION_S, calibration_turns
-from chaserdock_protocol import rotations
-from chaserdock_protocol.camera import Q_CRF_IRF_FORWARD_WXYZ
-from chaserdock_protocol.rotations import Array
+from chaserdock_controller.estimation.camera_calibration import ERRORS, NO_ERROR, seen_by
+from chaserdock_controller.estimation.motion_models import constant_rates
+from chaserdock_controller.estimation.types import Eye
+from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns
+from chaserdock_models import rotations
+from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
+from chaserdock_models.rotations import Array
 from results import options_of, write_json
 
 TUMBLE, STILL = np.array([0.015, 0.045, 0.03]), np.zeros(3)

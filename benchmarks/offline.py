@@ -12,21 +12,21 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from chaserdock_agents.chaser.eye import look, prediction_from
-from chaserdock_agents.chaser.pilot import passed_on
-from chaserdock_agents.perception import make_perception
-from chaserdock_agents.thrusters.pilot import JetPilot
-from chaserdock_controller.flight import Flight, Inputs, Outputs
-from chaserdock_protocol import rotations
+from chaserdock_agents.chaser.command_gate import passed_on
+from chaserdock_agents.chaser.perception import make_perception
+from chaserdock_agents.chaser.sighting import look, prediction_from
+from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, OperatorCommand, PoseSolution, Sighting
-from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.actuators import fly_to
-from chaserdock_world.cameras import Cameras
-from chaserdock_world.jet_actuators import actuators_of
-from chaserdock_world.physics import TARGET, BodyState, Physics
-from chaserdock_world.publish import docking_status, odometry_of
+from chaserdock_world.actuators.ideal import fly_to
+from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
+from chaserdock_world.rendering.cameras import Cameras
+from chaserdock_world.sensors.publish import docking_status, odometry_of
 
 States = dict[str, BodyState]
 Eye = Callable[[int, int, int, States], Sighting]

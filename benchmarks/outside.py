@@ -28,10 +28,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from chaserdock_agents.analysis.flight import load_flight
-from chaserdock_agents.analysis.summary import estimate_errors
-from chaserdock_agents.logs.tracks import write_tracks
 from results import options_of, write_json
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import estimate_errors
+from chaserdock.logs.tracks import write_tracks
 
 PACKAGES = ("evo", "pymcap-cli", "mcap", "mcap-ros2-support-fast", "rerun-sdk")
 WITHIN = 0.01

@@ -11,10 +11,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_protocol import rotations
+from chaserdock_models import rotations
 from chaserdock_protocol.scenario import load_scenario
-from chaserdock_world.cameras import Cameras
-from chaserdock_world.physics import TARGET, BodyState, prescribed_state
+from chaserdock_world.physics.simulation import TARGET, BodyState, prescribed_state
+from chaserdock_world.rendering.cameras import Cameras
 
 ROOT = Path(__file__).resolve().parents[1]
 PLAIN = (

@@ -30,12 +30,13 @@ import numpy as np
 import psutil
 import viser
 import websockets
-from chaserdock_agents.launcher import Fleet, free_port, open_hub
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.transport import Node, Raw
 from results import options_of, write_json
 from websockets.asyncio.client import connect
+
+from chaserdock.launch.launcher import Fleet, free_port, open_hub
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "four-chaser-docking.toml"

@@ -21,11 +21,12 @@ from typing import Any
 
 import numpy as np
 import psutil
-from chaserdock_agents.logs import open_log
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from offline import Offline, seeing_eye
 from results import options_of, write_json
+
+from chaserdock.logs import open_log
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
@@ -68,11 +69,11 @@ class Clock:
 
 def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
     """Seconds of processor time a tick by part, in one process; medians."""
-    import chaserdock_world.cameras
+    import chaserdock_world.rendering.cameras
     import offline
 
     clock = Clock()
-    kept = [(offline, "look"), (chaserdock_world.cameras.Cameras, "picture")]
+    kept = [(offline, "look"), (chaserdock_world.rendering.cameras.Cameras, "picture")]
     before = [getattr(owner, name) for owner, name in kept]
     for (owner, name), part in zip(kept, ("perceive", "render"), strict=True):
         clock.wrap(owner, name, part)
@@ -100,8 +101,8 @@ def processes_of(launcher: psutil.Process) -> dict[str, float]:
             words, times = child.cmdline(), child.cpu_times()
         except (psutil.NoSuchProcess, psutil.AccessDenied):
             continue
-        if "chaserdock_agents" in words:
-            name = words[words.index("chaserdock_agents") + 1]
+        if "chaserdock" in words:
+            name = words[words.index("chaserdock") + 1]
             used[name] = used.get(name, 0.0) + times.user + times.system
     return used
 
@@ -120,7 +121,7 @@ def fly(n: int, flown_s: float) -> dict[str, float]:
             "success.steady_position_rms_m=0.3",
             "success.steady_orientation_rms_deg=20.0",
         ]
-        command = [sys.executable, "-m", "chaserdock_agents", "run", str(path), "--out", str(out), "-q"]
+        command = [sys.executable, "-m", "chaserdock", "run", str(path), "--out", str(out), "-q"]
         command += [item for rule in rules for item in ("--set", rule)]
         said = (Path(folder) / "said.txt").open("w+")
         done = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)

@@ -20,10 +20,10 @@ from typing import Any
 import cv2
 import msgspec
 import numpy as np
-from chaserdock_protocol import rotations
+from chaserdock_models import rotations
 from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.imperfect import true_camera
+from chaserdock_world.sensors.errors import true_camera
 from results import options_of, write_json
 from seen_loop import Estimates, Flown, changed, fly
 

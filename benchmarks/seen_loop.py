@@ -12,21 +12,21 @@ from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
-from chaserdock_agents.chaser.eye import look, prediction_from
-from chaserdock_agents.chaser.pilot import passed_on
-from chaserdock_agents.perception import make_perception
-from chaserdock_controller.flight import Flight, Inputs, Outputs
-from chaserdock_protocol import rotations
+from chaserdock_agents.chaser.command_gate import passed_on
+from chaserdock_agents.chaser.perception import make_perception
+from chaserdock_agents.chaser.sighting import look, prediction_from
+from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Image, OperatorCommand, Sighting
 from chaserdock_protocol.messages import TargetEstimate as Estimate
-from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.actuators import fly_to
-from chaserdock_world.cameras import Cameras
-from chaserdock_world.imperfect import Navigation
-from chaserdock_world.jet_actuators import actuators_of
-from chaserdock_world.physics import BodyState, Physics
-from chaserdock_world.publish import odometry_of
+from chaserdock_world.actuators.ideal import fly_to
+from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.physics.simulation import BodyState, Physics
+from chaserdock_world.rendering.cameras import Cameras
+from chaserdock_world.sensors.errors import Navigation
+from chaserdock_world.sensors.publish import odometry_of
 
 OnPicture = Callable[[Image], Image | None]
 """What becomes of a picture on its way to perception; None: it never comes."""

@@ -24,15 +24,16 @@ from pathlib import Path
 
 import numpy as np
 import psutil
-from chaserdock_agents.analysis.flight import load_flight
-from chaserdock_agents.analysis.summary import summarize
-from chaserdock_agents.launcher import Fleet, free_port, run_mission
-from chaserdock_agents.progress import Show
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.log import read_log
 from chaserdock_protocol.messages import ActuatorCommand, MissionEnd, Tick, WrenchCommand
+from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.transport import Link, Node, Raw
 from results import options_of, write_json
+
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summarize
+from chaserdock.launch.launcher import Fleet, free_port, run_mission
+from chaserdock.launch.progress import Show
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "fault-drill.toml"

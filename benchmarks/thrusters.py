@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from chaserdock_agents.thrusters.allocation import allocator_of
-from chaserdock_agents.thrusters.modulation import Modulator
-from chaserdock_protocol import rotations
-from chaserdock_protocol.rotations import Array
+from chaserdock_agents.chaser.thrusters.allocation import allocator_of
+from chaserdock_agents.chaser.thrusters.modulation import Modulator
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
+from chaserdock_models.thruster_model import Valves
 from chaserdock_protocol.scenario import Scenario, parse_scenario
-from chaserdock_protocol.scenario_thrusters import thrusts_max
-from chaserdock_protocol.valves import Valves
+from chaserdock_protocol.scenario.thrusters import thrusts_max
 from closed_loop import Record, fly
 from results import options_of, write_json
 

@@ -14,15 +14,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_agents.perception import Method, Perception, Sighting
-from chaserdock_protocol import rotations
-from chaserdock_protocol.camera import Camera
-from chaserdock_protocol.rotations import Array
-from chaserdock_protocol.targets import face_rotation, target_model
-from chaserdock_world.effects import CameraEffects, Effects
-from chaserdock_world.render import Renderer
-from chaserdock_world.sky import Light
-from chaserdock_world.tinyrenderer import TinyRenderer
+from chaserdock_agents.chaser.perception import Method, Perception, Sighting
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from chaserdock_models.rotations import Array
+from chaserdock_models.targets import face_rotation, target_model
+from chaserdock_world.rendering.background import Light
+from chaserdock_world.rendering.effects import CameraEffects, Effects
+from chaserdock_world.rendering.rasterizer import Renderer
+from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from numpy.typing import NDArray
 from results import options_of, write_json
 

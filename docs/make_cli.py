@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from chaserdock_agents import flight_lines, statuses
-from chaserdock_agents.cli import app
-from chaserdock_agents.verbs.plain import PlainGroup
 from typer.main import get_command
+
+from chaserdock import exit_codes as statuses
+from chaserdock.cli.main import app
+from chaserdock.cli.plain import PlainGroup
+from chaserdock.launch import json_events as flight_lines
 
 sys.path.insert(0, str(Path(__file__).parent))
 from make_protocol import doc_of, words_of

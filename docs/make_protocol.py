@@ -13,9 +13,9 @@ from pathlib import Path
 import msgspec
 from chaserdock_protocol import messages, topics
 from chaserdock_protocol.codec import MAX_BYTES, UNIT_QUATERNION_TOLERANCE
-from chaserdock_protocol.presence import EARLY_PERIOD_S, STEADY_PERIOD_S
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE
+from chaserdock_protocol.transport.session import EARLY_PERIOD_S, STEADY_PERIOD_S
 from msgspec import Struct
 from msgspec import inspect as shapes
 

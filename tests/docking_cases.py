@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.capture import Senses
-from chaserdock_protocol import rotations
-from chaserdock_protocol.docking import PortView
-from chaserdock_protocol.rotations import Array
+from chaserdock_controller.guidance.docking import Senses
+from chaserdock_models import rotations
+from chaserdock_models.docking_geometry import PortView
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario, parse_scenario
-from chaserdock_world.physics import TARGET, BodyState, Physics
+from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
 
 TARGET_KG, CHASER_KG = 40.0, 17.8
 TARGET_INERTIA, CHASER_INERTIA = (0.683, 0.875, 0.9), (0.3, 0.31, 0.33)

@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.moves import Motion
-from chaserdock_protocol import rotations
+from chaserdock_controller.guidance.trajectories import Motion
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Odometry
-from chaserdock_protocol.rotations import Array
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from hypothesis import settings
 from hypothesis import strategies as st

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from chaserdock_controller.fusion import (
+from chaserdock_controller.estimation import (
     Eye,
     Measurement,
     Mekf,
@@ -14,9 +14,9 @@ from chaserdock_controller.fusion import (
     PoseHypothesis,
     TargetEstimate,
 )
-from chaserdock_controller.fusion.eyes import seen_by
-from chaserdock_protocol import rotations as rot
-from chaserdock_protocol.camera import Q_CRF_IRF_FORWARD_WXYZ
+from chaserdock_controller.estimation.camera_calibration import seen_by
+from chaserdock_models import rotations as rot
+from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
 from hypothesis import settings
 from hypothesis import strategies as st
 

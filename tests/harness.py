@@ -13,8 +13,9 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-from chaserdock_agents.launcher import free_port
-from chaserdock_protocol.runtime import SINGLE_THREADED
+from chaserdock_protocol.process import SINGLE_THREADED
+
+from chaserdock.launch.launcher import free_port
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = (
@@ -31,7 +32,7 @@ SHORT = (
 def chaserdock(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
     """Starts the program, as an installed command would."""
     env = {**os.environ, **SINGLE_THREADED, **options.pop("env", {})}
-    command = [sys.executable, "-m", "chaserdock_agents", *arguments]
+    command = [sys.executable, "-m", "chaserdock", *arguments]
     process: Any = subprocess.Popen(command, env=env, cwd=ROOT, **options)
     return process
 

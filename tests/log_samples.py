@@ -7,7 +7,7 @@ from typing import Any
 
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
-from chaserdock_protocol.log import LogWriter
+from chaserdock_protocol.recording.log import LogWriter
 
 V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
 SCENARIO = '{"name": "a scenario"}'

@@ -11,8 +11,8 @@ import tempfile
 from pathlib import Path
 
 from chaserdock_protocol import codec
-from chaserdock_protocol.log import LogWriter, read_log, read_scenario
 from chaserdock_protocol.messages import BodyTruth, Image, WorldTruth, encoding_of
+from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from harness import ROOT, run
 
 GOLDEN = ROOT / "tests" / "golden"

@@ -7,13 +7,19 @@ from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
-from chaserdock_agents.keys import init_keys
-from chaserdock_agents.launcher import free_port
-from chaserdock_protocol.rights import access_control, common_name
+from chaserdock_protocol.topics import TOPICS
 from chaserdock_protocol.transport import Link, Node, Tls
+from chaserdock_protocol.transport.access_control import LOOK_ON, access_control, common_name, identities
+
+from chaserdock.launch.keys import init_keys
+from chaserdock.launch.launcher import free_port
 
 NAMESPACE = "rights"
 CHASERS = 3
+EVERYONE = identities(CHASERS)
+PUBLISHERS = {w.process: w for w in EVERYONE if w.role not in LOOK_ON}
+PATIENCE_S = 20.0
+_OWN = tuple(f"controller/{what}" for what in ("event", "health", "presence", "farewell"))
 
 
 def make_keys(folder: Path) -> Path:
@@ -40,3 +46,24 @@ def router_with_rights(keys: Path) -> Iterator[str]:
         yield endpoint
     finally:
         node.close()
+
+
+def keys_with_owners() -> list[tuple[str, str]]:
+    """Every concrete key of the topics table and who may publish on it: one process, of controllers each."""
+    out = []
+    for topic in TOPICS:
+        if "{chaser}" in topic.key:
+            for i in range(CHASERS):
+                owner = f"chaser/{i}" if topic.writer == "chaser" else topic.writer
+                out.append((topic.key_of(i), owner))
+        elif topic.writer == "any":
+            out += [(topic.key_of(name), name) for name in PUBLISHERS]
+        elif "{process}" in topic.key:
+            bodies = ("target", *(f"chaser/{i}" for i in range(CHASERS)))
+            out += [(topic.key_of(body), topic.writer) for body in bodies]
+        else:
+            out.append((topic.key, topic.writer))
+    # What is one controller's to say is the other's, too: the world says which of them is obeyed.
+    return out + [
+        (key, "standby") for key, owner in out if owner == "controller" and not key.startswith(_OWN)
+    ]

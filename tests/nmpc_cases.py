@@ -7,21 +7,14 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from chaserdock_controller.nmpc import (
-    NmpcInput,
-    NmpcParameters,
-    NmpcPlan,
-    NmpcSolver,
-    kernels,
-    make_solver,
-)
-from chaserdock_controller.reference import (
+from chaserdock_controller.guidance.reference import (
     feed_forward,
     predict_target,
     reference_state,
     reference_trajectory,
 )
-from chaserdock_protocol import rotations
+from chaserdock_controller.nmpc import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver, kernels, make_solver
+from chaserdock_models import rotations
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]

@@ -10,8 +10,8 @@ from typing import Any
 
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.dead_reckoning import went_on
-from chaserdock_protocol.faults import Lost, layer_of
+from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.fault_injection import Lost, layer_of
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -27,18 +27,19 @@ from chaserdock_protocol.messages import (
     Sighting,
     Tick,
 )
-from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
-from chaserdock_protocol.runtime import ProcessOptions, Stop, built
+from chaserdock_protocol.process import ProcessOptions, Stop, built
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node, Received
+from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
 
-from .agreement import Agreement
-from .flight import Flight, Inputs, Outputs
-from .memory import Memory, NoMemory
-from .odometry_watch import OdometryWatch
-from .shadow import Shadow
-from .telling import no_command
+from chaserdock_controller.ingest.odometry_validation import OdometryWatch
+from chaserdock_controller.ingest.sensor_consistency import Agreement
+from chaserdock_controller.output.message_builders import no_command
+from chaserdock_controller.redundancy.checkpoint import Memory, NoMemory
+from chaserdock_controller.redundancy.standby import Shadow
+
+from .core import Flight, Inputs, Outputs
 
 _REMEMBERED_TICKS = 256
 _IDLE = 5

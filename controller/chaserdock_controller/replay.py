@@ -8,11 +8,11 @@ from typing import Any, cast
 
 import msgspec
 from chaserdock_protocol import topics
+from chaserdock_protocol.replay_node import Said, SilentTeller, Stage, Tape
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.tape import Said, SilentTeller, Stage, Tape
 from chaserdock_protocol.transport import Node, Received
 
-from .flight import Flight, Inputs, Outputs
+from .core import Flight, Inputs, Outputs
 from .process import Controller
 
 

@@ -2,8 +2,8 @@
 
 import cv2
 import numpy as np
-from chaserdock_agents.perception import PoseSolution, Sighting
-from chaserdock_protocol import rotations
+from chaserdock_agents.chaser.perception import PoseSolution, Sighting
+from chaserdock_models import rotations
 
 
 class OwnPerception:

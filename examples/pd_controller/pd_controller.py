@@ -2,7 +2,7 @@
 
 import numpy as np
 from chaserdock_controller.nmpc import NmpcPlan
-from chaserdock_protocol import rotations
+from chaserdock_models import rotations
 
 KP, KD = 0.16, 0.72  # 1/s^2 and 1/s: 0.4 rad/s, damped 0.9
 

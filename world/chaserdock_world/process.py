@@ -11,25 +11,25 @@ import uuid
 from collections.abc import Callable, Mapping, Sequence
 
 import cv2
+from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
-from chaserdock_protocol.clock import Timing
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.faults import layer_of
+from chaserdock_protocol.fault_injection import layer_of
 from chaserdock_protocol.messages import JetFaultCommand, JoinReply, JoinRequest, MissionEnd
-from chaserdock_protocol.presence import PresenceTeller, new_instance
-from chaserdock_protocol.runtime import ProcessOptions, Stop, built, say
+from chaserdock_protocol.process import ProcessOptions, Stop, built, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
+from chaserdock_protocol.transport.session import PresenceTeller, new_instance
 
-from .actuators import Actuators, fly_to
-from .answers import Answers
-from .cameras import Cameras, States
-from .imperfect import Navigation
-from .jet_actuators import actuators_of
-from .jet_faults import JetFaultDesk
-from .membership import Membership
-from .physics import Physics
-from .publish import publish_docking, publish_odometry, publish_truth
+from chaserdock_world.actuators.ideal import Actuators, fly_to
+from chaserdock_world.actuators.operator_faults import JetFaultDesk
+from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.lockstep.membership import Membership
+from chaserdock_world.lockstep.tick_barrier import Answers
+from chaserdock_world.physics.simulation import Physics
+from chaserdock_world.rendering.cameras import Cameras, States
+from chaserdock_world.sensors.errors import Navigation
+from chaserdock_world.sensors.publish import publish_docking, publish_odometry, publish_truth
 
 
 def main(options: ProcessOptions) -> int:

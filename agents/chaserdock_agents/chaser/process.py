@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import cv2
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.dead_reckoning import went_on
-from chaserdock_protocol.faults import Lost, layer_of
+from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.fault_injection import Lost, layer_of
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     DockingStatus,
@@ -27,18 +27,18 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
-from chaserdock_protocol.runtime import ProcessOptions, Stop, built
+from chaserdock_protocol.process import ProcessOptions, Stop, built
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
+from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
 
-from chaserdock_agents.perception import make_perception
-from chaserdock_agents.thrusters.pilot import JetPilot
+from chaserdock_agents.chaser.thrusters.controller import JetPilot
 
-from .alone import Alone, LastWord, clear_m, goes_on, wrench_of
-from .eye import look, prediction_from
-from .pilot import brake, own_command, passed_on, refusal, stale_term
+from .command_gate import brake, own_command, passed_on, refusal, stale_term
+from .fallback import Alone, LastWord, clear_m, goes_on, wrench_of
+from .perception import make_perception
+from .sighting import look, prediction_from
 
 
 def main(options: ProcessOptions) -> int:

@@ -7,8 +7,8 @@ from typing import Any, cast
 
 import cv2
 from chaserdock_protocol import topics
+from chaserdock_protocol.replay_node import Said, SilentTeller, Stage, Tape
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.tape import Said, SilentTeller, Stage, Tape
 from chaserdock_protocol.transport import Node, Received
 
 from .process import Chaser

@@ -16,8 +16,7 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.faults import layer_of
-from chaserdock_protocol.inbox import Inbox
+from chaserdock_protocol.fault_injection import layer_of
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Farewell,
@@ -28,15 +27,15 @@ from chaserdock_protocol.messages import (
     SolverStatus,
     Tick,
 )
-from chaserdock_protocol.presence import PresenceTeller, health_of, take_part
-from chaserdock_protocol.runtime import ProcessOptions, Stop, say
+from chaserdock_protocol.process import ProcessOptions, Stop, say
+from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Node, Raw
+from chaserdock_protocol.transport.bounded_queue import Inbox
+from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
 
-from chaserdock_agents.runs import run_name
-
-from .recording import Recording
-from .viewer import SHOWN
+from .foxglove_layer import SHOWN
+from .rotation import Recording
 
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15

@@ -5,7 +5,7 @@ from __future__ import annotations
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import SOLVERS
 
-from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver
+from .types import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver
 
 __all__ = ["BACK_ENDS", "NmpcInput", "NmpcParameters", "NmpcPlan", "NmpcSolver", "make_solver"]
 
@@ -20,19 +20,19 @@ def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int |
     """
     # Imported here so that the one does not cost the start-up time of the other.
     if name == "rti":
-        from chaserdock_controller.nmpc.rti import RtiSolver
+        from .rti import RtiSolver
 
         return RtiSolver(params, n, max_iterations)
     if name in ("ipopt", "fatrop"):
-        from chaserdock_controller.nmpc.nlp import NlpSolver
+        from .casadi_nlp import NlpSolver
 
         return NlpSolver(name, params, n, max_iterations)
     if name == "alpaqa":
-        from chaserdock_controller.nmpc.alm import AlpaqaSolver
+        from .alpaqa import AlpaqaSolver
 
         return AlpaqaSolver(params, n, max_iterations)
     if name == "open":
-        from chaserdock_controller.nmpc.open_engine import OpenSolver
+        from .open import OpenSolver
 
         return OpenSolver(params, n, max_iterations)
     return plugins.load("solver", name, BACK_ENDS)(params, n, max_iterations)

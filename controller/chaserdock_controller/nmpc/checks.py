@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from chaserdock_controller.nmpc.kernels import normalize_rows, shifted, sign_of
-from chaserdock_controller.nmpc.types import Array, NmpcInput, NmpcParameters
+from .kernels import normalize_rows, shifted, sign_of
+from .types import Array, NmpcInput, NmpcParameters
 
 # Measured quaternions are normalized; one this far off is a mistake, not a rounding error.
 QUATERNION_NORM_TOLERANCE = 0.1

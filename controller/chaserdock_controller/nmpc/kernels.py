@@ -11,10 +11,11 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from chaserdock_protocol.native import address, function, memory
+from chaserdock_models.native import address, scratch
 from numpy.typing import NDArray
 
-from chaserdock_controller.nmpc.types import Array, IntArray, NmpcInput, NmpcParameters
+from .native import function
+from .types import Array, IntArray, NmpcInput, NmpcParameters
 
 # Explicit Runge-Kutta tableaux with one sub-diagonal, which is all that euler and rk4 need.
 RK_NODES = {"euler": (0.0,), "rk4": (0.0, 0.5, 0.5, 1.0)}
@@ -247,7 +248,7 @@ def solve_qp(
     dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
     qp = _Qp(d, rows, max_iterations, h, w1, w2, *(address(v) for v in (mats, *model, stage, a, c)))
     answer = _Answer(address(dx), address(dw), address(mul))
-    work = memory(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))
+    work = scratch(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))
     code = function("solve_qp", c_int)(ctypes.byref(qp), ctypes.byref(answer), address(work))
     return QpAnswer(code, answer.iterations, answer.mu, dx, dw, mul)
 
@@ -267,7 +268,7 @@ class _Tick(Structure):
 
 @cache
 def _tick_memory(n: int, d: int) -> NDArray[np.float64]:
-    return memory(function("tick_workspace", c_int64)(c_int64(n), c_int64(d)))
+    return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d)))
 
 
 def solve_tick(

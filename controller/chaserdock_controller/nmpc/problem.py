@@ -13,8 +13,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from chaserdock_controller.nmpc.slack import SLACK_L2
-from chaserdock_controller.nmpc.types import INTEGRATORS, NmpcParameters
+from .slack import SLACK_L2
+from .types import INTEGRATORS, NmpcParameters
 
 
 def multiply(a: Any, b: Any) -> Any:

@@ -13,10 +13,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from chaserdock_controller.nmpc.frame import Frame, worded
-from chaserdock_controller.nmpc.kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick
-from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
-from chaserdock_controller.nmpc.types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
+from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick
+from .slack import SLACK_L2, slack_l1_weight
+from .types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
+from .warm_start import Frame, worded
 
 # Rows that no admissible input can reach are left out; the bound is taken this much wider.
 REACH_SAFETY = 1.5

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from chaserdock_controller.nmpc.types import Array, NmpcParameters
+from .types import Array, NmpcParameters
 
 # L1 and L2 weights of the slacks of the distance constraints. The L1 weight must exceed the constraint's
 # multiplier for the penalty to be exact: at 1e3 the terminal weight pressed chasers to 0.32 m of 0.35 m.

@@ -1,0 +1,60 @@
+"""The paper's perception, as a baseline: undistort the picture, ArUco, EPnP on all corners.
+
+Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC 2023, sec. 4.
+Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of the views of a single
+face; that is part of the baseline. Nothing is checked but that the result is a finite pose in front.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from chaserdock_models.rotations import Array
+from numpy.typing import NDArray
+
+from . import pnp
+from .detect import NOTHING, Detections
+
+
+def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dictionary) -> Detections:
+    """Markers with OpenCV's default settings and sub-pixel corners, in ideal pixels."""
+    if camera.distortion:
+        matrix = camera.matrix()
+        image = np.asarray(cv2.undistort(image, matrix, np.array(camera.distortion)), dtype=np.uint8)
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    corners, ids, _ = cv2.aruco.ArucoDetector(dictionary, parameters).detectMarkers(image)
+    if ids is None or len(ids) == 0:
+        return NOTHING
+    return Detections(
+        np.asarray(ids, dtype=np.int64).ravel(), np.array(corners, dtype=float).reshape(-1, 4, 2)
+    )
+
+
+def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple[pnp.PoseSolution, ...]:
+    """EPnP on all corners (n, 4, 2), ideal pixels, of markers with corners at ``points_trf_m`` (n, 4, 3).
+
+    One pose, or none when it is not finite or behind the camera.
+
+    Its covariance is the first-order one at that pose, from its own residuals.
+    """
+    if not len(points_trf_m):
+        return ()
+    points, pixels = points_trf_m.reshape(-1, 3), corners_ideal_px.reshape(-1, 2)
+    try:
+        ok, rvec, tvec = cv2.solvePnP(points, pixels, camera.matrix(), None, flags=cv2.SOLVEPNP_EPNP)
+    except cv2.error:  # degenerate corners
+        return ()
+    position = np.asarray(tvec, dtype=float).ravel()
+    rotation = np.asarray(cv2.Rodrigues(rvec)[0], dtype=float)
+    if not ok or not np.all(np.isfinite(position)) or not np.all(np.isfinite(rotation)):
+        return ()
+    floor = pnp.SIGMA_FLOOR_SINGLE_PX if len(points_trf_m) == 1 else pnp.SIGMA_FLOOR_PX
+    sigma = np.ones(len(points))
+    result = pnp.pose_covariance(camera, points, pixels, position, rotation, floor, sigma)
+    if result is None:
+        return ()
+    rms = pnp.reprojection_rms_px(camera, points, pixels, position, rotation)
+    return (pnp.PoseSolution(position, rotations.from_matrix(rotation), result[0], rms),)

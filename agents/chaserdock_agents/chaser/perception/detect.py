@@ -1,0 +1,155 @@
+"""Finding markers: OpenCV's ArUco detector with settings measured for this job."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from chaserdock_models.rotations import Array
+from chaserdock_models.targets import TargetModel
+from numpy.typing import ArrayLike, NDArray
+
+# Shortest perimeter of a marker, pixels, that is worth looking at.
+_MIN_PERIMETER_PX = 40.0
+# A region of interest is grown by this share of its size and this much, for an uncertain prediction.
+_REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
+# Pictures, or regions, with a smaller side than this are not halved.
+_HALVED_PX = 300
+# A larger share of the picture than this is no saving.
+_REGION_LIMIT = 0.7
+_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+
+Region = tuple[int, int, int, int]
+
+
+@dataclass(frozen=True)
+class Detections:
+    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the given picture: top left, top right, bottom right, bottom
+    left of the upright marker. An id can occur more than once."""
+
+    ids: NDArray[np.int64]
+    corners_px: Array
+
+
+class _Windows(NamedTuple):
+    """Threshold windows, and the distance, over a marker's perimeter, within which two candidates are one."""
+
+    least_px: int
+    most_px: int
+    step_px: int
+    distance_rate: float
+
+
+# OpenCV's own distance is 0.125.
+_WINDOWS = (_Windows(7, 7, 16, 0.125), _Windows(7, 23, 16, 0.125))
+_THOROUGH = _Windows(3, 23, 10, 0.01)
+
+NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
+
+
+def dictionary_of(name: str) -> cv2.aruco.Dictionary:
+    """OpenCV's predefined dictionary of that name. Raises ValueError for a name that it does not have."""
+    code = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or code is None:
+        raise ValueError(f"unknown ArUco dictionary {name!r}")
+    return cv2.aruco.getPredefinedDictionary(code)
+
+
+def detect(
+    image: NDArray[np.uint8],
+    dictionary: cv2.aruco.Dictionary,
+    region: Region | None,
+    thorough: bool = False,
+    enough: int | None = None,
+) -> Detections:
+    """Markers of ``dictionary`` in a grey picture, or in its ``region`` (left, top, right, bottom; pixels,
+    right and bottom excluded). Corners are where OpenCV's contours have them: good to about a pixel.
+
+    The threshold window of 7 px finds nearly all that 7 and 23 px together find, in half the time; the second
+    is used where the first leaves fewer than two markers. ``thorough`` looks with 3, 13 and 23 px, and keeps
+    apart what lies close together: slower, for pictures that show a narrow white border. Where ``enough`` is
+    given, a large picture is looked at in half its size first, in a third of the time, and that has to do when it
+    shows so many markers.
+    """
+    left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
+    part = image[top:bottom, left:right]
+    found = NOTHING
+    if enough is not None and not thorough and min(part.shape) >= _HALVED_PX:
+        half = np.asarray(
+            cv2.resize(part, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8
+        )
+        found = _detect(half, dictionary, _WINDOWS[0])
+        if len(found.ids) >= enough:
+            return Detections(found.ids, 2.0 * found.corners_px + 0.5 + np.array([left, top]))
+    for windows in (_THOROUGH,) if thorough else _WINDOWS:
+        found = _detect(part, dictionary, windows)
+        if len(found.ids) >= 2:
+            break
+    return Detections(found.ids, found.corners_px + np.array([left, top]))
+
+
+@lru_cache(maxsize=4096)
+def _detector(dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: int) -> cv2.aruco.ArucoDetector:
+    """OpenCV's detector for pictures whose longer side has so many pixels; kept, as a flight meets few sizes."""
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.adaptiveThreshWinSizeMin = windows.least_px
+    parameters.adaptiveThreshWinSizeMax = windows.most_px
+    parameters.adaptiveThreshWinSizeStep = windows.step_px
+    parameters.minMarkerDistanceRate = windows.distance_rate
+    # A rate of the size of the picture passed in, so it differs between a region and the whole.
+    parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_px
+    # The rate counts from the longer side too; a marker that fills the picture must pass.
+    parameters.maxMarkerPerimeterRate = 8.0
+    parameters.maxErroneousBitsInBorderRate = 0.15
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+    return cv2.aruco.ArucoDetector(dictionary, parameters)
+
+
+def _detect(part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: _Windows) -> Detections:
+    corners, ids, _ = _detector(dictionary, windows, max(part.shape)).detectMarkers(part)
+    if ids is None or len(ids) == 0:
+        return NOTHING
+    px = np.array(corners, dtype=float).reshape(-1, 4, 2)
+    return Detections(np.asarray(ids, dtype=np.int64).ravel(), px)
+
+
+def region_of(
+    camera: Camera, model: TargetModel, position_irf_m: ArrayLike, q_irf_trf_wxyz: ArrayLike
+) -> Region | None:
+    """Where in the picture a target with this predicted pose is; None for "look at all of it"."""
+    turn = rotations.to_matrix(q_irf_trf_wxyz)
+    points = _box(model.size_m) @ turn.T + np.asarray(position_irf_m)
+    # Infinity or NaN anywhere makes the sum of all one of them.
+    if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
+        return None
+    x_px, y_px = camera.project(points).T.tolist()
+    across, down = _grown(x_px, camera.width_px), _grown(y_px, camera.height_px)
+    if across is None or down is None:
+        return None
+    (left, right), (top, bottom) = across, down
+    if right - left < 16 or bottom - top < 16:
+        return None
+    if (right - left) * (bottom - top) > _REGION_LIMIT * camera.width_px * camera.height_px:
+        return None
+    return left, top, right, bottom
+
+
+@lru_cache
+def _box(size_m: tuple[float, float, float]) -> Array:
+    """Corners (8, 3) of a box about the origin."""
+    return _CUBE * size_m
+
+
+def _grown(px: list[float], end: int) -> tuple[int, int] | None:
+    """Where along one axis of the picture, ``end`` pixels long, these coordinates and a margin are; None for nowhere."""
+    low, high = min(px), max(px)
+    grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX
+    if not math.isfinite(grow):
+        return None
+    return math.floor(max(low - grow, 0.0)), min(math.ceil(min(high + grow, end)) + 1, end)

@@ -1,0 +1,6 @@
+/* The kernels of perception, compiled once per instruction set (LEVEL). See base.h. */
+#include "base.h"
+#include "elementary.h"
+#include "corners.c"
+#include "pose.c"
+#include "views.c"

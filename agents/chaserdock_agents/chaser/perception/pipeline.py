@@ -1,0 +1,133 @@
+"""From a picture to the pose of the target: the entry to this package."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from chaserdock_models.camera import Camera
+from chaserdock_models.rotations import Array
+from chaserdock_models.targets import TargetModel
+from numpy.typing import ArrayLike, NDArray
+
+from . import baseline as paper
+from . import corners, detect, pnp
+from .pnp import PoseSolution
+
+_ENOUGH = 6
+"""So many markers make a pose to which further ones add little."""
+
+Method = Literal["default", "paper"]
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """What one picture tells of the target.
+
+    ``solutions``: best first, empty when nothing (or nothing trustworthy) is seen, two when a plane's tilt is
+    ambiguous. ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), in the picture as taken, distorted: of the
+    markers used. ``rejected_ids``: detected but not used, in ascending order: not on this target, twice in
+    the picture, contradicted by the others, or with a side that cannot be made out.
+    """
+
+    solutions: tuple[PoseSolution, ...]
+    marker_ids: NDArray[np.int64]
+    corners_px: Array
+    rejected_ids: tuple[int, ...]
+
+
+class Perception:
+    """Finds a target of one model in the pictures of one camera.
+
+    Holds constants only: `estimate` depends on its arguments alone. ``method``: "default", or "paper" for
+    the paper's baseline. Raises ValueError for another method, or for an unknown marker dictionary.
+    """
+
+    def __init__(self, camera: Camera, model: TargetModel, method: Method = "default"):
+        if method not in ("default", "paper"):
+            raise ValueError(f"unknown perception method {method!r}; known: default, paper")
+        self.camera = camera
+        self.model = model
+        self.method: Method = method
+        self._dictionary = detect.dictionary_of(model.dictionary)
+        self._table = pnp.MarkerTable.of(model)
+        # Targets with many markers a face can spare the small ones that half a picture does not show.
+        self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
+        self._rows = {int(i): row for row, i in enumerate(self._table.ids)}
+
+    def estimate(
+        self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
+    ) -> Sighting:
+        """The target's pose in a grey picture (h, w), uint8.
+
+        ``predicted``: position in IRF (3,), metres, and rotation TRF -> IRF (4,), where there is an idea
+        of them. It says where to look first and has no part in the result. Raises ValueError for a
+        picture of another shape or type than the camera's.
+        """
+        shape = (self.camera.height_px, self.camera.width_px)
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
+            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise ValueError(f"expected a uint8 picture of {shape}, got {got}")
+        image = np.ascontiguousarray(image)
+        if self.method == "paper":
+            return self._estimate_paper(image)
+        region = None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
+        if region is not None:
+            sighting = self._estimate_in(image, region)
+            if sighting.solutions:
+                return sighting
+        sighting = self._estimate_in(image, None)
+        rejected = sighting.rejected_ids
+        if sighting.solutions or len(set(rejected)) < len(
+            rejected
+        ):  # found, or two of one: not for want of looking
+            return sighting
+        again = self._estimate_in(image, None, thorough=True)
+        return again if again.solutions else sighting
+
+    def _estimate_in(
+        self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
+    ) -> Sighting:
+        found = detect.detect(image, self._dictionary, region, thorough, self._enough)
+        rows = np.array([self._rows.get(i, -1) for i in found.ids.tolist()], dtype=np.intp)
+        known = rows >= 0
+        px, rows = self.camera.undistort(found.corners_px[known]), rows[known]
+        cells = self._dictionary.markerSize + 2
+        margin = self._table.margin_share[rows]
+        refined = corners.refine(image, self.camera, px, cells, margin)
+        if not refined.good.all():
+            # The detector may have taken the outer edge of the white border for the marker's.
+            lost = ~refined.good
+            inner = corners.inside_border(px[lost], margin[lost])
+            refined = refined.with_others(
+                lost, corners.refine(image, self.camera, inner, cells, margin[lost])
+            )
+            refined, rows = refined.part(refined.good), rows[refined.good]
+        px, sigma = refined.corners_px, refined.relative_sigma
+        solutions, used = pnp.solve(self.camera, self._table, rows, px, sigma)
+        return self._sighting(found.ids, solutions, self._table.ids[rows[used]], px[used])
+
+    def _estimate_paper(self, image: NDArray[np.uint8]) -> Sighting:
+        found = paper.detect(image, self.camera, self._dictionary)
+        ids, counts = np.unique(found.ids, return_counts=True)
+        once = set(ids[counts == 1].tolist()) & self._rows.keys()
+        kept = np.array([int(i) in once for i in found.ids], dtype=bool)
+        ids, px = found.ids[kept], found.corners_px[kept]
+        rows = np.array([self._rows[int(i)] for i in ids], dtype=np.intp)
+        solutions = paper.solve(self.camera, self._table.corners[rows], px)
+        if not solutions:
+            ids, px = ids[:0], px[:0]
+        return self._sighting(found.ids, solutions, ids, px)
+
+    def _sighting(
+        self,
+        found_ids: NDArray[np.int64],
+        solutions: tuple[PoseSolution, ...],
+        ids: NDArray[np.int64],
+        ideal_px: Array,
+    ) -> Sighting:
+        rejected = found_ids.tolist()
+        for i in ids.tolist():
+            rejected.remove(i)
+        return Sighting(solutions, ids, self.camera.distort(ideal_px), tuple(sorted(rejected)))

@@ -1,5 +1,0 @@
-"""Work with recorded logs: open, repair, export, send again."""
-
-from .opened import Log, open_log
-
-__all__ = ["Log", "open_log"]

@@ -1,0 +1,194 @@
+"""The log's viewer layer: Foxglove's messages beside the verbatim ones. Rerun, Foxglove and Lichtblick open it as it is.
+
+Channels (all under ``/viewer/``) and what they show; times are simulated:
+
+- ``tf``: frames ``target`` and ``chaser/N`` as they truly were in ``world`` (WRF), ``chaser/N/camera`` (IRF) on each
+  chaser, and ``target/estimate``, the fused estimate while there is one
+- ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: picture, camera, corners that were used
+- ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in WRF): poses
+- ``scene``: the bodies as boxes in their true frames; ``events``: what processes told
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import foxglove.messages as fox
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import (
+    BodyTruth,
+    Event,
+    Image,
+    Quaternion,
+    Reference,
+    Sighting,
+    TargetEstimate,
+    Vector3,
+)
+from chaserdock_protocol.recording.scan import VIEWER_PREFIX
+from chaserdock_protocol.scenario import Scenario
+
+Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
+"""``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
+
+SHOWN = frozenset(
+    {topics.IMAGE, topics.TRUTH_BODY, topics.SIGHTING, topics.TARGET, topics.REFERENCE, topics.EVENT}
+)
+"""Topics whose messages the layer is made of."""
+
+_LATEST_NS = (2**32 - 1) * 1_000_000_000  # what a viewer's time stamp can hold
+
+_LEVELS = {"info": fox.LogLevel.Info, "warning": fox.LogLevel.Warning, "error": fox.LogLevel.Error}
+_CAMERA_COLOUR = fox.Color(r=0.35, g=0.86, b=0.35, a=1.0)
+_TARGET_COLOUR = fox.Color(r=0.85, g=0.65, b=0.25, a=0.9)
+_CHASER_COLOUR = fox.Color(r=0.35, g=0.55, b=0.85, a=0.6)
+
+
+class ViewerLayer:
+    """Turns messages into the viewer layer of one file; each file of a rotated log needs its own."""
+
+    def __init__(self, scenario: Scenario, write: Write) -> None:
+        self._write = write
+        self._scenario = scenario
+        self._schemas: dict[type, tuple[str, str, bytes]] = {}
+        camera = scenario.camera_model()
+        self._camera_pose = (camera.position_crf_m, camera.q_crf_irf_wxyz)
+        matrix = [float(x) for x in camera.matrix().ravel()]
+        self._calibration: dict[str, Any] = {
+            "width": camera.width_px,
+            "height": camera.height_px,
+            "distortion_model": "plumb_bob",
+            "D": [*camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0][:5],
+            "K": matrix,
+            "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            "P": [*matrix[0:3], 0.0, *matrix[3:6], 0.0, *matrix[6:9], 0.0],
+        }
+        self._begun = False
+
+    def take(self, message: Any) -> None:
+        """Writes what there is to see of a message; nothing for those that are not ``SHOWN``."""
+        time_ns = getattr(message, "sim_time_ns", 0)
+        if time_ns > _LATEST_NS:
+            return
+        if not self._begun:
+            self._begun = True
+            self._begin(time_ns)
+        for name, view in self._views(message, _time(time_ns)):
+            self._put(name, view, time_ns)
+
+    def _put(self, name: str, view: Any, time_ns: int) -> None:
+        kind = type(view)
+        if kind not in self._schemas:
+            schema = kind.get_schema()
+            self._schemas[kind] = (schema.name, schema.encoding, schema.data)
+        self._write(VIEWER_PREFIX + name, self._schemas[kind], view.encode(), time_ns)
+
+    def _begin(self, time_ns: int) -> None:
+        """What never changes: cameras on the chasers, and the bodies' shapes."""
+        stamp = _time(time_ns)
+        shapes = [("target", self._scenario.target_model().size_m, _TARGET_COLOUR)]
+        for i in range(len(self._scenario.chasers)):
+            self._put("tf", _frame(stamp, f"chaser/{i}", f"chaser/{i}/camera", *self._camera_pose), time_ns)
+            shapes.append((f"chaser/{i}", self._scenario.chaser.size_m, _CHASER_COLOUR))
+        entities = [
+            fox.SceneEntity(
+                timestamp=stamp,
+                frame_id=frame,
+                id=frame,
+                frame_locked=True,
+                cubes=[fox.CubePrimitive(pose=_NO_POSE, size=_vector(size_m), color=colour)],
+            )
+            for frame, size_m, colour in shapes
+        ]
+        self._put("scene", fox.SceneUpdate(entities=entities), time_ns)
+
+    def _views(self, message: Any, stamp: fox.Timestamp) -> Iterator[tuple[str, Any]]:
+        match message:
+            case Image():
+                yield f"chaser/{message.chaser}/image", _picture(message, stamp)
+                frame = f"chaser/{message.chaser}/camera"
+                calibration = fox.CameraCalibration(timestamp=stamp, frame_id=frame, **self._calibration)
+                yield f"chaser/{message.chaser}/calibration", calibration
+            case BodyTruth():
+                yield "tf", _frame(stamp, "world", message.body, message.position_m, message.q_wxyz)
+            case TargetEstimate() if message.status in ("tracking", "predicting"):
+                where = (message.position_m, message.q_wxyz)
+                yield "tf", _frame(stamp, "world", "target/estimate", *where)
+                yield "target/estimate", _pose_in(stamp, "world", *where)
+            case Sighting():
+                yield f"chaser/{message.chaser}/detections", _detections(message, stamp)
+                for best in message.solutions[:1]:
+                    frame = f"chaser/{message.chaser}/camera"
+                    measured = _pose_in(stamp, frame, best.position_m, best.q_wxyz)
+                    yield f"chaser/{message.chaser}/measurement", measured
+            case Reference():
+                reference = _pose_in(stamp, "world", message.position_m, message.q_wxyz)
+                yield f"chaser/{message.chaser}/reference", reference
+            case Event():
+                text = f"{message.what}: {message.detail}" if message.detail else message.what
+                level = _LEVELS[message.level]
+                yield "events", fox.Log(timestamp=stamp, level=level, message=text, name=message.process)
+
+
+def _time(time_ns: int) -> fox.Timestamp:
+    return fox.Timestamp(sec=time_ns // 1_000_000_000, nsec=time_ns % 1_000_000_000)
+
+
+def _vector(v: Vector3) -> fox.Vector3:
+    return fox.Vector3(x=v[0], y=v[1], z=v[2])
+
+
+def _quaternion(q_wxyz: Quaternion) -> fox.Quaternion:
+    w, x, y, z = q_wxyz
+    return fox.Quaternion(x=x, y=y, z=z, w=w)
+
+
+_NO_POSE = fox.Pose(position=_vector((0.0, 0.0, 0.0)), orientation=_quaternion((1.0, 0.0, 0.0, 0.0)))
+
+
+def _frame(stamp: fox.Timestamp, parent: str, child: str, p: Vector3, q: Quaternion) -> fox.FrameTransform:
+    return fox.FrameTransform(
+        timestamp=stamp,
+        parent_frame_id=parent,
+        child_frame_id=child,
+        translation=_vector(p),
+        rotation=_quaternion(q),
+    )
+
+
+def _pose_in(stamp: fox.Timestamp, frame: str, p: Vector3, q: Quaternion) -> fox.PoseInFrame:
+    pose = fox.Pose(position=_vector(p), orientation=_quaternion(q))
+    return fox.PoseInFrame(timestamp=stamp, frame_id=frame, pose=pose)
+
+
+def _picture(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawImage:
+    frame = f"chaser/{image.chaser}/camera"
+    if image.encoding == "jpeg":
+        return fox.CompressedImage(timestamp=stamp, frame_id=frame, data=image.data, format="jpeg")
+    return fox.RawImage(
+        timestamp=stamp,
+        frame_id=frame,
+        width=image.width_px,
+        height=image.height_px,
+        encoding="mono8",
+        step=image.width_px,
+        data=image.data,
+    )
+
+
+def _detections(sighting: Sighting, stamp: fox.Timestamp) -> fox.ImageAnnotations:
+    """Outlines of the markers that were used; viewers count pixels from the corner of the first, we from its centre."""
+    u, v = sighting.corners_px[0::2], sighting.corners_px[1::2]
+    corners = [fox.Point2(x=a + 0.5, y=b + 0.5) for a, b in zip(u, v, strict=False)]
+    outlines = [
+        fox.PointsAnnotation(
+            timestamp=stamp,
+            type=fox.PointsAnnotationType.LineLoop,
+            points=corners[k : k + 4],
+            outline_color=_CAMERA_COLOUR,
+            thickness=2.0,
+        )
+        for k in range(0, len(corners), 4)
+    ]
+    return fox.ImageAnnotations(timestamp=stamp, points=outlines)

@@ -1,0 +1,76 @@
+"""The files of one recording: verbatim and viewer layer together, a new file by size or time where that is asked for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from chaserdock_protocol.messages import JoinReply
+from chaserdock_protocol.process import Rotation
+from chaserdock_protocol.recording.log import LogError, LogWriter
+from chaserdock_protocol.recording.scan import LOG_NAME, part_name
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.transport import Raw
+
+from .foxglove_layer import ViewerLayer
+
+
+class Recording:
+    """A mission's log in ``folder``, which is made; each of its files stands for itself.
+
+    With ``scenario`` None there is no viewer layer. Raises LogError when a file cannot be created or written.
+    """
+
+    def __init__(
+        self, folder: Path, mission: JoinReply, rotation: Rotation, scenario: Scenario | None
+    ) -> None:
+        self._folder, self._mission, self._rotation, self._scenario = folder, mission, rotation, scenario
+        self._part = 0
+        self._from_ns: int | None = None
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from None
+        if any(folder.glob("mission*.mcap")):
+            raise LogError(f"{folder}: holds a log already; a log is never overwritten")
+        self._open()
+
+    @property
+    def path(self) -> Path:
+        """The file being written."""
+        return self._writer.path
+
+    def _open(self) -> None:
+        run = {"run_id": self._mission.run_id, "mode": self._mission.mode}
+        name = LOG_NAME
+        if self._rotation.wanted:
+            name, run["part"] = part_name(self._part), str(self._part)
+        self._writer = LogWriter(self._folder / name)
+        self._writer.describe(self._mission.scenario_json, run)
+        self._viewer = ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
+        self._from_ns = None
+
+    def write(self, raw: Raw, message: Any) -> None:
+        """Appends what came over the wire; ``message`` is the same opened, or None if nobody here needs it."""
+        if self._rotation.wanted and self._is_full():
+            self._writer.close()
+            self._part += 1
+            self._open()
+        time_ns = None if message is None else message.sim_time_ns
+        self._writer.write(raw.key, raw.encoding, raw.payload, raw.sent_ns, time_ns)
+        if self._from_ns is None:
+            self._from_ns = self._writer.last_time_ns
+        if self._viewer is not None and message is not None:
+            self._viewer.take(message)
+
+    def _is_full(self) -> bool:
+        size, seconds = self._rotation.size_bytes, self._rotation.seconds
+        if size is not None and self._writer.size_bytes >= size:
+            return True
+        if seconds is None or self._from_ns is None:
+            return False
+        return self._writer.last_time_ns - self._from_ns >= seconds * 1e9
+
+    def close(self) -> None:
+        """Ends the last file; raises LogError."""
+        self._writer.close()

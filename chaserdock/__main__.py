@@ -1,0 +1,6 @@
+"""``python -m chaserdock`` is the ``chaserdock`` program."""
+
+from chaserdock.cli.main import main
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,131 @@
+"""A mission's bodies drawn from outside, with OpenCV: flat faces, ordered by depth (the painter's way)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
+
+from .plots import colour
+from .scene import Face, Scene
+
+Picture = NDArray[np.uint8]
+Pose = tuple[Array, Array]
+"""Position (3,) WRF and attitude (4,) body to WRF."""
+
+_NEAR_M = 0.02
+_SHIFT = 4
+_SPACE = (26, 21, 18)
+_TARGET_PATH = (150, 150, 150)
+
+
+def tint(chaser: int) -> Array:
+    """A chaser's colour (3,), BGR, 0 to 255: that of the figures, lighter for the dark sky."""
+    rgb = np.array(to_rgb(colour(chaser)))
+    return (255.0 * (0.78 * rgb + 0.22))[::-1]
+
+
+@dataclass(frozen=True)
+class Viewpoint:
+    """A camera that looks at ``centre_m`` (WRF) from ``distance_m`` away: azimuth and elevation in the world, radians."""
+
+    centre_m: Array
+    distance_m: float
+    azimuth_rad: float
+    elevation_rad: float
+    width_px: int
+    height_px: int
+
+    def axes(self) -> Array:
+        """Right, up and towards the viewer (3, 3), rows in WRF."""
+        ca, sa = np.cos(self.azimuth_rad), np.sin(self.azimuth_rad)
+        ce, se = np.cos(self.elevation_rad), np.sin(self.elevation_rad)
+        back = np.array([ce * ca, ce * sa, se])
+        right = np.array([-sa, ca, 0.0])
+        return np.stack([right, np.cross(back, right), back])
+
+    def see(self, points_m: Array) -> tuple[Array, Array]:
+        """Pixels (..., 2) and depths (...) in metres of points (..., 3) in WRF; behind the viewer pixels mean nothing."""
+        local = (points_m - self.centre_m) @ self.axes().T
+        depth = self.distance_m - local[..., 2]
+        focal = 1.25 * min(self.width_px, 1.35 * self.height_px)
+        scale = focal / np.maximum(depth, _NEAR_M)[..., None]
+        px = local[..., :2] * scale * (1.0, -1.0) + (self.width_px / 2.0, self.height_px / 2.0)
+        return px, depth
+
+
+def _fixed(px: Array) -> NDArray[np.int32]:
+    # OpenCV's fixed-point coordinates overflow far outside; nothing there is seen anyway.
+    return np.round(np.clip(px, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
+
+
+def _fill(picture: Picture, px: Array, bgr: Array) -> None:
+    cv2.fillConvexPoly(picture, _fixed(px), np.clip(bgr, 0, 255).tolist(), cv2.LINE_AA, _SHIFT)
+
+
+def _lines(
+    picture: Picture, view: Viewpoint, points_m: Array, bgr: Sequence[float], closed: bool = False
+) -> None:
+    px, depth = view.see(points_m)
+    if len(px) > 1 and np.all(depth > _NEAR_M):
+        cv2.polylines(picture, [_fixed(px)], closed, bgr, 1, cv2.LINE_AA, _SHIFT)
+
+
+def draw(
+    scene: Scene,
+    view: Viewpoint,
+    sun: Array,
+    target: Pose,
+    chasers: dict[int, Pose],
+    paths: dict[int | None, Array],
+    seeing: frozenset[int],
+) -> Picture:
+    """The picture (height, width, 3), BGR, of target and chasers.
+
+    ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
+    under None. ``seeing``: chasers whose picture was used; their cameras' outlines are brighter.
+    """
+    picture = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
+    for body, points in paths.items():
+        shade = _TARGET_PATH if body is None else (0.75 * tint(body)).tolist()
+        _lines(picture, view, points, shade)
+    bodies: list[tuple[Pose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
+    bodies += [(pose, scene.chaser, tint(i)) for i, pose in chasers.items()]
+    eye = view.centre_m + view.axes()[2] * view.distance_m
+    visible = []
+    for (position, attitude), faces, hue in bodies:
+        for face in faces:
+            corners = rotations.rotate(attitude, face.corners_m) + position
+            normal = rotations.rotate(attitude, face.normal)
+            away = eye - corners.mean(axis=0)
+            if normal @ away > 0.0:
+                light = 0.45 + 0.55 * max(0.0, float(normal @ sun))
+                visible.append((float(np.linalg.norm(away)), position, attitude, face, corners, light, hue))
+    visible.sort(key=lambda item: -item[0])
+    for _, position, attitude, face, corners, light, hue in visible:
+        px, depth = view.see(corners)
+        if np.any(depth <= _NEAR_M):
+            continue
+        bgr = np.full(3, float(face.grey)) if hue is None else hue * (0.3 + 0.75 * face.grey / 128.0)
+        _fill(picture, px, bgr * light)
+        for quad, grey in face.decals:
+            px, _ = view.see(rotations.rotate(attitude, quad) + position)
+            _fill(picture, px, np.full(3, grey * light))
+    for i, (position, attitude) in chasers.items():
+        strength = 1.0 if i in seeing else 0.4
+        bgr = (strength * tint(i)).tolist()
+        far = rotations.rotate(attitude, scene.camera_corners_m) + position
+        origin = rotations.rotate(attitude, scene.camera_origin_m) + position
+        for corner in far:
+            _lines(picture, view, np.stack([origin, corner]), bgr)
+        _lines(picture, view, far, bgr, closed=True)
+        (x, y), _ = view.see(position)
+        place = (round(float(np.clip(x, -1e4, 1e4))) + 22, round(float(np.clip(y, -1e4, 1e4))) - 20)
+        cv2.putText(picture, str(i), place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
+    return picture

@@ -1,0 +1,75 @@
+"""The cameras' pictures of a log in step with what was found in them, a few at a time, never all in memory."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict, deque
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from chaserdock_protocol.messages import Image, Sighting
+from chaserdock_protocol.recording.log import read_log
+from chaserdock_protocol.topics import IMAGE, SIGHTING
+
+Pair = tuple[Image, Sighting | None]
+
+_HELD = 4
+
+
+def pairs(log: Path, chasers: int) -> Iterator[Pair]:
+    """Every picture with the sighting of the same exposure, or None where the log has none; each chaser's by time.
+
+    A log's order is that of arrival: a sighting may lie a little before its picture, or behind the next one. Holds at most
+    a few pictures a chaser; raises LogError where the log cannot be read.
+    """
+    waiting: dict[int, deque[Image]] = defaultdict(deque)
+    early: dict[int, dict[int, Sighting]] = defaultdict(dict)
+    keys = [t.key_of(i) for i in range(chasers) for t in (IMAGE, SIGHTING)]
+    for record in read_log(log, keys):
+        message: Any = record.message
+        images, sightings = waiting[message.chaser], early[message.chaser]
+        if isinstance(message, Image):
+            images.append(message)
+        else:
+            sightings[message.sim_time_ns] = message
+            if len(sightings) > _HELD:
+                del sightings[min(sightings)]
+        while images and (images[0].sim_time_ns in sightings or len(images) > _HELD):
+            first = images.popleft()
+            yield first, sightings.pop(first.sim_time_ns, None)
+    for chaser, images in sorted(waiting.items()):
+        for image in images:
+            yield image, early[chaser].pop(image.sim_time_ns, None)
+
+
+def shots(
+    log: Path, chasers: int, every_s: float, first_s: float = 0.0
+) -> Iterator[tuple[float, dict[int, Pair]]]:
+    """At ``first_s`` and then ``every_s`` (simulated seconds): the time and each chaser's latest picture up to then.
+
+    The last one comes at or after the end of the pictures; none does where that is before ``first_s``. Where
+    the log's order is not that of time, a chaser's picture may be one older than it could be.
+    """
+    latest: dict[int, Pair] = {}
+    number, time_s = 0, -math.inf
+    for image, sighting in pairs(log, chasers):
+        time_s = image.sim_time_ns / 1e9
+        while time_s > first_s + number * every_s + 1e-9:
+            if latest:
+                yield first_s + number * every_s, dict(latest)
+            number += 1
+        latest[image.chaser] = (image, sighting)
+    if time_s > first_s - every_s:
+        yield first_s + number * every_s, latest
+
+
+def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tuple[int, int]:
+    """In how many columns ``number`` pictures of this aspect (width over height) get largest, and how wide each then is."""
+    best = (1, 1)
+    for columns in range(1, number + 1):
+        rows = math.ceil(number / columns)
+        width = int(min(width_px / columns, height_px / rows * aspect))
+        if width > best[1]:
+            best = (columns, width)
+    return best

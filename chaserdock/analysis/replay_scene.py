@@ -1,0 +1,117 @@
+"""Data of the page's 3-D replay: a flight thinned to what an eye can follow, faces, and small camera pictures."""
+
+from __future__ import annotations
+
+import base64
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.recording.log import LogError
+from numpy.typing import NDArray
+
+from .flight import Flight, Track
+from .images import Pair, shots
+from .scene import Face, scene_of
+from .snapshot import view
+from .summary import tracking_errors
+from .time_series import Traces
+
+_MOST_SAMPLES = 1200
+_MOST_SHOTS = 120
+_SHOT_WIDTH_PX = 256
+
+
+def _numbers(values: Array, digits: int) -> list[float]:
+    # As text of fixed length, and without the -0.0 that JSON would carry along.
+    return (np.round(np.asarray(values, dtype=float).ravel(), digits) + 0.0).tolist()
+
+
+def _faces(faces: tuple[Face, ...]) -> list[dict[str, Any]]:
+    return [
+        {
+            "c": _numbers(f.corners_m, 4),
+            "n": _numbers(f.normal, 4),
+            "g": f.grey,
+            "d": [[_numbers(quad, 4), grey] for quad, grey in f.decals],
+        }
+        for f in faces
+    ]
+
+
+def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
+    return {"p": _numbers(track.position_m[rows], 4), "q": _numbers(track.q_wxyz[rows], 4)}
+
+
+def replay_data(flight: Flight, traces: Traces, pictures: dict[str, Any]) -> dict[str, Any]:
+    """Plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases, what became of pictures.
+
+    Bodies' rows are those of ``times``, at most 1200 and evenly spread; a body that was lost has fewer.
+    """
+    target = flight.truth["target"]
+    rows = np.arange(0, len(target.time_s), max(1, -(-len(target.time_s) // _MOST_SAMPLES)))
+    if rows[-1] != len(target.time_s) - 1:
+        rows = np.append(rows, len(target.time_s) - 1)
+    chasers, reach_m = [], 0.3
+    for i in range(len(flight.scenario.chasers)):
+        own = flight.truth.get(f"chaser/{i}")
+        if own is None:
+            continue
+        mine = rows[rows < len(own.time_s)]
+        _, position, _ = tracking_errors(flight, i)
+        distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)
+        # Far flown strays must not make all others small.
+        reach_m = max(reach_m, min(float(distance.max()), 3.0))
+        looks = list(traces.looks[i].stretches()) if i in traces.looks else []
+        told = flight.told.get(i)
+        chasers.append(
+            {
+                "id": i,
+                **_thinned(own, mine),
+                "phase": [[round(t, 3), name] for t, name in (told.phases if told else [])],
+                "look": [[round(t, 3), look] for t, _, look in looks],
+                "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
+            }
+        )
+    scene = scene_of(flight.scenario)
+    return {
+        "times": _numbers(target.time_s[rows], 3),
+        "reach_m": reach_m,
+        "sun": list(flight.scenario.camera.sun_direction),
+        "target": _thinned(target, rows),
+        "chasers": chasers,
+        "scene": {
+            "target": _faces(scene.target),
+            "chaser": _faces(scene.chaser),
+            "camera_origin": _numbers(scene.camera_origin_m, 4),
+            "camera_corners": _numbers(scene.camera_corners_m, 4),
+        },
+        "pictures": pictures,
+    }
+
+
+def small_pictures(log: Path, flight: Flight) -> dict[str, Any]:
+    """Camera pictures with detections, as data URLs, at most 120 a chaser: ``times`` (s) and ``chasers`` by number.
+
+    An empty text stands where a chaser had no readable picture.
+    """
+    number = len(flight.scenario.chasers)
+    every_s = max(1.0, flight.scenario.duration_s / _MOST_SHOTS)
+    times: list[float] = []
+    out: dict[str, list[str]] = {str(i): [] for i in range(number)}
+    for time_s, latest in shots(log, number, every_s):
+        times.append(round(time_s, 3))
+        for i in range(number):
+            out[str(i)].append(_data_url(flight, latest[i]) if i in latest else "")
+    return {"times": times, "chasers": {i: urls for i, urls in out.items() if any(urls)}}
+
+
+def _data_url(flight: Flight, pair: Pair) -> str:
+    try:
+        picture = view(flight.scenario, *pair, _SHOT_WIDTH_PX)
+    except LogError:
+        return ""
+    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 72])
+    return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

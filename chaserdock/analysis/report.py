@@ -1,0 +1,291 @@
+"""One self-contained page about a recorded flight: verdict, tables, 3-D replay, figures, events, scenario, versions.
+
+Opens from a file without a network; the page forbids itself any request (Content-Security-Policy). A log that
+holds less gives a page with less, which says what is missing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from string import Template
+from typing import Any
+
+from chaserdock_protocol.errors import ChaserdockError
+
+from .figures import drawn
+from .flight import Flight, load_flight
+from .plots import step_of, to_inline_svg
+from .replay_scene import replay_data, small_pictures
+from .summary import summary_of
+from .time_series import load_traces
+
+_PAGE = files("chaserdock.analysis") / "page"
+_DASH = "–"  # noqa: RUF001
+
+
+def write_report(log: Path, out: Path | None = None) -> Path:
+    """Writes the page of a log (or run folder), by default as ``report.html`` beside the log, and tells where.
+
+    Raises LogError for a log that cannot be read and ChaserdockError where the page cannot be written.
+    """
+    out = out or (log if log.is_dir() else log.parent) / "report.html"
+    text = report_of(log)
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
+    return out
+
+
+def report_of(log: Path) -> str:
+    """The page as text; raises LogError for a log that cannot be read."""
+    flight = load_flight(log)
+    result = summary_of(flight)
+    every = step_of(flight.world.ticks)
+    traces = load_traces(log, range(len(flight.scenario.chasers)), every)
+    missing: list[str] = []
+    figures = []
+    for kind, figure in drawn(flight, traces):
+        if isinstance(figure, str):
+            missing.append(f"{kind.title}: {figure}.")
+            continue
+        svg = to_inline_svg(figure, kind.name, kind.title)
+        figures.append(
+            f'<h3 id="figure-{kind.name}">{escape(kind.title)}</h3>\n<figure>'
+            f"<figcaption>{escape(kind.caption)}</figcaption>\n{svg}</figure>"
+        )
+    replay, script = "", ""
+    if "target" in flight.truth:
+        data = replay_data(flight, traces, small_pictures(log, flight))
+        replay = _replay(data)
+        # "</" would end the script element, wherever it stood.
+        text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
+        code = (_PAGE / "replay.js").read_text(encoding="utf-8")
+        script = (
+            f'<script type="application/json" id="replay-data">{text}</script>\n<script>\n{code}</script>'
+        )
+    else:
+        missing.insert(0, "3-D replay: the log holds no ground truth of the target.")
+    body = [
+        _head(flight, result),
+        _outcome(result),
+        _chasers(flight, result),
+        _numbers(flight, result),
+        replay,
+        '<h2 id="figures">Figures</h2>',
+        f'<p class="faint">A long flight: one of {every} ticks is drawn; tables are of all.</p>'
+        if every > 1
+        else "",
+        *figures,
+        _missing(missing),
+        _events(result, bool(replay)),
+        _details(flight, result),
+    ]
+    page = Template((_PAGE / "report.html").read_text(encoding="utf-8"))
+    return page.substitute(
+        title=escape(f"{flight.scenario.name} {_DASH} chaserdock"),
+        style=(_PAGE / "report.css").read_text(encoding="utf-8"),
+        body="\n".join(part for part in body if part),
+        script=script,
+    )
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    """A table; the first cell of a row names it. Cells are text, and escaped here."""
+    top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
+    lines = []
+    for row in rows:
+        first, *rest = row
+        cells = "".join(f"<td>{escape(cell)}</td>" for cell in rest)
+        lines.append(f'<tr><th scope="row">{escape(first)}</th>{cells}</tr>')
+    return (
+        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+    )
+
+
+def _shown(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
+    if value is None:
+        return _DASH
+    # With "#" trailing zeros stay; a bare point at the end does not.
+    return f"{f'{value * factor:#.{digits}g}'.rstrip('.')} {unit}".rstrip()
+
+
+def _rms(mean_square: float | None, unit: str, factor: float) -> str:
+    return _shown(None if mean_square is None else math.sqrt(mean_square), unit, factor)
+
+
+def _head(flight: Flight, result: dict[str, Any]) -> str:
+    s = flight.scenario
+    verdict = (
+        '<span class="verdict good">success</span>'
+        if result["success"]
+        else '<span class="verdict bad">not successful</span>'
+    )
+    where = [("figures", "Figures"), ("events", "Events"), ("scenario", "Scenario"), ("versions", "Versions")]
+    if "target" in flight.truth:
+        where.insert(0, ("replay-section", "Replay"))
+    links = "".join(f'<a href="#{anchor}">{name}</a>' for anchor, name in where)
+    mode = {"lockstep": "lock-step", "realtime": "real time"}.get(result["mode"]) or "unknown mode"
+    return (
+        f"<h1>{escape(s.name)}</h1><p>{escape(s.description)}</p>\n<p>{verdict} "
+        f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
+        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {len(s.chasers)} chaser(s); seed {s.seed}; "
+        f"digest {escape(result['digest'][:16])}</span></p>\n<nav>{links}</nav>"
+    )
+
+
+def _outcome(result: dict[str, Any]) -> str:
+    if not result["failures"]:
+        return ""
+    items = "".join(f"<li>{escape(f)}</li>" for f in result["failures"])
+    return f'<h2>Not met</h2><ul class="bad">{items}</ul>'
+
+
+def _chasers(flight: Flight, result: dict[str, Any]) -> str:
+    if not result["chasers"]:
+        return "<h2>Chasers</h2><p>The log holds no motion of any chaser.</p>"
+    degree = math.degrees(1.0)
+    rows = [
+        (
+            f"chaser {i}",
+            _rms(c["steady"]["position_mse_m2"], "mm", 1e3),
+            _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
+            _shown(c["position_mse_m2"], "m²"),
+            _shown(c["orientation_mse_rad2"], "rad²"),
+            f"{c['dock_time_s']:.2f} s" if c["docked"] else "no",
+            _shown(c["min_distance_target_m"], "m"),
+            _shown(c["impulse_N_s"], "N s"),
+        )
+        for i, c in result["chasers"].items()
+    ]
+    s = flight.scenario
+    head = (
+        "",
+        "steady position RMS",
+        "steady orientation RMS",
+        "position MSE, whole run",
+        "orientation MSE, whole run",
+        "docked since",
+        "nearest to target",
+        "impulse",
+    )
+    until = s.steady_until_s or s.duration_s
+    return (
+        "<h2>Chasers</h2>"
+        + table(head, rows)
+        + '<p class="faint">Chaser against its reference pose on the true target. '
+        + f"Steady: {s.settling_s:g} s to {until:g} s.</p>"
+    )
+
+
+def _numbers(flight: Flight, result: dict[str, Any]) -> str:
+    e, degree = result["target_estimate"], math.degrees(1.0)
+    estimate = [
+        ("position", _shown(e["position_rms_m"], "mm", 1e3), _shown(e["max_position_error_m"], "mm", 1e3)),
+        (
+            "orientation",
+            _shown(e["orientation_rms_rad"], "°", degree),
+            _shown(e["max_orientation_error_rad"], "°", degree),
+        ),
+        ("velocity", _shown(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
+        ("rate", _shown(e["omega_rms_rad_s"], "°/s", degree), ""),
+    ]
+    latency, solver = result["latency_s"], result["solver"]
+    safety = [
+        ("nearest two chasers", _shown(result["min_distance_chasers_m"], "m")),
+        ("collisions", str(result["collisions"])),
+        ("mean NEES of the estimate (6 expected)", _shown(e["nees_mean"], "")),
+        (f"solve time ({solver['name']}), median", _shown(solver["solve_s"]["p50"], "ms", 1e3)),
+        ("solve time, 95 %", _shown(solver["solve_s"]["p95"], "ms", 1e3)),
+        ("failed solves", str(solver["failures"])),
+        ("exposure to command, median", _shown(latency["p50"], "ms", 1e3)),
+        ("exposure to command, 99 %", _shown(latency["p99"], "ms", 1e3)),
+        ("late commands", str(result["late_commands"])),
+        ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
+    ]
+    return (
+        f'<div class="pair"><section><h2>Target estimate</h2>{table(("", "RMS", "largest error"), estimate)}'
+        f'<p class="faint">Fused estimate against the truth, after {flight.scenario.settling_s:g} s, '
+        "at the time of exposure.</p></section>"
+        f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
+    )
+
+
+def _replay(data: dict[str, Any]) -> str:
+    end = data["times"][-1]
+    seen = list(data["pictures"]["chasers"])
+    columns = 1 if len(seen) <= 4 else 2
+    width = 256 if len(seen) <= 2 else 210 if len(seen) == 3 else 190
+    images = "".join(f'<img data-chaser="{i}" alt="picture of chaser {i}">' for i in seen)
+    views = (
+        f'<div id="replay-views" style="grid-template-columns: repeat({columns}, 1fr); width: {width * columns}px">'
+        f"{images}</div>"
+    )
+    rows = "".join(f'<tr id="replay-row-{c["id"]}"></tr>' for c in data["chasers"])
+    speeds = "".join(
+        f'<option value="{v}"{" selected" if v == 5 else ""}>{v} ×</option>'  # noqa: RUF001
+        for v in (1, 2, 5, 10, 20)
+    )
+    return f"""<h2 id="replay-section">Replay</h2>
+<div class="player">
+<div class="stage"><canvas id="replay" tabindex="0" role="img" aria-label="target and chasers in three dimensions">
+</canvas>{views}</div>
+<div class="controls"><button id="replay-play" type="button">Play</button>
+<input id="replay-time" type="range" min="0" max="{end}" step="0.05" value="0" aria-label="time">
+<span id="replay-clock"></span>
+<label>speed <select id="replay-speed">{speeds}</select></label>
+<label><input id="replay-ride" type="checkbox"> ride on the target</label></div>
+<div class="wide"><table>
+<thead><tr><th></th><th>phase</th><th>to the target</th><th>position error</th><th>picture</th></tr></thead>
+<tbody>{rows}</tbody></table></div>
+<p class="faint">Drag to turn, wheel to zoom; arrow keys, +, − and space do the same. Ground truth. A camera's outline is
+bright while its picture is used; chaser colours are the figures'.</p>
+</div>"""  # noqa: RUF001
+
+
+def _missing(missing: list[str]) -> str:
+    if not missing:
+        return ""
+    items = "".join(f"<li>{escape(m)}</li>" for m in missing)
+    return f'<h3 id="missing">Not in this log</h3><ul class="faint">{items}</ul>'
+
+
+def _events(result: dict[str, Any], jumps: bool) -> str:
+    if not result["events"]:
+        return '<h2 id="events">Events</h2><p>None recorded.</p>'
+    rows = []
+    for event in result["events"]:
+        time_s = event["time_s"]
+        shown = f"{time_s:.2f} s"
+        if jumps:
+            shown = (
+                f'<button type="button" data-time="{time_s:.3f}" title="show in the replay">{shown}</button>'
+            )
+        rows.append(f'<tr><td>{shown}</td><td class="text">{escape(event["what"])}</td></tr>')
+    return f'<h2 id="events">Events</h2><div class="wide"><table><tbody>{"".join(rows)}</tbody></table></div>'
+
+
+def _details(flight: Flight, result: dict[str, Any]) -> str:
+    scenario = json.dumps(flight.scenario.model_dump(mode="json"), indent=2, ensure_ascii=False)
+    versions = [
+        (k.removeprefix("version."), v) for k, v in sorted(flight.run.items()) if k.startswith("version.")
+    ]
+    run = [(k, v) for k, v in sorted(flight.run.items()) if not k.startswith("version.")]
+    messages = [(key, str(m["count"]), str(m["lost"])) for key, m in result["messages"].items()]
+    refused = [(reason, str(count)) for reason, count in result["rejected"].items()]
+    # The whole digest, too: two pages of the same flight can be told to be the same.
+    run.append(("digest", result["digest"]))
+    return (
+        '<h2 id="scenario">Scenario and data</h2>'
+        f"<details><summary>Scenario as flown</summary><pre>{escape(scenario)}</pre></details>"
+        f"<details><summary>Messages</summary>{table(('topic', 'in the log', 'lost'), messages)}"
+        + (f"<h3>Refused at a process' boundary</h3>{table(('reason', 'count'), refused)}" if refused else "")
+        + "</details>"
+        f"<details><summary>Summary as JSON</summary><pre>{escape(json.dumps(result, indent=2))}</pre></details>"
+        f'<h2 id="versions">Run and versions</h2>{table(("", ""), [*run, *versions])}'
+    )

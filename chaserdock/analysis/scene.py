@@ -1,0 +1,118 @@
+"""The bodies of a mission as coloured faces in their own axes, for those who draw them: the page's replay, the video."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
+from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
+from chaserdock_protocol.scenario import Scenario
+
+Grey = int
+"""0 black to 255 white, in full light."""
+
+_PROBE_WIDTH_M = 0.012
+# A long thin box is cut, so that ordering faces by their centres' depth puts every part of it right.
+_LONGEST_PIECE_M = 0.06
+
+
+@dataclass(frozen=True)
+class Face:
+    """A flat quadrangle ``corners_m`` (4, 3) in body axes, its outward ``normal``; ``decals`` are painted on it in turn."""
+
+    corners_m: Array
+    normal: Array
+    grey: Grey
+    decals: tuple[tuple[Array, Grey], ...] = ()
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Faces of the target (TRF) and of any chaser (CRF), and the far corners (4, 3) of a camera's view in CRF."""
+
+    target: tuple[Face, ...]
+    chaser: tuple[Face, ...]
+    camera_origin_m: Array
+    camera_corners_m: Array
+
+
+def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey], ...]:
+    """Quadrangles (4, 3) in TRF of a printed marker: white border, black square, and the white cells, row by row."""
+    table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, model.dictionary))
+    n = table.markerSize + 2
+    cells = np.asarray(cv2.aruco.generateImageMarker(table, marker.id, n, borderBits=1)) > 0
+    top_left, top_right, _, bottom_left = marker.corners_trf_m()
+    right, down = top_right - top_left, bottom_left - top_left
+
+    def quad(x0: float, y0: float, x1: float, y1: float) -> Array:
+        return np.array(
+            [top_left + x * right + y * down for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        )
+
+    margin = model.white_margin_m / marker.side_m
+    out = [(quad(-margin, -margin, 1 + margin, 1 + margin), 242), (quad(0, 0, 1, 1), 13)]
+    for row in range(n):
+        edges = np.flatnonzero(np.diff(np.concatenate([[False], cells[row], [False]]).astype(int)))
+        for first, last in edges.reshape(-1, 2).tolist():
+            out.append((quad(first / n, row / n, last / n, (row + 1) / n), 242))
+    return tuple(out)
+
+
+def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
+    """The six faces of a box in the axes it is given in; with a ``model``, the markers that lie on them."""
+    out = []
+    for index in range(6):
+        q = rotations.multiply(box.q_wxyz, face_rotation(index))
+        width, height, depth = face_extent(box.size_m, index)
+        flat = [[x * width / 2, y * height / 2, depth] for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
+        normal = rotations.rotate(q, (0.0, 0.0, 1.0))
+        # White borders may reach under neighbouring markers: all of them come first.
+        borders: list[tuple[Array, Grey]] = []
+        prints: list[tuple[Array, Grey]] = []
+        for marker in model.markers if model else ():
+            offset = np.array(marker.position_trf_m) - box.position_m
+            if model and abs(offset @ normal - depth) < 1e-6 and marker.normal_trf() @ normal > 0.999:
+                border, *printed = marker_decals(model, marker)
+                borders.append(border)
+                prints += printed
+        corners = rotations.rotate(q, np.array(flat)) + box.position_m
+        out.append(Face(corners, normal, round(255 * box.shade), (*borders, *prints)))
+    return out
+
+
+def _probe(front_m: float, reach_m: float) -> list[Face]:
+    pieces = max(1, round((reach_m - front_m) / _LONGEST_PIECE_M))
+    length = (reach_m - front_m) / pieces
+    size = (length, _PROBE_WIDTH_M, _PROBE_WIDTH_M)
+    return [
+        face
+        for k in range(pieces)
+        for face in box_faces(Box(size, (front_m + (k + 0.5) * length, 0.0, 0.0), shade=0.55))
+    ]
+
+
+def scene_of(scenario: Scenario, view_m: float = 0.22) -> Scene:
+    """What a scenario's bodies look like; ``view_m``: how far the outline of a camera's view is drawn."""
+    model = scenario.target_model()
+    body = scenario.chaser
+    front = body.size_m[0] / 2.0
+    chaser = box_faces(Box(body.size_m, shade=0.42))
+    if body.probe_reach_m > front:
+        chaser += _probe(front, body.probe_reach_m)
+    camera = scenario.camera_model()
+    edges = ((0, 0), (camera.width_px, 0), (camera.width_px, camera.height_px), (0, camera.height_px))
+    rays = [
+        [(u - camera.cx_px) / camera.fx_px * view_m, (v - camera.cy_px) / camera.fy_px * view_m, view_m]
+        for u, v in edges
+    ]
+    origin = np.array(camera.position_crf_m)
+    corners = rotations.rotate(camera.q_crf_irf_wxyz, np.array(rays)) + origin
+    return Scene(
+        target=tuple(face for box in model.boxes for face in box_faces(box, model)),
+        chaser=tuple(chaser),
+        camera_origin_m=origin,
+        camera_corners_m=corners,
+    )

@@ -1,0 +1,89 @@
+"""What every camera saw at one moment of a recorded flight, with the detections drawn, as one picture."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from chaserdock_agents.chaser.sighting import BadPicture, decode_picture
+from chaserdock_models import rotations
+from chaserdock_protocol.messages import Image, Sighting
+from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
+from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.topics import IMAGE, SIGHTING
+from numpy.typing import NDArray
+
+_MARKER = (90, 220, 90)
+_TEXT = (235, 235, 235)
+_AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
+
+
+def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
+    """BGR mosaic of all chasers' pictures exposed at or just before ``at_s``, each ``width_px`` wide.
+
+    Raises LogError when the log cannot be read or holds no picture up to then.
+    """
+    scenario = scenario_from_json(read_scenario(log)[0], f"{log}: scenario")
+    numbers = range(len(scenario.chasers))
+    images: dict[int, Image] = {}
+    sightings: dict[int, Sighting] = {}
+    keys = [t.key_of(i) for i in numbers for t in (IMAGE, SIGHTING)]
+    for record in read_log(log, keys):
+        message = record.message
+        if message.sim_time_ns > at_s * 1e9:
+            continue
+        (images if isinstance(message, Image) else sightings)[message.chaser] = message
+    if not images:
+        raise LogError(f"{log}: holds no picture up to {at_s:g} s")
+    views = [view(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
+    columns = math.ceil(math.sqrt(len(views)))
+    blank = np.zeros_like(views[0])
+    views += [blank] * (-len(views) % columns)
+    rows = [np.hstack(views[k : k + columns]) for k in range(0, len(views), columns)]
+    return np.vstack(rows)
+
+
+def view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int) -> NDArray[np.uint8]:
+    """BGR picture ``width_px`` wide with the sighting's markers and pose drawn; raises LogError for a bad picture."""
+    try:
+        grey = decode_picture(image)
+    except BadPicture as error:
+        raise LogError(
+            f"picture of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}"
+        ) from None
+    # People see the dark side of things better after a gamma correction; the cameras had no such luck.
+    gamma = np.array([255 * (v / 255) ** 0.6 for v in range(256)]).astype(np.uint8)
+    view: Any = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
+    scale = width_px / image.width_px
+    view = cv2.resize(view, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA)
+    if sighting is not None and sighting.sim_time_ns == image.sim_time_ns:
+        corners = (np.reshape(sighting.corners_px, (-1, 4, 2)) + 0.5) * scale - 0.5
+        for square in corners:
+            points = np.round(square * 16).astype(np.int32)
+            cv2.polylines(view, [points], True, _MARKER, 1, cv2.LINE_AA, 4)
+        if sighting.solutions:
+            _axes(view, scenario, sighting, scale)
+    count = len(sighting.marker_ids) if sighting else 0
+    seen = f"{count} marker{'s' if count > 1 else ''}" if count else "sees nothing"
+    text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen}"
+    (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
+    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # a small picture gets small words
+    cv2.putText(view, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
+    return np.asarray(view, dtype=np.uint8)
+
+
+def _axes(view: NDArray[np.uint8], scenario: Scenario, sighting: Sighting, scale: float) -> None:
+    """The measured target frame: x red, y green, z blue, 8 cm each."""
+    best = sighting.solutions[0]
+    points = np.vstack([np.zeros(3), 0.08 * np.eye(3)])
+    irf = rotations.rotate(best.q_wxyz, points) + best.position_m
+    px = (scenario.camera_model().project(irf) + 0.5) * scale - 0.5
+    if not np.all(np.isfinite(px)):
+        return
+    ends = np.round(px * 16).astype(int)
+    for k, colour in enumerate(_AXES):
+        a, b = ends[0].tolist(), ends[k + 1].tolist()
+        cv2.line(view, a, b, colour, 2, cv2.LINE_AA, 4)

@@ -1,0 +1,355 @@
+"""summary.json: a flight judged, ground truth against reference. SI units and radians; keys as in docs/summary.md."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.scenario import Scenario
+from numpy.typing import NDArray
+
+from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
+from .columns import nanoseconds, rows_since
+from .flight import Flight, Track, load_flight
+from .reached import not_reached, reached_time
+
+_PART = 1 << 14  # rows that are worked on at a time
+
+
+def summarize(log: Path) -> dict[str, Any]:
+    """The summary of a log; raises LogError when the log cannot be read."""
+    return summary_of(load_flight(log))
+
+
+def true_reference(flight: Flight, chaser: int, rows: slice, target: Track) -> tuple[Array, Array]:
+    """Positions (K, 3) WRF and attitudes (K, 4) that a chaser should have had, at these rows of the target's truth.
+
+    The commanded offset on the *true* target, so that errors of estimation count as errors of tracking. Before
+    the controller names an offset it is the scenario's.
+    """
+    c = flight.scenario.chasers[chaser]
+    offsets = told_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
+    positions = target.position_m[rows] + rotations.rotate(target.q_wxyz[rows], offsets)
+    q_off = np.array(c.q_wxyz)
+    if flight.scenario.approach.face_target:
+        q_off = facing_attitudes(c.position_m, q_off, offsets)
+    return positions, rotations.multiply(target.q_wxyz[rows], q_off)
+
+
+def told_offsets(flight: Flight, chaser: int, before: Array, time_s: Array) -> Array:
+    """The offset (K, 3) that a chaser was told, TRF, at the times (K,); ``before`` the first one, (3,)."""
+    told = flight.told.get(chaser)
+    if told is None:
+        return np.broadcast_to(before, (len(time_s), 3))
+    row = rows_since(nanoseconds(told.time_s), nanoseconds(time_s))
+    return np.vstack([before, told.offset_m])[row + 1]
+
+
+def parts(number: int) -> Iterator[slice]:
+    """``number`` rows, a part at a time: what is computed on the way must not need the memory of a whole long flight."""
+    return (slice(k, min(k + _PART, number)) for k in range(0, number, _PART))
+
+
+def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
+    """Times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from its true reference."""
+    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
+    n = min(len(target.time_s), len(own.time_s))
+    position, angle = np.empty(n), np.empty(n)
+    for rows in parts(n):
+        positions, attitudes = true_reference(flight, chaser, rows, target)
+        position[rows] = np.linalg.norm(own.position_m[rows] - positions, axis=1)
+        angle[rows] = rotations.angle_between(attitudes, own.q_wxyz[rows])
+    return target.time_s[:n], position, angle
+
+
+def known_estimates(flight: Flight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Rows of the estimate (K,) at which the target was known, and the rows of its truth at the same times."""
+    none = np.zeros(0, dtype=np.intp)
+    truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
+    if truth is None or not len(known):
+        return none, none
+    at_ns, truth_ns = nanoseconds(flight.estimate.time_s[known]), nanoseconds(truth.time_s)
+    row = rows_since(truth_ns, at_ns)
+    both = (row >= 0) & (truth_ns[row] == at_ns)
+    return known[both], row[both]
+
+
+def estimate_errors(flight: Flight) -> dict[str, Array]:
+    """Errors of the fused estimate where there is one: ``time_s``, ``position_m``, ``orientation_rad``,
+    ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and attitude), each (K,)."""
+    a, b = known_estimates(flight)
+    truth = flight.truth.get("target", flight.estimate)  # without a truth there are no rows
+    e = flight.estimate
+    errors = {
+        name: np.empty(len(a))
+        for name in ("position_m", "orientation_rad", "velocity_m_s", "omega_rad_s", "nees")
+    }
+    for rows in parts(len(a)):
+        i, j = a[rows], b[rows]
+        position = truth.position_m[j] - e.position_m[i]
+        angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[i]), truth.q_wxyz[j]))
+        pose = np.concatenate([position, angle], axis=1)
+        weighed = np.linalg.solve(flight.pose_covariance(i), pose[:, :, None])[:, :, 0]
+        errors["position_m"][rows] = np.linalg.norm(position, axis=1)
+        errors["orientation_rad"][rows] = np.linalg.norm(angle, axis=1)
+        errors["velocity_m_s"][rows] = np.linalg.norm(truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1)
+        errors["omega_rad_s"][rows] = np.linalg.norm(truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1)
+        errors["nees"][rows] = np.einsum("ki,ki->k", pose, weighed)
+    return {"time_s": e.time_s[a], **errors}
+
+
+def _rms(x: Array) -> float | None:
+    return float(np.sqrt(np.mean(x * x))) if len(x) else None
+
+
+def _mean_square(x: Array) -> float | None:
+    return float(np.mean(x * x)) if len(x) else None
+
+
+def _greatest(x: Array) -> float | None:
+    return float(np.max(x)) if len(x) else None
+
+
+def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
+    out: dict[str, float | None] = {
+        n: float(np.percentile(x, p)) if len(x) else None for n, p in names.items()
+    }
+    return out | {"max": _greatest(x)}
+
+
+def _distance(a: Track, b: Track) -> Array:
+    n = min(len(a.time_s), len(b.time_s))
+    return np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
+
+
+def dock_time(flight: Flight, chaser: int) -> float | None:
+    """When a chaser came into the docking tolerances for good (s), on ground truth, or None if it is not docked.
+
+    Docked: its reference is at the docking distance, and at the end it has been within the scenario's position
+    and angle tolerances of it for at least ``docked_time_s``.
+    """
+    approach = flight.scenario.approach
+    time_s, position, angle = tracking_errors(flight, chaser)
+    away = np.linalg.norm(told_offsets(flight, chaser, np.full(3, math.inf), time_s), axis=1)
+    reached = np.abs(away - approach.dock_distance_m) < 1e-6
+    limit = math.radians(approach.docked_angle_deg)
+    inside = reached & (position <= approach.docked_position_m) & (angle <= limit)
+    if not len(inside) or not inside[-1]:
+        return None
+    outside = np.flatnonzero(~inside)
+    since = time_s[outside[-1] + 1] if len(outside) else time_s[0]
+    return float(since) if time_s[-1] - since >= approach.docked_time_s else None
+
+
+def _unanswered(flight: Flight) -> int:
+    """Commands that a tick expected and that never came (in lock-step none can be missing)."""
+    return max(
+        0, flight.expected_commands - sum(n for key, n in flight.counts.items() if key.endswith("/actuators"))
+    )
+
+
+def summary_of(flight: Flight) -> dict[str, Any]:
+    """The summary of a flight as plain values for JSON."""
+    s = flight.scenario
+    chasers, names = {}, [f"chaser/{i}" for i in range(len(s.chasers))]
+    until = s.steady_until_s or s.duration_s
+    for i, name in enumerate(names):
+        if name not in flight.truth or "target" not in flight.truth:
+            continue
+        time_s, position, angle = tracking_errors(flight, i)
+        steady = (time_s >= s.settling_s) & (time_s < until)
+        docked_s = dock_time(flight, i)
+        chasers[str(i)] = {
+            "position_mse_m2": _mean_square(position),
+            "orientation_mse_rad2": _mean_square(angle),
+            "steady": {
+                "position_mse_m2": _mean_square(position[steady]),
+                "orientation_mse_rad2": _mean_square(angle[steady]),
+            },
+            "docked": docked_s is not None,
+            "dock_time_s": docked_s,
+            "reached_time_s": reached_time(flight, i),
+            "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
+            "impulse_N_s": flight.absolute_impulse_N_s[name],
+            "jet_impulse_N_s": flight.jet_impulse_N_s[name],
+            "propellant_kg": flight.propellant_kg[name],
+        }
+        if (capture := capture_of(flight, i)) is not None:
+            chasers[str(i)]["capture"] = capture
+    flown = [n for n in names if n in flight.truth]
+    between = [
+        float(np.min(_distance(flight.truth[a], flight.truth[b])))
+        for k, a in enumerate(flown)
+        for b in flown[:k]
+    ]
+    errors = estimate_errors(flight)
+    late = errors["time_s"] >= s.settling_s
+    end_s = float(flight.truth["target"].time_s[-1]) if "target" in flight.truth else 0.0
+    result: dict[str, Any] = {
+        "scenario": s.name,
+        "seed": s.seed,
+        "mode": flight.run.get("mode", ""),
+        "ticks": flight.counts.get("truth/world", 1) - 1,
+        "sim_time_s": end_s,
+        "wall_time_s": flight.wall_time_s,
+        "success": False,
+        "failures": [],
+        "events": _events(flight),
+        "chasers": chasers,
+        "min_distance_chasers_m": min(between) if between else None,
+        "collisions": flight.world.contacts,
+        "target_estimate": {
+            "position_rms_m": _rms(errors["position_m"][late]),
+            "orientation_rms_rad": _rms(errors["orientation_rad"][late]),
+            "velocity_rms_m_s": _rms(errors["velocity_m_s"][late]),
+            "omega_rms_rad_s": _rms(errors["omega_rad_s"][late]),
+            "max_position_error_m": _greatest(errors["position_m"][late]),
+            "max_orientation_error_rad": _greatest(errors["orientation_rad"][late]),
+            "nees_mean": float(np.mean(errors["nees"][late])) if np.any(late) else None,
+        },
+        "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
+        "late_commands": flight.world.late_commands,
+        "unanswered": _unanswered(flight),
+        "solver": {
+            "name": flight.solves.name or s.controller.solver,
+            "solve_s": _percentiles(flight.solves.wall_s, {"p50": 50, "p95": 95}),
+            "failures": flight.solves.statuses["failed"],
+            "relaxed": flight.solves.statuses["infeasible_relaxed"],
+        },
+        "messages": _messages(flight),
+        "rejected": flight.rejected,
+        "digest": flight.digest,
+    }
+    result["failures"] = failures_of(result, s)
+    result["success"] = not result["failures"]
+    return result
+
+
+def _events(flight: Flight) -> list[dict[str, Any]]:
+    told = [(e.sim_time_ns, f"{e.process}: {e.what} {e.detail}".strip()) for e in flight.events]
+    for r in flight.replies:
+        said = "accepted" if r.accepted else "refused"
+        told.append((r.sim_time_ns, f"command {r.command} chaser {r.chaser}: {said}: {r.reason}"))
+    return [{"time_s": t / 1e9, "what": what} for t, what in sorted(told)]
+
+
+def _messages(flight: Flight) -> dict[str, dict[str, int]]:
+    out: dict[str, dict[str, int]] = defaultdict(lambda: {"count": 0, "lost": 0})
+    for key, count in flight.counts.items():
+        # Presence is told before anybody listens; what was missed then is no loss.
+        lost = 0 if key.endswith("/presence") else flight.lost.get(key, 0)
+        out[key] = {"count": count, "lost": lost}
+    return dict(out)
+
+
+def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
+    """Which of the scenario's criteria a summary does not meet, in words."""
+    out = []
+    if result["sim_time_s"] < s.duration_s - 1.0 / s.time.rate_hz:
+        out.append(f"ended at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
+    if result["collisions"] > s.success.max_collisions:
+        out.append(f"{result['collisions']} collisions, at most {s.success.max_collisions} allowed")
+    nearest = result["min_distance_chasers_m"]
+    if s.success.keep_distances and nearest is not None and nearest < s.limits.min_distance_chasers_m:
+        out.append(
+            f"two chasers came within {nearest:.3f} m; the limit is {s.limits.min_distance_chasers_m:g} m"
+        )
+    for i, c in result["chasers"].items():
+        distance = c["min_distance_target_m"]
+        limit = nearest_allowed_m(s, int(i))
+        if s.success.keep_distances and distance < limit:
+            out.append(f"chaser {i} came within {distance:.3f} m of the target; the limit is {limit:g} m")
+        if int(i) in s.success.docked and not c["docked"]:
+            out.append(f"chaser {i} is not docked")
+        out += not_reached(s, int(i), c["reached_time_s"])
+        _limit(
+            out,
+            f"chaser {i}: steady position RMS",
+            c["steady"]["position_mse_m2"],
+            s.success.steady_position_rms_m,
+            1.0,
+            "m",
+        )
+        _limit(
+            out,
+            f"chaser {i}: steady orientation RMS",
+            c["steady"]["orientation_mse_rad2"],
+            s.success.steady_orientation_rms_deg,
+            180.0 / math.pi,
+            "deg",
+        )
+    out += capture_failures(result, s)
+    estimate = result["target_estimate"]
+    for label, value, limit, unit, factor in (
+        ("position", estimate["max_position_error_m"], s.success.max_estimate_position_m, "m", 1.0),
+        (
+            "orientation",
+            estimate["max_orientation_error_rad"],
+            s.success.max_estimate_orientation_deg,
+            "deg",
+            180.0 / math.pi,
+        ),
+    ):
+        if limit is not None and (value is None or value * factor > limit):
+            shown = "unknown" if value is None else f"{value * factor:.4g} {unit}"
+            out.append(f"largest {label} error of the estimate: {shown}, at most {limit:g} {unit} allowed")
+    return out
+
+
+def _limit(
+    out: list[str], what: str, mean_square: float | None, limit: float | None, factor: float, unit: str
+) -> None:
+    if limit is None:
+        return
+    value = None if mean_square is None else math.sqrt(mean_square) * factor
+    if value is None or value > limit:
+        shown = "unknown" if value is None else f"{value:.4g} {unit}"
+        out.append(f"{what}: {shown}, at most {limit:g} {unit} allowed")
+
+
+def text_of(result: dict[str, Any]) -> str:
+    """The summary for people, a few lines."""
+    factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
+    lines = [
+        f"{result['scenario']}: {'success' if result['success'] else 'FAILED'}; {result['sim_time_s']:.1f} s flown in "
+        f"{result['wall_time_s']:.1f} s ({factor:.2f} x real time), digest {result['digest'][:16]}"
+    ]
+    for i, c in result["chasers"].items():
+        steady = c["steady"]
+        line = f"  chaser {i}: "
+        if steady["position_mse_m2"] is not None:
+            line += (
+                f"steady RMS {math.sqrt(steady['position_mse_m2']) * 1e3:.2f} mm, "
+                f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
+            )
+        line += f"nearest to the target {c['min_distance_target_m']:.3f} m"
+        if c["propellant_kg"] > 0.0:
+            line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
+        if c["docked"]:
+            line += f"; docked since {c['dock_time_s']:.1f} s"
+        if "capture" in c:
+            line += capture_text(c["capture"])
+        lines.append(line)
+    estimate = result["target_estimate"]
+    if estimate["position_rms_m"] is not None:
+        lines.append(
+            f"  target estimate: RMS {estimate['position_rms_m'] * 1e3:.2f} mm, "
+            f"{math.degrees(estimate['orientation_rms_rad']):.3f} deg; largest error "
+            f"{estimate['max_position_error_m'] * 1e3:.2f} mm, "
+            f"{math.degrees(estimate['max_orientation_error_rad']):.3f} deg; mean NEES {estimate['nees_mean']:.2f} of 6"
+        )
+    if result["mode"] == "realtime" and result["latency_s"]["p50"] is not None:
+        latency = result["latency_s"]
+        lines.append(
+            f"  exposure to command: median {latency['p50'] * 1e3:.1f} ms, p99 {latency['p99'] * 1e3:.1f} ms; "
+            f"{result['late_commands']} commands late, {result['unanswered']} never came"
+        )
+    lines += [f"  not met: {failure}" for failure in result["failures"]]
+    return "\n".join(lines)

@@ -1,0 +1,211 @@
+"""A film of a recorded flight: the mission from outside beside what the cameras saw, detections drawn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import av
+import cv2
+import numpy as np
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.recording.log import LogError
+
+from .chase_camera import Picture, Pose, Viewpoint, draw, tint
+from .columns import nanoseconds
+from .flight import Flight, Track, load_flight
+from .images import Pair, columns_for, shots
+from .scene import scene_of
+from .snapshot import view
+from .summary import tracking_errors
+
+ENDINGS = (".mp4", ".webp", ".gif")
+_CODECS = {".mp4": "libx264", ".webp": "libwebp_anim", ".gif": "gif"}
+_AZIMUTH_RAD, _ELEVATION_RAD = math.radians(-52.0), math.radians(26.0)
+_TRAIL_S = 25.0
+_INK = (235, 235, 235)
+_MARGIN_PX = 8
+
+
+def write_video(
+    log: Path,
+    out: Path,
+    speed: float = 1.0,
+    fps: int = 15,
+    width_px: int = 1280,
+    height_px: int = 720,
+    part_s: tuple[float, float] = (0.0, math.inf),
+    quality: int = 60,
+    told: Callable[[float], None] = lambda time_s: None,
+) -> int:
+    """Writes the film of a log (or run folder) and returns the number of its frames.
+
+    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds a second of film; ``part_s``: the
+    simulated times of the first and last frame; ``quality``: of .webp, 0 to 100; ``told`` hears of each frame's
+    simulated time. Raises LogError for a log that cannot be read or holds no motion or picture, and
+    ChaserdockError for a size or file that cannot be.
+    """
+    ending = out.suffix.lower()
+    if ending not in _CODECS:
+        raise ChaserdockError(f"{out}: must end in {', '.join(ENDINGS)}")
+    if width_px % 2 or height_px % 2:
+        raise ChaserdockError(
+            f"{width_px} x {height_px} pixels: both must be even for the film to play everywhere"
+        )
+    if not part_s[0] < part_s[1]:
+        raise ChaserdockError(f"a film from {part_s[0]:g} s to {part_s[1]:g} s has no length")
+    flight = load_flight(log)
+    if "target" not in flight.truth:
+        raise LogError(f"{log}: holds no motion of the target; there is nothing to film")
+    number = 0
+    try:
+        with av.open(str(out), "w") as container:
+            stream: Any = container.add_stream(_CODECS[ending], rate=fps)
+            stream.width, stream.height = width_px, height_px
+            stream.pix_fmt = {".mp4": "yuv420p", ".webp": "yuv420p", ".gif": "rgb8"}[ending]
+            stream.time_base = Fraction(1, fps)
+            if ending == ".mp4":
+                stream.options = {"crf": "21", "preset": "medium", "movflags": "+faststart"}
+            elif ending == ".webp":
+                stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
+            for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
+                told(time_s)
+                picture = av.VideoFrame.from_ndarray(frame, format="bgr24")
+                picture.pts = number
+                container.mux(stream.encode(picture))
+                number += 1
+            if number:
+                container.mux(stream.encode())
+    except OSError as error:
+        raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
+    if not number:
+        out.unlink(missing_ok=True)
+        begun = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
+        raise LogError(f"{log}: holds no picture{begun}; there is nothing to film")
+    return number
+
+
+def frames(
+    log: Path,
+    flight: Flight,
+    every_s: float,
+    width_px: int,
+    height_px: int,
+    part_s: tuple[float, float] = (0.0, math.inf),
+) -> Iterator[tuple[float, Picture]]:
+    """Simulated time (s) and film frame (height, width, 3), BGR, ``every_s`` of simulated time within ``part_s``."""
+    number = len(flight.scenario.chasers)
+    camera = flight.scenario.camera
+    aspect = camera.width_px / camera.height_px
+    columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
+    rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
+    side_px = columns * shot_px
+    director = _Director(flight, width_px - side_px, height_px, part_s)
+    for time_s, latest in shots(log, number, every_s, part_s[0]):
+        if time_s > part_s[1] + 1e-9:
+            return
+        frame = np.zeros((height_px, width_px, 3), dtype=np.uint8)
+        frame[:, : width_px - side_px] = director.shoot(time_s)
+        top = max(0, (height_px - rows * shot_height_px) // 2)
+        for i in range(number):
+            x = width_px - side_px + (i % columns) * shot_px
+            y = top + (i // columns) * shot_height_px
+            picture = _camera(flight, i, latest.get(i), shot_px)
+            h = min(len(picture), height_px - y)
+            frame[y : y + h, x : x + shot_px] = picture[:h]
+            cv2.rectangle(frame, (x + 1, y + 1), (x + shot_px - 2, y + h - 2), tint(i).tolist(), 2)
+        yield time_s, frame
+
+
+def _camera(flight: Flight, chaser: int, pair: Pair | None, width_px: int) -> Picture:
+    height = round(width_px * flight.scenario.camera.height_px / flight.scenario.camera.width_px)
+    said = "no picture yet"
+    if pair is not None:
+        try:
+            return view(flight.scenario, *pair, width_px)
+        except LogError:
+            said = "unreadable picture"
+    empty = np.full((height, width_px, 3), 24, dtype=np.uint8)
+    cv2.putText(
+        empty, f"chaser {chaser}  {said}", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA
+    )
+    return empty
+
+
+class _Director:
+    """Knows the flight and where to look at it from; one picture a time."""
+
+    def __init__(self, flight: Flight, width_px: int, height_px: int, part_s: tuple[float, float]) -> None:
+        self.flight = flight
+        self.size = (width_px, height_px)
+        self.scene = scene_of(flight.scenario)
+        sun = np.array(flight.scenario.camera.sun_direction)
+        self.sun = sun / np.linalg.norm(sun)
+        self.numbers = [i for i in range(len(flight.scenario.chasers)) if f"chaser/{i}" in flight.truth]
+        self.target = target = flight.truth["target"]
+        self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
+        reach = 0.3
+        for own in self.chasers.values():
+            n = min(len(own.time_s), len(target.time_s))
+            shown = (own.time_s[:n] >= part_s[0]) & (own.time_s[:n] <= part_s[1])
+            away_m = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)[shown]
+            reach = max(reach, float(away_m.max(initial=0.0)))
+        # Far flown strays must not make all others small.
+        self.distance_m = 3.5 * min(reach, 3.0)
+        self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
+        self.phases = {i: flight.told[i].phases if i in flight.told else [] for i in self.numbers}
+        self.seen = {
+            i: set(nanoseconds(s.time_s[s.seen]).tolist())
+            for i in self.numbers
+            if (s := flight.sightings.get(i)) is not None
+        }
+
+    def shoot(self, time_s: float) -> Picture:
+        """The mission from outside at a simulated time, with clock and phases."""
+        chasers = {i: _pose(own, time_s) for i, own in self.chasers.items()}
+        paths: dict[int | None, Any] = {None: _trail(self.target, time_s)}
+        paths |= {i: _trail(own, time_s) for i, own in self.chasers.items()}
+        at = _pose(self.target, time_s)
+        look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
+        time_ns = round(_time_of(self.target, time_s) * 1e9)
+        seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
+        picture = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
+        self._write(picture, time_s)
+        return picture
+
+    def _write(self, picture: Picture, time_s: float) -> None:
+        def put(text: str, x: int, y: int, bgr: Any, size: float = 0.5) -> None:
+            cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, bgr, 1, cv2.LINE_AA)
+
+        put(f"{self.flight.scenario.name}", _MARGIN_PX + 4, 24, _INK, 0.6)
+        put(f"t = {time_s:6.1f} s", _MARGIN_PX + 4, 48, _INK, 0.6)
+        for line, i in enumerate(self.numbers):
+            phase = next((name for t, name in reversed(self.phases[i]) if t <= time_s + 1e-9), "waiting")
+            times, position, _ = self.errors[i]
+            row = min(int(np.searchsorted(times, time_s + 1e-6)) - 1, len(times) - 1)
+            error = f"{1e3 * position[max(row, 0)]:7.2f} mm off" if len(times) else ""
+            y = self.size[1] - 14 - 20 * (len(self.numbers) - 1 - line)
+            put(f"chaser {i}  {phase:<9}", _MARGIN_PX + 4, y, tint(i).tolist())
+            put(error, _MARGIN_PX + 180, y, _INK)
+
+
+def _row(track: Track, time_s: float) -> int:
+    return max(0, int(np.searchsorted(track.time_s, time_s + 1e-6)) - 1)
+
+
+def _time_of(track: Track, time_s: float) -> float:
+    return float(track.time_s[_row(track, time_s)])
+
+
+def _pose(track: Track, time_s: float) -> Pose:
+    """The pose at the last tick up to a time: what a picture of that time shows."""
+    row = _row(track, time_s)
+    return track.position_m[row], track.q_wxyz[row]
+
+
+def _trail(track: Track, time_s: float) -> Any:
+    first = int(np.searchsorted(track.time_s, time_s - _TRAIL_S))
+    return track.position_m[first : _row(track, time_s) + 1 : 3]

@@ -1,0 +1,165 @@
+"""A camera's matrix and lens from pictures of a board, with OpenCV.
+
+A picture that fits the others badly is left out, and named: its root mean square is over three times the median
+and over half a pixel. (Not a cure for a board that is not flat.)
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from chaserdock_agents.chaser.perception.detect import dictionary_of
+from chaserdock_models.rotations import Array
+from numpy.typing import NDArray
+
+LEAST_PICTURES = 6
+_LEAST_CORNERS = 8
+_ODD_TIMES, _ODD_PX = 3.0, 0.5
+_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
+
+
+class BadBoard(Exception):
+    """A board that cannot be, or a folder without pictures."""
+
+
+class TooFew(Exception):
+    """Too few usable pictures; the text says why the others are not."""
+
+
+@dataclass(frozen=True)
+class Board:
+    """``points_m`` (n, 3): inner corners; ``charuco``: OpenCV's board, or None for a chessboard of ``size`` corners."""
+
+    points_m: NDArray[np.float32]
+    size: tuple[int, int]
+    charuco: Any = None
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard deviation of fx, fy,
+    cx, cy, pixels; ``rms_px``: by picture used; ``left_out``: by picture, why."""
+
+    width_px: int
+    height_px: int
+    matrix: Array
+    distortion: Array
+    sigma: Array
+    total_rms_px: float
+    rms_px: dict[str, float]
+    left_out: dict[str, str]
+
+
+def board_of(text: str, square_m: float, marker_m: float, dictionary: str) -> Board:
+    """The board that a text such as ``charuco 8x6`` (squares) or ``chessboard 9x6`` (inner corners) describes.
+
+    Raises BadBoard.
+    """
+    found = re.fullmatch(r"(charuco|chessboard)\s+(\d+)x(\d+)", text.strip())
+    if found is None or min(int(found[2]), int(found[3])) < 3:
+        raise BadBoard(f"--board {text}: must be like 'charuco 8x6' or 'chessboard 9x6', 3 or more each way")
+    size = (int(found[2]), int(found[3]))
+    if not square_m > 0.0:
+        raise BadBoard(f"--square {square_m}: must be positive")
+    if found[1] == "chessboard":
+        grid = np.mgrid[: size[0], : size[1]].T.reshape(-1, 2) * square_m
+        return Board(np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32), size)
+    if not 0.0 < marker_m < square_m:
+        raise BadBoard(f"--marker {marker_m}: must be smaller than a square ({square_m})")
+    try:
+        table = dictionary_of(dictionary)
+    except ValueError as error:
+        raise BadBoard(f"--dictionary: {error}") from None
+    if size[0] * size[1] // 2 > len(table.bytesList):
+        raise BadBoard(f"--board {text}: needs {size[0] * size[1] // 2} markers, {dictionary} has fewer")
+    charuco = cv2.aruco.CharucoBoard(size, square_m, marker_m, table)
+    return Board(np.asarray(charuco.getChessboardCorners(), dtype=np.float32), size, charuco)
+
+
+def calibrate_folder(folder: Path, board: Board) -> Calibration:
+    """Calibration from all pictures in a folder. Raises BadBoard when there are none, TooFew when too few are good."""
+    paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
+    if not paths:
+        raise BadBoard(f"{folder}: no pictures ({', '.join(_SUFFIXES)}) there")
+    pictures: dict[str, NDArray[np.uint8] | None] = {}
+    for path in paths:
+        picture: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        pictures[path.name] = picture
+    return calibrate(pictures, board)
+
+
+def calibrate(pictures: dict[str, NDArray[np.uint8] | None], board: Board) -> Calibration:
+    """Calibration from grey pictures by name (None: unreadable). Raises TooFew."""
+    left_out: dict[str, str] = {}
+    views: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
+    shapes = [p.shape for p in pictures.values() if p is not None]
+    usual = max(sorted(set(shapes)), key=shapes.count) if shapes else (0, 0)
+    for name, picture in pictures.items():
+        if picture is None:
+            left_out[name] = "not a picture"
+        elif picture.shape != usual:
+            left_out[name] = f"{picture.shape[1]} x {picture.shape[0]}, others {usual[1]} x {usual[0]}"
+        else:
+            points, px = find_board(picture, board)
+            if len(px) < _LEAST_CORNERS:
+                left_out[name] = f"{len(px)} corners of the board found, {_LEAST_CORNERS} needed"
+            else:
+                views[name] = (points, px)
+    while True:
+        if len(views) < LEAST_PICTURES:
+            reasons = "".join(f"\n{name}: {reason}" for name, reason in left_out.items())
+            raise TooFew(f"{len(views)} usable pictures, at least {LEAST_PICTURES} are needed{reasons}")
+        points = [v[0] for v in views.values()]
+        px = [v[1] for v in views.values()]
+        size = (usual[1], usual[0])
+        # Stubs ask for matrices to begin with, which OpenCV takes only as a guess.
+        solve: Any = cv2.calibrateCameraExtended
+        total, matrix, lens, _, _, sigma, _, each = solve(points, px, size, None, None)
+        rms = dict(zip(views, np.ravel(each).tolist(), strict=True))
+        worst = max(rms, key=lambda name: rms[name])
+        if rms[worst] <= max(_ODD_TIMES * float(np.median(list(rms.values()))), _ODD_PX):
+            break
+        left_out[worst] = f"fits the others badly: {rms[worst]:.2f} px"
+        del views[worst]
+    return Calibration(
+        usual[1],
+        usual[0],
+        np.asarray(matrix, dtype=float),
+        np.ravel(lens).astype(float)[:5],
+        np.ravel(sigma)[:4].astype(float),
+        float(total),
+        rms,
+        left_out,
+    )
+
+
+def find_board(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Corners found, in the board's axes (n, 3), metres, and in the picture (n, 2), pixels."""
+    none = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32)
+    if board.charuco is None:
+        find: Any = cv2.findChessboardCornersSB
+        ok, px = find(image, board.size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
+        return (board.points_m, np.asarray(px, np.float32).reshape(-1, 2)) if ok else none
+    px, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(image)
+    if ids is None or px is None:
+        return none
+    return board.points_m[np.asarray(ids, dtype=np.intp).ravel()], np.asarray(px, np.float32).reshape(-1, 2)
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """Writes OpenCV's YAML, JSON or XML, by the file's ending. Raises OSError."""
+    store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    if not store.isOpened():
+        raise OSError(f"{path} cannot be opened")
+    store.write("image_width", calibration.width_px)
+    store.write("image_height", calibration.height_px)
+    store.write("camera_matrix", calibration.matrix)
+    store.write("distortion_coefficients", calibration.distortion.reshape(1, -1))
+    store.write("avg_reprojection_error", calibration.total_rms_px)
+    store.write("nr_of_frames", len(calibration.rms_px))
+    store.release()

@@ -1,0 +1,177 @@
+"""The campaign file and the runs that it asks for. Pure but for reading the file.
+
+A campaign is a scenario, values that all runs share, and what varies: a grid (every combination of ``values``) or a
+random sample (each parameter drawn from its distribution). Equal files give equal runs with equal names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import msgspec
+import numpy as np
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.scenario.fields import Name, Number, Positive, Section
+from chaserdock_protocol.scenario.overrides import ScenarioError, explain
+from pydantic import Field, ValidationError, model_validator
+
+from chaserdock.launch.scenario_files import find_scenario
+
+MAX_RUNS = 100_000
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+
+
+class Variation(Section):
+    """How one parameter varies: ``values`` in a grid; ``uniform`` [low, high] or ``normal`` [mean, sigma] in a sample."""
+
+    values: tuple[Any, ...] | None = None
+    uniform: tuple[Number, Number] | None = None
+    normal: tuple[Number, Positive] | None = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Variation:
+        given = [n for n in ("values", "uniform", "normal") if getattr(self, n) is not None]
+        if len(given) != 1:
+            raise ValueError("needs exactly one of values, uniform, normal")
+        if self.values is not None and not self.values:
+            raise ValueError("values must not be empty")
+        if self.uniform is not None and not self.uniform[0] < self.uniform[1]:
+            raise ValueError(f"uniform must be [low, high] with low < high, not {list(self.uniform)}")
+        return self
+
+
+class CampaignFile(Section):
+    """The whole file. ``seeds``: how many (0, 1, …) or which seeds every combination is flown with."""
+
+    name: Name
+    scenario: str
+    method: Literal["grid", "random"] = "grid"
+    samples: Annotated[int, Field(ge=1, le=MAX_RUNS)] | None = None
+    sample_seed: Seed = 0
+    seeds: Annotated[int, Field(ge=1, le=MAX_RUNS)] | tuple[Seed, ...] = 1
+    set: dict[str, Any] = Field(default_factory=dict)
+    vary: dict[str, Variation] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _fits(self) -> CampaignFile:
+        if (self.method == "random") != (self.samples is not None):
+            raise ValueError('samples goes with method = "random", and that needs it')
+        if isinstance(self.seeds, tuple) and not 0 < len(self.seeds) == len(set(self.seeds)):
+            raise ValueError("seeds must be different numbers, at least one")
+        for name, v in self.vary.items():
+            if self.method == "grid" and v.values is None:
+                raise ValueError(
+                    f'vary.{name}: a grid needs values; for a distribution say method = "random"'
+                )
+        if "seed" in self.vary or "seed" in self.set:
+            raise ValueError("seed: say seeds instead")
+        return self
+
+
+class Run(msgspec.Struct, frozen=True):
+    """One run: its place in the campaign, a name made of all that it depends on, what is varied, and all overrides."""
+
+    index: int
+    name: str
+    seed: int
+    varied: dict[str, Any]
+    overrides: tuple[str, ...]
+
+
+class Campaign(msgspec.Struct, frozen=True):
+    """A campaign ready to be flown."""
+
+    name: str
+    scenario: Path
+    parameters: tuple[str, ...]
+    runs: tuple[Run, ...]
+
+
+def load_campaign(path: Path) -> Campaign:
+    """Reads and checks a campaign file, every run's scenario included; raises ScenarioError, one line a fault."""
+    try:
+        values = tomllib.loads(path.read_text(encoding="utf-8"))
+        file = CampaignFile.model_validate(values)
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ScenarioError(f"{path}: not TOML: {error}") from None
+    except ValidationError as error:
+        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error))) from None
+    beside = path.parent / file.scenario
+    scenario = beside if beside.is_file() else find_scenario(file.scenario)
+    if scenario is None:
+        raise ScenarioError(
+            f"{path}: scenario: {file.scenario}: no such file, and none of that name is shipped"
+        )
+    return Campaign(file.name, scenario, tuple(file.vary), _runs(file, scenario, path))
+
+
+def _combinations(file: CampaignFile) -> list[dict[str, Any]]:
+    if file.method == "grid":
+        axes = [v.values or () for v in file.vary.values()]
+        return [dict(zip(file.vary, point, strict=True)) for point in itertools.product(*axes)]
+    rng = np.random.default_rng(file.sample_seed)
+    return [{name: _drawn(v, rng) for name, v in file.vary.items()} for _ in range(file.samples or 0)]
+
+
+def _drawn(v: Variation, rng: np.random.Generator) -> Any:
+    if v.uniform is not None:
+        return float(rng.uniform(*v.uniform))
+    if v.normal is not None:
+        return float(rng.normal(*v.normal))
+    values = v.values or ()
+    return values[int(rng.integers(len(values)))]
+
+
+def _runs(file: CampaignFile, scenario: Path, path: Path) -> tuple[Run, ...]:
+    seeds = tuple(range(file.seeds)) if isinstance(file.seeds, int) else file.seeds
+    combinations = _combinations(file)
+    if len(combinations) * len(seeds) > MAX_RUNS:
+        raise ScenarioError(
+            f"{path}: {len(combinations)} combinations of {len(seeds)} seeds are more than {MAX_RUNS} runs"
+        )
+    shared = [f"{key}={toml_value(value)}" for key, value in file.set.items()]
+    runs = []
+    for varied in combinations:
+        own = [f"{key}={toml_value(value)}" for key, value in varied.items()]
+        for seed in seeds:
+            overrides = (*shared, *own, f"seed={seed}")
+            try:
+                resolved = load_scenario(scenario, overrides)
+            except ScenarioError as error:
+                raise ScenarioError(
+                    f"{path}: run {len(runs)} ({', '.join(own) or 'nothing varied'}): {error}"
+                ) from None
+            name = hashlib.sha256(resolved.model_dump_json().encode()).hexdigest()[:12]
+            runs.append(Run(len(runs), name, seed, varied, overrides))
+    _refuse_twins(runs, path)
+    return tuple(runs)
+
+
+def _refuse_twins(runs: list[Run], path: Path) -> None:
+    seen: dict[str, int] = {}
+    for run in runs:
+        if run.name in seen:
+            raise ScenarioError(
+                f"{path}: runs {seen[run.name]} and {run.index} are the same scenario; a value stands twice, or varies "
+                "nothing"
+            )
+        seen[run.name] = run.index
+
+
+def toml_value(value: Any) -> str:
+    """A value in TOML's notation, as ``--set`` takes it: numbers, texts, booleans, arrays and inline tables."""
+    if isinstance(value, dict):
+        inner = ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {toml_value(v)}" for k, v in value.items())
+        return "{" + inner + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)

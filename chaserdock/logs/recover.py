@@ -1,0 +1,199 @@
+"""What can be saved of a log that was cut off or damaged, as a new and whole log."""
+
+from __future__ import annotations
+
+import mmap
+import struct
+from collections.abc import Iterator
+from importlib.metadata import version
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import msgspec
+from chaserdock_protocol.recording.log import LogError
+from chaserdock_protocol.recording.scan import (
+    DAMAGE,
+    MAX_RECORD_BYTES,
+    RECOVERED,
+    attachment_of,
+    chunk_records,
+    metadata_of,
+    seal,
+)
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Attachment, Channel, Metadata, Schema
+from mcap.records import Message as McapMessage
+from mcap.writer import MCAP0_MAGIC, CompressionType, Writer
+
+_HEAD = struct.Struct("<BQ")
+# A chunk's head: opcode and length, then 28 bytes of times, size and checksum, then the name of its compression.
+_CHUNK_MARK, _MARK_OFFSET = b"\x04\x00\x00\x00zstd", _HEAD.size + 28
+
+
+class Recovered(msgspec.Struct):
+    """What was saved: messages, chunks; and what was not: records whose checksum or form was broken, bytes skipped."""
+
+    messages: int = 0
+    chunks: int = 0
+    broken_records: int = 0
+    skipped_bytes: int = 0
+    messages_without_channel: int = 0
+
+
+def recover(log: Path, out: Path) -> Recovered:
+    """Copies every message of ``log`` that is whole, by its chunk's checksum, into the new log ``out``.
+
+    Raises LogError when ``log`` is no log or holds no whole message, or ``out`` exists or cannot be written.
+    """
+    try:
+        with log.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+            if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
+                raise LogError(f"{log}: no MCAP log")
+            found = Recovered()
+            channels, schemas = _declared(data)
+            with out.open("xb") as target:
+                try:
+                    _copy(data, target, channels, schemas, found, str(log))
+                except OSError as error:
+                    raise LogError(f"{out}: cannot be written: {error.strerror or error}") from None
+    except FileExistsError:
+        raise LogError(f"{out}: already exists; a log is never overwritten") from None
+    except OSError as error:
+        raise LogError(f"{error.filename or log}: {error.strerror or error}") from None
+    except ValueError:
+        raise LogError(f"{log}: no MCAP log") from None  # an empty file cannot be mapped
+    if not found.messages:
+        out.unlink()
+        raise LogError(f"{log}: holds no whole message")
+    return found
+
+
+def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
+    """Opcode and content of everything that looks like a record; after a broken one, from the next chunk on."""
+    place = len(MCAP0_MAGIC)
+    while place + _HEAD.size <= len(data):
+        opcode, length = _HEAD.unpack_from(data, place)
+        known = Opcode.HEADER <= opcode <= Opcode.DATA_END
+        if known and length <= min(MAX_RECORD_BYTES, len(data) - place - _HEAD.size):
+            content = data[place + _HEAD.size : place + _HEAD.size + length]
+            if opcode == Opcode.DATA_END and length == 4:
+                return
+            if opcode != Opcode.CHUNK or _is_whole(content):
+                yield opcode, content
+                place += _HEAD.size + length
+                continue
+        following = _next_chunk(data, place + 1)
+        # What is left of a killed writer's last record is expected; only something in the middle was broken.
+        found.broken_records += following < len(data)
+        found.skipped_bytes += following - place
+        place = following
+
+
+def _is_whole(chunk: bytes) -> bool:
+    try:
+        chunk_records(chunk)
+    except DAMAGE:
+        return False
+    return True
+
+
+def _next_chunk(data: mmap.mmap, place: int) -> int:
+    """Where the next whole chunk begins; the end if there is none."""
+    mark = data.find(_CHUNK_MARK, place)
+    while mark >= 0:
+        begin = mark - _MARK_OFFSET
+        if begin >= place:
+            opcode, length = _HEAD.unpack_from(data, begin)
+            content = data[begin + _HEAD.size : begin + _HEAD.size + min(length, MAX_RECORD_BYTES)]
+            if opcode == Opcode.CHUNK and len(content) == length and _is_whole(content):
+                return begin
+        mark = data.find(_CHUNK_MARK, mark + 1)
+    return len(data)
+
+
+def _declared(data: mmap.mmap) -> tuple[dict[int, Channel], dict[int, Schema]]:
+    """Channels and schemas that a closed log repeats in its summary: the chunk that declared them may be lost."""
+    channels: dict[int, Channel] = {}
+    schemas: dict[int, Schema] = {}
+    footer = len(data) - len(MCAP0_MAGIC) - 20 - _HEAD.size
+    if footer < 0 or data[footer] != Opcode.FOOTER:
+        return channels, schemas
+    place = struct.unpack_from("<Q", data, footer + _HEAD.size)[0]
+    while 0 < place < footer:
+        opcode, length = _HEAD.unpack_from(data, place)
+        stream = ReadDataStream(BytesIO(data[place + _HEAD.size : place + _HEAD.size + min(length, 1 << 24)]))
+        try:
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(stream)
+                schemas[schema.id] = schema
+            elif opcode == Opcode.CHANNEL:
+                channel = Channel.read(stream)
+                channels[channel.id] = channel
+        except DAMAGE:
+            return {}, {}
+        place += _HEAD.size + length
+    return channels, schemas
+
+
+def _copy(
+    data: mmap.mmap,
+    target: Any,
+    channels: dict[int, Channel],
+    schemas: dict[int, Schema],
+    found: Recovered,
+    source: str,
+) -> None:
+    writer = Writer(target, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True)
+    writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')} recover")
+    writer.add_metadata(RECOVERED, seal({"from": source}))
+    new_channels: dict[int, int] = {}
+    new_schemas: dict[int, int] = {}
+    for opcode, content in _walk(data, found):
+        try:
+            if opcode == Opcode.ATTACHMENT:
+                a: Attachment = attachment_of(content)
+                writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
+            elif opcode == Opcode.METADATA:
+                metadata: Metadata = metadata_of(content)
+                if metadata.name != RECOVERED:
+                    writer.add_metadata(metadata.name, metadata.metadata)
+            elif opcode == Opcode.CHUNK:
+                found.chunks += 1
+                for record in chunk_records(content):
+                    if isinstance(record, Schema):
+                        schemas[record.id] = record
+                    elif isinstance(record, Channel):
+                        channels[record.id] = record
+                    else:
+                        _copy_message(writer, record, channels, schemas, new_channels, new_schemas, found)
+        except DAMAGE:
+            found.broken_records += 1
+    writer.finish()
+
+
+def _copy_message(
+    writer: Writer,
+    message: McapMessage,
+    channels: dict[int, Channel],
+    schemas: dict[int, Schema],
+    new_channels: dict[int, int],
+    new_schemas: dict[int, int],
+    found: Recovered,
+) -> None:
+    channel = channels.get(message.channel_id)
+    schema = schemas.get(channel.schema_id) if channel is not None else None
+    if channel is None or schema is None:
+        found.messages_without_channel += 1
+        return
+    if channel.id not in new_channels:
+        if schema.id not in new_schemas:
+            new_schemas[schema.id] = writer.register_schema(schema.name, schema.encoding, schema.data)
+        new_channels[channel.id] = writer.register_channel(
+            channel.topic, channel.message_encoding, new_schemas[schema.id], channel.metadata
+        )
+    writer.add_message(
+        new_channels[channel.id], message.log_time, message.data, message.publish_time, message.sequence
+    )
+    found.messages += 1

@@ -1,0 +1,61 @@
+"""Trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` a line, in WRF; evo, rpg and others read them."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, TextIO
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.recording.log import LogError, LogSource, Record
+
+from .reader import open_log
+
+
+def _track_of(record: Record) -> str | None:
+    """Name of the track that a message is a point of."""
+    message: Any = record.message
+    match record.topic:
+        case topics.TRUTH_BODY:
+            return f"{message.body.replace('/', '_')}_truth"
+        case topics.TARGET if message.status in ("tracking", "predicting"):
+            return "target_estimate"
+        case topics.ODOMETRY:
+            return f"chaser_{message.chaser}_odometry"
+        case topics.REFERENCE:
+            return f"chaser_{message.chaser}_reference"
+    return None
+
+
+def write_tracks(log: LogSource, folder: Path, from_s: float = 0.0, to_s: float = math.inf) -> dict[str, int]:
+    """Truth of all bodies, the target's estimate, chasers' odometries and references from ``from_s`` to ``to_s``.
+
+    Points by file name. Raises LogError when the log or the files cannot be used.
+    """
+    opened = open_log(log)
+    wanted = (topics.TRUTH_BODY, topics.TARGET, topics.ODOMETRY, topics.REFERENCE)
+    files: dict[str, TextIO] = {}
+    points: dict[str, int] = {}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for record in opened.records(*wanted):
+            time_ns = record.message.sim_time_ns
+            name = _track_of(record)
+            if name is None or not from_s <= time_ns / 1e9 <= to_s:
+                continue
+            if name not in files:
+                files[name] = (folder / f"{name}.tum").open("x", encoding="ascii")
+            w, x, y, z = record.message.q_wxyz
+            values = " ".join(repr(v) for v in (*record.message.position_m, x, y, z, w))
+            files[name].write(f"{time_ns // 1_000_000_000}.{time_ns % 1_000_000_000:09d} {values}\n")
+            points[f"{name}.tum"] = points.get(f"{name}.tum", 0) + 1
+    except FileExistsError as error:
+        raise LogError(f"{error.filename}: already exists; write into an empty folder") from None
+    except OSError as error:
+        raise LogError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    finally:
+        for file in files.values():
+            file.close()
+    if not points:
+        raise LogError(f"{log}: holds no track between {from_s:g} and {to_s:g} s")
+    return dict(sorted(points.items()))

@@ -1,0 +1,123 @@
+"""Two recorded flights side by side: summaries, digests, the first message that differs, how far the bodies came apart."""
+
+from __future__ import annotations
+
+from itertools import zip_longest
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_protocol.recording.log import LogSource, read_log
+
+from chaserdock.analysis.flight import NOT_IN_DIGEST, Flight, load_flight
+from chaserdock.analysis.summary import summary_of
+
+from .difference import Comparison, TopicDifference, difference_lines, first_difference
+
+# Matters of the machine, by the beginning of their names: shown, and no difference between flights.
+_WALL = ("wall_time_s", "latency_s.", "solver.solve_s.", "peak_memory_bytes", "cpu_s", "messages.", "digest")
+
+
+class Apart(msgspec.Struct):
+    """How far two tracks of one body ever are apart, and when."""
+
+    position_m: float
+    position_time_s: float
+    orientation_rad: float
+    orientation_time_s: float
+
+
+class RunComparison(msgspec.Struct):
+    """``summary``: keys whose values differ, both values. ``apart``: by track; ``target estimate`` is the fused one."""
+
+    digests: tuple[str, str]
+    first_difference: str | None
+    summary: dict[str, tuple[Any, Any]]
+    apart: dict[str, Apart]
+    topics: list[TopicDifference]
+
+    @property
+    def equal(self) -> bool:
+        return self.digests[0] == self.digests[1]
+
+
+def flat(value: Any, name: str = "") -> dict[str, Any]:
+    """Nested dictionaries as one, keys joined by dots."""
+    if not isinstance(value, dict):
+        return {name: value}
+    out: dict[str, Any] = {}
+    for key, item in value.items():
+        out |= flat(item, f"{name}.{key}" if name else str(key))
+    return out
+
+
+def compare(first: Path, second: Path, tolerance: float = 0.0) -> RunComparison:
+    """Compares the flights in two logs or run folders; raises LogError or ScenarioError."""
+    flights = load_flight(first), load_flight(second)
+    a, b = (flat(summary_of(f)) for f in flights)
+    topics = _messages(first, second, tolerance)
+    return RunComparison(
+        digests=(flights[0].digest, flights[1].digest),
+        first_difference=first_difference(topics),
+        summary={k: (a.get(k), b.get(k)) for k in {**a, **b} if a.get(k) != b.get(k)},
+        apart=_apart(*flights),
+        topics=topics,
+    )
+
+
+def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[TopicDifference]:
+    comparison = Comparison(tolerance)
+    for pair in zip_longest(read_log(first), read_log(second)):
+        for side, record in enumerate(pair):
+            if record is not None and record.topic not in NOT_IN_DIGEST:
+                comparison.add(side, record.key, record.message)
+    return comparison.finish()
+
+
+def _apart(a: Flight, b: Flight) -> dict[str, Apart]:
+    out = {}
+    for name in [*(n for n in a.truth if n in b.truth), "target estimate"]:
+        estimate = name == "target estimate"
+        one, other = (f.estimate if estimate else f.truth[name] for f in (a, b))
+        _, k, m = np.intersect1d(one.time_s, other.time_s, return_indices=True)
+        if not len(k):
+            continue
+        position = np.linalg.norm(one.position_m[k] - other.position_m[m], axis=1)
+        angle = rotations.angle_between(one.q_wxyz[k], other.q_wxyz[m])
+        p, q = int(np.argmax(position)), int(np.argmax(angle))
+        out[name] = Apart(
+            float(position[p]), float(one.time_s[k][p]), float(angle[q]), float(one.time_s[k][q])
+        )
+    return out
+
+
+def comparison_lines(found: RunComparison) -> list[str]:
+    """The comparison for people."""
+    if found.equal:
+        return [f"equal flights, digest {found.digests[0]}"]
+    lines = ["summary (first, second, second / first):"]
+    for wall in (False, True):
+        for key, (x, y) in sorted(found.summary.items()):
+            if key.startswith(_WALL) != wall or not isinstance(x, int | float | None | bool | str):
+                continue
+            ratio = f"  {y / x:8.3f}" if _is_size(x) and _is_size(y) else ""
+            lines.append(f"  {key}: {_shown(x)}  {_shown(y)}{ratio}{'  (the machine)' if wall else ''}")
+    lines.append("largest distance between the flights:")
+    for name, d in found.apart.items():
+        lines.append(
+            f"  {name}: {d.position_m:.3g} m at {d.position_time_s:.2f} s, "
+            f"{d.orientation_rad:.3g} rad at {d.orientation_time_s:.2f} s"
+        )
+    lines += difference_lines(found.topics, ("first", "second"))
+    lines.append(f"first difference: {found.first_difference or 'none within the tolerance'}")
+    return lines
+
+
+def _is_size(x: Any) -> bool:
+    return isinstance(x, int | float) and not isinstance(x, bool) and x != 0
+
+
+def _shown(x: Any) -> str:
+    return f"{x:.6g}" if isinstance(x, float) else str(x)

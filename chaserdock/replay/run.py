@@ -1,0 +1,89 @@
+"""A log through one stage of today's code: what it says now against what was recorded."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from importlib.metadata import entry_points
+
+import msgspec
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.recording.log import LogError, LogSource, read_log, read_scenario
+from chaserdock_protocol.replay_node import Stage, by_tick
+from chaserdock_protocol.scenario import parse_scenario
+from chaserdock_protocol.scenario.overrides import override
+from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport import Received
+
+from .difference import Comparison, TopicDifference
+
+
+class ReplayError(ChaserdockError):
+    """A replay that cannot be done as asked."""
+
+
+class Replay(msgspec.Struct):
+    """What a replay found. ``notes`` are reservations, in words."""
+
+    through: str
+    topics: list[TopicDifference]
+    notes: list[str] = []
+
+    @property
+    def equal(self) -> bool:
+        return all(t.equal for t in self.topics)
+
+
+def stage_of(name: str) -> Stage:
+    """The stage of that name (entry points, group ``chaserdock.replays``); raises ReplayError."""
+    found = {e.name: e for e in entry_points(group="chaserdock.replays")}
+    if name not in found:
+        raise ReplayError(f"--through {name}: must be one of {', '.join(sorted(found))}")
+    return found[name].load()
+
+
+def _places(topic: Topic, stage: Stage, chasers: int) -> Iterable[int | str | None]:
+    if "{chaser}" in topic.key:
+        return range(chasers)
+    return [stage.process] if "{process}" in topic.key else [None]
+
+
+def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolerance: float = 0.0) -> Replay:
+    """Replays a log through ``perception``, ``fusion`` or ``controller``, its scenario changed by ``overrides``.
+
+    Raises LogError, ScenarioError or ReplayError.
+    """
+    stage = stage_of(through)
+    text, run = read_scenario(log)
+    values = json.loads(text)
+    for change in overrides:
+        override(values, change, lambda: parse_scenario(values, "the log's scenario").model_dump(mode="json"))
+    scenario = parse_scenario(values, "the log's scenario")
+    keys = [
+        topic.key_of(place)
+        for topic in (*stage.inputs, *stage.answers)
+        for place in _places(topic, stage, len(scenario.chasers))
+    ]
+    answers = {id(t) for t in stage.answers}
+    comparison = Comparison(tolerance)
+
+    def recorded() -> Iterator[Received]:
+        for record in read_log(log, keys):
+            if id(record.topic) in answers:
+                comparison.add(0, record.key, record.message)
+            yield Received(record.topic, record.place, record.message, record.sent_ns)
+
+    lockstep = run.get("mode") != "realtime"
+    played = 0
+    for topic, place, message in stage.play(scenario, by_tick(stage, recorded()) if lockstep else recorded()):
+        if id(topic) in answers:
+            comparison.add(1, topic.key_of(place), message)
+            played += 1
+    if not played:
+        raise LogError(f"{log}: holds nothing to replay through {through}")
+    notes = []
+    if not lockstep:
+        notes.append(
+            "flown in real time: when a message reached its reader is not recorded, differences are no proof"
+        )
+    return Replay(through=through, topics=comparison.finish(), notes=notes)

@@ -1,0 +1,151 @@
+"""The 3-D scene: bodies, estimate, plans, corridors, keep-out, camera views, drawn with viser."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal, get_args
+
+import numpy as np
+import trimesh
+import viser
+from chaserdock_models import rotations
+from chaserdock_protocol.scenario import Scenario
+
+from chaserdock.analysis.scene import scene_of
+
+from . import shapes
+from .history import History
+from .plots import COLOURS, ESTIMATE_COLOUR
+from .snapshot import Now, Pose, pose_of
+
+ViewFrom = Literal["beside the target", "on the target", "the world"]
+VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
+"""Which axes stand still on the screen: the world's, moved along with the target; the target's own; the world's."""
+
+TRAIL_S = 60.0
+_VIEW_M = 0.22
+_NOWHERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+
+
+def _rgb(colour: str) -> tuple[int, int, int]:
+    return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
+
+
+class Stage:
+    """The scene of one mission; everything under ``/scene``, whose place makes the view stand still."""
+
+    def __init__(self, server: viser.ViserServer, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._scene = scene = server.scene
+        scene.configure_default_lights(cast_shadow=False)
+        self._root = scene.add_frame("/scene", show_axes=False)
+        looks = scene_of(scenario)
+        self._target = self._body("/scene/target", shapes.mesh_of(looks.target))
+        self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
+        size = scenario.target_model().size_m
+        self._lines("/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0)
+        self._keep_out_m = scenario.limits.min_distance_target_m
+        self._keep_out = self._lines(
+            "/scene/estimate/keep_out", shapes.sphere(self._keep_out_m), (176, 118, 128), 1.0
+        )
+        self._chasers: list[Any] = []
+        self._plans: list[Any] = []
+        self._references: list[Any] = []
+        self._trails: list[Any] = []
+        self._corridors: list[Any] = []
+        self._frustums: list[Any] = []
+        camera = scenario.camera_model()
+        for i in range(len(scenario.chasers)):
+            colour = _rgb(COLOURS[i % len(COLOURS)])
+            name = f"/scene/chaser_{i}"
+            self._chasers.append(self._body(name, shapes.mesh_of(looks.chaser, colour)))
+            scene.add_label(f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2]))
+            self._frustums.append(
+                scene.add_camera_frustum(
+                    f"{name}/camera",
+                    fov=2.0 * math.atan2(camera.height_px / 2.0, camera.fy_px),
+                    aspect=camera.width_px / camera.height_px,
+                    scale=_VIEW_M,
+                    thickness=1.5,
+                    thickness_units="screen",
+                    color=colour,
+                    wxyz=np.asarray(camera.q_crf_irf_wxyz),
+                    position=np.asarray(camera.position_crf_m),
+                    cast_shadow=False,
+                )
+            )
+            self._plans.append(
+                self._lines(f"/scene/plan_{i}", shapes.polyline(np.zeros((0, 3))), colour, 3.0)
+            )
+            self._references.append(
+                scene.add_frame(f"/scene/reference_{i}", axes_length=0.08, axes_radius=0.0025, visible=False)
+            )
+            trail = self._lines(f"/scene/estimate/trail_{i}", shapes.polyline(np.zeros((0, 3))), colour, 1.0)
+            self._trails.append(trail)
+            corridor = shapes.corridor_of(scenario, i)
+            if corridor is not None:
+                self._corridors.append(self._lines(f"/scene/estimate/corridor_{i}", corridor, colour, 1.0))
+        self.view: ViewFrom = VIEWS[0]
+        far = 2.0 * max(math.hypot(*c.position_m) for c in scenario.chasers)
+        server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
+        server.initial_camera.look_at = (0.0, 0.0, 0.0)
+
+    def _body(self, name: str, mesh: shapes.Mesh) -> Any:
+        solid = trimesh.Trimesh(
+            mesh.vertices_m, mesh.triangles, vertex_colors=mesh.colours, process=False, validate=False
+        )
+        return self._scene.add_mesh_trimesh(name, solid, cast_shadow=False, receive_shadow=False)
+
+    def _lines(self, name: str, segments: Any, colour: tuple[int, int, int], pixels: float) -> Any:
+        return self._scene.add_line_segments(
+            name, segments, colour, thickness=pixels, thickness_units="screen"
+        )
+
+    def show_corridors(self, shown: bool) -> None:
+        """Corridors on or off."""
+        for corridor in self._corridors:
+            corridor.visible = shown
+
+    def show_keep_out(self, shown: bool) -> None:
+        """The sphere that the chasers may not plan to enter, on or off."""
+        self._keep_out.visible = shown
+
+    def show_views(self, shown: bool) -> None:
+        """The cameras' views on or off."""
+        for frustum in self._frustums:
+            frustum.visible = shown
+
+    def draw(self, now: Now, history: History, slow: bool) -> None:
+        """The present; lines that grow (trails) only when ``slow`` says so."""
+        estimate, true = now.estimate(), now.true_target()
+        shown = true or estimate
+        self._put(self._target, shown)
+        self._put(self._estimate, estimate)
+        self._stand_still(shown or _NOWHERE)
+        keep_out_m = now.keep_out_m(self._scenario.limits.min_distance_target_m)
+        if keep_out_m != self._keep_out_m:
+            self._keep_out_m, self._keep_out.points = keep_out_m, shapes.sphere(keep_out_m)
+        for i, chaser in enumerate(now.chasers):
+            self._put(self._chasers[i], now.chaser(i))
+            self._put(self._references[i], pose_of(chaser.reference) if chaser.reference else None)
+            if chaser.plan is not None:
+                self._plans[i].points = shapes.polyline(np.reshape(chaser.plan.positions_m, (-1, 3)))
+            if slow and estimate is not None:
+                trail = history.trails[i].between(now.time_s() - TRAIL_S, now.time_s())
+                self._trails[i].points = shapes.polyline(trail)
+
+    def _stand_still(self, target: Pose) -> None:
+        if self.view == "the world":
+            q, p = _NOWHERE.q_wxyz, _NOWHERE.position_m
+        elif self.view == "on the target":
+            q = rotations.conjugate(target.q_wxyz)
+            p = -rotations.rotate(q, target.position_m)
+        else:
+            q, p = _NOWHERE.q_wxyz, -target.position_m
+        self._root.position, self._root.wxyz = p, q
+
+    def _put(self, node: Any, pose: Pose | None) -> None:
+        if node.visible != (pose is not None):
+            node.visible = pose is not None
+        if pose is not None:
+            node.position, node.wxyz = pose.position_m, pose.q_wxyz

@@ -1,0 +1,121 @@
+"""The bodies, corridors and lines of the 3-D scene as plain arrays. No browser here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_models.docking_geometry import centre_offset
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.scenario import Scenario
+from numpy.typing import NDArray
+
+from chaserdock.analysis.scene import Face
+
+# What is painted on a face lies this far above it, layer by layer, so that the browser's depth tells them apart.
+_LAYER_M = 0.0004
+_SIDES = 24
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """``vertices_m`` (V, 3), ``triangles`` (F, 3) of their indices, ``colours`` (V, 3), 0 to 255."""
+
+    vertices_m: Array
+    triangles: NDArray[np.int32]
+    colours: NDArray[np.uint8]
+
+
+def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> Mesh:
+    """Faces with what is painted on them, in the body's axes; ``tint`` colours the faces, not the paint."""
+    corners: list[Array] = []
+    normals: list[Array] = []
+    colours: list[Array] = []
+    for face in faces:
+        colour = np.full(3, float(face.grey))
+        if tint is not None:
+            colour = 0.35 * colour + 0.65 * np.array(tint)
+        corners.append(face.corners_m)
+        normals += [face.normal] * (1 + len(face.decals))
+        colours.append(np.tile(colour, (4, 1)))
+        for layer, (painted, grey) in enumerate(face.decals):
+            # The border, then the black square, then its white cells: three layers do.
+            corners.append(painted + face.normal * _LAYER_M * (1 + min(layer, 2)))
+            colours.append(np.full((4, 3), float(grey)))
+    # Each quadrangle has corners of its own, so that the browser shades it flat; outside is where its corners go
+    # round to the left.
+    quads = np.array([_counterclockwise(c, n) for c, n in zip(corners, normals, strict=True)])
+    halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
+    triangles = (4 * np.arange(len(quads), dtype=np.int32)[:, None, None] + halves).reshape(-1, 3)
+    return Mesh(quads.reshape(-1, 3), triangles, np.concatenate(colours).astype(np.uint8))
+
+
+def _counterclockwise(corners: Array, normal: Array) -> Array:
+    """Corners (4, 3) in the order that has ``normal`` (3,) outside."""
+    turned = np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ normal
+    return corners if turned > 0.0 else corners[::-1]
+
+
+def polyline(points: Array) -> NDArray[np.float32]:
+    """Points (K, 3) as segments (K - 1, 2, 3); one of no length where there are fewer than two points."""
+    if len(points) < 2:
+        points = np.zeros((2, 3)) if len(points) == 0 else np.repeat(points, 2, axis=0)
+    return np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+
+
+def box_edges(size_m: tuple[float, float, float]) -> NDArray[np.float32]:
+    """The twelve edges (12, 2, 3) of a box about the origin."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
+    pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
+    return np.array([[corners[a], corners[b]] for a, b in pairs], dtype=np.float32)
+
+
+def tube(begin_m: Array, end_m: Array, radius_m: float) -> NDArray[np.float32]:
+    """A cylinder about the line between two points (3,), as segments (K, 2, 3): rings and four lines along it."""
+    axis = (end_m - begin_m) / max(1e-12, float(np.linalg.norm(end_m - begin_m)))
+    aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    aside /= np.linalg.norm(aside)
+    angles = np.linspace(0.0, 2.0 * np.pi, _SIDES + 1)
+    circle = radius_m * (np.outer(np.cos(angles), aside) + np.outer(np.sin(angles), np.cross(axis, aside)))
+    rings = [polyline(circle + begin_m + share * (end_m - begin_m)) for share in (0.0, 0.5, 1.0)]
+    along = np.stack([circle[:-1:6] + begin_m, circle[:-1:6] + end_m], axis=1).astype(np.float32)
+    return np.concatenate([*rings, along])
+
+
+def sphere(radius_m: float) -> NDArray[np.float32]:
+    """A ball about the origin, as circles of latitude and longitude (K, 2, 3)."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 2 * _SIDES + 1)
+    flat = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
+    circles = []
+    for latitude in np.radians([-45.0, 0.0, 45.0]):
+        circles.append(flat * np.cos(latitude) + [0.0, 0.0, np.sin(latitude)])
+    for longitude in np.radians(np.arange(0.0, 180.0, 45.0)):
+        turn = np.array([-np.sin(longitude), np.cos(longitude)])
+        circles.append(np.stack([flat[:, 0] * turn[0], flat[:, 0] * turn[1], flat[:, 1]], axis=1))
+    return (radius_m * np.concatenate([polyline(c) for c in circles])).astype(np.float32)
+
+
+def corridor_of(scenario: Scenario, chaser: int) -> NDArray[np.float32] | None:
+    """A chaser's way in, in TRF, as segments (K, 2, 3); None where it has none.
+
+    By capture: where its centre may be from the corridor's entry to the port, then within the final approach's limits.
+    Else, the line from its place to the docking distance, as wide as what counts as docked.
+    """
+    docking, port = scenario.docking, scenario.docking.port_of(chaser)
+    if docking.kind == "capture":
+        if port is None:
+            return None
+        reach_m = scenario.chaser.probe_reach_m
+        entry, last, there = (
+            centre_offset(port, reach_m, g) for g in (docking.entry_m, docking.final_m, 0.0)
+        )
+        return np.concatenate(
+            [tube(entry, last, docking.corridor.lateral_m), tube(last, there, docking.final.lateral_m)]
+        )
+    begin = np.array(scenario.chasers[chaser].position_m)
+    distance_m = float(np.linalg.norm(begin))
+    if distance_m <= scenario.approach.dock_distance_m:
+        return None
+    end = begin * scenario.approach.dock_distance_m / distance_m
+    return tube(begin, end, scenario.approach.docked_position_m)

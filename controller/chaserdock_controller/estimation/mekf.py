@@ -1,0 +1,217 @@
+"""The default estimator: a multiplicative Kalman filter that takes measurements at their exposure time.
+
+Mathematics: docs/fusion.md. Late measurements go in by roll back and replay over a short buffer, so the
+state after a set of measurements does not depend on the order or the calls in which they came.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left, bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from .camera_calibration import ERRORS
+from .filter_update import Event, FilterState, is_lost, mixture_covariance, process, shaken
+from .hypothesis import POSE, predict
+from .parameters import MekfParameters
+from .types import (
+    CameraError,
+    Matrix3,
+    Measurement,
+    Shock,
+    TargetEstimate,
+    content_key,
+    is_usable,
+    no_estimate,
+)
+
+
+@dataclass
+class Exposure:
+    """The measurements of one exposure time (sorted by chaser) and what they led to.
+
+    ``parameters`` hold up to it from the exposure before; ``shocks`` changed the rates after it.
+    """
+
+    time_ns: int
+    group: list[Measurement]
+    parameters: MekfParameters
+    shocks: list[Shock] = field(default_factory=list)
+    state: FilterState | None = None
+    events: tuple[Event, ...] = ()
+
+
+class Mekf:
+    """Target state from the measurements of all chasers.
+
+    Counters: ``accepted`` and ``gated`` measurements, ``reinitialisations``; ``late_dropped`` (older
+    than the buffer), ``early_dropped`` (exposed after ``now_ns``), ``invalid`` (not finite, wrong shape
+    or a covariance that is none) and ``duplicates`` (chaser and time as in one already taken).
+    """
+
+    def __init__(self, parameters: MekfParameters | None = None) -> None:
+        self.parameters = parameters if parameters is not None else MekfParameters()
+        self.late_dropped = 0
+        self.early_dropped = 0
+        self.invalid = 0
+        self.duplicates = 0
+        self._buffer: list[Exposure] = []
+        self._base: FilterState | None = None  # the state just before the buffer
+        self._pending: list[Event] = []  # events outside of the buffer, not yet drained
+        self._drained: set[Event] = set()  # events of the buffer already drained
+        self._was_lost = False
+
+    @property
+    def accepted(self) -> int:
+        """Measurements accepted so far."""
+        state = self._newest()
+        return state.accepted if state else 0
+
+    @property
+    def gated(self) -> int:
+        """Measurements gated out so far."""
+        state = self._newest()
+        return state.gated if state else 0
+
+    @property
+    def reinitialisations(self) -> int:
+        """How often the filter began anew with the rates kept."""
+        state = self._newest()
+        return state.reinitialisations if state else 0
+
+    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate:
+        """Takes in measurements, of any exposure times up to ``now_ns`` and in any order, and returns
+        the estimate for ``now_ns``. Raises ValueError as ``estimate_at``."""
+        newest = self._buffer[-1].time_ns if self._buffer else None
+        horizon = None if newest is None else newest - self._buffer_ns
+        first_changed: int | None = None
+        for m in sorted(measurements, key=content_key):
+            if m.time_ns > now_ns:
+                self.early_dropped += 1
+                self._pending.append((now_ns, f"chaser {m.chaser}: exposure later than now, dropped"))
+            elif (horizon is not None and m.time_ns < horizon) or (
+                self._base is not None and m.time_ns <= self._base.time_ns
+            ):
+                self.late_dropped += 1
+            elif not is_usable(m):
+                self.invalid += 1
+                self._pending.append((now_ns, f"chaser {m.chaser}: unusable measurement, dropped"))
+            elif self._insert(m):
+                first_changed = m.time_ns if first_changed is None else min(first_changed, m.time_ns)
+        if first_changed is not None:
+            self._replay(first_changed)
+            self._trim()
+        estimate = self.estimate_at(now_ns)
+        lost = estimate.status == "lost"
+        if lost and not self._was_lost:
+            self._pending.append((now_ns, "lost"))
+        self._was_lost = lost
+        return estimate
+
+    def estimate_at(self, time_ns: int) -> TargetEstimate:
+        """The estimate for ``time_ns``, from the measurements exposed up to then; changes nothing.
+
+        Raises ValueError for a time before the oldest state still held in the buffer.
+        """
+        i = bisect_right(self._buffer, time_ns, key=lambda e: e.time_ns)
+        state = self._buffer[i - 1].state if i > 0 else self._base
+        if state is None or not state.branches:
+            return no_estimate(time_ns)
+        if time_ns < state.time_ns:
+            raise ValueError(f"no state as old as {time_ns} ns is held; the oldest is {state.time_ns} ns")
+        branches = tuple(predict(b, time_ns, self.parameters) for b in state.branches)
+        best = branches[0]
+        if is_lost(best, self.parameters):
+            status = "lost"
+        elif time_ns - state.last_accepted_ns <= self.parameters.tracking_s * 1e9:
+            status = "tracking"
+        else:
+            status = "predicting"
+        covariance = mixture_covariance(branches)
+        covariance[np.ix_(POSE, POSE)] += state.frozen
+        return TargetEstimate(
+            time_ns,
+            best.position_m.copy(),
+            best.velocity_m_s.copy(),
+            best.q_wxyz.copy(),
+            best.omega_rad_s.copy(),
+            covariance,
+            status,
+            len(state.seen),
+            state.rejected,
+        )
+
+    def cameras(self) -> tuple[CameraError, ...]:
+        """What is known of the calibration errors of the cameras seen so far, at the newest exposure, by chaser."""
+        state = self._newest()
+        if state is None or not state.branches:
+            return ()
+        best, found = state.branches[0], []
+        for k, (chaser, error) in enumerate(zip(best.cameras, best.bias, strict=True)):
+            i = slice(12 + ERRORS * k, 12 + ERRORS * (k + 1))
+            found.append(CameraError(chaser, error[:3], error[3:6], float(error[6]), best.covariance[i, i]))
+        return tuple(sorted(found, key=lambda e: e.chaser))
+
+    def disturb(self, shock: Shock) -> None:
+        """Something has pushed the target since the newest exposure."""
+        if self._buffer:
+            newest = self._buffer[-1]
+            newest.shocks.append(shock)
+            if newest.state is not None:
+                newest.state = shaken(newest.state, [shock])
+
+    def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
+        """From the newest exposure on the target is another rigid body, free of torque: ``inertia`` (TRF, rows, about
+        the centre of mass, to any factor), ``centre_trf_m`` its centre of mass in TRF. Raises ValueError for an
+        inertia that no body has."""
+        self.parameters = replace(
+            self.parameters,
+            motion_model="torque_free",
+            inertia_ratios=inertia,
+            centre_of_mass_trf_m=centre_trf_m,
+        )
+
+    def drain_events(self) -> list[Event]:
+        """What happened since the last call, as (simulated time in ns, text), in order of time."""
+        fresh = [e for x in self._buffer for e in x.events if e not in self._drained]
+        self._drained.update(fresh)
+        events = sorted([*self._pending, *fresh], key=lambda e: e[0])
+        self._pending = []
+        return events
+
+    @property
+    def _buffer_ns(self) -> int:
+        return round(self.parameters.buffer_s * 1e9)
+
+    def _newest(self) -> FilterState | None:
+        return self._buffer[-1].state if self._buffer else self._base
+
+    def _insert(self, m: Measurement) -> bool:
+        i = bisect_left(self._buffer, m.time_ns, key=lambda e: e.time_ns)
+        if i == len(self._buffer) or self._buffer[i].time_ns != m.time_ns:
+            self._buffer.insert(i, Exposure(m.time_ns, [m], self.parameters))
+            return True
+        group = self._buffer[i].group
+        if any(other.chaser == m.chaser for other in group):
+            self.duplicates += 1
+            return False
+        group.append(m)
+        group.sort(key=lambda other: other.chaser)
+        return True
+
+    def _replay(self, time_ns: int) -> None:
+        i = bisect_left(self._buffer, time_ns, key=lambda e: e.time_ns)
+        state = self._buffer[i - 1].state if i > 0 else self._base
+        for exposure in self._buffer[i:]:
+            state, exposure.events = process(state, exposure.time_ns, exposure.group, exposure.parameters)
+            exposure.state = state = shaken(state, exposure.shocks)
+
+    def _trim(self) -> None:
+        horizon = self._buffer[-1].time_ns - self._buffer_ns
+        while self._buffer[0].time_ns < horizon:
+            old = self._buffer.pop(0)
+            self._base = old.state
+            self._pending += [e for e in old.events if e not in self._drained]
+            self._drained.difference_update(old.events)

@@ -1,0 +1,123 @@
+"""Where a chaser looks when it does not just face the target: the search for it, and the manoeuvre that shows how its
+camera is mounted. Pure functions of time; SI units, radians.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.braking import brake_wrench
+from chaserdock_models.camera import Camera
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.scenario.bodies import Body
+from numpy.typing import ArrayLike
+
+SEARCH_RATE_RAD_S = math.radians(15.0)
+"""Mean rate at which the line of sight moves along a ring of the search."""
+_RING_SHARE = 0.9
+"""Rings grow by this share of the picture's height, so that each overlaps the one before."""
+_WIDEST_RAD = math.radians(170.0)
+
+CALIBRATION_S = 30.0
+"""How long the calibration manoeuvre takes."""
+_RAMP_S = 6.0
+_ROLL, _YAW, _PITCH = math.radians(70.0), math.radians(12.0), math.radians(6.0)
+
+# Attitude law of the search: a critically damped oscillator of 2 rad/s.
+_STIFFNESS, _DAMPING = 4.0, 4.0
+_STEP_S = 0.02
+
+
+def field_of_view(camera: Camera) -> tuple[float, float]:
+    """Width and height of the picture as angles, rad."""
+    return (
+        2.0 * math.atan(camera.width_px / 2.0 / camera.fx_px),
+        2.0 * math.atan(camera.height_px / 2.0 / camera.fy_px),
+    )
+
+
+def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[float, float]:
+    """Yaw and pitch (about Z and Y of the body as the search found it) of the line of sight, ``time_s`` into a search.
+
+    Ellipses about the first line of sight. After the k-th all within height/2 + k 0.9 height of it has been in the
+    picture, in every direction. The last one is repeated.
+    """
+    before, left_s, k = (0.0, 0.0), max(time_s, 0.0), 1
+    while True:
+        edge = min(height_rad * (0.5 + _RING_SHARE * k), _WIDEST_RAD)
+        yaw, pitch = max(edge - width_rad / 2.0, 0.0), edge - height_rad / 2.0
+        out_s = max(math.hypot(yaw - before[0], pitch - before[1]), 1e-6) / SEARCH_RATE_RAD_S
+        # Circumference of an ellipse (S. Ramanujan, 1914).
+        h = ((yaw - pitch) / (yaw + pitch)) ** 2
+        round_s = (
+            math.pi * (yaw + pitch) * (1.0 + 3.0 * h / (10.0 + math.sqrt(4.0 - 3.0 * h))) / SEARCH_RATE_RAD_S
+        )
+        if left_s < out_s:
+            # Out along the pitch axis, where the picture is lowest.
+            return 0.0, before[1] + (pitch - before[1]) * left_s / out_s
+        left_s -= out_s
+        if left_s < round_s or edge >= _WIDEST_RAD:
+            phase = 2.0 * math.pi * left_s / round_s
+            return yaw * math.sin(phase), pitch * math.cos(phase)
+        left_s -= round_s
+        before, k = (0.0, pitch), k + 1
+
+
+def search_attitude(q_start_wxyz: ArrayLike, camera: Camera, time_s: float) -> Array:
+    """Attitude (4,), CRF to WRF, ``time_s`` into a search that began at ``q_start_wxyz``."""
+    yaw, pitch = search_angles(time_s, *field_of_view(camera))
+    return rotations.multiply(q_start_wxyz, rotations.exp([0.0, pitch, yaw]))
+
+
+def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
+    """The attitude (4,) nearest to ``q_wxyz``, CRF to WRF, that has +X along ``direction_w`` (3,), which is not zero."""
+    a = rotations.rotate(q_wxyz, [1.0, 0.0, 0.0])
+    b = np.asarray(direction_w, dtype=float) / np.linalg.norm(np.asarray(direction_w, dtype=float))
+    axis, cosine = np.cross(a, b), float(a @ b)
+    size = float(np.linalg.norm(axis))
+    if size < 1e-9:  # there already, or opposite: then about Z of the body
+        axis, size = rotations.rotate(q_wxyz, [0.0, 0.0, 1.0]), 1.0
+    angle = math.atan2(float(np.linalg.norm(np.cross(a, b))), cosine)
+    return rotations.normalize(rotations.multiply(rotations.exp(axis / size * angle), q_wxyz))
+
+
+def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: Array) -> Array:
+    """Force and torque (6,), body axes: comes to rest in place and turns to ``q_wxyz`` (4,), which is at ``q_soon_wxyz``
+    0.02 s later."""
+    wrench = brake_wrench(odometry, body)
+    error = rotations.log(rotations.multiply(rotations.conjugate(odometry.q_wxyz), q_wxyz))
+    ahead = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), q_soon_wxyz)) / _STEP_S
+    omega, inertia = np.array(odometry.omega_rad_s), np.array(body.inertia)
+    torque = inertia * (_STIFFNESS * error + _DAMPING * (ahead - omega)) + np.cross(omega, inertia * omega)
+    wrench[3:] = np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m)
+    return wrench
+
+
+def search_wrench(
+    odometry: Odometry, body: Body, camera: Camera, q_start_wxyz: Array, time_s: float
+) -> Array:
+    """Force and torque (6,), body axes, of a chaser that has been searching for ``time_s``."""
+    now, soon = (search_attitude(q_start_wxyz, camera, time_s + dt) for dt in (0.0, _STEP_S))
+    return turning_wrench(odometry, body, now, soon)
+
+
+def calibration_turns(times_s: ArrayLike) -> Array:
+    """Rotations (K, 4) of the body away from facing the target at times (K,) of the calibration manoeuvre; none before and
+    after it.
+
+    To either side about the line of sight, which shows the mounting's yaw and pitch, and a little about the other axes,
+    which shows its roll: three sines of one, two and three periods, with smooth ends (fifth-degree polynomials).
+    """
+    t = np.clip(np.asarray(times_s, dtype=float), 0.0, CALIBRATION_S)
+    x = np.clip(np.minimum(t, CALIBRATION_S - t) / _RAMP_S, 0.0, 1.0)
+    window = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    phase = 2.0 * math.pi * t / CALIBRATION_S
+    zero = np.zeros_like(t)
+    roll = np.stack([window * _ROLL * np.sin(phase), zero, zero], axis=-1)
+    aside = np.stack(
+        [zero, window * _PITCH * np.sin(3.0 * phase), window * _YAW * np.sin(2.0 * phase)], axis=-1
+    )
+    return rotations.multiply(rotations.exp(roll), rotations.exp(aside))

@@ -1,0 +1,133 @@
+"""Back end `alpaqa`: PANOC with an augmented Lagrangian, the family of the paper's solver, by alpaqa's own wheel.
+
+Single shooting of `problem.build_nlp`: states are eliminated, distances are left to the augmented Lagrangian, whose
+greatest penalty stands for the slack. CasADi's wheel has a plugin of that name, but with fixed settings (a
+tolerance of 1e-10, an L-BFGS memory of two) and a report on standard output at each call, so the wheel
+`alpaqa` is used (extra ``chaserdock[alpaqa]``). Limited by iterations, never by time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .casadi_nlp import pack, row_floor
+from .problem import Nlp, build_nlp
+from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
+from .warm_start import Frame, worded
+
+MAX_OUTER, MAX_INNER = 10, 100
+# Of the scaled problem, inputs as shares of their limits: gradient in units of cost (it begins at some 1e3), and m.
+TOLERANCE, ROOM_TOLERANCE = 0.5, 1e-3
+
+
+class AlpaqaSolver:
+    """alpaqa for up to ``n_chasers`` chasers; keeps each one's plan as its warm start.
+
+    ``max_iterations`` bounds the inner iterations of one outer step, MAX_INNER if None. Raises ValueError for
+    n_chasers < 1 or where alpaqa is not installed.
+    """
+
+    def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
+        try:
+            import alpaqa  # pyright: ignore[reportMissingImports] (an extra)
+        except ImportError:
+            raise ValueError(
+                "solver 'alpaqa' needs the package alpaqa: pip install 'chaserdock[alpaqa]'"
+            ) from None
+        self._frame = Frame(params, n_chasers)
+        inner = MAX_INNER if max_iterations is None else max_iterations
+        inner_solver: Any = alpaqa.PANOCSolver({"max_iter": inner}, {"memory": 30})
+        self._solver: Any = alpaqa.ALMSolver(
+            alm_params={
+                "tolerance": TOLERANCE,
+                "dual_tolerance": ROOM_TOLERANCE,
+                "max_iter": MAX_OUTER,
+                "initial_penalty": 1e3,
+                "max_penalty": 1e7,
+                "penalty_update_factor": 10.0,
+            },
+            inner_solver=inner_solver,
+        )
+        self._alpaqa = alpaqa
+        self._converged, self._late = (
+            alpaqa.SolverStatus.Converged,
+            (alpaqa.SolverStatus.MaxIter, alpaqa.SolverStatus.NoProgress),
+        )
+        self._programmes: dict[int, tuple[Nlp, Any]] = {}
+        for n in range(1, n_chasers + 1):
+            nlp = build_nlp(n, params, shooting="single")
+            self._programmes[n] = nlp, _callbacks(alpaqa, nlp)
+
+    def reset(self) -> None:
+        """Forgets every warm start."""
+        self._frame.plans = {}
+
+    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
+        """One tick; arguments, answer and errors as `RtiSolver.solve`. The chasers share one status.
+
+        ``iterations`` counts the inner ones.
+        """
+        frame = self._frame
+        task = frame.begin(problem, shift_s, ids)
+        u, limits = task.start.copy(), task.problem.input_max
+        n, d = len(u), frame.params.stages
+        nlp, programme = self._programmes[n]
+        programme.parameters = np.concatenate([pack(frame.params, task), limits.ravel()])
+        programme.general_bounds.lower = row_floor(nlp, task).ravel()
+        scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
+        start = (u / scale).transpose(1, 0, 2).ravel()
+        w, _, stats = self._solver(
+            self._alpaqa.Problem(programme), x=start, y=np.zeros(d * nlp.rows), asynchronous=False
+        )
+        solution = np.asarray(w).reshape(d, n, 6).transpose(1, 0, 2)
+        late = stats["status"] in self._late
+        usable = (late or stats["status"] == self._converged) and bool(np.isfinite(solution).all())
+        if usable:
+            u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
+        iterations = np.full(n, int(stats["inner"]["iterations"]), dtype=np.int64)
+        return frame.finish(task, u, [worded(usable, late)] * n, iterations)
+
+
+def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
+    """The problem as alpaqa asks for it, evaluated by CasADi's virtual machine.
+
+    alpaqa's own way from CasADi needs a C compiler, or a CasADi whose files the one built into alpaqa reads
+    (1.1.0a2 reads none of 3.8).
+    """
+    n = nlp.n
+    x, p = nlp.problem["x"], nlp.problem["p"]
+    # Inputs as shares of their limits, which are the last parameters: a well-scaled box.
+    w, limits = ca.SX.sym("w", x.numel()), ca.SX.sym("limits", 6 * n)
+    f, g = ca.Function("nlp", [x, p], [nlp.problem["f"], nlp.problem["g"]])(
+        w * ca.repmat(limits, nlp.stages, 1), p
+    )
+    y, parameters = ca.SX.sym("y", g.numel()), ca.vertcat(p, limits)
+    cost = ca.Function("f", [w, parameters], [f])
+    slope = ca.Function("grad_f", [w, parameters], [ca.gradient(f, w)])
+    rooms = ca.Function("g", [w, parameters], [g])
+    pull = ca.Function("grad_g_prod", [w, y, parameters], [ca.jtimes(g, w, y, True)])
+
+    class Callbacks(alpaqa.BoxConstrProblem):
+        def __init__(self) -> None:
+            super().__init__(w.numel(), g.numel())
+            self.variable_bounds.lower, self.variable_bounds.upper = np.full((2, w.numel()), [[-1.0], [1.0]])
+            self.general_bounds.upper = np.full(g.numel(), np.inf)
+            self.parameters = np.zeros(parameters.numel())
+
+        def eval_objective(self, at: Array) -> float:
+            return float(cost(at, self.parameters))
+
+        def eval_objective_gradient(self, at: Array, out: Array) -> None:
+            out[:] = slope(at, self.parameters).full().ravel()
+
+        def eval_constraints(self, at: Array, out: Array) -> None:
+            out[:] = rooms(at, self.parameters).full().ravel()
+
+        def eval_constraints_gradient_product(self, at: Array, multipliers: Array, out: Array) -> None:
+            out[:] = pull(at, multipliers, self.parameters).full().ravel()
+
+    return Callbacks()

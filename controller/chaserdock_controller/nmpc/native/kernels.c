@@ -1,0 +1,11 @@
+/* The kernels of the NMPC, compiled once per instruction set (LEVEL). See base.h. */
+#include "base.h"
+#include "elementary.h"
+#include "model.h"
+#include "checks.c"
+#include "dynamics.c"
+#include "cost.c"
+#include "planes.c"
+#include "riccati.c"
+#include "ipm.c"
+#include "tick.c"

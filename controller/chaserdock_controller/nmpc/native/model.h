@@ -1,0 +1,12 @@
+#ifndef CHASERDOCK_MODEL_H
+#define CHASERDOCK_MODEL_H
+
+#include "base.h"
+
+/* What `NmpcParameters` says of the body and the discretization; the Runge-Kutta tableau has one sub-diagonal. */
+typedef struct {
+    double step_s, mass_kg, per_mass, inertia[9], inverse[9], nodes[4], weights[4];
+    int64_t parts;
+} Model;
+
+#endif

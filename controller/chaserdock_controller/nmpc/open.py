@@ -1,0 +1,175 @@
+"""Back end `open`: OpEn (Optimization Engine), the paper's own solver, through opengen.
+
+Sopasakis, Fresk and Patrinos, "OpEn: Code generation for embedded nonconvex optimization", IFAC 2020: PANOC over the
+box of inputs, single shooting. Distances are priced by a quadratic penalty of fixed weight within the cost; OpEn's own
+ways (`with_penalty_constraints`, `with_aug_lagrangian_constraints`) make opengen write C that differentiates every
+distance by itself, tens of megabytes for four chasers, which no compiler here came to the end of. opengen writes
+Rust for each number of chasers, which cargo compiles, a minute the first time; the result is kept in
+``$XDG_CACHE_HOME/chaserdock/open`` (``~/.cache``), under a digest of the problem. Limited by iterations, never by time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import importlib.util
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from .casadi_nlp import pack, row_floor
+from .problem import Nlp, build_nlp
+from .types import NmpcInput, NmpcParameters, NmpcPlan
+from .warm_start import Frame, worded
+
+MAX_INNER = 500
+TOLERANCE = 1e-3
+# Cost of a squared metre of violation, halved: 1 mm for a multiplier of 1e3.
+PENALTY = 1e6
+# Far beyond any solve: OpEn wants a time, and ours are limited by iterations.
+_NEVER_US = 60_000_000
+# What cargo calls a shared library, and what Python wants it to be called.
+_LIBRARY_SUFFIXES = (".so", ".dylib", ".dll")
+_SUFFIX = {"win32": ".pyd"}
+
+
+class OpenSolver:
+    """OpEn for up to ``n_chasers`` chasers; keeps each one's plan as its warm start.
+
+    ``max_iterations`` bounds the iterations of a solve, MAX_INNER if None. Raises ValueError for
+    n_chasers < 1 or where opengen or cargo is not installed.
+    """
+
+    def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
+        self._frame = Frame(params, n_chasers)
+        if importlib.util.find_spec("opengen") is None:
+            raise ValueError("solver 'open' needs the package opengen: pip install 'chaserdock[open]'")
+        if shutil.which("cargo") is None:
+            raise ValueError(
+                "solver 'open' needs cargo, Rust's build tool, on the PATH: see https://rustup.rs"
+            )
+        inner = MAX_INNER if max_iterations is None else max_iterations
+        self._programmes: dict[int, tuple[Nlp, Any]] = {}
+        for n in range(1, n_chasers + 1):
+            nlp = build_nlp(n, params, shooting="single", symbol=ca.MX.sym)
+            self._programmes[n] = nlp, _built(nlp, inner)
+
+    def reset(self) -> None:
+        """Forgets every warm start."""
+        self._frame.plans = {}
+
+    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
+        """One tick; arguments, answer and errors as `RtiSolver.solve`. The chasers share one status.
+
+        ``iterations`` counts the inner ones.
+        """
+        frame = self._frame
+        task = frame.begin(problem, shift_s, ids)
+        u, limits = task.start.copy(), task.problem.input_max
+        n, d = len(u), frame.params.stages
+        scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
+        nlp, programme = self._programmes[n]
+        floor = row_floor(nlp, task)
+        answer = programme.run(
+            p=np.concatenate([pack(frame.params, task), limits.ravel(), floor.ravel()]).tolist(),
+            initial_guess=(u / scale).transpose(1, 0, 2).ravel().tolist(),
+        )
+        usable, late, iterations = False, False, 0
+        if answer.is_ok():
+            status = answer.get()
+            solution = np.array(status.solution).reshape(d, n, 6).transpose(1, 0, 2)
+            late = status.exit_status != "Converged"
+            usable = bool(np.isfinite(solution).all())
+            iterations = int(status.num_inner_iterations)
+            if usable:
+                u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
+        return frame.finish(task, u, [worded(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+
+
+def _called(nlp: Nlp, x: Any, p: Any) -> tuple[Any, Any]:
+    """Cost and distances of a programme of MX symbols, at ``x`` and ``p``."""
+    symbols = [ca.symvar(nlp.problem["x"]), ca.symvar(nlp.problem["p"])]
+    arguments = []
+    for given, parts in zip((x, p), symbols, strict=True):
+        pieces = ca.vertsplit(given, [0, *np.cumsum([s.numel() for s in parts]).tolist()])
+        arguments += [ca.reshape(piece, *s.shape) for piece, s in zip(pieces, parts, strict=True)]
+    function = ca.Function("nlp", [*symbols[0], *symbols[1]], [nlp.problem["f"], nlp.problem["g"]])
+    cost, distances = function.call(arguments, True, False)
+    return cost, distances
+
+
+def _built(nlp: Nlp, inner: int) -> Any:
+    """The compiled solver of a problem, from the cache or fresh."""
+    import opengen as og  # pyright: ignore[reportMissingImports] (an extra)
+
+    # Inputs as shares of their limits, a well-scaled box. Lower bounds of the distances are parameters.
+    inputs, rooms = 6 * nlp.n * nlp.stages, nlp.stages * nlp.rows
+    w, p = ca.MX.sym("w", inputs), ca.MX.sym("p", nlp.problem["p"].numel())
+    limits, floor = ca.MX.sym("limits", 6 * nlp.n), ca.MX.sym("floor", rooms)
+    f, g = _called(nlp, w * ca.repmat(limits, nlp.stages, 1), p)
+    missed = ca.fmin(0, g - floor)
+    cost = f + 0.5 * PENALTY * ca.dot(missed, missed)
+    parameters = ca.MX.sym("parameters", p.numel() + limits.numel() + rooms)
+    parts = ca.vertsplit(parameters, [0, p.numel(), p.numel() + limits.numel(), parameters.numel()])
+    whole = ca.Function("whole", [w, p, limits, floor], [cost])
+    cost = whole.call([w, *parts], True, False)[0]
+    text = ca.Function("all", [w, parameters], [cost]).serialize()
+    name = "open_" + hashlib.sha256(f"{text} {inner} {TOLERANCE} {sys.version}".encode()).hexdigest()[:16]
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "chaserdock" / "open"
+    found = cache / f"{name}{_SUFFIX.get(sys.platform, '.so')}"
+    if not found.exists():
+        _build(og, name, cache, og.builder.Problem(w, parameters, cost), inputs, inner, found)
+    spec = importlib.util.spec_from_file_location(name, found)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module.solver()
+
+
+def _build(og: Any, name: str, cache: Path, problem: Any, size: int, inner: int, found: Path) -> None:
+    """Has opengen write the Rust and cargo compile it to ``found``. Raises RuntimeError with cargo's words."""
+    problem = problem.with_constraints(og.constraints.Rectangle([-1.0] * size, [1.0] * size))
+    solver = (
+        og.config.SolverConfiguration()
+        .with_tolerance(TOLERANCE)
+        .with_initial_tolerance(TOLERANCE)
+        .with_lbfgs_memory(30)
+        .with_max_inner_iterations(inner)
+        .with_max_outer_iterations(1)
+        .with_max_duration_micros(_NEVER_US)
+    )
+    build = (
+        og.config.BuildConfiguration()
+        .with_build_directory(str(cache))
+        .with_build_mode("release")
+        .with_build_python_bindings()
+    )
+    meta = og.config.OptimizerMeta().with_optimizer_name(name)
+    cache.mkdir(parents=True, exist_ok=True)
+    # opengen writes some of its files beside itself first: into the folder it is run in.
+    with contextlib.chdir(cache):
+        builder = og.builder.OpEnOptimizerBuilder(problem, meta, build, solver)
+        builder.with_verbosity_level(logging.WARNING).with_generate_not_build_flag(True).build()
+    # By ourselves, for opengen would compile the solver twice, and all that it is made of again for each problem.
+    target = cache / "target"
+    done = subprocess.run(
+        ["cargo", "build", "-q", "--release"],
+        cwd=cache / name / f"python_bindings_{name}",
+        env=os.environ | {"CARGO_TARGET_DIR": str(target)},
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise RuntimeError(f"cargo could not compile OpEn's solver:\n{done.stderr}")
+    made = next(path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES)
+    made.replace(found)
+    shutil.rmtree(cache / name)

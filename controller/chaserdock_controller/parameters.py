@@ -1,0 +1,60 @@
+"""From the scenario to the parameters of estimator and NMPC."""
+
+from __future__ import annotations
+
+import math
+
+from chaserdock_protocol import plugins
+from chaserdock_protocol.scenario import ESTIMATORS, Scenario
+from chaserdock_protocol.scenario.bodies import cuboid_inertia
+
+from chaserdock_controller.estimation.parameters import MekfParameters
+from chaserdock_controller.estimation.types import Estimator
+
+from .estimation import make_estimator
+from .nmpc import NmpcParameters
+
+
+def nmpc_parameters(scenario: Scenario) -> NmpcParameters:
+    """The NMPC's parameters; the scenario has checked them."""
+    c, body = scenario.controller, scenario.chaser
+    ix, iy, iz = body.inertia
+    return NmpcParameters(
+        mass_kg=body.mass_kg,
+        inertia_kg_m2=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
+        force_max_N=body.force_max_N,
+        torque_max_N_m=body.torque_max_N_m,
+        horizon_s=c.horizon_s,
+        dt_s=c.dt_s,
+        falloff=c.falloff,
+        weight_position=c.weight_position,
+        weight_orientation=c.weight_orientation,
+        weight_force=c.weight_force,
+        weight_torque=c.weight_torque,
+        weight_final_position=c.weight_final_position,
+        weight_final_orientation=c.weight_final_orientation,
+        max_reference_distance_m=scenario.limits.max_reference_distance_m,
+        integrator=c.integrator,
+    )
+
+
+def estimator_of(scenario: Scenario) -> Estimator:
+    """The estimator that the scenario names: one of ours, or an installed ``chaserdock.estimators`` entry point, a
+    function of the scenario. Raises PluginError when there is no such thing here."""
+    if scenario.estimator.name == "paper":
+        return make_estimator("paper")
+    if scenario.estimator.name != "mekf":
+        return plugins.load("estimator", scenario.estimator.name, ESTIMATORS)(scenario)
+    target, e = scenario.target, scenario.estimator
+    size_m = scenario.target_model().size_m
+    ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, size_m)
+    return make_estimator(
+        "mekf",
+        MekfParameters(
+            motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
+            inertia_ratios=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
+            bias_position_m=e.camera_bias_position_m,
+            bias_attitude_rad=math.radians(e.camera_bias_attitude_deg),
+            bias_focal_share=e.camera_bias_focal_share,
+        ),
+    )

@@ -1,0 +1,47 @@
+"""The safe command that everyone may fall back on: come to rest, within the actuators' limits."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import rotations
+from .rotations import Array
+
+BRAKE_TIME_S = 3.0
+"""Time constant with which velocity and rate decay while the limits allow."""
+
+
+class MovingBody(Protocol):
+    """Velocity (3,) in WRF, attitude (4,) body to WRF, and rate (3,) in body axes."""
+
+    @property
+    def velocity_m_s(self) -> ArrayLike: ...
+    @property
+    def q_wxyz(self) -> ArrayLike: ...
+    @property
+    def omega_rad_s(self) -> ArrayLike: ...
+
+
+class ActuatedBody(Protocol):
+    """Mass, inertia (3, 3) or its diagonal (3,), and the limits per axis of an actuated body."""
+
+    @property
+    def mass_kg(self) -> float: ...
+    @property
+    def inertia(self) -> ArrayLike: ...
+    @property
+    def force_max_N(self) -> float: ...
+    @property
+    def torque_max_N_m(self) -> float: ...
+
+
+def brake_wrench(odometry: MovingBody, body: ActuatedBody) -> Array:
+    """Force and torque (6,), body axes, that bring a chaser to rest in WRF."""
+    velocity = rotations.rotate_inverse(odometry.q_wxyz, odometry.velocity_m_s)
+    force = np.clip(-body.mass_kg / BRAKE_TIME_S * velocity, -body.force_max_N, body.force_max_N)
+    torque = -np.asarray(body.inertia) / BRAKE_TIME_S * np.asarray(odometry.omega_rad_s)
+    torque = np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m)
+    return np.concatenate([force, torque])

@@ -1,0 +1,122 @@
+"""A probe before its port: the geometry that the flying side steers by and the world judges by. Pure functions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from . import rotations
+from .rotations import Array
+
+
+class Port(Protocol):
+    """A docking port: position (3,) and outward axis (3,), both in TRF."""
+
+    @property
+    def position_m(self) -> ArrayLike: ...
+    @property
+    def axis(self) -> ArrayLike: ...
+
+
+class PoseLimits(Protocol):
+    """Tolerances of a probe's pose and motion relative to its port."""
+
+    @property
+    def lateral_m(self) -> float: ...
+    @property
+    def angle_deg(self) -> float: ...
+    @property
+    def lateral_speed_m_s(self) -> float: ...
+
+
+@dataclass(frozen=True)
+class Motion:
+    """A body: position (3,) and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) in body axes."""
+
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+
+
+@dataclass(frozen=True)
+class PortView:
+    """A probe's tip relative to its port, in the port's moving frame.
+
+    ``gap_m`` along the axis, positive outside; ``lateral_m`` off the axis; ``closing_m_s`` towards the port;
+    ``lateral_speed_m_s``; ``angle_rad`` between the chaser's attitude and the one it is to dock in.
+    """
+
+    gap_m: float
+    lateral_m: float
+    angle_rad: float
+    closing_m_s: float
+    lateral_speed_m_s: float
+
+    def fault(self, limits: PoseLimits, closing_m_s: float = math.inf) -> str:
+        """Which of the limits does not hold, in words with the figures; empty when all do."""
+        for what, value, most, unit in (
+            ("lateral", self.lateral_m * 1e3, limits.lateral_m * 1e3, "mm"),
+            ("angle", math.degrees(self.angle_rad), limits.angle_deg, "deg"),
+            ("lateral speed", self.lateral_speed_m_s * 1e3, limits.lateral_speed_m_s * 1e3, "mm/s"),
+            ("closing speed", self.closing_m_s * 1e3, closing_m_s * 1e3, "mm/s"),
+        ):
+            if value > most:
+                return f"{what} {value:.2f} {unit}, at most {most:g}"
+        return ""
+
+
+def centre_offset(port: Port, reach_m: float, gap_m: float) -> Array:
+    """Where in TRF a chaser's centre (3,) is with its tip ``gap_m`` before the port; its +X is along -axis."""
+    return np.asarray(port.position_m) + np.asarray(port.axis) * (reach_m + gap_m)
+
+
+def axis_error_deg(port: Port, q_off_wxyz: Array) -> float:
+    """Angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,) CRF to TRF."""
+    ahead = rotations.rotate(q_off_wxyz, (1.0, 0.0, 0.0))
+    return math.degrees(math.acos(min(1.0, max(-1.0, -float(ahead @ np.asarray(port.axis))))))
+
+
+def view_of(port: Port, reach_m: float, q_off_wxyz: Array, chaser: Motion, target: Motion) -> PortView:
+    """Tip relative to port. ``reach_m``: tip from the chaser's centre along +X; ``q_off_wxyz`` (4,) CRF to TRF docked.
+
+    Velocities are relative to the target as it turns: what an observer on the port sees.
+    """
+    tip = rotations.rotate(chaser.q_wxyz, (reach_m, 0.0, 0.0))
+    position = rotations.rotate_inverse(target.q_wxyz, chaser.position_m + tip - target.position_m)
+    tip_turn = rotations.rotate(
+        chaser.q_wxyz, rotations.cross(chaser.omega_rad_s, np.array([reach_m, 0.0, 0.0]))
+    )
+    moving = rotations.rotate_inverse(target.q_wxyz, chaser.velocity_m_s + tip_turn - target.velocity_m_s)
+    moving = moving - rotations.cross(target.omega_rad_s, position)
+    axis = np.asarray(port.axis)
+    off = position - np.asarray(port.position_m)
+    gap, speed = float(off @ axis), float(moving @ axis)
+    attitude = rotations.multiply(target.q_wxyz, q_off_wxyz)
+    return PortView(
+        gap_m=gap,
+        lateral_m=float(np.linalg.norm(off - gap * axis)),
+        angle_rad=float(rotations.angle_between(attitude, chaser.q_wxyz)),
+        closing_m_s=-speed,
+        lateral_speed_m_s=float(np.linalg.norm(moving - speed * axis)),
+    )
+
+
+def segments_apart(a: Array, b: Array, c: Array, d: Array) -> float:
+    """Least distance between the segments a-b and c-d, each end (3,).
+
+    Source: C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9.
+    """
+    u, v, r = b - a, d - c, a - c
+    uu, vv, uv, ur, vr = (float(x) for x in (u @ u, v @ v, u @ v, u @ r, v @ r))
+    slant = uu * vv - uv * uv
+    s = min(1.0, max(0.0, (uv * vr - ur * vv) / slant)) if slant > 1e-12 * uu * vv and slant > 0.0 else 0.0
+    t = (uv * s + vr) / vv if vv > 0.0 else 0.0
+    if not 0.0 <= t <= 1.0 or vv == 0.0:
+        t = min(1.0, max(0.0, t))
+        s = min(1.0, max(0.0, (uv * t - ur) / uu)) if uu > 0.0 else 0.0
+    return float(np.linalg.norm(r + s * u - t * v))

@@ -1,0 +1,75 @@
+"""Load the numerical kernels, which are written in C and compiled when the package is built.
+
+Each package with kernels has a folder ``native`` with its C sources, ``kernels.c`` which includes them, and one shared
+library ``kernels.so``. This module loads such libraries and offers the kernels of ``chaserdock_models`` itself.
+
+A library contains every function once per instruction set (on x86-64: SSE4, and AVX2 with FMA). The processor decides
+which copy runs; all copies give the same bits. Arguments are addresses of C-contiguous float64 arrays (int64 or uint8
+where stated); callers check shapes.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .build import LIBRARY_NAME, source_digest
+
+_INSTALL = "reinstall chaserdock (in a clone: pip install --no-deps -e .), which compiles it"
+
+
+class KernelLibrary:
+    """The compiled kernels of one package, loaded on first use from ``folder`` (its ``native`` folder)."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / LIBRARY_NAME
+        self._functions: dict[tuple[str, int], Any] = {}
+
+    @cached_property
+    def library(self) -> ctypes.CDLL:
+        """The shared library. Raises ImportError if it is missing, does not load, or was compiled from other sources."""
+        if not self.path.exists():
+            raise ImportError(f"{self.path}: the compiled kernels are missing; {_INSTALL}")
+        try:
+            library = ctypes.CDLL(str(self.path))
+        except OSError as error:
+            raise ImportError(f"{self.path}: not for this kind of machine ({error}); {_INSTALL}") from None
+        library.source_digest.restype = ctypes.c_char_p
+        if library.source_digest().decode() != source_digest(self.path.parent):
+            raise ImportError(f"{self.path}: compiled from other sources than those beside it; {_INSTALL}")
+        return library
+
+    @cached_property
+    def level(self) -> int:
+        """The instruction set in use: 3 or 2 for x86-64-v3 or -v2, 0 on other processors."""
+        return int(self.library.level())
+
+    def function(self, name: str, result: Any = None, at_level: int | None = None) -> Any:
+        """Return kernel ``name`` for this processor, or its copy for ``at_level``; ``result`` is its ctypes type."""
+        level = self.level if at_level is None else at_level
+        found = self._functions.get((name, level))
+        if found is None:
+            found = self._functions[name, level] = self.library[f"v{level}_{name}"]
+            found.restype = result
+        return found
+
+
+def address(array: NDArray[Any]) -> ctypes.c_void_p:
+    """Return the address of a writable C-contiguous array. Keep the array alive while the address is used."""
+    # By the buffer protocol, which refuses other arrays and takes a sixth of the time of `array.ctypes`.
+    buffer: Any = array
+    return ctypes.c_void_p(ctypes.addressof(ctypes.c_char.from_buffer(buffer)) if array.size else 0)
+
+
+def scratch(doubles: int) -> NDArray[np.float64]:
+    """Allocate uninitialized working memory for a kernel."""
+    return np.empty(doubles)
+
+
+LIBRARY = KernelLibrary(Path(__file__).parent)
+function = LIBRARY.function

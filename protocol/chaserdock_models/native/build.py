@@ -1,0 +1,96 @@
+"""Compile the kernels: ``python protocol/chaserdock_models/native/build.py``. Building the package does this as well.
+
+The compiler is zig's (a Clang), from the wheel ``ziglang``, so that a machine needs no compiler of its own. The result
+does not depend on the machine: no headers, no C library and no processor type are taken from it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+LIBRARY_NAME = "kernels.so"
+# Folders with kernels, relative to the root of the source tree.
+NATIVE_FOLDERS = (
+    "protocol/chaserdock_models/native",
+    "world/chaserdock_world/rendering/native",
+    "agents/chaserdock_agents/chaser/perception/native",
+    "controller/chaserdock_controller/nmpc/native",
+)
+# What every library is compiled with, beside the sources of its own folder.
+_SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")
+
+# No floating-point liberties (base.h says why), and no calls into a C library.
+FLAGS = (
+    "-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-ffreestanding", "-fno-builtin", "-fvisibility=hidden",
+    "-Wall", "-Wextra", "-Werror",
+)  # fmt: skip
+# One copy of the kernels for each instruction set, by the number that `level` in dispatch.c gives.
+X86_64 = ((2, "-mcpu=x86_64_v2"), (3, "-mcpu=x86_64_v3"))
+OTHER = ((0, "-mcpu=baseline"),)
+
+
+def source_digest(folder: Path) -> str:
+    """Return the SHA-256 (hexadecimal) of the sources of the library in ``folder``."""
+    digest = hashlib.sha256()
+    own = {path for pattern in ("*.c", "*.h") for path in folder.glob(pattern)}
+    for path in sorted(own | {HERE / name for name in _SHARED}, key=lambda p: (p.name, str(p))):
+        digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+def compile_kernels(folder: Path) -> Path:
+    """Compile ``kernels.c`` of ``folder`` into its shared library and return its path.
+
+    Raises RuntimeError with the compiler's output if compilation fails.
+    """
+    library = folder / LIBRARY_NAME
+    levels = X86_64 if platform.machine().lower() in ("x86_64", "amd64") else OTHER
+    target = ["-target", f"{platform.machine()}-linux-gnu.2.17", "-fPIC"] if sys.platform == "linux" else []
+    with tempfile.TemporaryDirectory(prefix="chaserdock-kernels-") as name:
+        temporary = Path(name)
+        environment = os.environ | {
+            "ZIG_GLOBAL_CACHE_DIR": f"{name}/zig",
+            "ZIG_LOCAL_CACHE_DIR": f"{name}/zig",
+        }
+
+        def zig(*arguments: str) -> None:
+            command = [sys.executable, "-m", "ziglang", "cc", *target, *arguments]
+            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+            if done.returncode:
+                raise RuntimeError(
+                    f"the kernels do not compile: {' '.join(command)}\n{done.stdout}{done.stderr}"
+                )
+
+        include = f"-I{HERE}"
+        objects = []
+        for level, processor in levels:
+            objects.append(str(temporary / f"v{level}.o"))
+            zig(*FLAGS, include, processor, f"-DLEVEL=v{level}_", "-c", "kernels.c", "-o", objects[-1])
+        objects.append(str(temporary / "dispatch.o"))
+        digest = f'-DSOURCE_DIGEST="{source_digest(folder)}"'
+        zig(*FLAGS, levels[0][1], digest, "-c", str(HERE / "dispatch.c"), "-o", objects[-1])
+        linked = temporary / LIBRARY_NAME
+        freestanding = ["-nostdlib", "-s", "-Wl,-z,defs"] if sys.platform == "linux" else []
+        zig("-shared", *freestanding, *objects, "-o", str(linked))
+        # Replaced in one step: a process may have the old library loaded.
+        beside = library.with_suffix(".new")
+        beside.write_bytes(linked.read_bytes())
+        beside.chmod(0o755)
+        beside.replace(library)
+    return library
+
+
+def compile_all(root: Path) -> list[Path]:
+    """Compile the libraries of all packages below ``root``, the source tree, and return their paths."""
+    return [compile_kernels(root / folder) for folder in NATIVE_FOLDERS]
+
+
+if __name__ == "__main__":
+    compile_all(HERE.parents[2])

@@ -1,0 +1,75 @@
+/* The elementary functions that kernels need, of + - * / alone, so that they give the same bits everywhere. */
+#ifndef CHASERDOCK_ELEMENTARY_H
+#define CHASERDOCK_ELEMENTARY_H
+
+#include "base.h"
+
+/* e^x to about one unit in the last place; 0 below -700. By powers of two and Taylor's series on |r| <= ln(2) / 2. */
+static inline double exponential(double x) {
+    if (!(x > -700.0)) return x <= -700.0 ? 0.0 : x;
+    if (x > 700.0) x = 700.0;
+    double n = x * 1.4426950408889634 + (x < 0.0 ? -0.5 : 0.5);
+    int64_t k = (int64_t)n;
+    /* ln(2) in two parts, the first short enough for exact products (W. J. Cody, W. Waite, 1980). */
+    double r = (x - (double)k * 0.693145751953125) - (double)k * 1.4286068203094172e-06;
+    double sum = 1.0;
+    for (int i = 13; i >= 1; i--) sum = madd(sum, r / (double)i, 1.0);
+    union {
+        int64_t bits;
+        double value;
+    } power = {(k + 1023) << 52};
+    return sum * power.value;
+}
+
+/* Sine and cosine of an angle from 0 up to 2e-16 (within half a turn): the series at a quarter of it, doubled twice. The C
+ * library's differ from version to version, and from processor to processor. */
+static inline void sine_cosine(double angle, double *sine, double *cosine) {
+    if (angle > 3.141592653589793)
+        angle = angle < 1e9 ? angle - (double)(int64_t)(angle * 0.15915494309189535 + 0.5) * 6.283185307179586 : 0.0;
+    double x = 0.25 * angle, y = x * x, s = 0.0, c = 0.0;
+    for (int i = 15; i >= 3; i -= 2) {
+        s = y / (i * (i - 1)) * (1.0 - s);
+        c = y / ((i - 1) * (i - 2)) * (1.0 - c);
+    }
+    s = x * (1.0 - s);
+    c = 1.0 - c;
+    for (int i = 0; i < 2; i++) {
+        double twice = 2.0 * s * c;
+        c = 1.0 - 2.0 * s * s;
+        s = twice;
+    }
+    *sine = s;
+    *cosine = c;
+}
+
+/* Solves A x = b in place (A (n, n) row by row, b (n) becomes x), with row pivots; 0 where A is singular. */
+static inline int solve_rows(double *a, double *b, int n) {
+    for (int j = 0; j < n; j++) {
+        int p = j;
+        for (int i = j + 1; i < n; i++)
+            if (size_of(a[i * n + j]) > size_of(a[p * n + j])) p = i;
+        if (!(size_of(a[p * n + j]) > 0.0)) return 0;
+        if (p != j) {
+            for (int k = j; k < n; k++) {
+                double kept = a[j * n + k];
+                a[j * n + k] = a[p * n + k];
+                a[p * n + k] = kept;
+            }
+            double kept = b[j];
+            b[j] = b[p];
+            b[p] = kept;
+        }
+        for (int i = j + 1; i < n; i++) {
+            double f = a[i * n + j] / a[j * n + j];
+            for (int k = j + 1; k < n; k++) a[i * n + k] -= f * a[j * n + k];
+            b[i] -= f * b[j];
+        }
+    }
+    for (int i = n - 1; i >= 0; i--) {
+        for (int k = i + 1; k < n; k++) b[i] -= a[i * n + k] * b[k];
+        b[i] /= a[i * n + i];
+    }
+    return 1;
+}
+
+#endif

@@ -1,0 +1,174 @@
+"""The targets that can be docked with: their boxes and the ArUco markers on them.
+
+Marker axes: x to the marker's right, y up, z out of the face, origin at the marker's centre.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from . import rotations
+from .rotations import Array
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+# The six faces of a box in the order of the marker ids: outward normal, and "up" of what is printed on it.
+FACES: tuple[tuple[Vector3, Vector3], ...] = (
+    ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
+    ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
+    ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
+)
+
+
+@dataclass(frozen=True)
+class Box:
+    """A cuboid: edge lengths ``size_m``, centre and attitude in the frame of the body it belongs to.
+
+    ``shade``: reflectance, 0 (black) to 1 (white).
+    """
+
+    size_m: Vector3
+    position_m: Vector3 = (0.0, 0.0, 0.0)
+    q_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
+    shade: float = 0.5
+
+
+@dataclass(frozen=True)
+class Marker:
+    """A square ArUco marker; ``side_m``: edge of its black square; ``q_trf_marker_wxyz``: marker -> TRF."""
+
+    id: int
+    side_m: float
+    position_trf_m: Vector3
+    q_trf_marker_wxyz: Quaternion
+
+    def corners_trf_m(self) -> Array:
+        """Corners (4, 3) in TRF: top left, top right, bottom right, bottom left of the upright marker."""
+        h = self.side_m / 2.0
+        corners = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
+        return rotations.rotate(self.q_trf_marker_wxyz, corners) + self.position_trf_m
+
+    def normal_trf(self) -> Array:
+        """Unit vector (3,) in TRF, out of the marked face."""
+        return rotations.rotate(self.q_trf_marker_wxyz, (0.0, 0.0, 1.0))
+
+
+@dataclass(frozen=True)
+class TargetModel:
+    """A target: ``boxes`` in TRF, ``markers`` of the OpenCV ``dictionary``, overall ``size_m``.
+
+    ``white_margin_m``: width of the white border printed round every marker, under its neighbours.
+    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws in the place of the boxes, times
+    ``mesh_scale``; empty for none. What is collided with are the boxes.
+    """
+
+    name: str
+    boxes: tuple[Box, ...]
+    markers: tuple[Marker, ...]
+    dictionary: str
+    size_m: Vector3
+    white_margin_m: float
+    mesh: str = ""
+    mesh_scale: float = 1.0
+
+    def marker(self, marker_id: int) -> Marker | None:
+        """The marker of that id, or None when this target has none."""
+        return next((m for m in self.markers if m.id == marker_id), None)
+
+
+def face_rotation(face: int) -> Array:
+    """Rotation (4,) from the axes of face ``face`` (0..5; x right, y up, z outward) to the box's axes."""
+    normal, up = (np.array(v) for v in FACES[face])
+    return rotations.from_matrix(np.stack([np.cross(up, normal), up, normal], axis=-1))
+
+
+def face_extent(size_m: Vector3, face: int) -> tuple[float, float, float]:
+    """Width (right), height (up) and distance from the box's centre of face ``face``, metres."""
+    right, up, out = (np.abs(axis) @ np.array(size_m) for axis in rotations.to_matrix(face_rotation(face)).T)
+    return float(right), float(up), float(out) / 2.0
+
+
+def _on_face(size_m: Vector3, face: int, right_m: float, up_m: float) -> tuple[Vector3, Quaternion]:
+    q = face_rotation(face)
+    x, y, z = rotations.rotate(q, (right_m, up_m, face_extent(size_m, face)[2])).tolist()
+    qw, qx, qy, qz = q.tolist()
+    return (x, y, z), (qw, qx, qy, qz)
+
+
+def _paper() -> TargetModel:
+    size = (0.10, 0.10, 0.20)
+    markers = tuple(Marker(face, 0.09, *_on_face(size, face, 0.0, 0.0)) for face in range(6))
+    return TargetModel("paper", (Box(size, shade=0.6),), markers, "DICT_5X5_50", size, 0.005)
+
+
+# Side, right and up of the centre, of the twelve markers on a face of the servicer (shared notes, vision).
+_SERVICER_LAYOUT: tuple[Vector3, ...] = (
+    (0.108, -0.086, 0.086),
+    (0.108, 0.086, 0.086),
+    (0.108, 0.086, -0.086),
+    (0.108, -0.086, -0.086),
+    (0.036, -0.086, 0.0),
+    (0.036, 0.086, 0.0),
+    (0.036, 0.0, 0.086),
+    (0.036, 0.0, -0.086),
+    (0.021, -0.016, 0.016),
+    (0.021, 0.016, 0.016),
+    (0.021, 0.016, -0.016),
+    (0.021, -0.016, -0.016),
+)
+
+
+def _servicer() -> TargetModel:
+    size = (0.40, 0.32, 0.32)
+    markers = tuple(
+        Marker(12 * face + k, side, *_on_face(size, face, right, up))
+        for face in range(6)
+        for k, (side, right, up) in enumerate(_SERVICER_LAYOUT)
+    )
+    return TargetModel("servicer", (Box(size, shade=0.6),), markers, "DICT_4X4_100", size, 0.032)
+
+
+_MODELS: dict[str, Callable[[], TargetModel]] = {"paper": _paper, "servicer": _servicer}
+
+
+def target_names() -> tuple[str, ...]:
+    """The names of the targets that are known."""
+    return tuple(sorted(_MODELS))
+
+
+def target_model(name: str) -> TargetModel:
+    """The target of that name. Raises ValueError, naming the known ones, for an unknown name."""
+    if name not in _MODELS:
+        raise ValueError(f"unknown target {name!r}; known: {', '.join(sorted(_MODELS))}")
+    return _MODELS[name]()
+
+
+def clear_margin_m(model: TargetModel, marker: Marker) -> float:
+    """Width of the plain white border along the sides of a marker: up to its nearest neighbour, the end of the
+    white paint or the edge of its face, whichever comes first."""
+    q_marker_trf = rotations.conjugate(marker.q_trf_marker_wxyz)
+    half = marker.side_m / 2.0
+    clear = model.white_margin_m
+    positions = np.array([other.position_trf_m for other in model.markers])
+    depths = rotations.rotate(q_marker_trf, positions - np.array(marker.position_trf_m))[:, 2]
+    for i in np.flatnonzero(np.abs(depths) < 1e-6):
+        other = model.markers[i]
+        corners = rotations.rotate(q_marker_trf, other.corners_trf_m() - np.array(marker.position_trf_m))
+        if other.id != marker.id and np.all(np.abs(corners[:, 2]) < 1e-6):
+            gaps = np.maximum(corners[:, :2].min(axis=0) - half, -half - corners[:, :2].max(axis=0))
+            if gaps.min() < 0.0:  # beside one of the sides, and not off a corner
+                clear = min(clear, float(gaps.max()))
+    for box in model.boxes:
+        q_marker_box = rotations.multiply(q_marker_trf, box.q_wxyz)
+        centre = rotations.rotate(q_marker_trf, np.array(box.position_m) - marker.position_trf_m)
+        reach = np.abs(rotations.to_matrix(q_marker_box)) @ np.array(box.size_m) / 2.0
+        if abs(centre[2] + reach[2]) < 1e-6:  # the marker lies on this box
+            clear = min(clear, float((reach[:2] - np.abs(centre[:2])).min()) - half)
+    return clear

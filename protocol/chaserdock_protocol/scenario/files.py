@@ -1,0 +1,114 @@
+"""Files that a scenario names: the target's and the camera's. What is in them becomes part of the scenario, which
+the world sends to processes that have no such file."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from chaserdock_models.targets import TargetModel, target_model
+from pydantic import ValidationError
+
+from .overrides import ScenarioError, explain
+from .target import Geometry
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The tables of a TOML file; raises ScenarioError, which names it, for one that cannot be read."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ScenarioError(f"{path}: cannot be read: {error.strerror or error}") from None
+    except UnicodeDecodeError as error:
+        raise ScenarioError(f"{path}: not UTF-8 text: {error}") from None
+    except tomllib.TOMLDecodeError as error:
+        raise ScenarioError(f"{path}: not TOML: {error}") from None
+    except RecursionError:
+        raise ScenarioError(f"{path}: not TOML of ours: nested too deeply") from None
+
+
+def resolve_files(values: dict[str, Any], folder: Path) -> None:
+    """Puts the contents of the files that a scenario names into its tables, in place; paths are relative to
+    ``folder``. Raises ScenarioError for files that cannot be read or do not hold what they should."""
+    target, camera = values.get("target"), values.get("camera")
+    if isinstance(target, dict):
+        model = target.get("model")
+        if isinstance(model, str) and model.endswith(".toml"):
+            path = folder / model
+            target["geometry"] = _geometry_values(path)
+            target["model"] = path.stem
+        elif isinstance(target.get("geometry"), dict):
+            _absolute_mesh(target["geometry"], folder)
+    if isinstance(camera, dict) and isinstance(camera.get("calibration"), str):
+        camera["intrinsics"] = read_calibration(folder / camera.pop("calibration"))
+
+
+def _geometry_values(path: Path) -> dict[str, Any]:
+    values = read_toml(path)
+    try:
+        Geometry.model_validate(values)
+    except ValidationError as error:
+        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error))) from None
+    _absolute_mesh(values, path.parent)
+    return values
+
+
+def _absolute_mesh(geometry: dict[str, Any], folder: Path) -> None:
+    mesh = geometry.get("mesh")
+    if isinstance(mesh, str) and mesh:
+        path = (folder / mesh).resolve()
+        if not path.is_file():
+            raise ScenarioError(f"{path}: no such mesh file")
+        geometry["mesh"] = str(path)
+
+
+def find_target(name: str) -> TargetModel:
+    """The target of a file (``….toml``) or of a known name; raises ScenarioError."""
+    if name.endswith(".toml"):
+        return Geometry.model_validate(_geometry_values(Path(name))).model(Path(name).stem)
+    try:
+        return target_model(name)
+    except ValueError as error:
+        raise ScenarioError(f"{error}, or a file ….toml") from None
+
+
+def read_calibration(path: Path) -> dict[str, Any]:
+    """The scenario's ``camera.intrinsics`` from a calibration file as OpenCV writes them (YAML, JSON or XML, with
+    ``image_width``, ``image_height``, ``camera_matrix`` and ``distortion_coefficients``). Raises ScenarioError."""
+    import cv2  # heavy, and needed for such files alone
+
+    if not path.is_file():
+        raise ScenarioError(f"{path}: no such calibration file")
+    try:
+        store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+        if not store.isOpened():
+            raise ScenarioError(f"{path}: not a calibration file of OpenCV (YAML, JSON or XML)")
+        matrix = store.getNode("camera_matrix").mat()
+        lens = store.getNode("distortion_coefficients").mat()
+        width, height = (store.getNode(key).real() for key in ("image_width", "image_height"))
+        store.release()
+    except (cv2.error, SystemError) as error:
+        reason = str(error).strip().splitlines()[-1]
+        raise ScenarioError(f"{path}: not a calibration file of OpenCV: {reason}") from None
+    if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+        raise ScenarioError(f"{path}: camera_matrix must be a 3 x 3 matrix")
+    if width < 1 or height < 1:
+        raise ScenarioError(f"{path}: image_width and image_height must be there, and positive")
+    coefficients = [] if lens is None else np.ravel(lens).astype(float).tolist()
+    while len(coefficients) > 5 and coefficients[-1] == 0.0:
+        coefficients.pop()
+    if len(coefficients) not in (0, 4, 5):
+        raise ScenarioError(
+            f"{path}: distortion_coefficients must be k1, k2, p1, p2[, k3]; these are {len(coefficients)}"
+        )
+    return {
+        "width_px": int(width),
+        "height_px": int(height),
+        "fx_px": float(matrix[0, 0]),
+        "fy_px": float(matrix[1, 1]),
+        "cx_px": float(matrix[0, 2]),
+        "cy_px": float(matrix[1, 2]),
+        "distortion": coefficients,
+    }

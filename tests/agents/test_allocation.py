@@ -1,0 +1,93 @@
+"""Thruster selection: exact where that is possible, closest where not, cheap, and within limits that change."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from chaserdock_agents.chaser.thrusters.allocation import allocator_of
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from thruster_cases import box, mission
+
+BODIES = ("tetra12", "slider")
+quick = settings(derandomize=True, deadline=None, max_examples=100)
+CASES = {
+    b: (allocator_of(mission(b).chaser), thrusts_max(mission(b).chaser.thrusters), box(mission(b)))
+    for b in BODIES
+}
+
+
+@pytest.mark.parametrize("body", BODIES)
+def test_exact_to_a_billionth_inside_the_feasible_set(body: str) -> None:
+    allocator, full, limits = CASES[body]
+    rng = np.random.default_rng(1)
+    for k in range(2000):
+        feasible = full * rng.uniform(0.0, 1.0, len(full)) * (rng.uniform(size=len(full)) < (k % 4 + 1) / 4)
+        wrench = allocator.matrix @ feasible
+        got = allocator.allocate(wrench, full)
+        assert got.exact
+        assert np.all((got.thrusts_N >= 0.0) & (got.thrusts_N <= full))
+        error = (allocator.matrix @ got.thrusts_N - wrench) / limits
+        assert np.abs(error).max() <= 1e-9 * np.abs(wrench / limits).max() + 1e-12
+        # No dearer than the thrusts that the wrench was made of.
+        assert got.thrusts_N.sum() <= feasible.sum() * (1 + 1e-9) + 1e-12
+
+
+@given(st.sampled_from(BODIES), st.integers(0, 2**31), st.sets(st.integers(0, 11), max_size=2))
+@quick
+def test_closest_outside_and_jets_that_are_out_stay_out(body: str, seed: int, out: set[int]) -> None:
+    """The optimality conditions of the closest point: no jet that could still give more, or less, would help."""
+    allocator, full, limits = CASES[body]
+    allowed = full.copy()
+    allowed[list(out)] = 0.0
+    rng = np.random.default_rng(seed)
+    wrench = limits * rng.normal(size=6) * rng.uniform(0.5, 10.0)
+    got = allocator.allocate(wrench, allowed)
+    f = got.thrusts_N
+    assert np.all((f >= 0.0) & (f <= allowed))
+    rows = allocator.matrix / limits[:, None]
+    short = wrench / limits - rows @ f
+    if got.exact:
+        assert np.abs(short).max() <= 1e-9 * np.abs(wrench / limits).max() + 1e-12
+        return
+    assert np.linalg.norm(short) > 1e-6
+    helps = rows.T @ short / np.linalg.norm(short)
+    assert np.all(helps[f < allowed - 1e-6] <= 1e-5)
+    assert np.all(helps[f > 1e-6] >= -1e-5)
+
+
+@given(st.sampled_from(BODIES), st.integers(0, 2**31))
+@quick
+def test_equal_wrenches_have_equal_answers_and_near_ones_near(body: str, seed: int) -> None:
+    allocator, full, limits = CASES[body]
+    rng = np.random.default_rng(seed)
+    wrench = limits * rng.uniform(-1.0, 1.0, 6)
+    first = allocator.allocate(wrench, full).thrusts_N
+    allocator.allocate(-wrench, full)
+    np.testing.assert_array_equal(allocator.allocate(wrench, full).thrusts_N, first)
+    near = allocator.allocate(wrench * (1 + 1e-9), full).thrusts_N
+    np.testing.assert_allclose(near, first, atol=1e-5)
+
+
+def test_nothing_asked_nothing_given() -> None:
+    for allocator, full, _ in CASES.values():
+        assert allocator.allocate(np.zeros(6), full).thrusts_N.max() < 1e-9
+        assert not allocator.allocate(np.ones(6), np.zeros(len(full))).thrusts_N.any()
+
+
+def test_numbers_that_are_none_are_refused() -> None:
+    allocator, full, _ = CASES["tetra12"]
+    for wrench, limits in ((np.full(6, np.nan), full), (np.zeros(6), -full), (np.zeros(6), full * np.inf)):
+        with pytest.raises(ValueError, match="finite"):
+            allocator.allocate(wrench, limits)
+
+
+def test_a_lost_jet_costs_its_share_of_the_box_only() -> None:
+    """Every corner of the limits that the pilot would tell the controller is still given exactly."""
+    allocator, full, limits = CASES["slider"]
+    corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T * limits
+    for lost in (0, 2):
+        allowed = np.where(np.arange(len(full)) == lost, 0.0, full)
+        assert all(allocator.allocate(corner, allowed).exact for corner in corners)

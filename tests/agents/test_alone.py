@@ -1,0 +1,301 @@
+"""A chaser without commands: its last plan to the end, then to rest, then clear of the corridor it was in."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from chaserdock_agents.chaser.fallback import (
+    CLEAR_M,
+    Alone,
+    LastWord,
+    at_rest,
+    clear_m,
+    goes_on,
+    planned,
+    target_at,
+    wrench_of,
+)
+from chaserdock_agents.chaser.process import Chaser
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate, Tick, WrenchCommand
+from chaserdock_protocol.replay_node import SilentTeller, Tape
+from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.transport import Received
+
+ROOT = Path(__file__).resolve().parents[2]
+STEP_S, DT_S, STAGES = 0.1, 0.1, 30
+Q = (1.0, 0.0, 0.0, 0.0)
+ZERO = (0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return load_scenario(ROOT / "scenarios" / "fault-drill.toml")
+
+
+def moving(x: Array, time_s: float) -> Odometry:
+    return Odometry(
+        tick=round(time_s / STEP_S),
+        sim_time_ns=round(time_s * 1e9),
+        chaser=0,
+        position_m=vector(x[:3]),
+        velocity_m_s=vector(x[3:6]),
+        q_wxyz=vector(rotations.normalize(x[6:10])),
+        omega_rad_s=vector(x[10:]),
+    )
+
+
+def straight(speed_m_s: float) -> Plan:
+    """Three seconds along +X from (-1, 0, 0)."""
+    along = np.arange(STAGES + 1) * DT_S * speed_m_s
+    places = np.stack([along - 1.0, 0 * along, 0 * along], axis=1)
+    return Plan(
+        tick=0,
+        sim_time_ns=0,
+        chaser=0,
+        step_s=DT_S,
+        positions_m=vector(places),
+        quaternions_wxyz=Q * (STAGES + 1),
+        inputs=(0.0,) * (6 * STAGES),
+    )
+
+
+def target(
+    x_m: float = 0.0, velocity_m_s: tuple[float, float, float] = ZERO, status: Any = "tracking"
+) -> TargetEstimate:
+    return TargetEstimate(
+        status=status,
+        position_m=(x_m, 0.0, 0.0),
+        velocity_m_s=velocity_m_s,
+        q_wxyz=Q,
+        omega_rad_s=ZERO,
+        covariance=(0.0,) * 144,
+        accepted=(),
+        rejected=(),
+    )
+
+
+def flown(scenario: Scenario, last: LastWord, x: Array, seconds: float) -> tuple[list[Alone], Array]:
+    """A rigid body that flies by itself: what it did at every step, and its states (K, 13)."""
+    body, least_m = scenario.chaser, clear_m(scenario, 0)
+    did: list[Alone] = []
+    states, alone = [x], None
+    for k in range(round(seconds / STEP_S)):
+        odometry = moving(x, k * STEP_S)
+        effective_ns = odometry.sim_time_ns
+        alone = goes_on(alone, odometry, effective_ns, last, least_m)
+        u = wrench_of(alone, odometry, effective_ns, last, body)
+        assert np.all(np.abs(u[:3]) <= body.force_max_N * (1 + 1e-9))
+        assert np.all(np.abs(u[3:]) <= body.torque_max_N_m * (1 + 1e-9))
+        v = x[3:6] + rotations.rotate(x[6:10], u[:3]) / body.mass_kg * STEP_S
+        omega = x[10:] + u[3:] / np.asarray(body.inertia) * STEP_S
+        x = np.concatenate([x[:3] + v * STEP_S, v, rotations.integrate(x[6:10], omega, STEP_S), omega])
+        did.append(alone)
+        states.append(x)
+    return did, np.array(states)
+
+
+def start(position_m: Any = (-1.0, 0.0, 0.0), velocity_m_s: Any = ZERO, omega_rad_s: Any = ZERO) -> Array:
+    return np.array([*position_m, *velocity_m_s, *Q, *omega_rad_s], dtype=float)
+
+
+def states_of(did: list[Alone]) -> list[str]:
+    """The states in a row, each once."""
+    return [a.state for k, a in enumerate(did) if k == 0 or did[k - 1].state != a.state]
+
+
+def test_the_plan_is_flown_to_its_end_then_it_brakes_then_it_holds(scenario: Scenario) -> None:
+    speed = 0.03
+    last = LastWord(straight(speed), target())
+    did, x = flown(scenario, last, start(velocity_m_s=(speed, 0.0, 0.0)), 60.0)
+    assert states_of(did) == ["plan", "brake", "hold"]
+    assert [a.state for a in did].count("plan") == STAGES
+    np.testing.assert_allclose(x[STAGES, :3], [-1.0 + 3.0 * speed, 0.0, 0.0], atol=1e-3)
+    rested = next(k for k, a in enumerate(did) if a.state == "hold")
+    assert np.linalg.norm(x[rested, 3:6]) < 0.005
+    assert np.linalg.norm(x[-1, :3] - x[rested, :3]) < 0.01  # far enough out: it stays
+
+
+def test_off_its_plan_it_comes_back_to_it(scenario: Scenario) -> None:
+    x = start((-1.0, 0.02, 0.0), (0.0, 0.0, 0.0))
+    did, states = flown(scenario, LastWord(straight(0.0), target()), x, 2.9)
+    assert states_of(did) == ["plan"]
+    assert abs(states[-1, 1]) < 0.016
+
+
+def test_in_its_corridor_it_backs_out_and_goes_with_the_target(scenario: Scenario) -> None:
+    drift = (0.0, 0.01, 0.0)
+    last = LastWord(None, target(0.0, drift))
+    did, x = flown(scenario, last, start((-0.45, 0.0, 0.0), (0.02, 0.0, 0.0)), 90.0)
+    assert states_of(did) == ["brake", "hold"]
+    away = x[:, :3] - np.outer(np.arange(len(x)) * STEP_S, drift)
+    assert did[-1].distance_m == pytest.approx(clear_m(scenario, 0))
+    assert np.linalg.norm(away[-1]) == pytest.approx(clear_m(scenario, 0), abs=0.01)
+    assert np.linalg.norm(away, axis=1).min() > 0.35
+    np.testing.assert_allclose(x[-1, 3:6], drift, atol=1e-3)
+
+
+def test_it_comes_to_rest_however_it_turned(scenario: Scenario) -> None:
+    did, x = flown(
+        scenario, LastWord(), start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)), 60.0
+    )
+    assert states_of(did) == ["brake", "hold"]
+    assert did[-1].distance_m is None
+    assert "knows of no target" in did[-1].text()
+    assert at_rest(moving(x[-1], 60.0))
+
+
+def test_no_state_comes_again(scenario: Scenario) -> None:
+    fast = moving(start(velocity_m_s=(0.1, 0.0, 0.0)), 0.0)
+    for before in (Alone("brake"), Alone("hold", np.zeros(3))):
+        again = goes_on(before, fast, 0, LastWord(straight(0.1), target()), 0.5)
+        assert again.state == before.state
+
+
+def test_a_plan_is_what_it_says_between_its_nodes_and_over_after_them() -> None:
+    plan = straight(0.1)
+    goal = planned(plan, 250_000_000)
+    assert goal is not None
+    np.testing.assert_allclose(goal.position_m, [-0.975, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(goal.velocity_m_s, [0.1, 0.0, 0.0], atol=1e-12)
+    assert planned(plan, 3_000_000_000) is None
+    assert planned(None, 0) is None
+    early = planned(msgspec.structs.replace(plan, sim_time_ns=1_000_000_000), 0)
+    assert early is not None
+    np.testing.assert_allclose(early.position_m, [-1.0, 0.0, 0.0])
+
+
+@pytest.mark.parametrize("status", ["none", "lost"])
+def test_what_nobody_knows_is_no_place(status: str) -> None:
+    assert target_at(target(status=status), 10**9) is None
+    np.testing.assert_allclose(target_at(target(1.0, (0.0, 0.0, 0.5)), 2 * 10**9), [1.0, 0.0, 1.0])  # type: ignore[arg-type]
+
+
+def test_clear_is_outside_of_the_keep_out_ball_and_of_the_corridor() -> None:
+    for name in ("fault-drill", "docking-contact"):
+        scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
+        assert clear_m(scenario, 0) >= scenario.limits.min_distance_target_m + CLEAR_M
+    docking = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    port = docking.docking.port_of(0)
+    assert port is not None
+    entry = np.asarray(port.position_m) + np.asarray(port.axis) * (0.35 + docking.docking.entry_m)
+    assert clear_m(docking, 0) > np.linalg.norm(entry)
+
+
+# -- in its process -----------------------------------------------------------------------------------------
+
+
+def tell(chaser: Chaser, topic: Any, message: Any) -> list[tuple[Any, Any]]:
+    tape: Any = chaser.node
+    tape.put(Received(topic, None if topic is topics.TICK else "0", message, 0))
+    chaser.listen()
+    return [(t, m) for t, _, m in tape.said()]
+
+
+def tick_of(scenario: Scenario, tick: int, commander: str, term: int, revision: int = 0) -> Tick:
+    return Tick(
+        tick=tick,
+        revision=revision,
+        sim_time_ns=scenario.timing.tick_time_ns(tick),
+        pictures=False,
+        chasers=(0,),
+        controller=bool(commander),
+        term=term,
+        commander=commander,
+        instance=commander[:1],
+    )
+
+
+def command(scenario: Scenario, tick: int, commander: str, term: int) -> WrenchCommand:
+    now_ns = scenario.timing.tick_time_ns(tick)
+    return WrenchCommand(
+        tick=tick,
+        sim_time_ns=now_ns,
+        chaser=0,
+        effective_time_ns=scenario.timing.effective_ns(tick),
+        expires_ns=now_ns + 500_000_000,
+        mode="nmpc",
+        force_N=(0.01, 0.0, 0.0),
+        torque_N_m=ZERO,
+        term=term,
+        commander=commander,
+        instance=commander[:1],
+    )
+
+
+@pytest.fixture
+def chaser(scenario: Scenario) -> Chaser:
+    made = Chaser(Tape("chaser/0"), scenario, 0)  # type: ignore[arg-type]
+    made.teller = SilentTeller()  # type: ignore[assignment]
+    return made
+
+
+def at(scenario: Scenario, tick: int) -> Odometry:
+    return msgspec.structs.replace(
+        moving(start(), 0.0), tick=tick, sim_time_ns=scenario.timing.tick_time_ns(tick)
+    )
+
+
+def sources(said: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
+    return [(m.source, m.term) for t, m in said if t is topics.ACTUATORS]
+
+
+def test_states_are_named_in_the_log_each_once_and_its_end(chaser: Chaser, scenario: Scenario) -> None:
+    plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
+    tell(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
+    tell(chaser, topics.ODOMETRY, at(scenario, 0))
+    tell(chaser, topics.PLAN, plan)
+    assert sources(tell(chaser, topics.WRENCH, command(scenario, 0, "controller", 1))) == [("command", 1)]
+    said = []
+    for tick in range(1, 40):
+        said += tell(chaser, topics.TICK, tick_of(scenario, tick, "", 1))
+        said += tell(chaser, topics.ODOMETRY, at(scenario, tick))
+    told = [m.what for t, m in said if t is topics.EVENT]
+    assert told == ["alone: plan", "alone: hold"]  # it was at rest when the plan was over
+    assert [s for s, _ in sources(said)].count("plan") == STAGES - 1
+    tell(chaser, topics.TICK, tick_of(scenario, 40, "standby", 2))
+    tell(chaser, topics.ODOMETRY, at(scenario, 40))
+    said = tell(chaser, topics.WRENCH, command(scenario, 40, "standby", 2))
+    assert sources(said) == [("command", 2)]
+    assert "commanded again" in [m.what for t, m in said if t is topics.EVENT]
+
+
+def test_a_plan_whose_command_never_came_is_not_flown(chaser: Chaser, scenario: Scenario) -> None:
+    tell(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
+    tell(chaser, topics.ODOMETRY, at(scenario, 0))
+    tell(chaser, topics.PLAN, straight(0.0))
+    said = tell(chaser, topics.TICK, tick_of(scenario, 0, "", 1, 1))
+    assert [s for s, _ in sources(said)] == ["hold"]
+
+
+def test_stale_terms_are_refused_counted_and_told_once(chaser: Chaser, scenario: Scenario) -> None:
+    for tick in (1, 2):
+        tell(chaser, topics.TICK, tick_of(scenario, tick, "standby", 2))
+        tell(chaser, topics.ODOMETRY, at(scenario, tick))
+        said = tell(chaser, topics.WRENCH, command(scenario, tick, "controller", 1))
+        assert sources(said) == []  # the right one is still to come
+        assert len([m for t, m in said if t is topics.EVENT]) == (1 if tick == 1 else 0)
+    assert chaser.node.counts.rejected["wrench:stale term"] == 2
+    assert sources(tell(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))) == [("command", 2)]
+
+
+def test_who_takes_over_in_the_middle_of_a_tick_is_not_obeyed_twice(
+    chaser: Chaser, scenario: Scenario
+) -> None:
+    tell(chaser, topics.TICK, tick_of(scenario, 3, "controller", 1))
+    tell(chaser, topics.ODOMETRY, at(scenario, 3))
+    assert sources(tell(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]
+    tell(chaser, topics.TICK, tick_of(scenario, 3, "standby", 2, 1))
+    assert tell(chaser, topics.WRENCH, command(scenario, 3, "standby", 2)) == []
+    tell(chaser, topics.TICK, tick_of(scenario, 4, "standby", 2))
+    tell(chaser, topics.ODOMETRY, at(scenario, 4))
+    # Its tick is known, the older commander's next word is not obeyed any more.
+    assert sources(tell(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == []
+    assert sources(tell(chaser, topics.WRENCH, command(scenario, 4, "standby", 2))) == [("command", 2)]

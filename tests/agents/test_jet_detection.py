@@ -1,0 +1,167 @@
+"""Which jet has failed: found from residuals alone, and never where nothing has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from chaserdock_agents.chaser.thrusters.fault_detection import Flags, JetWatch, Verdict
+from chaserdock_agents.chaser.thrusters.impulse_residual import Noise, covariance, noise_of, observed_impulse
+from chaserdock_controller.output.latency_compensation import integrate
+from chaserdock_models.rotations import Array
+from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.scenario.bodies import Body
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+from flight_cases import start
+from thruster_cases import mission
+
+TICK_S = 1.0 / 15
+
+
+class Case:
+    """A body whose odometry comes from integrating what its jets really give."""
+
+    def __init__(
+        self, body: str, seed: int, noise: Noise | None = None, odometry_noise: bool = False
+    ) -> None:
+        self.body: Body = mission(body).chaser
+        self.noise = noise or Noise()
+        self.matrix, self.full = wrench_matrix(self.body.thrusters), thrusts_max(self.body.thrusters)
+        least = self.full * [t.min_on_s for t in self.body.thrusters]
+        self.watch = JetWatch(self.matrix, self.full, least)
+        self.rng = np.random.default_rng(seed)
+        self.state = start(seed)
+        self.state[3:6] *= 0.05
+        self.state[10:13] *= 0.05
+        self.jitter = odometry_noise
+        self.tick = 0
+        self.last = self._odometry()
+
+    def _odometry(self) -> Odometry:
+        x = self.state.copy()
+        if self.jitter:
+            x[3:6] += self.rng.normal(size=3) * self.noise.velocity_m_s
+            x[10:13] += self.rng.normal(size=3) * self.noise.omega_rad_s
+        v = [tuple(part.tolist()) for part in (x[:3], x[3:6], x[6:10], x[10:13])]
+        return Odometry(
+            chaser=0,
+            tick=self.tick,
+            sim_time_ns=round(self.tick * TICK_S * 1e9),
+            position_m=v[0],
+            velocity_m_s=v[1],
+            q_wxyz=v[2],
+            omega_rad_s=v[3],
+        )
+
+    def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> Verdict | None:
+        self.state = integrate(self.state, self.matrix @ given_N_s / TICK_S, self.body, TICK_S)
+        self.tick += 1
+        now = self._odometry()
+        residual = observed_impulse(self.last, now, self.body) - self.matrix @ asked_N_s
+        spread = covariance(self.noise, self.body, self.matrix, asked_N_s, self.last, now)
+        self.last = now
+        everyone: Flags = np.ones(len(self.full), dtype=np.bool_)
+        return self.watch.look(
+            residual, spread, asked_N_s, TICK_S, everyone if suspects is None else suspects
+        )
+
+    def random(self, share: float = 0.25) -> Array:
+        """Impulses of jets, some of which fire."""
+        fires = self.rng.uniform(size=len(self.full)) < share
+        return np.where(fires, self.full * self.rng.uniform(0.01, 0.05, len(self.full)), 0.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_observed_impulse_is_what_was_given(seed: int) -> None:
+    case = Case("tetra12", seed)
+    for _ in range(10):
+        jets, before = case.random(), case.last
+        case.step(jets, jets)
+        seen = observed_impulse(before, case.last, case.body)
+        np.testing.assert_allclose(seen, case.matrix @ jets, atol=2e-4)
+
+
+@pytest.mark.parametrize(
+    ("body", "jet"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
+)
+def test_stuck_on_is_found_within_three_ticks(body: str, jet: int) -> None:
+    case = Case(body, jet)
+    for _ in range(5):
+        jets = case.random()
+        assert case.step(jets, jets) is None
+    verdict = None
+    for part in (0.4, 1.0, 1.0):  # the first tick in part only
+        asked = case.random(0.1)
+        given = asked.copy()
+        given[jet] = max(asked[jet], case.full[jet] * TICK_S * part)
+        if (verdict := case.step(asked, given)) is not None:
+            break
+    assert verdict == Verdict(jet, "stuck_on", 1.0)
+
+
+@pytest.mark.parametrize(
+    ("body", "jet"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
+)
+@pytest.mark.parametrize(("left", "kind"), [(0.0, "stuck_off"), (0.5, "weak")])
+def test_a_lost_jet_is_found_after_some_pulses(body: str, jet: int, left: float, kind: str) -> None:
+    case = Case(body, jet)
+    verdict = None
+    for _ in range(120):
+        asked = case.random()
+        given = asked.copy()
+        given[jet] *= left
+        if (verdict := case.step(asked, given)) is not None:
+            break
+    assert verdict is not None
+    assert (verdict.jet, verdict.kind) == (jet, kind)
+    assert verdict.factor == pytest.approx(left, abs=0.15)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
+    noise = Noise(velocity_m_s=5e-4, omega_rad_s=5e-4)
+    case = Case(("tetra12", "slider")[seed % 2], seed, noise, odometry_noise=True)
+    for _ in range(1500):
+        asked = case.random()
+        given = asked * (1.0 + 0.05 * case.rng.normal(size=len(asked)))
+        assert case.step(asked, given) is None
+
+
+def test_the_scenarios_odometry_is_the_pilots_noise() -> None:
+    s = mission(odometry={"velocity_noise_m_s": 0.002, "omega_noise_deg_s": 0.1, "attitude_noise_deg": 0.3})
+    assert noise_of(s.odometry) == Noise(0.002, np.radians(0.1), np.radians(0.3))
+    assert noise_of(mission().odometry) == Noise()
+
+
+@pytest.mark.parametrize("jet", [0, 4, 8])
+def test_noisy_odometry_takes_longer_and_finds_the_same(jet: int) -> None:
+    noise = Noise(velocity_m_s=5e-4, omega_rad_s=5e-4)
+    case = Case("tetra12", jet, noise, odometry_noise=True)
+    verdict = None
+    for _ in range(7):  # half a second, less the latency
+        given = np.zeros(12)
+        given[jet] = case.full[jet] * TICK_S
+        if (verdict := case.step(np.zeros(12), given)) is not None:
+            break
+    assert verdict == Verdict(jet, "stuck_on", 1.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_bump_or_a_pull_is_no_jet(seed: int) -> None:
+    """What touches the chaser pushes as no jet does: nobody is blamed."""
+    case = Case("tetra12", seed)
+    rng = np.random.default_rng(seed)
+    pull = rng.normal(size=6) * ([0.05] * 3 + [0.002] * 3)
+    for k in range(40):
+        asked = case.random()
+        pushed = np.linalg.lstsq(case.matrix, pull if k % 10 < 6 else np.zeros(6), rcond=None)[0]
+        assert case.step(asked, asked + pushed) is None
+
+
+def test_only_suspects_are_blamed() -> None:
+    case = Case("tetra12", 1)
+    suspects = np.arange(12) != 5
+    for _ in range(6):
+        given = np.zeros(12)
+        given[5] = 0.1
+        assert case.step(np.zeros(12), given, suspects) is None

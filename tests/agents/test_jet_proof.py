@@ -1,0 +1,127 @@
+"""Test burns: they leave the motion of a healthy chaser as it is, reach every jet in turn, and find the idle one that
+has failed."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_agents.chaser.command_gate import passed_on
+from chaserdock_agents.chaser.thrusters.allocation import allocator_of
+from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_agents.chaser.thrusters.self_test import JetProof
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+from closed_loop import fly
+from thruster_cases import at_rest, mission, wrench
+
+PERIOD_S, S = 0.1, 1_000_000_000
+
+
+class Bench:
+    """The proofs of a body's jets; what a burn fires counts as ``information`` each."""
+
+    def __init__(self, body: str = "tetra12", every_s: float = 10.0) -> None:
+        chaser = mission(body).chaser
+        self.full = thrusts_max(chaser.thrusters)
+        self.allocator = allocator_of(chaser)
+        self.least = self.full * [t.min_on_s for t in chaser.thrusters]
+        self.proof = JetProof(self.allocator, self.least, every_s, enough=200.0)
+        self.able = np.ones(len(self.full), dtype=np.bool_)
+
+    def burn(self, now_ns: int, can: Array | None = None, asked: Array | None = None) -> Array | None:
+        can, asked = self.full if can is None else can, 0.0 * self.full if asked is None else asked
+        return self.proof.burn(now_ns, self.able & (can > 0.0), can, asked, PERIOD_S)
+
+
+@pytest.mark.parametrize("body", ["tetra12", "slider"])
+@pytest.mark.parametrize("lost", [None, 3])
+def test_burns_cancel_and_reach_every_jet_and_then_there_is_peace(body: str, lost: int | None) -> None:
+    bench, tested = Bench(body), np.zeros(0)
+    can = bench.full.copy()
+    if lost is not None:
+        can[lost] = 0.0
+    now_ns, burns = 0, 0
+    while (impulses := bench.burn(now_ns, can)) is not None:
+        np.testing.assert_allclose(bench.allocator.matrix @ impulses, 0.0, atol=1e-9)
+        assert np.all(impulses >= -1e-12)
+        assert lost is None or impulses[lost] == 0.0
+        fired = impulses >= 0.5 * bench.least
+        assert fired.sum() >= 2  # what cancels it is not too little to fire
+        bench.proof.heard(np.where(fired, 150.0, 0.0), now_ns)
+        tested = np.union1d(tested, np.flatnonzero(fired))
+        now_ns, burns = now_ns + S // 2, burns + 1
+        assert burns <= 2 * len(can)
+    assert len(tested) == len(can) - (lost is not None)
+    # Anew when the proofs have grown old, and not before.
+    assert bench.burn(9 * S, can) is None
+    assert bench.burn(now_ns + 11 * S, can) is not None
+
+
+def test_one_look_is_no_proof_and_neither_are_poor_ones() -> None:
+    bench = Bench()
+    assert bench.proof.unproved(0).all()
+    bench.proof.heard(np.full(12, 1e6), 0)
+    assert bench.proof.unproved(0).all()
+    bench.proof.heard(np.full(12, 1.0), 1)
+    assert not bench.proof.unproved(1).any()
+    noisy = Bench()
+    for k in range(5):
+        noisy.proof.heard(np.full(12, 30.0), k)
+    assert noisy.proof.unproved(5).all()
+
+
+@pytest.mark.parametrize("every_s", [0.0, 10.0])
+def test_what_is_old_is_forgotten_though_nobody_asks(every_s: float) -> None:
+    bench = Bench(every_s=every_s)
+    for k in range(1000):
+        bench.proof.heard(np.full(12, 1.0), k * S)
+    assert max(map(len, bench.proof._heard)) <= every_s + 1
+
+
+def test_burns_are_apart_and_only_where_there_is_room() -> None:
+    bench = Bench()
+    assert bench.burn(0, asked=bench.full * 0.85) is None
+    assert bench.burn(0) is not None
+    assert bench.burn(S // 4) is None
+    assert bench.burn(S // 2) is not None
+    assert Bench(every_s=0.0).burn(0) is None
+
+
+def fired(odometry: dict[str, float] | None = None, chaser: Any = None, **command_as: Any) -> set[int]:
+    """Jets that open within three seconds in which a pilot is asked for nothing."""
+    s = mission(chaser=chaser or {}, odometry=odometry or {})
+    pilot, out = JetPilot(s, 0), set()
+    for tick in range(45):
+        pilot.observe(at_rest(s, tick))
+        command = wrench(s, tick, **command_as)
+        pilot.heed(command)
+        out |= {p.jet for p in pilot.fly(passed_on(command)).pulses}
+    return out
+
+
+def test_a_pilot_tests_when_it_may_and_can() -> None:
+    assert len(fired()) >= 3
+    assert fired(chaser={"jet_test_s": 0}) == set()
+    assert fired(chaser={"modulation": {"modulator": "schmitt"}}) == set()
+    assert len(fired({"velocity_noise_m_s": 0.001, "omega_noise_deg_s": 0.05})) >= 3
+    # Where a least pulse drowns in the noise of the odometry, tests would go on for ever.
+    assert fired({"velocity_noise_m_s": 0.01, "omega_noise_deg_s": 1.0}) == set()
+
+
+def test_who_is_about_to_touch_or_is_held_tests_nothing() -> None:
+    """The latch is armed from the final approach on (test_capture_guidance)."""
+    assert len(fired(latch="release")) >= 3
+    assert fired(latch="arm") == set()
+    assert fired(free=False) == set()
+
+
+@pytest.mark.parametrize(("test_s", "finds"), [(10.0, True), (0.0, False)])
+def test_an_idle_jet_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
+    """Jet 11 of tetra12 is not used at the paper's rates: without tests nobody learns that it is gone."""
+    failure = {"chaser": 0, "jet": 11, "at_s": 8.0, "kind": "stuck_off"}
+    record = fly(mission(duration_s=26.0, chaser={"jet_test_s": test_s}, jet_failure=[failure]))[0]
+    told = [what for _, what in record.events if "limits" not in what]
+    assert told == (["jet 11 stuck off: found, isolated"] if finds else [])
+    assert max(np.array(record.position_m)[np.array(record.time_s) > 8.0]) < 0.05

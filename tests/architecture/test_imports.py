@@ -1,0 +1,148 @@
+"""Architecture rules: who imports whom, and that flight software cannot reach ground truth."""
+
+from __future__ import annotations
+
+import ast
+import graphlib
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol import topics
+from chaserdock_protocol.topics import Role
+from chaserdock_protocol.transport import Link, Node
+from source_tree import FLYING, MODULES, PACKAGES, imported, module_name, short, tree_of
+
+MAY_IMPORT = {
+    "chaserdock_models": set(),
+    "chaserdock_protocol": {"chaserdock_models"},
+    "chaserdock_world": {"chaserdock_models", "chaserdock_protocol"},
+    "chaserdock_agents": {"chaserdock_models", "chaserdock_protocol"},
+    "chaserdock_controller": {"chaserdock_models", "chaserdock_protocol"},
+    "chaserdock": {
+        "chaserdock_models", "chaserdock_protocol", "chaserdock_world", "chaserdock_agents", "chaserdock_controller",
+    },
+}  # fmt: skip
+NAMES = {module_name(path): path for _, path in MODULES}
+
+
+def own_imports(path: Path) -> set[str]:
+    """Modules of ours that a module imports."""
+    return {name for name in imported(path) if name in NAMES} - {module_name(path)}
+
+
+def test_there_are_modules_to_check() -> None:
+    assert all(folder.is_dir() for folder in PACKAGES.values())
+    assert len(MODULES) > 200
+    assert len(FLYING) > 60
+
+
+def test_relative_imports_are_resolved() -> None:
+    """The checks below depend on it."""
+    chaser = own_imports(PACKAGES["chaserdock_agents"] / "chaser" / "process.py")
+    assert {"chaserdock_agents.chaser.command_gate", "chaserdock_protocol.scenario"} <= chaser
+
+
+@pytest.mark.parametrize(("package", "path"), MODULES, ids=short)
+def test_imports_point_downwards(package: str, path: Path) -> None:
+    ours = {name.partition(".")[0] for name in imported(path) if name.startswith("chaserdock")}
+    assert ours - {package} - MAY_IMPORT[package] == set()
+
+
+def test_there_are_no_import_cycles() -> None:
+    graph: dict[str, set[str]] = {}
+    for name, path in NAMES.items():
+        # `from package import module` runs the package's __init__ too, but needs only the module.
+        found = own_imports(path)
+        graph[name] = {f for f in found if not any(other.startswith(f"{f}.") for other in found)}
+        if path.name == "__init__.py":
+            continue
+        graph[name] -= {name.rpartition(".")[0]}
+    tuple(graphlib.TopologicalSorter(graph).static_order())
+
+
+@pytest.mark.parametrize(
+    ("library", "homes"),
+    [("zenoh", {"chaserdock_protocol.transport.node"}), ("pybullet", {"chaserdock_world.physics.bullet"})],
+)
+def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:
+    users = {
+        module_name(p) for _, p in MODULES if any(n.split(".")[0].startswith(library) for n in imported(p))
+    }
+    assert users == homes
+
+
+# -- the truth --------------------------------------------------------------------------------------------
+
+TRUTHS = {name for name in vars(topics) if name.startswith("TRUTH")}
+
+
+@pytest.mark.parametrize("path", FLYING, ids=short)
+def test_what_flies_does_not_even_mention_the_truth(path: Path) -> None:
+    for node in ast.walk(tree_of(path)):
+        named = (
+            node.attr
+            if isinstance(node, ast.Attribute)
+            else node.id
+            if isinstance(node, ast.Name)
+            else node.name
+            if isinstance(node, ast.alias)
+            else ""
+        )
+        assert not named.startswith("TRUTH"), f"line {getattr(node, 'lineno', '?')}"
+        assert named not in ("BodyTruth", "WorldTruth", "subscribe_raw", "TOPICS", "zenoh")
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            assert "truth/" not in node.value
+            assert not node.value.startswith("truth")
+
+
+def test_flying_modules_import_neither_world_nor_log() -> None:
+    for path in FLYING:
+        names = set(imported(path))
+        assert not any(
+            n.startswith(("chaserdock_world", "chaserdock_protocol.recording.log")) for n in names
+        ), path
+
+
+@pytest.fixture(scope="module", params=["chaser", "controller"])
+def node(request: pytest.FixtureRequest) -> Iterator[Node]:
+    role: Role = request.param
+    name = "chaser/0" if role == "chaser" else role
+    opened = Node(name, role, Link(namespace="test-boundaries"))
+    yield opened
+    opened.close()
+
+
+def test_there_is_a_truth_to_keep_away_from() -> None:
+    assert {"TRUTH_BODY", "TRUTH_WORLD"} == TRUTHS
+
+
+@pytest.mark.parametrize("name", sorted(TRUTHS))
+def test_what_flies_cannot_subscribe_the_truth(node: Node, name: str) -> None:
+    topic = getattr(topics, name)
+    with pytest.raises(PermissionError, match=f"{node.role} may not read truth/"):
+        node.subscribe(topic)
+    with pytest.raises(PermissionError):
+        node.subscribe(topic, latest=True)
+    if "{" in topic.key:
+        with pytest.raises(PermissionError):
+            node.subscribe(topic, "target")
+    with pytest.raises(PermissionError, match="may not write"):
+        node.advertise(topic, "target" if "{" in topic.key else None)
+
+
+@pytest.mark.parametrize("expression", ["**", "truth/**", "world/tick", "*/body/target"])
+def test_what_flies_cannot_subscribe_expressions(node: Node, expression: str) -> None:
+    heard: list[object] = []
+    with pytest.raises(PermissionError, match="may not read"):
+        node.subscribe_raw(expression, heard.append)
+    assert heard == []
+
+
+def test_what_flies_can_subscribe_what_is_meant_for_it(node: Node) -> None:
+    node.subscribe(topics.TICK)
+    node.subscribe(topics.ODOMETRY, 0)
+    with pytest.raises(PermissionError):
+        node.subscribe(topics.SOLVER)
+    with pytest.raises(PermissionError):
+        node.advertise(topics.TICK)

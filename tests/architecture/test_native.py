@@ -1,0 +1,221 @@
+"""The compiled kernels: the same bits from every instruction set, and one clear error where they cannot be had."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from chaserdock_agents.chaser.perception import corners, refine
+from chaserdock_agents.chaser.perception import native as perception_native
+from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
+from chaserdock_controller.nmpc import native as nmpc_native
+from chaserdock_models import native
+from chaserdock_models.camera import Camera
+from chaserdock_models.native import KernelLibrary
+from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS, X86_64, source_digest
+from chaserdock_models.targets import target_model
+from chaserdock_world.rendering import native as rendering_native
+from chaserdock_world.rendering import scene_geometry as faces
+from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
+from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap
+from numpy.typing import NDArray
+from source_tree import ROOT
+
+LEVELS = [number for number, _ in X86_64]
+
+
+def has(number: int) -> bool:
+    return native.LIBRARY.level != 0 and number <= native.LIBRARY.level
+
+
+@pytest.mark.parametrize("number", LEVELS)
+def test_every_instruction_set_gives_the_same_bits(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two chasers swapping head-on, one in a corridor: interior point, tilted planes, cone."""
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+    corridors = np.zeros((2, 31, 5))
+    corridors[0, :] = [-1.0, 0.0, 0.0, 1.2, 2.0]
+
+    def flown() -> tuple[Array, list[int]]:
+        problem_at, states = swap()
+
+        def with_corridor(x: Array, now_s: float) -> NmpcInput:
+            problem = problem_at(x, now_s)
+            return NmpcInput(**{**vars(problem), "corridors": corridors})
+
+        flight = fly(make_solver("rti", PARAMS, 2), with_corridor, states, 0.1, 2.0)
+        return flight.states, [int(p.iterations.sum()) for p in flight.plans]
+
+    expected, iterations = flown()
+    assert any(iterations)
+    own = nmpc_native.function
+    monkeypatch.setattr(kernels, "function", lambda name, result=None: own(name, result, number))
+    states, _ = flown()
+    np.testing.assert_array_equal(states, expected)
+
+
+@pytest.mark.parametrize("number", LEVELS)
+@pytest.mark.parametrize("distortion", [(), (-0.18, 0.05, 0.0006, -0.0004)])
+def test_every_instruction_set_sees_the_same_bits(
+    number: int, distortion: tuple[float, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Corners of large markers and of such with a narrow border, and a pose from a start far off."""
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+    rng = np.random.default_rng(3)
+    camera = Camera.from_hfov(320, 240, 1.0, distortion=distortion)
+    noise = rng.integers(0, 255, (240, 320), dtype=np.uint8)
+    image = np.asarray(cv2.GaussianBlur(noise, (7, 7), 1.5), dtype=np.uint8)
+    quads = np.array([[40, 40], [90, 45], [88, 95], [38, 90]]) + rng.uniform(0, 120, (12, 1, 2))
+    margin = rng.uniform(0.02, 0.2, 12)
+    points = rng.uniform(-0.3, 0.3, (8, 3))
+    truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
+    pixels = camera.project_ideal(points @ truth.rotation.T + truth.position) + rng.normal(0.0, 0.1, (8, 2))
+    start = pose_at([0.0, 0.0, 1.2], [0.0, -1.6, 0.5])
+
+    def seen() -> list[NDArray[Any]]:
+        found = corners.refine(image, camera, quads, 6, margin)
+        pose = refine.refine(camera.matrix(), points, pixels, np.ones(16), start)
+        assert pose is not None
+        np.testing.assert_allclose(pose.rotation, truth.rotation, atol=0.01)
+        return [found.corners_px, found.good, found.relative_sigma, pose.position, pose.rotation]
+
+    expected = seen()
+    assert 0 < expected[1].sum() < 12
+    own = perception_native.function
+    for module in (corners, refine):
+        monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, number))
+    for ours, theirs in zip(seen(), expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("number", LEVELS)
+def test_every_instruction_set_draws_the_same_picture(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+    renderer = Renderer(Camera.from_hfov(320, 240, 1.0), target_model("servicer"))
+    rng = np.random.default_rng(7)
+    views = [(rng.uniform(-0.4, 0.4, 3), rng.normal(size=4)) for _ in range(6)]
+
+    def drawn() -> list[NDArray[np.uint8]]:
+        eye, ahead = np.array([0.0, 0.0, -1.2]), np.array([1.0, 0.0, 0.0, 0.0])
+        other = (chaser_boxes(), np.array([0.3, 0.1, 0.2]), ahead)
+        return [renderer.render(eye, ahead, p, q / np.linalg.norm(q), [other]) for p, q in views]
+
+    expected = drawn()
+    assert all(picture.max() > 60 for picture in expected)
+    own = rendering_native.function
+    monkeypatch.setattr(faces, "function", lambda name, result=None: own(name, result, number))
+    np.testing.assert_array_equal(drawn(), expected)
+
+
+@pytest.mark.parametrize("corner", [np.nan, np.inf, -np.inf, 1e300, -1e9])
+def test_corners_that_lie_nowhere_are_not_good(corner: float) -> None:
+    image = np.full((48, 64), 200, dtype=np.uint8)
+    quads = np.array([[[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]]])
+    quads[0, 2, 0] = corner
+    found = corners.refine(image, Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
+    assert not found.good.any()
+    np.testing.assert_array_equal(found.corners_px, quads)
+    with pytest.raises(ValueError, match="has no corners"):
+        corners.refine(image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
+
+
+def pose_at(position: list[float], rotation_vector: list[float]) -> refine.Pose:
+    return refine.Pose(np.array(position), refine.rotation_matrix(rotation_vector))
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-9, 0.3, 2.0])
+def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
+    """The gradient by OpenCV's projection, which the kernel does not use; a start off by ``turn`` rad comes back."""
+    rng = np.random.default_rng(5)
+    matrix = np.array([[600.0, 0.0, 320.0], [0.0, 590.0, 240.0], [0.0, 0.0, 1.0]])
+    points = rng.uniform(-0.3, 0.3, (8, 3))
+    truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
+    at = points @ truth.rotation.T + truth.position
+    pixels = at[:, :2] / at[:, 2:] * [600.0, 590.0] + [320.0, 240.0] + rng.normal(0.0, 0.2, (8, 2))
+    weight = np.repeat(rng.uniform(0.5, 1.0, 8), 2)
+    start = refine.Pose(truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation)
+    pose = refine.refine(matrix, points, pixels, weight, start)
+    assert pose is not None
+    np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14)
+    found = refine.residual_of(matrix, points, pixels, weight, pose)
+    assert found is not None
+    residual, jacobian = found
+    step = np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ residual)
+    assert np.abs(step).max() < 1e-5
+    assert (
+        refine.refine(matrix, points - [0.0, 0.0, 50.0], pixels, weight, pose_at([0, 0, 1], [0, 0, 0]))
+        is None
+    )
+
+
+def copied(folder: Path) -> KernelLibrary:
+    """A copy of the NMPC's sources and library, to be tampered with."""
+    target = folder / "native"
+    shutil.copytree(nmpc_native.LIBRARY.path.parent, target, ignore=shutil.ignore_patterns("__pycache__"))
+    return KernelLibrary(target)
+
+
+def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
+    copy = copied(tmp_path)
+    assert copy.library.source_digest().decode() == source_digest(copy.path.parent)
+    with (copy.path.parent / "cost.c").open("a") as file:
+        file.write("\n/* an edit */\n")
+    with pytest.raises(ImportError, match=r"compiled from other sources.*pip install"):
+        _ = KernelLibrary(copy.path.parent).library
+
+
+def test_a_library_that_is_missing_or_broken_is_named(tmp_path: Path) -> None:
+    copy = copied(tmp_path)
+    copy.path.write_bytes(b"not a library")
+    with pytest.raises(ImportError, match=r"not for this kind of machine.*pip install"):
+        _ = copy.library
+    copy.path.unlink()
+    with pytest.raises(ImportError, match=r"missing.*pip install"):
+        _ = copy.library
+
+
+@pytest.mark.parametrize("folder", NATIVE_FOLDERS)
+def test_a_library_needs_no_other(folder: str) -> None:
+    """Neither a C library nor any other: so one file serves every Linux of its processor."""
+    content = (ROOT / folder / LIBRARY_NAME).read_bytes()
+    assert not any(name in content for name in (b"libc.so", b"libm.so", b"GLIBC_"))
+
+
+def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached() -> None:
+    """The quick test for a pair finds what the whole one finds: with a reach just above and just below the room."""
+    states = np.array([at_rest(np.array([-2.0, 2.0, 0.0])), at_rest(np.array([2.0, 2.0, 0.0]))])
+    problem = fixed_problem(states, states[:, :3], d_target=0.0)
+    frame = make_solver("rti", PARAMS, 2)._frame  # pyright: ignore[reportAttributeAccessIssue]
+    task = frame.begin(problem, 0.0, None)
+    x = frame.rolled(task, task.start)
+    room_m = 0.5 * (4.0 - 0.35 - 5e-3)
+    for reach_m, rows in ((room_m - 1e-6, 0), (room_m + 1e-6, 30)):
+        found = kernels.build_rows(task.problem, x, 25.0, np.full((2, 31), reach_m))
+        assert list(found.n_rows) == [rows, rows]
+
+
+def test_working_memory_is_enough() -> None:
+    """Nothing is written behind the memory that a tick asks for, with as many rows as there can be."""
+    n, d = 3, PARAMS.stages
+    doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(ctypes.c_int64(n), ctypes.c_int64(d))
+    guarded = np.full(doubles + 64, 7.0)
+    rng = np.random.default_rng(1)
+    states = np.array([at_rest(0.3 * rng.normal(size=3)) for _ in range(n)])
+    corridors = np.tile([1.0, 0, 0, 0.5, 0.0], (n, d + 1, 1))
+    problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors})
+    kept = kernels._tick_memory
+    kept.cache_clear()
+    patch = pytest.MonkeyPatch()
+    patch.setattr(kernels, "_tick_memory", lambda n, d: guarded)
+    plan = make_solver("rti", PARAMS, n).solve(problem, 0.0)
+    patch.undo()
+    assert plan.iterations.all()
+    assert (guarded[doubles:] == 7.0).all()
+    assert (guarded[:doubles] != 7.0).mean() > 0.5

@@ -1,0 +1,339 @@
+"""Campaigns: which runs a file asks for, what the table says, that nothing is flown twice or lost."""
+
+from __future__ import annotations
+
+import html
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import time
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from chaserdock_protocol.scenario import ScenarioError, load_scenario
+from harness import chaserdock, descendants
+from harness import finished as program
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chaserdock.campaign.plan import Campaign, load_campaign, toml_value
+from chaserdock.campaign.report import page
+from chaserdock.campaign.table import cause_of, causes, rank_correlation, row_of, rows_of, wilson
+from chaserdock.campaign.worker import CampaignError, Result, finished, fly_campaign, note, result_path
+
+GRID = """
+name = "grid"
+scenario = "single"
+seeds = [3, 5]
+[set]
+duration_s = 8.0
+[vary."chasers.0.start_offset_m.0"]
+values = [-0.05, -0.3]
+[vary."controller.solver"]
+values = ["rti", "ipopt"]
+"""
+SAMPLE = """
+name = "sample"
+scenario = "single"
+method = "random"
+samples = 20
+sample_seed = 7
+[vary."target.omega_rad_s.0"]
+uniform = [0.0, 0.05]
+[vary."chaser.mass_kg"]
+normal = [30.0, 1.0]
+[vary."controller.integrator"]
+values = ["rk4", "euler"]
+"""
+TINY = """
+name = "tiny"
+scenario = "single"
+[set]
+duration_s = 1.0
+settling_s = 0.5
+"camera.width_px" = 320
+"camera.height_px" = 240
+"success.steady_position_rms_m" = 0.5
+"success.steady_orientation_rms_deg" = 90.0
+[vary."chasers.0.start_offset_m.0"]
+values = [-0.02, -0.04, -0.06, -0.08]
+"""
+
+
+def campaign_of(text: str, folder: Path) -> Campaign:
+    file = folder / "campaign.toml"
+    file.write_text(text)
+    return load_campaign(file)
+
+
+def test_a_grid_is_every_combination_with_every_seed(tmp_path: Path) -> None:
+    campaign = campaign_of(GRID, tmp_path)
+    flown = [
+        (r.varied["chasers.0.start_offset_m.0"], r.varied["controller.solver"], r.seed) for r in campaign.runs
+    ]
+    assert sorted(flown) == sorted(
+        (x, s, seed) for x in (-0.05, -0.3) for s in ("rti", "ipopt") for seed in (3, 5)
+    )
+    assert len({r.name for r in campaign.runs}) == 8
+    for run in campaign.runs:  # the overrides make just that scenario
+        scenario = load_scenario(campaign.scenario, run.overrides)
+        assert scenario.seed == run.seed
+        assert scenario.duration_s == 8.0
+        assert scenario.controller.solver == run.varied["controller.solver"]
+
+
+def test_a_sample_is_drawn_from_its_distributions_and_the_same_each_time(tmp_path: Path) -> None:
+    campaign = campaign_of(SAMPLE, tmp_path)
+    rates = [r.varied["target.omega_rad_s.0"] for r in campaign.runs]
+    masses = [r.varied["chaser.mass_kg"] for r in campaign.runs]
+    assert len(campaign.runs) == 20
+    assert all(0.0 <= rate <= 0.05 for rate in rates)
+    assert len(set(rates)) == 20
+    assert 29.0 < sum(masses) / 20 < 31.0
+    assert {r.varied["controller.integrator"] for r in campaign.runs} == {"rk4", "euler"}
+    assert campaign_of(SAMPLE, tmp_path) == campaign
+    assert campaign_of(SAMPLE.replace("= 7", "= 8"), tmp_path).runs != campaign.runs
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ('scenario = "nowhere"', "nowhere"),
+        ("seeds = 0", "seeds"),
+        ("seeds = [1, 1]", "different numbers"),
+        ('method = "random"', "samples goes with"),
+        ('[vary."chaser.mass_kg"]\nuniform = [1.0, 2.0]', "a grid needs values"),
+        ('[vary."chaser.mass_kg"]\nvalues = []', "must not be empty"),
+        ('[vary."chaser.mass_kg"]\nvalues = [1.0]\nnormal = [1.0, 2.0]', "exactly one"),
+        ('[vary."chaser.mass_kg"]\nvalues = [-1.0]', "chaser.mass_kg"),
+        ('[vary."chaser.weight"]\nvalues = [1.0]', "weight"),
+        ('[vary."chaser.mass_kg"]\nvalues = [30.0, 30.0]', "same scenario"),
+        ("[vary.seed]\nvalues = [1]", "seeds instead"),
+        ("[vary", "not TOML"),
+        ("colour = 1", "colour"),
+    ],
+)
+def test_a_wrong_file_is_told(tmp_path: Path, wrong: str, told: str) -> None:
+    base = 'name = "x"\n' + ("" if wrong.startswith("scenario") else 'scenario = "single"\n')
+    (tmp_path / "c.toml").write_text(base + wrong)
+    with pytest.raises(ScenarioError, match=re.escape(told)) as caught:
+        load_campaign(tmp_path / "c.toml")
+    assert "c.toml" in str(caught.value)
+
+
+@given(
+    st.recursive(
+        st.integers(-(2**31), 2**31)
+        | st.floats(allow_nan=False, allow_infinity=False)
+        | st.booleans()
+        | st.text(st.characters(exclude_categories=("Cs",)), max_size=8),
+        lambda inner: (
+            st.lists(inner, max_size=3) | st.dictionaries(st.text("ab_", min_size=1), inner, max_size=3)
+        ),
+    )
+)
+def test_values_survive_toml(value: Any) -> None:
+    import tomllib
+
+    assert tomllib.loads(f"x = {toml_value(value)}")["x"] == value
+
+
+def test_wilson_against_published_values() -> None:
+    # R. G. Newcombe, Statistics in Medicine 17 (1998), table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29.
+    published = (
+        (81, 263, 0.2553, 0.3662),
+        (15, 148, 0.0624, 0.1605),
+        (0, 20, 0.0, 0.1611),
+        (1, 29, 0.0061, 0.1718),
+    )
+    for passed, of, low, high in published:
+        assert wilson(passed, of) == pytest.approx((low, high), abs=6e-5)
+    with pytest.raises(ValueError, match="no pass rate"):
+        wilson(0, 0)
+
+
+def test_rank_correlation() -> None:
+    x = [1.0, 2.0, 3.0, 4.0]
+    assert rank_correlation(x, [math.exp(v) for v in x]) == pytest.approx(1.0)
+    assert rank_correlation(x, [-v for v in x]) == pytest.approx(-1.0)
+    assert rank_correlation([1.0, 2.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]) == pytest.approx(
+        0.9486833
+    )  # ties: mean rank
+    assert math.isnan(rank_correlation(x, [1.0] * 4))
+    assert rank_correlation([*x, 5.0], [*x, math.nan]) == pytest.approx(1.0)
+
+
+def summary(failures: list[str]) -> dict[str, Any]:
+    return {
+        "success": not failures,
+        "failures": failures,
+        "digest": "d",
+        "wall_time_s": 1.0,
+        "chasers": {
+            "0": {
+                "steady": {"position_mse_m2": 4e-6, "orientation_mse_rad2": 1e-6},
+                "min_distance_target_m": 0.9,
+            },
+            "1": {
+                "steady": {"position_mse_m2": None, "orientation_mse_rad2": 9e-6},
+                "min_distance_target_m": 0.8,
+            },
+        },
+        "target_estimate": {"position_rms_m": 1e-4, "max_position_error_m": None},
+    }
+
+
+def results_of(campaign: Campaign) -> list[tuple[Any, Result]]:
+    out = []
+    for k, run in enumerate(campaign.runs):
+        bad = [f"chaser 0: steady RMS: 0.0{k} m"] if k % 2 else []
+        out.append(
+            (run, Result(run.name, 1 if bad else 0, summary(bad), "", f"/logs/{k}.mcap" if bad else None))
+        )
+    return out
+
+
+def test_a_row_takes_the_worst_chaser_and_nothing_of_the_wall_clock(tmp_path: Path) -> None:
+    campaign = campaign_of(GRID, tmp_path)
+    rows = rows_of(results_of(campaign))
+    assert rows[0]["steady_position_mse_m2"] == 4e-6
+    assert rows[0]["steady_orientation_mse_rad2"] == 9e-6
+    assert rows[0]["min_distance_target_m"] == 0.8
+    assert rows[0]["success"]
+    assert not any("wall" in column for column in rows[0])
+    assert math.isnan(rows[0]["estimate_max_position_error_m"])
+    assert causes(rows) == [(cause_of("chaser 0: steady RMS: 0.01 m"), 4)]
+    crashed = row_of(campaign.runs[0], Result(campaign.runs[0].name, 2, None, "chaserdock: no port"))
+    assert not crashed["success"]
+    assert crashed["cause"] == "chaserdock: no port"
+
+
+class Seen(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.links += [v for k, v in attrs if k in ("href", "src") and v and not v.startswith("#")]
+
+
+def test_the_page_counts_names_and_links(tmp_path: Path) -> None:
+    campaign = campaign_of(GRID, tmp_path)
+    results = results_of(campaign)
+    text = page(campaign, rows_of(results[:-1]), Path("/logs/here"))
+    assert "4 of 7 passed" in text
+    assert "1 are missing" in text
+    assert "--set 'seed=5'" in html.unescape(text)
+    seen = Seen()
+    seen.feed(text)
+    assert {link for link in seen.links if link.endswith(".mcap")} == {"../1.mcap", "../3.mcap", "../5.mcap"}
+    assert not [link for link in seen.links if link.startswith(("http:", "https:", "//"))]
+
+
+def test_a_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    campaign = campaign_of(GRID, tmp_path)
+    flown: list[str] = []
+
+    def fly(run: Any, *_: Any) -> Result:
+        flown.append(run.name)
+        return Result(run.name, 0, summary([]), "")
+
+    monkeypatch.setattr("chaserdock.campaign.worker.fly", fly)
+    earlier = campaign.runs[2]
+    note(tmp_path, earlier, Result(earlier.name, 1, None, "was so"))
+    import threading
+
+    told: list[int] = []
+    results = fly_campaign(
+        campaign,
+        tmp_path,
+        "none",
+        2,
+        None,
+        lambda done, of, run, result: told.append(done),
+        threading.Event(),
+    )
+    assert sorted(flown) == sorted(r.name for r in campaign.runs if r is not earlier)
+    assert [r.name for r, _ in results] == [r.name for r in campaign.runs]
+    assert results[2][1].last_words == "was so"
+    assert told == [2, 3, 4, 5, 6, 7, 8]
+
+
+def test_a_broken_result_is_told_not_taken(tmp_path: Path) -> None:
+    campaign = campaign_of(GRID, tmp_path)
+    run = campaign.runs[0]
+    assert finished(tmp_path, run) is None
+    note(tmp_path, run, Result(run.name, 0, None, ""))
+    result_path(tmp_path, run).write_text(result_path(tmp_path, run).read_text()[:-9])
+    with pytest.raises(CampaignError, match="delete it"):
+        finished(tmp_path, run)
+
+
+def test_the_program_tells_bad_input(tmp_path: Path) -> None:
+    (tmp_path / "c.toml").write_text(TINY)
+    for arguments, told in (
+        (("campaign", str(tmp_path / "none.toml")), "none.toml: cannot be read"),
+        (("campaign", str(tmp_path / "c.toml"), "--only", "9"), "the runs are 0 to 3"),
+        (("campaign", str(tmp_path / "c.toml"), "--only", "1", "--jobs", "2"), "--only flies one run"),
+        (
+            (
+                "campaign",
+                str(tmp_path / "c.toml"),
+                "--out",
+                str(tmp_path / "o"),
+                "--cluster",
+                "tcp://127.0.0.1:9",
+            ),
+            "no Dask",
+        ),
+    ):
+        status, said = program(*arguments)
+        assert status == 2, said
+        assert told in said
+        assert "Traceback" not in said
+
+
+def table(folder: Path) -> list[dict[str, Any]]:
+    return [
+        {k: v for k, v in row.items() if k != "log"}
+        for row in pq.read_table(folder / "results.parquet").to_pylist()
+    ]
+
+
+@pytest.mark.slow
+def test_killed_resumed_and_on_a_cluster_the_table_is_the_same(tmp_path: Path) -> None:
+    file, here, there = tmp_path / "c.toml", tmp_path / "here", tmp_path / "there"
+    file.write_text(TINY)
+    first = chaserdock("campaign", str(file), "--out", str(here), "--jobs", "1", stdout=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not list(here.glob("runs/*/result.json")) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    children = descendants(first)
+    first.kill()
+    first.wait()
+    for child in children:  # whoever flew for it must not go on for nobody
+        if child.is_running():
+            child.send_signal(signal.SIGKILL)
+    before = {p: p.stat().st_mtime_ns for p in here.glob("runs/*/result.json")}
+    assert 1 <= len(before) < 4
+    status, said = program("campaign", str(file), "--out", str(here), "--jobs", "2")
+    assert status == 0, said
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+    assert len(table(here)) == len({row["digest"] for row in table(here)}) == 4
+
+    from distributed import LocalCluster
+
+    os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
+    cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
+    with cluster:
+        status, said = program(
+            "campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address
+        )
+    assert status == 0, said
+    assert json.dumps(table(there)) == json.dumps(table(here))

@@ -1,0 +1,58 @@
+"""Tables that grow: in memory, in a file, and the same page from both."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chaserdock_protocol.errors import ChaserdockError
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from chaserdock.analysis import columns, summary
+from chaserdock.analysis.columns import Columns
+from chaserdock.analysis.report import report_of
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    width=st.integers(1, 5), rows=st.integers(0, 60), held=st.integers(1, 200), seed=st.integers(0, 2**32 - 1)
+)
+def test_a_table_holds_what_was_added_wherever_it_lies(width: int, rows: int, held: int, seed: int) -> None:
+    values = np.random.default_rng(seed).normal(size=(rows, width))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(columns, "_HELD", held)
+        table = Columns(width)
+        for row in values:
+            table.add(row[:1], row[1:])
+        for _ in range(2):  # a table can be asked for again
+            np.testing.assert_array_equal(table.table(), values)
+
+
+def test_a_torn_row_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(columns, "_HELD", 4)
+    table = Columns(3)
+    table.add((1.0, 2.0, 3.0), (4.0, 5.0))
+    with pytest.raises(ValueError, match="reshape"):
+        table.table()
+
+
+def test_a_long_flight_gives_the_page_of_a_short_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    in_memory = report_of(GOLDEN)
+    monkeypatch.setattr(columns, "_HELD", 64)
+    monkeypatch.setattr(summary, "_PART", 7)
+    assert report_of(GOLDEN) == in_memory
+
+
+def test_a_disk_that_is_full_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    full = Path("/dev/full")
+    if not full.exists():
+        pytest.skip("no /dev/full on this system")
+    monkeypatch.setattr(columns, "_HELD", 4)
+    monkeypatch.setattr(tempfile, "TemporaryFile", lambda **_: full.open("wb", buffering=0))
+    with pytest.raises(ChaserdockError, match=r"No space left on device; TMPDIR"):
+        Columns(4).add((1.0, 2.0, 3.0, 4.0))

@@ -1,0 +1,128 @@
+"""The image is built and a short mission flown by Compose, where a Docker engine is; compose.yaml is checked anywhere."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.transport.access_control import identities
+from harness import ROOT, SHORT
+
+sys.path.insert(0, str(ROOT / "benchmarks"))
+
+from containers import Project, compose_command, docker
+
+
+def why_no_docker() -> str:
+    """Why missions cannot fly in containers here, or nothing."""
+    if shutil.which("docker") is None:
+        return "no docker program"
+    if subprocess.run(["docker", "info"], capture_output=True, check=False).returncode != 0:
+        return "no Docker engine answers"
+    try:
+        compose_command()
+    except SystemExit as reason:
+        return str(reason)
+    ways = ("image inspect", "pull")
+    if all(
+        subprocess.run(
+            ["docker", *way.split(), "python:3.11-slim"], capture_output=True, check=False
+        ).returncode
+        for way in ways
+    ):
+        return "no image python:3.11-slim, and none can be had"
+    return ""
+
+
+@pytest.fixture(scope="module")
+def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clone as a user has it, of the files as they are here."""
+    if reason := why_no_docker():
+        pytest.skip(reason)
+    folder = tmp_path_factory.mktemp("clone")
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
+    names = subprocess.run(listed, cwd=ROOT, capture_output=True, check=True).stdout.split(b"\0")
+    for name in filter(None, map(os.fsdecode, names)):
+        if (ROOT / name).is_file():
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, folder / name)
+    return folder
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(2400)
+def test_short_mission_by_compose(clone: Path) -> None:
+    """Built, flown with rights on to success, its status passed on, its files the owner's; the image is small enough."""
+    owner = (clone / "compose.yaml").stat()
+    project = Project("two-chaser-tracking", " ".join(SHORT), clone)
+    try:
+        built = project.compose("build", "router")
+        assert built.returncode == 0, (built.stdout + built.stderr)[-3000:]
+        flown = project.compose("up", "--no-build", "--exit-code-from", "mission", timeout_s=900.0)
+        said = flown.stdout + flown.stderr
+        kept = docker("run", "--rm", "--entrypoint", "find", "chaserdock", "/keys", "-type", "f").stdout
+    finally:
+        project.down()
+    assert flown.returncode == 0, said[-5000:]
+    assert "with access rules" in said
+    assert "PRIVATE KEY" not in said
+    assert kept == ""
+    (log,) = clone.glob("runs/two-chaser-tracking-*/mission.mcap")
+    summary = json.loads((log.parent / "summary.json").read_text())
+    assert summary["success"]
+    assert summary["sim_time_s"] == 6.0
+    assert "</html>" in (log.parent / "report.html").read_text()
+    for path in (log, log.parent, log.parent / "summary.json", log.parent / "report.html"):
+        assert (path.stat().st_uid, path.stat().st_gid) == (owner.st_uid, owner.st_gid)
+    inspected = subprocess.run(
+        ["docker", "image", "inspect", "chaserdock"], capture_output=True, check=True, text=True
+    )
+    (image,) = json.loads(inspected.stdout)
+    assert image["Size"] < 1.5e9
+    assert image["Config"]["User"] not in ("", "root", "0")
+
+
+def test_a_container_mounts_its_own_keys_alone() -> None:
+    """Secrets: every service but the router, which makes them, sees one volume of keys, and that read-only."""
+    service, mounts = "", {}
+    for line in (ROOT / "compose.yaml").read_text(encoding="utf-8").splitlines():
+        if found := re.match(r"  ([a-z0-9-]+):", line):
+            service = found[1]
+        for name, where in re.findall(r"keys-([a-z0-9-]+):(/keys[a-z0-9/:-]*)", line):
+            mounts.setdefault(service, []).append((name, where))
+    everyone = {"router", *(who.common_name for who in identities(16))}
+    assert {name for name, _ in mounts.pop("router")} == everyone
+    assert set(mounts) == everyone - {"router", "analysis"} | {"mission"}
+    for service, mounted in mounts.items():
+        owner = "operator" if service == "mission" else service
+        assert mounted == [(owner, "/keys:ro")], service
+
+
+def test_the_image_has_a_folder_for_everyones_keys() -> None:
+    """A volume takes over the mode of the folder that it is mounted on; without one only root could write there."""
+    found = re.search(
+        r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
+        (ROOT / "Dockerfile").read_text(),
+    )
+    assert found
+    names = set(found[1].replace("\\", " ").split())
+    assert names | {f"chaser-{i}" for i in range(16)} == {
+        "router",
+        *(who.common_name for who in identities(16)),
+    }
+
+
+def test_only_the_viewers_page_is_published_and_on_the_loopback_alone() -> None:
+    text = (ROOT / "compose.yaml").read_text(encoding="utf-8")
+    assert not re.search(r"^\s*(network_mode|privileged|container_name)\s*:", text, re.MULTILINE)
+    published = re.findall(r"^\s*ports\s*:.*$", text, re.MULTILINE)
+    assert [line.strip() for line in published] == ['ports: ["127.0.0.1:${VIEW_PORT:-8080}:8080"]']
+    viewer = text[text.index("\n  viewer:") :]
+    assert published[0] in viewer[: viewer.index("\n\n")]
+    assert "profiles: [view]" in viewer[: viewer.index("\n\n")]

@@ -1,0 +1,129 @@
+"""The worked examples of docs/extend.md fly: an own perception, an own solver, and a controller that is none of ours."""
+
+from __future__ import annotations
+
+import ast
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chaserdock_controller.estimation.types import Eye, Measurement, PoseHypothesis
+from chaserdock_controller.parameters import estimator_of
+from chaserdock_protocol.process import SINGLE_THREADED
+from chaserdock_protocol.scenario import load_scenario
+from harness import ROOT, ByHand, finished, run, sets, summary
+
+EXAMPLES = ROOT / "examples"
+FOREIGN = EXAMPLES / "foreign_controller" / "foreign_controller.py"
+SHORT = ("duration_s=30.0", "settling_s=22.0", "camera.width_px=640", "camera.height_px=360")
+
+
+def install(example: Path, folder: Path) -> dict[str, str]:
+    """Puts an example's module and entry points into ``folder``; the environment that finds them there.
+
+    What ``pip install --no-deps --target`` does, without the build back end, which is not at hand off line.
+    """
+    project = tomllib.loads((example / "pyproject.toml").read_text())
+    for name in project["tool"]["hatch"]["build"]["targets"]["wheel"]["include"]:
+        (folder / name).write_text((example / name).read_text())
+    info = (
+        folder / f"{project['project']['name'].replace('-', '_')}-{project['project']['version']}.dist-info"
+    )
+    info.mkdir()
+    head = f"Metadata-Version: 2.1\nName: {project['project']['name']}\nVersion: {project['project']['version']}\n"
+    (info / "METADATA").write_text(head)
+    groups = project["project"]["entry-points"]
+    lines = [
+        line
+        for group, names in groups.items()
+        for line in (f"[{group}]", *(f"{k} = {v}" for k, v in names.items()))
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+    return {"PYTHONPATH": str(folder)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("example", "part"),
+    [
+        ("own_perception", ("perception.name=own", "target.model=servicer")),
+        ("pd_controller", ("controller.solver=pd",)),
+    ],
+)
+def test_a_part_of_ones_own_flies_to_success(example: str, part: tuple[str, ...], tmp_path: Path) -> None:
+    parts = tmp_path / "parts"
+    parts.mkdir()
+    env = install(EXAMPLES / example, parts)
+    status, said = run("single", tmp_path / "run", *SHORT, *part, env=env, arguments=["--quiet"])
+    assert status == 0, said
+    assert summary(tmp_path / "run")["success"]
+
+
+def test_a_part_that_is_not_installed_is_named(tmp_path: Path) -> None:
+    status, said = run("single", tmp_path, "controller.solver=pd", timeout_s=60)
+    assert status != 0
+    assert "'pd'" in said
+    assert "chaserdock.solvers" in said
+
+
+def test_the_pages_estimator_is_deaf_to_few_markers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "three_markers.py").write_text(code)
+    info = tmp_path / "three_markers-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: three-markers\nVersion: 1\n")
+    (info / "entry_points.txt").write_text("[chaserdock.estimators]\nthree = three_markers:ThreeMarkers\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    scenario = load_scenario(ROOT / "scenarios/single.toml", ("estimator.name=three",))
+    estimator = estimator_of(scenario)
+    pose = PoseHypothesis(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6))
+    eye = Eye(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    assert estimator.update([Measurement(0, 0, (pose,), 2, eye)], 0).status == "none"
+    assert estimator.accepted == 0
+    found = estimator.update([Measurement(0, 100_000_000, (pose,), 3, eye)], 100_000_000)
+    assert found.status == "tracking"
+    np.testing.assert_allclose(found.position_m, pose.position_m)
+
+
+def test_foreign_controller_imports_nothing_of_ours() -> None:
+    tree = ast.parse(FOREIGN.read_text())
+    names = {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
+    assert not [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    assert names - sys.stdlib_module_names == {"zenoh", "msgpack"}
+    assert "importlib" not in names
+    assert "__import__" not in FOREIGN.read_text()
+
+
+@pytest.mark.slow
+def test_foreign_controller_flies_to_success(tmp_path: Path) -> None:
+    """Criteria of its own: a PD law and an alpha-beta filter are not as good as what they replace."""
+    criteria = (
+        "success.steady_position_rms_m=0.03",
+        "success.steady_orientation_rms_deg=2.0",
+        "success.max_estimate_orientation_deg=2.0",
+    )
+    hand, out = ByHand.at_free_port("foreign"), tmp_path / "run"
+    words = (tmp_path / "foreign.txt").open("wb")
+    try:
+        hand.start("world", "world", str(ROOT / "scenarios/single.toml"), *sets(*SHORT, *criteria))
+        hand.start("chaser", "chaser", "0")
+        hand.start("recorder", "record", "--out", str(out))
+        command = [sys.executable, "-I", str(FOREIGN), hand.endpoint, hand.namespace]
+        hand.processes["foreign"] = subprocess.Popen(
+            command, cwd=tmp_path, env={**os.environ, **SINGLE_THREADED}, stdout=words, stderr=words
+        )
+        status, said = hand.said("world", timeout_s=300)
+        assert status == 0, said
+        assert hand.said("recorder")[0] == 0
+        assert hand.processes["foreign"].wait(timeout=30) == 0, (tmp_path / "foreign.txt").read_text()
+    finally:
+        hand.end()
+        words.close()
+    status, said = finished("summary", str(out))
+    assert status == 0, said

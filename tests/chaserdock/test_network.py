@@ -1,0 +1,290 @@
+"""A mission over a router, with rights, from the command line: keys, router, status, judge."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import stat
+import subprocess
+import sys
+import time
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.messages import Tick
+from chaserdock_protocol.recording.log import read_log
+from cryptography import x509
+from harness import ROOT, SHORT, all_gone, chaserdock, find_child, finished, sets, wait_for_log
+from mission_keys import make_keys
+
+from chaserdock.launch import container as member
+from chaserdock.launch.keys import KeysError, init_keys, names, why_not_usable
+from chaserdock.launch.launcher import free_port
+from chaserdock.launch.status import Status, expected
+
+NOW = datetime(2026, 1, 1, tzinfo=UTC)
+
+
+# -- keys -------------------------------------------------------------------------------------------------
+
+
+def test_a_process_gets_its_own_key_and_nobody_keeps_the_authoritys(tmp_path: Path) -> None:
+    init_keys(tmp_path, 2, ("example.org", "10.0.0.7"), 7, NOW)
+    authorities, private = set(), set()
+    for name in names(2):
+        folder = tmp_path / name
+        assert {f.name for f in folder.iterdir()} == {"ca.pem", "cert.pem", "key.pem"}
+        assert stat.S_IMODE((folder / "key.pem").stat().st_mode) == 0o600
+        authority = x509.load_pem_x509_certificate((folder / "ca.pem").read_bytes())
+        certificate = x509.load_pem_x509_certificate((folder / "cert.pem").read_bytes())
+        certificate.verify_directly_issued_by(authority)
+        assert certificate.subject.rfc4514_string() == f"CN={name}"
+        assert not certificate.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+        authorities.add((folder / "ca.pem").read_bytes())
+        private.add((folder / "key.pem").read_bytes())
+    assert len(authorities) == 1
+    assert len(private) == len(names(2))
+    assert {f.name for f in tmp_path.iterdir()} == set(names(2))
+    router = x509.load_pem_x509_certificate((tmp_path / "router" / "cert.pem").read_bytes())
+    hosts = router.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert hosts.get_values_for_type(x509.DNSName) == ["example.org"]
+    assert [str(a) for a in hosts.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
+
+
+def test_keys_are_not_overwritten_and_known_to_end(tmp_path: Path) -> None:
+    assert why_not_usable(tmp_path, 1, NOW) == "there are none"
+    init_keys(tmp_path, 1, ("localhost",), 2, NOW)
+    before = (tmp_path / "world" / "key.pem").read_bytes()
+    with pytest.raises(KeysError, match="never overwritten"):
+        init_keys(tmp_path, 1, ("localhost",), 2, NOW)
+    assert (tmp_path / "world" / "key.pem").read_bytes() == before
+    assert why_not_usable(tmp_path, 1, NOW) is None
+    assert "end at 2026-01-03" in (why_not_usable(tmp_path, 1, NOW + timedelta(days=2)) or "")
+    (tmp_path / "chaser-0" / "key.pem").unlink()
+    assert why_not_usable(tmp_path, 1, NOW) == "those of chaser-0 are missing"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["chaser", "0", "--keys", "{empty}"], "make a mission's keys"),
+        (["chaser", "0", "--keys", "{keys}", "-e", "tcp/127.0.0.1:1"], "must be tls/HOST:PORT"),
+        (["router", "--keys", "{keys}", "-l", "tcp/127.0.0.1:0"], "must be tls/ADDRESS:PORT"),
+        (["router", "--until", "nobody"], "--until nobody"),
+        (["status", "-e", "tcp/127.0.0.1:1", "--seconds", "0.5"], "nobody is there"),
+    ],
+)
+def test_wrong_use_is_one_clear_error(arguments: list[str], words: str, tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    keys = make_keys(tmp_path / "keys")
+    filled = [a.format(empty=tmp_path / "empty", keys=keys) for a in arguments]
+    status, said = finished(*filled, timeout_s=60)
+    assert status == 2, said
+    assert words in said
+    assert len(said.strip().splitlines()) == 1
+
+
+# -- a mission --------------------------------------------------------------------------------------------
+
+
+def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
+    """Every process with its own keys alone; the router is started again in flight; judged as a success."""
+    keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
+    endpoint = f"tls/127.0.0.1:{free_port()}"
+    reach = ["-e", endpoint, "--lease-ms", "10000"]
+    short = sets(*SHORT, "duration_s=60.0")  # `status` looks on meanwhile, for some seconds
+    processes: dict[str, subprocess.Popen[bytes]] = {}
+
+    def start(name: str, *arguments: str) -> None:
+        processes[name] = chaserdock(
+            *arguments,
+            "--keys",
+            str(keys / name),
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+        )
+
+    def start_router() -> None:
+        start("router", "router", "-l", endpoint, "--until", "operator")
+
+    try:
+        start("world", "world", "two-chaser-tracking", *short, "--rejoin-s", "30", *reach)
+        start("controller", "controller", *reach)
+        start("chaser-0", "chaser", "0", *reach)
+        start("chaser-1", "chaser", "1", *reach)
+        start("recorder", "record", "--out", str(runs), "--by-run", *reach)
+        start("operator", "judge", str(runs), *reach)
+        start_router()  # the last, as order must not matter
+        deadline = time.monotonic() + 60
+        while not (logs := list(runs.glob("two-chaser-tracking-*/mission.mcap"))):
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        wait_for_log(logs[0], 300_000, timeout_s=240.0)  # the solver may have to be compiled
+        status, said = finished("status", "--keys", str(keys), "-e", endpoint, "--json", timeout_s=60)
+        assert status == 0, said
+        seen = json.loads(said)
+        assert set(seen["processes"]) == {
+            "world",
+            "controller",
+            "chaser/0",
+            "chaser/1",
+            "recorder",
+            "operator",
+        }
+        assert seen["processes"]["chaser/1"]["expected"] is True
+        assert seen["tick"] > 0
+        assert set(seen["phases"]) == {"0", "1"}
+        processes["router"].kill()
+        processes["router"].wait()
+        start_router()
+        said_by = {}
+        for name, process in processes.items():
+            out, _ = process.communicate(timeout=120)
+            said_by[name] = out.decode()
+        statuses = {name: p.returncode for name, p in processes.items()}
+    finally:
+        for process in processes.values():
+            if process.poll() is None:
+                process.kill()
+            process.wait()
+    # What was on its way when the router died is lost, and the recorder says so; the flight itself is a success.
+    assert statuses.pop("recorder") in (0, 1), said_by
+    assert set(statuses.values()) == {0}, said_by
+    assert "denied" not in said_by["router"]  # nobody of a mission tries what it may not
+    summary = json.loads((logs[0].parent / "summary.json").read_text())
+    assert summary["success"]
+    assert summary["sim_time_s"] == 60.0
+    assert "</html>" in (logs[0].parent / "report.html").read_text()
+    ticks = [r.message for r in read_log(logs[0], ["world/tick"])]
+    assert ticks[-1].chasers == (0, 1)
+    assert ticks[-1].controller
+
+
+def test_one_machine_flies_with_rights_when_asked_for(tmp_path: Path) -> None:
+    """The flight is the same to the bit; the router says that it held everyone to his rights, and denied nothing."""
+    keys = make_keys(tmp_path / "keys")
+    digests = []
+    for name, asked in (("with", ["--keys", str(keys)]), ("without", [])):
+        out = tmp_path / name
+        run = ["run", "two-chaser-tracking", "-q", *sets(*SHORT, "duration_s=3.0"), "--out", str(out), *asked]
+        status, said = finished(*run, timeout_s=240.0)
+        assert status in (0, 1), said
+        summary = json.loads((out / "summary.json").read_text())
+        assert summary["sim_time_s"] == 3.0, said
+        digests.append(summary["digest"])
+    assert digests[0] == digests[1]
+    words = (tmp_path / "with" / "processes" / "router.txt").read_text()
+    assert "TLS, with access rules" in words
+    assert "denied" not in words
+    assert not (tmp_path / "without" / "processes" / "router.txt").exists()
+
+
+def test_a_run_without_the_keys_it_is_told_of_says_so(tmp_path: Path) -> None:
+    run = ["run", "two-chaser-tracking", "--keys", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
+    status, said = finished(*run)
+    assert status == 2
+    assert "there are none; make a mission's keys with `chaserdock keys init" in said
+    assert len(said.strip().splitlines()) == 1
+    four = make_keys(tmp_path / "three")  # of three chasers
+    status, said = finished("run", "four-chaser-docking", "--keys", str(four), "--out", str(tmp_path / "out"))
+    assert (status, "those of chaser-3 are missing" in said) == (2, True)
+    assert not (tmp_path / "out").exists()
+
+
+# -- a container's main process ---------------------------------------------------------------------------
+
+
+def test_sockets_of_proc_net_tcp() -> None:
+    with socket.socket() as listening, socket.socket() as calling:
+        listening.bind(("127.0.0.1", 0))
+        port = listening.getsockname()[1]
+        assert not member.linked(port)
+        listening.listen()
+        assert member.linked(port)
+        calling.connect(("127.0.0.1", port))
+        answering, _ = listening.accept()
+        assert member.router_there("127.0.0.1", port)
+        listening.close()
+        with answering:
+            assert member.linked(port)
+    assert not member.router_there("127.0.0.1", port)
+
+
+def test_health_is_an_open_link_or_a_listening_router(tmp_path: Path) -> None:
+    """docker/healthy asks without Python what the member asks."""
+
+    def health(port: int, call: str) -> int:
+        environment = {
+            **os.environ,
+            "ROUTER": f"router:{port}",
+            "HEALTHY_SEEN": str(tmp_path / call),  # the first time in a container's life: it does not wait
+        }
+        return subprocess.run([ROOT / "docker" / "healthy"], env=environment, check=False).returncode
+
+    with socket.socket() as listening, socket.socket() as calling:
+        listening.bind(("127.0.0.1", 0))
+        port = listening.getsockname()[1]
+        assert health(port, "bound") != 0
+        assert not (tmp_path / "bound").exists()
+        listening.listen()
+        assert health(port, "listening") == 0
+        assert (tmp_path / "listening").exists()
+        calling.connect(("127.0.0.1", port))
+        answering, _ = listening.accept()
+        listening.close()
+        with answering:
+            assert health(port, "connected") == 0
+    assert health(port, "closed") != 0
+
+
+def test_a_world_gets_the_overrides_and_too_many_chasers_are_told() -> None:
+    assert member.arguments_of(["world", "x"], "a=1 b='q r'") == [
+        "world",
+        "x",
+        "--set",
+        "a=1",
+        "--set",
+        "b=q r",
+    ]
+    assert member.arguments_of(["chaser", "0"], "a=1") == ["chaser", "0"]
+    assert member.chasers_of("two-chaser-tracking", "seed=3") == 2
+    assert member.too_many_chasers("four-chaser-docking", "", 4) is None
+    reason = member.too_many_chasers("four-chaser-docking", "", 3) or ""
+    assert "has 4 chasers" in reason
+    assert "COMPOSE_PROFILES=8-chasers" in reason
+    assert [member.services_of(p) for p in ("", "8-chasers", "tools,16-chasers")] == [4, 8, 16]
+
+
+def test_a_member_passes_on_signals_and_leaves_nobody_behind(tmp_path: Path) -> None:
+    """A recorder without a world, stopped as Docker stops a container."""
+    arguments = ["record", "--out", str(tmp_path / "run"), "-e", f"tcp/127.0.0.1:{free_port()}"]
+    process = subprocess.Popen([sys.executable, "-m", "chaserdock.launch.container", *arguments])
+    recorder = find_child(process, "record")
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(timeout=15) != 0
+    assert all_gone([recorder])
+
+
+# -- status -----------------------------------------------------------------------------------------------
+
+
+def test_status_tells_speed_and_who_is_in_the_tick() -> None:
+    status = Status()
+    ticks = [
+        Tick(tick=k, sim_time_ns=k * 500_000_000, pictures=True, chasers=(0, 2), controller=False)
+        for k in range(4)
+    ]
+    for tick in ticks:
+        status.take(tick, 10.0 + tick.tick)
+    assert status.speed == pytest.approx(0.5)
+    assert [expected(n, ticks[-1]) for n in ("chaser/0", "chaser/1", "controller", "world")] == [
+        True,
+        False,
+        False,
+        None,
+    ]
+    assert Status().speed is None
+    assert Status().as_dict()["tick"] is None

@@ -1,0 +1,364 @@
+"""What the viewer tells of a mission, without a browser: the present, the past, plots, shapes, logs, who may connect."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chaserdock_protocol import topics
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    BodyTruth,
+    CommandReply,
+    Event,
+    MissionEnd,
+    Odometry,
+    Reference,
+    Tick,
+)
+from chaserdock_protocol.recording.log import LogError
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.transport import Link, Node
+from harness import ROOT, finished
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mission_keys import client, make_keys, router_with_rights
+
+from chaserdock.viewer import plots, shapes
+from chaserdock.viewer import text as words
+from chaserdock.viewer.address import ViewError, may_connect, url_of
+from chaserdock.viewer.history import History, Series
+from chaserdock.viewer.logged import LoggedMission
+from chaserdock.viewer.page import TimeLine
+from chaserdock.viewer.player import advance
+from chaserdock.viewer.server import page_server
+from chaserdock.viewer.snapshot import Now
+
+GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+quick = settings(derandomize=True, deadline=None, max_examples=60)
+
+
+@pytest.fixture(scope="module")
+def mission() -> LoggedMission:
+    return LoggedMission(GOLDEN)
+
+
+# -- the present --------------------------------------------------------------------------------------------
+
+
+def test_the_error_is_that_of_one_tick(mission: LoggedMission) -> None:
+    """Odometry runs ahead of the reference that answers it; the two of one tick are compared."""
+    now = Now.of(1)
+    for tick, x in enumerate((0.0, 1.0, 2.0)):
+        at = Odometry(
+            tick=tick,
+            chaser=0,
+            position_m=(x, 0, 0),
+            velocity_m_s=(0, 0, 0),
+            q_wxyz=UPRIGHT,
+            omega_rad_s=(0, 0, 0),
+        )
+        now.take(topics.ODOMETRY, at)
+    assert now.chasers[0].error() is None
+    there = Reference(
+        tick=1, chaser=0, phase="hold", phase_time_s=0.0, position_m=(1.0, 0.25, 0.0), q_wxyz=UPRIGHT,
+        offset_m=(0, 0, 0), min_distance_target_m=0.5,
+    )  # fmt: skip
+    now.take(topics.REFERENCE, there)
+    assert now.chasers[0].error() == pytest.approx((0.25, 0.0))
+    assert now.keep_out_m(0.1) == 0.5
+    assert Now.of(1).keep_out_m(0.1) == 0.1
+
+
+def test_a_chaser_that_the_mission_does_not_have_is_not_noted() -> None:
+    now, history = Now.of(1), History(1)
+    stray = Odometry(
+        chaser=7, position_m=(0, 0, 0), velocity_m_s=(0, 0, 0), q_wxyz=UPRIGHT, omega_rad_s=(0, 0, 0)
+    )
+    now.take(topics.ODOMETRY, stray)
+    history.take(topics.ODOMETRY, stray, 0)
+    assert now.chasers[0].odometry is None
+
+
+def test_faults_are_told(mission: LoggedMission) -> None:
+    now, history = mission.at(1.0), mission.history
+    assert words.faults(now, history, set()) == "none"
+    assert "**chaser/1** is gone" in words.faults(now, history, {"chaser/1"})
+    now.take(topics.TICK, Tick(tick=20, pictures=True, chasers=(0,), controller=False))
+    brake = ActuatorCommand(
+        chaser=0, effective_time_ns=0, source="brake", force_N=(0, 0, 0), torque_N_m=(0, 0, 0)
+    )
+    now.take(topics.ACTUATORS, brake)
+    told = words.faults(now, history, set())
+    for text in (
+        "chaser 1 takes no part",
+        "the controller takes no part",
+        "chaser 0 flies by itself (brake)",
+    ):
+        assert text in told
+
+
+# -- the past -----------------------------------------------------------------------------------------------
+
+
+@quick
+@given(st.lists(st.floats(0, 1e4), max_size=300), st.integers(4, 50))
+def test_a_series_stays_in_order_and_bounded(times: list[float], most: int) -> None:
+    series = Series(most)
+    for t in times:
+        series.add(t, t)
+    kept, values = series.until(1e9)
+    assert len(kept) <= most
+    assert np.all(np.diff(kept) > 0)
+    assert np.array_equal(kept, values)
+    if times:
+        assert set(kept) <= set(times)
+
+
+@quick
+@given(st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(-1e3, 1e3)), min_size=1, max_size=2000))
+def test_plots_lose_no_peak_and_have_no_gaps(samples: list[tuple[float, float]]) -> None:
+    history = History(2)
+    kept = {}
+    for t, v in sorted(samples):
+        history.series["latency_ms", 0].add(t, v)
+        kept.setdefault(t, v)
+    history.series["latency_ms", 1].add(30.0, 5.0)
+    plot = next(p for p in plots.plots_of(2, False) if p.curves[0][2] == "latency_ms")
+    x, first, second = plots.points_of(plot, history, 0.0, 60.0)
+    assert len(x) == len(first) == len(second) <= plots.POINTS
+    assert np.isfinite(first).all()
+    assert np.isfinite(second).all()
+    assert np.max(first) == max(kept.values())
+    assert set(second) == {5.0}
+
+
+def test_a_plot_of_nothing_is_still_one_that_can_be_drawn() -> None:
+    for plot in plots.plots_of(3, True):
+        points = plots.points_of(plot, History(3), 0.0, 10.0)
+        assert [len(p) for p in points] == [2] * (len(plot.curves) + 1)
+
+
+def test_what_happened_is_told_newest_first_and_once() -> None:
+    history = History(1)
+    history.take(topics.EVENT, Event(sim_time_ns=10**9, process="world", level="warning", what="late"), 0)
+    reply = CommandReply(
+        sim_time_ns=2 * 10**9, command="approach", chaser=0, accepted=False, reason="why not"
+    )
+    for _ in range(3):
+        history.take(topics.COMMAND, reply, 0)
+    history.take(topics.END, MissionEnd(sim_time_ns=3 * 10**9, reason="all flown", complete=True), 0)
+    texts = [line.text for line in history.lines_until(2.5, 10)]
+    assert texts == ["approach chaser 0: refused, why not", "world: late"]
+    assert history.lines_until(9.0, 1)[0].text == "the mission has ended: all flown"
+
+
+def test_latency_is_from_the_picture_to_the_command_of_its_tick(mission: LoggedMission) -> None:
+    history = History(1)
+    history.exposed(0, 5, 1_000_000_000)
+    command = ActuatorCommand(
+        tick=5,
+        sim_time_ns=1,
+        chaser=0,
+        effective_time_ns=0,
+        source="command",
+        force_N=(0, 0, 0),
+        torque_N_m=(0, 0, 0),
+    )
+    history.take(topics.ACTUATORS, command, 1_025_000_000)
+    assert history.series["latency_ms", 0].until(1.0)[1].tolist() == [25.0]
+    assert len(mission.history.series["latency_ms", 1]) >= 17
+
+
+# -- a log --------------------------------------------------------------------------------------------------
+
+
+def test_a_log_is_opened_at_any_moment(mission: LoggedMission) -> None:
+    assert mission.truth
+    assert mission.end_s == pytest.approx(17 / 15, abs=1e-6)
+    for tick in (7, 17):
+        now = mission.at(tick / 15)
+        assert now.tick is not None
+        assert now.tick.tick == tick
+        for i, chaser in enumerate(now.chasers):
+            of_it = (chaser.odometry, chaser.reference, chaser.image, chaser.sighting, chaser.actuators)
+            assert [(m.chaser, m.tick) for m in of_it if m is not None] == [(i, tick)] * 5
+            assert chaser.image is not None
+            assert chaser.sighting_in(chaser.image) is chaser.sighting
+            assert chaser.error() is not None
+        assert set(now.truth) == {"target", "chaser/0", "chaser/1"}
+        assert now.ended is None or tick == 17
+    assert all(len(mission.history.series["position_error_mm", i]) >= 17 for i in (0, 1))
+    assert len(mission.history.series["estimate_error_mm", None]) >= 17
+    assert "approach chaser 0: accepted, phase approach" in words.happened(
+        mission.history.lines_until(9.0, 99)
+    )
+    table = words.chasers(mission.at(1.0), mission.history)
+    assert table.count("1 marker") == 2
+    assert "| approach |" in table
+    assert "| hold |" in table
+
+
+def test_a_log_cut_off_is_shown_up_to_there(tmp_path: Path) -> None:
+    whole = GOLDEN.read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: int(0.8 * len(whole))])
+    mission = LoggedMission(cut)
+    assert 0.0 < mission.end_s <= 17 / 15 + 1e-6
+    assert mission.at(mission.end_s).tick is not None
+
+
+def test_what_is_no_log_is_one_clear_line(tmp_path: Path) -> None:
+    (tmp_path / "x.mcap").write_bytes(b"no log at all")
+    with pytest.raises(LogError, match="no MCAP log"):
+        LoggedMission(tmp_path / "x.mcap")
+    status, said = finished("view", str(tmp_path))
+    assert status == 2
+    assert said.strip().splitlines() == [
+        f"chaserdock: {tmp_path}: holds no log (mission.mcap, or mission-0000.mcap and so on)"
+    ]
+
+
+def test_a_time_line_plays_to_its_end_and_obeys_a_person() -> None:
+    line = TimeLine(10.0, speed=2.0)
+    advance(line, 1.0)
+    assert line.at_s == 2.0
+    line.at_s, line.moved = 9.5, True
+    advance(line, 1.0)
+    assert (line.at_s, line.moved) == (9.5, False)
+    advance(line, 1.0)
+    assert line.at_s == 10.0
+    advance(line, 1.0)
+    assert not line.playing
+
+
+# -- shapes -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["four-chaser-docking", "docking-contact"])
+def test_bodies_are_closed_and_seen_from_outside(name: str) -> None:
+    from chaserdock.analysis.scene import scene_of
+
+    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
+    faces = scene_of(scenario).target
+    mesh = shapes.mesh_of(faces)
+    assert mesh.triangles.max() == len(mesh.vertices_m) - 1
+    a, b, c = (mesh.vertices_m[mesh.triangles[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    assert np.all(np.linalg.norm(normals, axis=1) > 0.0)
+    quads = [face.normal for face in faces for _ in range(1 + len(face.decals))]
+    assert np.all(np.einsum("ij,ij->i", normals, np.repeat(quads, 2, axis=0)) > 0.0)
+
+
+def test_a_corridor_is_where_the_chaser_may_be() -> None:
+    held = load_scenario(ROOT / "scenarios" / "four-chaser-docking.toml")
+    line = shapes.corridor_of(held, 0)
+    assert line is not None
+    axis = np.array(held.chasers[0].position_m)
+    along = line @ (axis / np.linalg.norm(axis))
+    assert (along.min(), along.max()) == pytest.approx((held.approach.dock_distance_m, 1.0), abs=1e-6)
+    captured = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    tube = shapes.corridor_of(captured, 0)
+    assert tube is not None
+    port = captured.docking.ports[0]
+    off = tube - np.array(port.position_m, dtype=np.float32)
+    gaps = off @ np.array(port.axis, dtype=np.float32) - captured.chaser.probe_reach_m
+    assert (gaps.min(), gaps.max()) == pytest.approx((0.0, captured.docking.entry_m), abs=1e-5)
+
+
+# -- the server and the network -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("origin", "asked", "host", "allowed"),
+    [
+        ("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
+        ("http://localhost:8080", "localhost:8080", "127.0.0.1", True),
+        (None, "127.0.0.1:8080", "127.0.0.1", True),
+        ("https://evil.example", "127.0.0.1:8080", "127.0.0.1", False),
+        ("http://127.0.0.1:9999", "127.0.0.1:8080", "127.0.0.1", False),
+        ("http://evil.example:8080", "evil.example:8080", "127.0.0.1", False),
+        ("null", "127.0.0.1:8080", "127.0.0.1", False),
+        ("http://lab-7:8080", "lab-7:8080", "0.0.0.0", True),
+        ("https://evil.example", "lab-7:8080", "0.0.0.0", False),
+    ],
+)
+def test_only_our_own_page_may_connect(origin: str | None, asked: str, host: str, allowed: bool) -> None:
+    assert may_connect(origin, asked, host) is allowed
+
+
+def test_a_port_that_is_taken_is_said_or_gone_round() -> None:
+    with page_server("127.0.0.1", None) as first:
+        with pytest.raises(
+            ViewError, match=f"port {first.get_port()} of 127.0.0.1: .*; choose another with --port"
+        ):
+            page_server("127.0.0.1", first.get_port()).__enter__()
+        with page_server("127.0.0.1", None) as second:
+            assert second.get_port() != first.get_port()
+            assert url_of("127.0.0.1", second.get_port()) == f"http://127.0.0.1:{second.get_port()}"
+    with pytest.raises(ViewError, match=r"--host 203\.0\.113\.7"):
+        page_server("203.0.113.7", None).__enter__()
+
+
+def test_rights_show_the_truth_to_a_viewer_and_not_with_an_operators_keys(tmp_path: Path) -> None:
+    keys = make_keys(tmp_path / "keys")
+    with router_with_rights(keys) as endpoint:
+        world = Node("world", "world", client(keys, "world", endpoint))
+        nodes = {who: Node("viewer", "viewer", client(keys, who, endpoint)) for who in ("viewer", "operator")}
+        try:
+            takers = {
+                (who, topic.key): node.follow(topic, 4, "target" if topic is topics.TRUTH_BODY else None)
+                for who, node in nodes.items()
+                for topic in (topics.TICK, topics.TRUTH_BODY, topics.EVENT)
+            }
+            truth = BodyTruth(
+                body="target",
+                position_m=(0, 0, 0),
+                velocity_m_s=(0, 0, 0),
+                q_wxyz=UPRIGHT,
+                omega_rad_s=(0, 0, 0),
+            )
+            wanted = {key for key in takers if key != ("operator", topics.TRUTH_BODY.key)}
+            got: set[tuple[str, str]] = set()
+            deadline = time.monotonic() + 60.0
+            while got != wanted and time.monotonic() < deadline:
+                world.publish(topics.TICK, Tick(pictures=False, chasers=(), controller=False))
+                world.publish(topics.TRUTH_BODY, truth, "target")
+                world.publish(topics.EVENT, Event(process="world", level="info", what="x"), "world")
+                time.sleep(0.1)
+                got |= {key for key, take in takers.items() if take()}
+            assert got == wanted
+        finally:
+            for node in (world, *nodes.values()):
+                node.close()
+
+
+def test_who_follows_gets_the_newest_and_never_holds_up_the_publisher() -> None:
+    """Of 5,000 messages that nobody took, the last four are there; the publisher has long sent them all."""
+    link = Link("follow", (), ("tcp/127.0.0.1:17999",))
+    world, looker = Node("world", "world", link), None
+    try:
+        looker = Node("viewer", "viewer", Link("follow", ("tcp/127.0.0.1:17999",), ()))
+        take = looker.follow(topics.TICK, 4)
+        world.advertise(topics.TICK)
+        deadline, got = time.monotonic() + 30.0, []
+        while not got and time.monotonic() < deadline:  # until they know each other
+            world.publish(topics.TICK, Tick(tick=0, pictures=False, chasers=(), controller=False))
+            time.sleep(0.05)
+            got = take()
+        assert got
+        for tick in range(1, 5001):
+            world.publish(topics.TICK, Tick(tick=tick, pictures=False, chasers=(), controller=False))
+        last: list[int] = []
+        while last[-1:] != [5000] and time.monotonic() < deadline:
+            time.sleep(0.2)
+            last = [received.message.tick for received in take()] or last
+        assert last == [4997, 4998, 4999, 5000]
+        assert looker.counts.lost.total() == 0
+    finally:
+        world.close()
+        if looker is not None:
+            looker.close()

@@ -1,0 +1,171 @@
+"""A chaser that is lost to the others: an obstacle where it should be, and wider the longer nothing is heard."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_controller.ingest.lost_chasers import (
+    ABSENT_S,
+    FIRST_M,
+    FORGOTTEN_S,
+    GROWTH_M_S,
+    MOST_M,
+    Absent,
+    coasting,
+    margin_m,
+    with_absent,
+)
+from chaserdock_controller.nmpc import NmpcInput
+from chaserdock_controller.output.latency_compensation import integrate
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import Odometry, OperatorCommand
+from chaserdock_protocol.scenario import Scenario, load_scenario
+
+ROOT = Path(__file__).resolve().parents[2]
+Q = (1.0, 0.0, 0.0, 0.0)
+STILL = (
+    "target.position_m=[0,0,0]",
+    "target.q_wxyz=[1,0,0,0]",
+    "target.velocity_m_s=[0,0,0]",
+    "target.omega_rad_s=[0,0,0]",
+    "approach.max_speed_m_s=0.1",
+)
+
+
+def odometry(i: int, time_s: float, position_m: Any, velocity_m_s: Any = (0.0, 0.0, 0.0)) -> Odometry:
+    return Odometry(
+        tick=round(time_s * 15),
+        sim_time_ns=round(time_s * 1e9),
+        chaser=i,
+        position_m=tuple(position_m),
+        velocity_m_s=tuple(velocity_m_s),
+        q_wxyz=Q,
+        omega_rad_s=(0.0, 0.0, 0.0),
+    )
+
+
+def test_what_is_added_grows_and_is_bounded() -> None:
+    margins = [margin_m(s) for s in np.linspace(0.0, FORGOTTEN_S, 50)]
+    assert margins == sorted(margins)
+    assert margins[0] == FIRST_M
+    assert margin_m(10.0) == pytest.approx(FIRST_M + 10.0 * GROWTH_M_S)
+    assert margins[-1] == MOST_M
+
+
+def test_it_goes_on_as_it_moved_last() -> None:
+    last = odometry(1, 1.0, (1.0, 2.0, 3.0), (0.1, 0.0, -0.1))
+    places = coasting(last, 3_000_000_000, np.array([0.0, 1.0]))
+    np.testing.assert_allclose(places, [[1.2, 2.0, 2.8], [1.3, 2.0, 2.7]])
+
+
+def test_who_is_away_is_told_once_and_so_is_the_end_of_it() -> None:
+    absent = Absent()
+    assert absent.take({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
+    told = []
+    for k in range(1, 200):
+        now_s = 0.4 * k
+        now = {0: odometry(0, now_s, Q[1:])}
+        told += [(round(now_s, 1), *event) for event in absent.take(now, round(now_s * 1e9))]
+    assert [(level, text.split(":")[0]) for _, level, text in told] == [("warning", "chaser 1")] * 2
+    assert "absent" in told[0][2]
+    assert "no obstacle any more" in told[1][2]
+    assert told[0][0] == pytest.approx(0.4)
+    assert told[1][0] > FORGOTTEN_S
+    absent.take({}, round(81e9))
+    (back,) = absent.take({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
+    assert back == ("info", "chaser 0: is heard again")
+
+
+def test_a_moment_unheard_of_is_no_absence() -> None:
+    absent = Absent()
+    absent.take({0: odometry(0, 1.0, Q[1:])}, 10**9)
+    assert absent.take({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
+    assert absent.away(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
+
+
+def test_nobody_away_leaves_the_problem_as_it_is() -> None:
+    problem: Any = object()
+    assert with_absent(problem, {}, 0, 0.1) is problem
+
+
+@pytest.mark.parametrize("between", [0.35, np.array([[0.0, 0.4], [0.4, 0.0]])])
+def test_an_absent_chaser_is_a_row_that_keeps_nothing_itself(between: Any) -> None:
+    stages, n = 5, 2
+    problem = NmpcInput(
+        states=np.zeros((n, 13)),
+        references=np.zeros((n, stages + 1, 7)),
+        u_ref=np.zeros((n, stages, 6)),
+        target_positions=np.zeros((stages + 1, 3)),
+        min_distance_target_m=np.full(n, 0.5),
+        min_distance_chasers_m=between,
+        input_max=np.ones((n, 6)),
+        corridors=np.ones((n, stages + 1, 5)),
+    )
+    last = odometry(7, 1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    with_it = with_absent(problem, {7: last}, 2_000_000_000, 0.1)
+    assert with_it.states.shape == (3, 13)
+    np.testing.assert_allclose(with_it.states[2, :6], [1.1, 0.0, 0.0, 0.1, 0.0, 0.0])
+    np.testing.assert_allclose(with_it.references[2, -1, :3], [1.15, 0.0, 0.0])
+    rows = np.asarray(with_it.min_distance_chasers_m)
+    np.testing.assert_allclose(rows[2, :2], np.max(between) + margin_m(1.5))
+    np.testing.assert_array_equal(rows, rows.T)
+    np.testing.assert_allclose(rows[0, 1], 0.35 if np.ndim(between) == 0 else 0.4)
+    assert with_it.min_distance_target_m[2] == 0.0
+    assert with_it.input_max[2].max() <= 1e-3
+    assert with_it.corridors is not None
+    assert not with_it.corridors[2].any()
+
+
+def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
+    """How near chaser 0, sent past it, comes to chaser 1, of which nothing is heard after a second; what is told."""
+    flight = Flight(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
+    if blind:
+        flight.absent.away = lambda now_ns: {}  # type: ignore[method-assign]
+    timing, rate_hz = scenario.timing, scenario.time.rate_hz
+    # In the way; the wrenches act at once, as the latency plays no part here.
+    lost = np.array([0.0, -0.8, -0.1])
+    x: Array = np.array([-1.0, 0.0, 0.0, *np.zeros(3), *Q, *np.zeros(3)])
+    near_m, told = np.inf, []
+    for tick in range(25 * rate_hz):
+        now_ns = timing.tick_time_ns(tick)
+        mine = Odometry(
+            tick=tick,
+            sim_time_ns=now_ns,
+            chaser=0,
+            position_m=vector(x[:3]),
+            velocity_m_s=vector(x[3:6]),
+            q_wxyz=vector(x[6:10]),
+            omega_rad_s=vector(x[10:]),
+        )
+        here = {0: mine}
+        if tick < rate_hz:
+            here[1] = odometry(1, now_ns / 1e9, lost)
+        commands: tuple[OperatorCommand, ...] = ()
+        if tick == 2 * rate_hz:
+            commands = (OperatorCommand(command="goto", chaser=0, offset_m=(1.0, -1.6, 0.0)),)
+        out = flight.step(Inputs(tick, now_ns, here, (), commands))
+        assert set(out.wrenches) == set(here)
+        assert out.solver is not None
+        assert len(out.solver.status) == len(out.solver.chasers) == len(here)
+        assert [r.accepted for r in out.replies] == [True] * len(commands)
+        told += [e.what for e in out.events]
+        wrench = np.array([*out.wrenches[0].force_N, *out.wrenches[0].torque_N_m])
+        x = integrate(x, wrench, scenario.chaser, 1.0 / rate_hz)
+        near_m = min(near_m, float(np.linalg.norm(x[:3] - lost)))
+    return near_m, told
+
+
+def test_the_others_fly_around_where_it_should_be() -> None:
+    scenario = load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]"))
+    least_m = scenario.limits.min_distance_chasers_m
+    around_m, told = nearest_m(scenario, blind=False)
+    through_m, _ = nearest_m(scenario, blind=True)
+    assert around_m > least_m
+    assert through_m < 0.8 * least_m
+    assert any("chaser 1: absent" in text for text in told)

@@ -1,0 +1,280 @@
+"""Docking by capture: phases, guards, time-outs, corridors and commands, without a world."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_controller.guidance.phases import Guidance
+from chaserdock_protocol.messages import OperatorCommand
+from docking_cases import scenario, senses
+from flight_cases import at
+
+DT_S = 0.1
+
+
+class Pilot:
+    """Guidance with chasers that are always where their references are, unless told otherwise."""
+
+    def __init__(self, chasers: int = 1, **changes: Any) -> None:
+        self.scenario = scenario(chasers, **changes)
+        self.guidance = Guidance(self.scenario)
+        self.now_s = 0.0
+        self.told: dict[int, dict[str, Any]] = {}
+        self.guidance.found(0.0)
+        self.fly(DT_S)
+
+    def phase(self, i: int = 0) -> str:
+        return self.guidance.chasers[i].phase
+
+    def ask(self, what: str, i: int = 0, **more: Any) -> tuple[bool, str]:
+        command = OperatorCommand(command=what, chaser=i, **more)  # type: ignore[arg-type]
+        answer = self.guidance.command(command, self.now_s)
+        return answer.accepted, answer.reason
+
+    def fly(self, seconds: float) -> None:
+        for _ in range(round(seconds / DT_S)):
+            self.now_s += DT_S
+            for i in range(len(self.scenario.chasers)):
+                position = at(self.guidance.chasers[i].move, self.now_s)[0]
+                self.guidance.observe(i, self.now_s, 0.0, 0.0)
+                self.guidance.sense(i, self.now_s, senses(position, **self.told.get(i, {})))
+
+    def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
+        begun_s = self.now_s
+        while self.phase(i) != phase:
+            assert self.now_s - begun_s < limit_s, f"still in phase {self.phase(i)}"
+            if phase == "contact" and self.phase(i) == "final":
+                self.told[i] = {"contact": True}
+            if phase in ("latched", "verified") and self.phase(i) == "final":
+                self.told[i] = {"latched": True}
+            self.fly(DT_S)
+
+
+def test_all_phases_in_order_and_the_latch_armed_only_where_it_should_be() -> None:
+    pilot = Pilot()
+    seen = [(pilot.phase(), pilot.guidance.latch(0))]
+    assert pilot.ask("approach") == (True, "phase align")
+    for phase in ("align", "approach", "final", "contact"):
+        pilot.fly_to(phase)
+        seen.append((pilot.phase(), pilot.guidance.latch(0)))
+    pilot.told[0] = {"latched": True}
+    for phase in ("latched", "verified"):
+        pilot.fly_to(phase)
+        seen.append((pilot.phase(), pilot.guidance.latch(0)))
+    assert seen == [
+        ("hold", "release"),
+        ("align", "release"),
+        ("approach", "release"),
+        ("final", "arm"),
+        ("contact", "arm"),
+        ("latched", "arm"),
+        ("verified", "arm"),
+    ]
+    told = [what for _, what, _ in pilot.guidance.drain_events()]
+    assert told == ["hold", "align", "approach", "final", "contact", "latched", "verified"]
+
+
+def test_the_approach_tapers_and_stays_on_the_axis() -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to("approach")
+    docking, fastest = pilot.scenario.docking, 0.0
+    while pilot.phase() in ("approach", "final"):
+        position, velocity, _ = at(pilot.guidance.chasers[0].move, pilot.now_s)
+        gap = -0.2 - 0.35 - position[0]
+        speed = float(velocity[0])
+        fastest = max(fastest, speed)
+        assert abs(position[1]) < 1e-9
+        assert abs(position[2] + 0.05) < 1e-9
+        if -docking.overdrive_m / 3 < gap < docking.final_m - 0.001:
+            assert speed == pytest.approx(docking.contact_speed_m_s, abs=1e-6)
+        pilot.fly(DT_S)
+        if gap < 0.0:
+            break
+    assert fastest == pytest.approx(docking.approach_speed_m_s, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("phase", "told", "why"),
+    [
+        ("approach", {"lateral_m": 0.04}, "left the corridor: lateral 40.00 mm"),
+        ("approach", {"closing_m_s": 0.05}, "left the corridor: closing speed"),
+        ("final", {"angle_rad": 0.05}, "left the corridor: angle"),
+        ("final", {"lateral_speed_m_s": 0.01}, "left the corridor: lateral speed"),
+        ("contact", {"lateral_m": 0.04, "contact": True}, "left the corridor"),
+    ],
+)
+def test_a_broken_limit_leads_back_out_and_to_another_attempt(
+    phase: str, told: dict[str, float], why: str
+) -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to(phase)
+    pilot.guidance.drain_events()
+    pilot.told[0] = told
+    pilot.fly(2 * DT_S)
+    assert pilot.phase() == "retreat"
+    (event,) = pilot.guidance.drain_events()
+    assert why in event[2]
+    assert pilot.guidance.latch(0) == "release"
+    pilot.told[0] = {}
+    pilot.fly_to("verified")
+    assert pilot.guidance.chasers[0].attempt == 2
+
+
+def test_after_the_last_attempt_it_holds_at_its_nominal_place() -> None:
+    pilot = Pilot(docking={"attempts": 2})
+    pilot.ask("approach")
+    for _ in range(2):
+        pilot.told[0] = {}
+        pilot.fly_to("final")
+        pilot.told[0] = {"lateral_m": 0.02}
+        pilot.fly_to("retreat")
+    pilot.fly_to("hold")
+    np.testing.assert_allclose(
+        at(pilot.guidance.chasers[0].move, pilot.now_s)[0], (-1.0, 0.0, -0.05), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("phase", "told", "within_s"),
+    [
+        ("align", {"lateral_m": 0.2}, 61.0),
+        ("final", {}, 31.0),
+        ("contact", {"contact": True}, 6.0),
+    ],
+)
+def test_nothing_lasts_for_ever(phase: str, told: dict[str, Any], within_s: float) -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to(phase)
+    pilot.told[0] = told
+    pilot.fly_to("retreat", limit_s=within_s)
+
+
+def test_a_latch_that_slips_under_the_pull_is_not_verified() -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to("latched")
+    docking = pilot.scenario.docking
+    pilot.fly(docking.settle_s + 2 * DT_S)
+    assert pilot.guidance.pull_N(0, pilot.now_s) == docking.pull_N
+    slipped = at(pilot.guidance.chasers[0].move, pilot.now_s)[0] - (0.006, 0.0, 0.0)
+    pilot.guidance.sense(0, pilot.now_s, senses(slipped, latched=True))
+    assert pilot.phase() == "retreat"
+    assert "moved 6.00 mm" in pilot.guidance.drain_events()[-1][2]
+
+
+def test_the_pull_gives_back_the_impulse_that_it_takes() -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to("latched")
+    since_s, given = pilot.guidance.chasers[0].since_s, []
+    while pilot.phase() == "latched":
+        given.append(pilot.guidance.pull_N(0, pilot.now_s))
+        pilot.fly(DT_S)
+    assert max(given) == -min(given) == pilot.scenario.docking.pull_N
+    assert abs(sum(given)) * DT_S <= pilot.scenario.docking.pull_N * DT_S
+    assert pilot.now_s - since_s < 5.0
+
+
+@pytest.mark.parametrize("phase", ["align", "approach", "final", "contact", "latched", "verified"])
+@pytest.mark.parametrize("what", ["abort", "retreat"])
+def test_from_every_phase_there_is_a_way_out_along_the_axis_and_in_again(phase: str, what: str) -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to(phase)
+    pilot.fly(0.0 if phase == "contact" else DT_S)
+    assert pilot.ask(what) == (True, f"phase {what}")
+    assert pilot.ask(what) == (True, f"already in phase {what}")
+    pilot.told[0] = {}
+    assert pilot.guidance.latch(0) == "release"
+    gap = -1.0
+    while pilot.phase() == what:
+        position = at(pilot.guidance.chasers[0].move, pilot.now_s)[0]
+        assert abs(position[1]) < 1e-9
+        assert -0.55 - position[0] >= gap - 1e-9 or phase == "align"
+        gap = -0.55 - position[0]
+        pilot.fly(DT_S)
+    assert pilot.phase() == "hold"
+    assert pilot.ask("approach")[0]
+    pilot.fly_to("verified")
+
+
+def test_commands_that_do_not_fit_are_refused_with_the_reason() -> None:
+    pilot = Pilot()
+    assert pilot.ask("approach", 5) == (False, "there is no chaser 5; this mission has 0 to 0")
+    pilot.fly(5.0)
+    accepted, reason = pilot.ask("approach", expires_ns=1_000_000_000)
+    assert not accepted
+    assert reason.startswith("stale: it was to be done by 1.00 s")
+    assert pilot.ask("approach", expires_ns=10_000_000_000)[0]
+    assert pilot.ask("approach") == (True, "already in phase align")
+    pilot.fly_to("latched")
+    assert pilot.ask("hold") == (False, "in phase latched it can only retreat or abort")
+    assert not pilot.ask("goto", offset_m=(0.0, 2.0, 0.0))[0]
+
+
+def test_of_two_operators_in_one_tick_the_first_counts_but_an_abort_always_does() -> None:
+    pilot = Pilot()
+    assert pilot.ask("approach", operator="ann")[0]
+    assert pilot.ask("retreat", operator="bob") == (False, "approach by ann came first in this tick")
+    assert pilot.ask("approach", operator="bob")[0]
+    assert pilot.ask("abort", operator="bob")[0]
+    assert pilot.ask("approach", operator="ann") == (False, "abort by bob came first in this tick")
+    pilot.fly(DT_S)
+    assert pilot.ask("hold", operator="ann")[0]
+
+
+def test_from_far_beside_the_axis_it_must_come_round_first() -> None:
+    pilot = Pilot()
+    assert pilot.ask("goto", offset_m=(0.0, 2.0, 0.0))[0]
+    pilot.fly_to("hold", limit_s=200.0)
+    accepted, reason = pilot.ask("approach")
+    assert not accepted
+    assert "beside its port's axis" in reason
+
+
+def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
+    pilot = Pilot(chasers=4)
+    pilot.ask("approach", 0)
+    pilot.ask("approach", 1)
+    assert pilot.ask("approach", 2) == (True, "phase wait")  # its port is on the face of chaser 0's
+    assert pilot.ask("approach", 3) == (True, "phase wait")  # a third
+    pilot.fly(1.0)
+    assert [pilot.phase(i) for i in range(4)] == ["align", "align", "wait", "wait"]
+    pilot.fly_to("verified", 0)
+    pilot.fly(DT_S)
+    assert pilot.phase(2) == "wait"
+    assert pilot.phase(3) == "align"
+    pilot.told[0] = {}
+    pilot.ask("retreat", 0)
+    pilot.fly_to("align", 2, limit_s=120.0)
+
+
+def test_keep_out_is_the_corridors_for_who_is_in_it_alone() -> None:
+    pilot = Pilot(chasers=2)
+    limit = pilot.scenario.limits.min_distance_target_m
+    assert pilot.guidance.min_distance_target_m(0) == limit
+    pilot.ask("approach")
+    pilot.fly_to("final")
+    assert 0.4 < pilot.guidance.min_distance_target_m(0) < 0.53
+    assert pilot.guidance.min_distance_target_m(1) == limit
+    pilot.fly_to("verified")
+    assert pilot.guidance.min_distance_target_m(0) == 0.0
+    assert pilot.guidance.min_distance_target_m(1) == limit
+
+
+def test_when_the_target_is_lost_an_approach_is_broken_off_and_a_latch_is_not() -> None:
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to("final")
+    pilot.guidance.lost(pilot.now_s)
+    assert pilot.phase() == "retreat"
+    other = Pilot()
+    other.ask("approach")
+    other.fly_to("verified")
+    other.guidance.lost(other.now_s)
+    assert other.phase() == "verified"

@@ -1,0 +1,369 @@
+"""What chasers are told to do: phases, operator's commands, and what happens without a target."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.guidance import loss_of_sight as vision
+from chaserdock_controller.guidance.phases import Guidance
+from chaserdock_models import rotations
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.messages import OperatorCommand
+from flight_cases import at, odometry, points, quick, scenario
+from hypothesis import given
+from hypothesis import strategies as st
+
+
+def operator(
+    command: Any, chaser: int = 0, offset: tuple[float, float, float] | None = None
+) -> OperatorCommand:
+    return OperatorCommand(command=command, chaser=chaser, offset_m=offset)
+
+
+def holding(**changes: Any) -> Guidance:
+    guidance = Guidance(scenario(**changes))
+    guidance.found(1.0)
+    guidance.drain_events()
+    return guidance
+
+
+def reference(guidance: Guidance, i: int, t: float) -> Array:
+    return at(guidance.chasers[i].move, t)[0]
+
+
+def phases(guidance: Guidance) -> list[str]:
+    return [c.phase for c in guidance.chasers]
+
+
+def test_nothing_is_accepted_before_the_target_is_found() -> None:
+    guidance = Guidance(scenario())
+    assert phases(guidance) == ["acquire", "acquire"]
+    for what in ("approach", "hold", "retreat", "abort"):
+        answer = guidance.command(operator(what), 1.0)
+        assert not answer.accepted
+        assert "not been found" in answer.reason
+    assert not guidance.command(operator("goto", 0, (2.0, 0.0, 0.0)), 1.0).accepted
+    assert phases(guidance) == ["acquire", "acquire"]
+    assert guidance.drain_events() == []
+    guidance.found(2.0)
+    assert phases(guidance) == ["hold", "hold"]
+    assert guidance.drain_events() == [(0, "hold", "from acquire"), (1, "hold", "from acquire")]
+    guidance.found(3.0)
+    assert guidance.drain_events() == []
+    assert guidance.chasers[0].since_s == 2.0
+
+
+def test_who_holds_stays_at_its_nominal_offset() -> None:
+    guidance = holding()
+    for i, nominal in enumerate(([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0])):
+        np.testing.assert_array_equal(reference(guidance, i, 50.0), nominal)
+        np.testing.assert_array_equal(at(guidance.chasers[i].move, 50.0)[1], np.zeros(3))
+
+
+@pytest.mark.parametrize("chaser", [2, 200])
+def test_commands_for_nobody_are_refused(chaser: int) -> None:
+    answer = holding().command(operator("approach", chaser), 1.0)
+    assert not answer.accepted
+    assert answer.reason == f"there is no chaser {chaser}; this mission has 0 to 1"
+
+
+def test_an_approach_goes_straight_in_to_the_docking_distance_and_docks() -> None:
+    guidance = holding()
+    answer = guidance.command(operator("approach", 1), 10.0)
+    assert (answer.accepted, answer.reason) == (True, "phase approach")
+    assert phases(guidance) == ["hold", "approach"]
+    np.testing.assert_allclose(guidance.dock_offset(1), [0.0, -0.4, 0.0])
+    end = 10.0 + guidance.chasers[1].move.duration_s
+    assert end == pytest.approx(10.0 + 1.875 * 0.8 / 0.03)
+    for t in np.linspace(10.0, end, 50):
+        p = reference(guidance, 1, t)
+        assert p[0] == p[2] == 0.0
+        assert -1.2 - 1e-9 <= p[1] <= -0.4 + 1e-9
+    # Under way good tracking is no docking.
+    guidance.observe(1, end - 1.0, 0.0, 0.0)
+    assert guidance.chasers[1].inside_since_s is None
+    angle = math.radians(1.0)
+    guidance.observe(1, end + 0.1, 0.009, angle * 0.99)
+    guidance.observe(1, end + 4.0, 0.011, 0.0)  # outside: from the beginning again
+    guidance.observe(1, end + 5.0, 0.009, 0.0)
+    guidance.observe(1, end + 9.9, 0.009, angle * 0.99)
+    assert phases(guidance)[1] == "approach"
+    guidance.observe(1, end + 10.0, 0.009, 0.0)
+    assert phases(guidance) == ["hold", "docked"]
+    assert guidance.drain_events() == [(1, "approach", "from hold"), (1, "docked", "from approach")]
+    # Docked is not for ever.
+    guidance.observe(1, end + 11.0, 0.0, angle * 1.01)
+    assert phases(guidance)[1] == "approach"
+    guidance.observe(1, end + 12.0, 0.0, 0.0)
+    guidance.observe(1, end + 17.0, 0.0, 0.0)
+    assert phases(guidance)[1] == "docked"
+
+
+def test_commands_are_idempotent() -> None:
+    guidance = holding()
+    assert guidance.command(operator("hold"), 5.0).reason == "already in phase hold"
+    guidance.command(operator("approach"), 10.0)
+    before = guidance.chasers[0]
+    again = guidance.command(operator("approach"), 20.0)
+    assert (again.accepted, again.reason) == (True, "already in phase approach")
+    assert guidance.chasers[0] is before  # neither the move nor the clock begins anew
+    end = 10.0 + before.move.duration_s
+    guidance.observe(0, end, 0.0, 0.0)
+    guidance.observe(0, end + 5.0, 0.0, 0.0)
+    assert phases(guidance)[0] == "docked"
+    docked = guidance.chasers[0]
+    again = guidance.command(operator("approach"), end + 6.0)
+    assert (again.accepted, again.reason) == (True, "already in phase docked")
+    assert guidance.chasers[0] is docked
+    for what in ("retreat", "abort"):
+        guidance.command(operator(what), end + 7.0)
+        under_way = guidance.chasers[0]
+        assert guidance.command(operator(what), end + 8.0).accepted
+        assert guidance.chasers[0] is under_way
+
+
+@pytest.mark.parametrize(("what", "speed"), [("retreat", 0.03), ("abort", 0.06)])
+def test_retreat_and_abort_go_back_to_the_nominal_offset_and_hold(what: str, speed: float) -> None:
+    guidance = holding()
+    guidance.command(operator("approach"), 10.0)
+    half_way = reference(guidance, 0, 30.0)
+    assert guidance.command(operator(what), 30.0).reason == f"phase {what}"
+    move = guidance.chasers[0].move
+    np.testing.assert_allclose(reference(guidance, 0, 30.0), half_way, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(move.goal_m, [-1.0, 0.0, 0.0], rtol=0, atol=1e-9)
+    speeds = np.linalg.norm(move.at(np.linspace(30.0, 30.0 + move.duration_s, 200))[1], axis=1)
+    assert speeds.max() <= speed * 1.01
+    guidance.observe(0, 30.0 + move.duration_s - 0.1, 0.0, 0.0)
+    assert phases(guidance)[0] == what
+    guidance.observe(0, 30.0 + move.duration_s, 5.0, 3.0)  # the reference is there, wherever the chaser is
+    assert phases(guidance)[0] == "hold"
+    np.testing.assert_allclose(reference(guidance, 0, 1000.0), [-1.0, 0.0, 0.0], rtol=0, atol=1e-9)
+
+
+def test_hold_stops_an_approach_where_it_is() -> None:
+    guidance = holding()
+    guidance.command(operator("approach"), 10.0)
+    here, velocity, _ = at(guidance.chasers[0].move, 28.0)
+    assert velocity[0] == pytest.approx(0.03, rel=0.05)
+    guidance.command(operator("hold"), 28.0)
+    move = guidance.chasers[0].move
+    np.testing.assert_allclose(at(move, 28.0)[1], velocity, rtol=0, atol=1e-12)
+    assert 0.0 < move.goal_m[0] - here[0] < 0.06
+    # And the approach can be taken up again from there.
+    assert guidance.command(operator("approach"), 60.0).accepted
+    np.testing.assert_allclose(guidance.chasers[0].move.goal_m, [-0.4, 0.0, 0.0], rtol=0, atol=1e-9)
+
+
+def test_goto_goes_where_it_may() -> None:
+    guidance = holding()
+    answer = guidance.command(operator("goto", 0, (0.0, 0.0, 1.5)), 10.0)
+    assert (answer.accepted, answer.reason) == (True, "phase goto")
+    first = guidance.chasers[0].move
+    np.testing.assert_allclose(first.goal_m, [0.0, 0.0, 1.5], rtol=0, atol=1e-9)
+    # Another goto changes the goal under way.
+    assert guidance.command(operator("goto", 0, (0.0, 0.0, 2.0)), 20.0).accepted
+    second = guidance.chasers[0].move
+    np.testing.assert_allclose(second.goal_m, [0.0, 0.0, 2.0], rtol=0, atol=1e-9)
+    np.testing.assert_allclose(at(second, 20.0)[1], at(first, 20.0)[1], rtol=0, atol=1e-12)
+    guidance.observe(0, 20.0 + second.duration_s, 1.0, 1.0)
+    assert phases(guidance)[0] == "hold"
+
+
+@pytest.mark.parametrize(
+    ("offset", "reason"),
+    [
+        (None, "goto needs an offset"),
+        ((0.0, 0.0, 0.0), "0 m from the target; allowed are more than 0.35 m"),
+        ((0.35, 0.0, 0.0), "0.35 m from the target"),
+        ((0.0, 0.0, 25.01), "25 m from the target"),
+        ((0.1, -1.2, 0.0), "0.1 m from where chaser 1 is to be"),
+    ],
+)
+def test_goto_is_refused_with_the_reason(offset: Any, reason: str) -> None:
+    guidance = holding()
+    before = guidance.chasers[0]
+    answer = guidance.command(operator("goto", 0, offset), 10.0)
+    assert not answer.accepted
+    assert reason in answer.reason
+    assert guidance.chasers[0] is before
+    assert guidance.drain_events() == []
+
+
+def test_goto_keeps_away_from_where_others_are_going_not_where_they_were() -> None:
+    guidance = holding()
+    guidance.command(operator("goto", 1, (0.0, 2.0, 0.0)), 10.0)
+    assert not guidance.command(operator("goto", 0, (0.0, 2.1, 0.0)), 11.0).accepted
+    assert guidance.command(operator("goto", 0, (0.0, -1.2, 0.0)), 12.0).accepted
+    assert guidance.command(operator("goto", 0, (0.0, -1.1, 0.0)), 13.0).accepted  # nor from itself
+
+
+def test_an_approach_starts_on_its_line_only() -> None:
+    guidance = holding()
+    guidance.command(operator("goto", 0, (-1.0, 0.5, 0.0)), 10.0)
+    end = 10.0 + guidance.chasers[0].move.duration_s
+    guidance.observe(0, end, 0.0, 0.0)
+    answer = guidance.command(operator("approach"), end)
+    assert not answer.accepted
+    assert answer.reason == "its reference is 0.50 m beside its approach line; retreat or goto first"
+    assert phases(guidance)[0] == "hold"
+    guidance.command(operator("retreat"), end)
+    assert guidance.command(operator("approach"), end + guidance.chasers[0].move.duration_s).accepted
+
+
+def test_an_approach_does_not_go_through_the_target() -> None:
+    guidance = holding()
+    guidance.command(operator("goto", 0, (1.0, 0.0, 0.0)), 10.0)
+    end = 10.0 + guidance.chasers[0].move.duration_s
+    assert not guidance.command(operator("approach"), end).accepted
+
+
+def test_losing_the_target_stops_whoever_moves() -> None:
+    guidance = holding()
+    guidance.command(operator("approach", 0), 10.0)
+    guidance.lost(30.0)
+    assert phases(guidance) == ["hold", "hold"]
+    assert np.linalg.norm(guidance.chasers[0].move.goal_m - reference(guidance, 0, 30.0)) < 0.06
+    stopped = guidance.chasers[0]
+    guidance.lost(31.0)
+    assert guidance.chasers[0] is stopped
+
+
+def test_timeline_commands_come_due_once_and_in_order() -> None:
+    timeline = [
+        {"at_s": 20.0, "command": "hold", "chasers": [1]},
+        {"at_s": 5.0, "command": "goto", "chasers": [0], "offset_m": [0.0, 0.0, 2.0]},
+        {"at_s": 5.0, "command": "approach", "chasers": [1, 0]},
+    ]
+    guidance = Guidance(scenario(timeline=timeline))
+    assert guidance.due_commands(4.99) == []
+    assert guidance.due_commands(5.0 - 1e-10) == [
+        operator("goto", 0, (0.0, 0.0, 2.0)),
+        operator("approach", 1),
+        operator("approach", 0),
+    ]
+    assert guidance.due_commands(10.0) == []
+    assert guidance.due_commands(1e9) == [operator("hold", 1)]
+    assert guidance.due_commands(2e9) == []
+
+
+COMMANDS = st.one_of(
+    st.tuples(st.sampled_from(["approach", "hold", "retreat", "abort"]), st.just(None)),
+    st.tuples(st.just("goto"), points),
+)
+
+
+@given(st.lists(st.tuples(COMMANDS, st.floats(0.1, 40.0)), max_size=8))
+@quick
+def test_whatever_is_asked_the_reference_is_smooth_and_slow(
+    asked: list[tuple[tuple[Any, Any], float]],
+) -> None:
+    guidance, now = holding(), 1.0
+    for (what, offset), wait_s in asked:
+        before = at(guidance.chasers[0].move, now)
+        answer = guidance.command(operator(what, 0, offset), now)
+        after = at(guidance.chasers[0].move, now)
+        np.testing.assert_allclose(after[0], before[0], rtol=0, atol=1e-8)
+        np.testing.assert_allclose(after[1], before[1], rtol=0, atol=1e-8)
+        assert answer.reason
+        goal = guidance.chasers[0].move.goal_m
+        assert 0.3 < np.linalg.norm(goal) < 10.0
+        for t in np.linspace(now, now + wait_s, 5):
+            assert np.linalg.norm(at(guidance.chasers[0].move, t)[1]) <= 0.06 * 1.3
+            guidance.observe(0, float(t), 0.0, 0.0)
+        now += wait_s
+    assert guidance.chasers[1].phase == "hold"
+
+
+# -- the controller without a target ----------------------------------------------------------------------
+
+
+def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
+    timeline = [{"at_s": 0.0, "command": "approach", "chasers": [0]}]
+    mission = scenario(timeline=timeline)
+    flight = Flight(mission, lambda: 0.0)
+    timing = mission.timing
+    for tick in range(4):
+        here = {i: odometry(i, tick, timing.tick_time_ns(tick)) for i in (0, 1)}
+        out = flight.step(Inputs(tick, timing.tick_time_ns(tick), here, ()))
+        assert out.target.status == "none"
+        assert out.target.accepted == ()
+        assert sorted(out.wrenches) == [0, 1]
+        assert out.plans == {}
+        for i, wrench in out.wrenches.items():
+            assert wrench.mode == "brake"
+            assert wrench.chaser == i
+            assert wrench.effective_time_ns == timing.effective_ns(tick)
+            assert wrench.expires_ns == wrench.sim_time_ns + 500_000_000
+            speed = rotations.rotate(here[i].q_wxyz, wrench.force_N) @ np.array(here[i].velocity_m_s)
+            assert speed < 0.0
+        assert out.solver is not None
+        assert out.solver.chasers == ()
+        told = [(r.accepted, r.reason) for r in out.replies]
+        assert told == ([(False, "the target has not been found yet")] if tick == 0 else [])
+    assert flight.step(Inputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())).wrenches.keys() == {1}
+
+
+# -- when nobody sees the target ----------------------------------------------------------------------------
+
+
+def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple[float, str, str]]:
+    """Phases of chaser 0, told to approach at 0 s, with their reasons; ``command`` at 10 s."""
+    guidance, out = Guidance(scenario()), []
+    guidance.found(0.0)
+    for k in range(300):
+        now_s = 0.1 * k
+        guidance.watch(now_s, seen(now_s))
+        if k == 1:
+            assert guidance.command(operator("approach"), now_s).accepted
+        if k == 100 and command:
+            guidance.command(operator(command), now_s)
+        out += [(round(now_s, 1), what, why) for i, what, why in guidance.drain_events() if i == 0]
+    return out
+
+
+def test_an_approach_holds_while_nobody_sees_and_then_goes_on() -> None:
+    told = blind_phases(lambda s: not 5.0 < s < 15.0)
+    assert [(what, why.partition(": ")[2]) for _, what, why in told] == [
+        ("hold", ""),
+        ("approach", ""),
+        ("hold", "nobody has seen the target for 3 s"),
+        ("approach", "the target is seen again"),
+    ]
+    assert told[2][0] == pytest.approx(8.0, abs=0.11)
+    assert told[3][0] == pytest.approx(15.0, abs=0.11)
+
+
+def test_a_moment_without_sight_changes_nothing() -> None:
+    assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 7.9)] == ["hold", "approach"]
+
+
+def test_who_was_told_otherwise_does_not_approach_again_by_itself() -> None:
+    assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 15.0, "hold")] == [
+        "hold",
+        "approach",
+        "hold",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("phase", "port", "unseen_s", "instead"),
+    [
+        ("approach", False, 2.9, None),
+        ("approach", False, 3.0, "hold"),
+        ("approach", True, 3.0, "back off"),
+        ("align", True, 3.0, "back off"),
+        ("final", True, 9.0, "back off"),
+        ("contact", True, 9.0, None),
+        ("latched", True, 9.0, None),
+        ("docked", False, 9.0, None),
+        ("retreat", True, 9.0, None),
+        ("goto", False, 9.0, None),
+    ],
+)
+def test_what_is_done_without_sight(phase: str, port: bool, unseen_s: float, instead: str | None) -> None:
+    assert vision.on_loss(phase, port, unseen_s) == instead

@@ -1,0 +1,138 @@
+"""Bad input to the controller: one clear error before the flight, or a named refusal and a safe command in flight."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_controller.parameters import nmpc_parameters
+from chaserdock_protocol import codec
+from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.messages import Odometry, OperatorCommand, encoding_of
+from chaserdock_protocol.scenario import Scenario, ScenarioError, parse_scenario
+from flight_cases import odometry, scenario
+
+AT_START = [
+    ({"controller": {"weight_position": -65.0}}, "controller.weight_position: "),
+    ({"controller": {"weight_orientation": -35.0}}, "controller.weight_orientation: "),
+    ({"controller": {"weight_force": -3.5}}, "controller.weight_force: "),
+    ({"controller": {"weight_torque": 0.0}}, "controller.weight_torque: "),
+    ({"controller": {"weight_final_position": -1.0}}, "controller.weight_final_position: "),
+    ({"controller": {"weight_final_orientation": -1.0}}, "controller.weight_final_orientation: "),
+    ({"controller": {"horizon_s": 0.04}}, "shorter than one step dt_s"),
+    ({"controller": {"falloff": 1.1}}, "controller.falloff: "),
+    ({"chaser": {"mass_kg": 0.0}}, "chaser.mass_kg: "),
+    ({"chaser": {"inertia_kg_m2": [0.1, 0.1, 0.0]}}, "chaser.inertia_kg_m2"),
+    ({"limits": {"min_distance_target_m": 1.1}}, "chasers.0.position_m: 1 m from the target, nearer than"),
+    (
+        {"limits": {"min_distance_chasers_m": 1.6}},
+        "chasers.0 and chasers.1 are to be 1.56 m apart, nearer than",
+    ),
+    (
+        {"limits": {"max_reference_distance_m": 0.9}},
+        "chasers.0.position_m: 1 m from the target, farther than",
+    ),
+]
+
+
+@pytest.mark.parametrize(("changes", "told"), AT_START)
+def test_what_cannot_be_flown_is_one_clear_error_at_the_start(changes: dict[str, Any], told: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        scenario(**changes)
+    (line,) = str(error.value).splitlines()
+    assert line.startswith("test: ")
+    assert told in line
+
+
+def test_a_quaternion_that_is_none_is_an_error_at_the_start() -> None:
+    chasers = [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [0.9, 0.0, 0.0, 0.0]}]
+    with pytest.raises(ScenarioError, match=r"test: chasers.0.q_wxyz: .*unit"):
+        parse_scenario({"name": "x", "duration_s": 1.0, "chasers": chasers}, "test")
+
+
+def test_a_chaser_may_start_where_it_may_not_stay() -> None:
+    """Inside the keep-out, or too near another: the flight begins with the way out."""
+    near = {
+        "start_offset_m": [0.75, 0.0, 0.0],
+        "position_m": [-1.0, 0.0, 0.0],
+        "q_wxyz": [1.0, 0.0, 0.0, 0.0],
+    }
+    assert nmpc_parameters(scenario(chasers=[near])).stages == 30
+
+
+def flying(mission: Scenario) -> Flight:
+    return Flight(mission, lambda: 0.0, PerfectEstimator(mission.target))
+
+
+def step(flight: Flight, tick: int, *commands: OperatorCommand, **changes: Any) -> Outputs:
+    """Chaser 0 as told, chaser 1 at its place."""
+    now_ns = flight.scenario.timing.tick_time_ns(tick)
+    here = {
+        0: odometry(
+            0, tick, now_ns, **({"position_m": (-1.0, 0.0, 0.0), "velocity_m_s": (0.0,) * 3} | changes)
+        ),
+        1: odometry(1, tick, now_ns, position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3),
+    }
+    return flight.step(Inputs(tick, now_ns, here, (), commands))
+
+
+BAD = [
+    ({"position_m": (float("nan"), 0.0, 0.0)}, "position_m holds a value that is not finite"),
+    ({"velocity_m_s": (0.0, float("inf"), 0.0)}, "velocity_m_s holds a value that is not finite"),
+    ({"omega_rad_s": (0.0, 0.0, float("nan"))}, "omega_rad_s holds a value that is not finite"),
+    ({"q_wxyz": (0.0, 0.0, 0.0, 0.0)}, "q_wxyz has length 0, not 1"),
+    ({"q_wxyz": (0.8, 0.0, 0.0, 0.0)}, "q_wxyz has length 0.8, not 1"),
+]
+
+
+@pytest.mark.parametrize(("changes", "told"), BAD)
+def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
+    changes: dict[str, Any], told: str
+) -> None:
+    """It cannot come over the network (below); should it come about all the same, that chaser coasts, and only it."""
+    flight = flying(scenario())
+    assert step(flight, 0).wrenches[0].mode == "nmpc"
+    for tick in (1, 2):
+        out = step(flight, tick, **changes)
+        errors = [e.what for e in out.events if e.level == "error"]
+        assert errors == ([f"chaser 0: odometry refused, coasting: {told}"] if tick == 1 else [])
+        assert out.wrenches[0].mode == "coast"
+        assert not any([*out.wrenches[0].force_N, *out.wrenches[0].torque_N_m])
+        assert out.wrenches[1].mode == "nmpc"
+        assert out.solver is not None
+        assert out.solver.chasers == (1,)
+        assert out.target.status == "tracking"
+    again = step(flight, 3)
+    assert again.wrenches[0].mode == again.wrenches[1].mode == "nmpc"
+    assert "chaser 0: planned again" in [e.what for e in again.events]
+
+
+def test_when_every_state_is_bad_everybody_coasts() -> None:
+    flight = flying(scenario())
+    bad = {i: odometry(i, 0, 0, q_wxyz=(0.0,) * 4) for i in (0, 1)}
+    out = flight.step(Inputs(0, 0, bad, ()))
+    assert [out.wrenches[i].mode for i in (0, 1)] == ["coast", "coast"]
+
+
+@pytest.mark.parametrize("changes", [c for c, _ in BAD])
+def test_a_bad_state_does_not_come_over_the_network(changes: dict[str, Any]) -> None:
+    payload = codec.encode(odometry(0, **changes))
+    with pytest.raises(Rejected):
+        codec.decode(Odometry, payload, encoding_of(Odometry))
+
+
+def test_a_reference_out_of_reach_is_refused_by_name_and_the_flight_goes_on() -> None:
+    flight = flying(scenario())
+    step(flight, 0)
+    for offset, told in (
+        ((30.0, 0.0, 0.0), "30 m from the target"),
+        ((0.1, 0.0, 0.0), "0.1 m from the target"),
+    ):
+        out = step(flight, 1, OperatorCommand(command="goto", chaser=0, offset_m=offset))
+        (reply,) = out.replies
+        assert not reply.accepted
+        assert told in reply.reason
+        assert out.wrenches[0].mode == "nmpc"
+        assert out.references[0].phase == "hold"

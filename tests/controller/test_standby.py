@@ -1,0 +1,315 @@
+"""A controller in another's shadow: what it waits for, what it takes over, and that it then knows the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+import numpy as np
+import pytest
+from chaserdock_controller.core import Flight
+from chaserdock_controller.process import Controller
+from chaserdock_controller.redundancy import serialization as plain
+from chaserdock_controller.redundancy.checkpoint import CLASSES, Memory, NoMemory
+from chaserdock_controller.redundancy.standby import Shadow
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import without_wall_time
+from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
+from chaserdock_protocol.recording.log import read_log, read_scenario
+from chaserdock_protocol.replay_node import SilentTeller, Tape
+from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.transport import Node, Received
+
+LOG = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
+INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return scenario_from_json(read_scenario(LOG)[0], "golden log")
+
+
+@pytest.fixture(scope="module")
+def ticks() -> dict[int, list[Received]]:
+    """The golden flight's inputs, by tick, as a standby would get them."""
+    out: dict[int, list[Received]] = {}
+    for r in read_log(LOG):
+        if r.topic in INPUTS:
+            message = r.message
+            if isinstance(message, Tick):
+                standing_by = {"standby": "s"}
+                message = msgspec.structs.replace(
+                    message, term=1, commander="controller", instance="c", standing_by=standing_by
+                )
+            out.setdefault(message.tick, []).append(Received(r.topic, r.place, message, 0))
+    last = max(tick for tick, came in out.items() if any(r.topic is topics.TICK for r in came))
+    return {tick: came for tick, came in sorted(out.items()) if tick <= last}
+
+
+def member(scenario: Scenario, name: str, instance: str) -> Controller:
+    made = Controller(cast(Node, Tape(name)), scenario, Flight(scenario, lambda: 0.0))
+    made.teller = cast(Any, SilentTeller())
+    made.shadow.instance = instance
+    return made
+
+
+def hear(process: Controller, *messages: Received) -> list[tuple[Any, Any]]:
+    """Hands a controller messages; what it says to them, without what is measured by the wall clock."""
+    tape = cast(Tape, process.node)
+    for message in messages:
+        tape.put(message)
+    before = None
+    while tape._heard or before != (process.done_tick, len(process.shadow._held)):
+        before = process.done_tick, len(process.shadow._held)
+        process.listen()
+    return [(t, m) for t, _, m in tape.said()]
+
+
+def words(said: list[tuple[Any, Any]]) -> list[Received]:
+    return [Received(t, None, m, 0) for t, m in said if t is topics.STATE]
+
+
+def flown(said: list[tuple[Any, Any]]) -> list[Any]:
+    """What is commanded and estimated, but for who says it."""
+    out = []
+    for topic, message in said:
+        if topic in (topics.WRENCH, topics.TARGET, topics.PLAN, topics.REFERENCE):
+            fields = without_wall_time(message)
+            out.append({k: v for k, v in fields.items() if k not in ("term", "commander")})
+    return out
+
+
+def named(came: list[Received], commander: str, instance: str, term: int, revision: int = 1) -> Received:
+    """A tick again, with another commander."""
+    tick = next(r for r in came if r.topic is topics.TICK)
+    fields = {"commander": commander, "instance": instance, "term": term, "revision": revision}
+    return Received(topics.TICK, None, msgspec.structs.replace(tick.message, **fields, standing_by={}), 0)
+
+
+def test_a_standby_says_nothing_and_then_the_same(scenario: Scenario, ticks: Any) -> None:
+    """Handed over before a tick was worked out by anybody, and after the standby had worked it out already."""
+    for heard_the_word in (False, True):
+        first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
+        said: list[tuple[Any, Any]] = []
+        for tick in list(ticks)[:12]:
+            said = hear(first, *ticks[tick])
+            assert flown(said)
+            shadowed = hear(second, *ticks[tick], *(words(said) if tick < 11 or heard_the_word else []))
+            assert not flown(shadowed)
+        said_second = hear(second, named(ticks[11], "standby", "s", 2))
+        assert flown(said_second) == flown(said)
+        commands = [m for t, m in said_second if t is topics.WRENCH]
+        assert {(m.term, m.commander, m.instance) for m in commands} == {(2, "standby", "s")}
+        assert not flown(hear(first, named(ticks[11], "standby", "s", 2)))  # the other has understood
+        for tick in list(ticks)[12:15]:
+            again = [named(ticks[tick], "standby", "s", 2, 0), *ticks[tick][1:]]
+            again += [r for r in ticks[tick][:1] if r.topic is not topics.TICK]
+            again = [r for r in again if r.topic is not topics.TICK or r.message.term == 2]
+            assert not flown(hear(first, *again))
+            assert flown(hear(second, *again))
+
+
+def test_in_lockstep_a_standby_waits_for_the_word_and_takes_ticks_in_their_order(
+    scenario: Scenario, ticks: Any
+) -> None:
+    first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
+    said = {tick: hear(first, *ticks[tick]) for tick in range(6)}
+    for tick in range(6):  # everything before a single word of the commander's
+        hear(second, *ticks[tick])
+    assert second.done_tick == -1
+    for tick in range(6):
+        hear(second, *[w for w in words(said[tick]) if not w.message.state])
+        assert second.done_tick == tick
+    before, after = (
+        flown(hear(c, *ticks[6], named(ticks[6], c.name, i, 2))) for c, i in ((first, "c"), (second, "s"))
+    )
+    assert before == after
+
+
+def test_who_comes_late_takes_the_state_over_and_goes_on_alike(scenario: Scenario, ticks: Any) -> None:
+    first, late = member(scenario, "controller", "c"), member(scenario, "standby", "s")
+    state = None
+    for tick in list(ticks)[:14]:
+        if tick == 10:
+            first._given_state_to = {}  # it has heard of the other one just now
+        said = hear(first, *ticks[tick])
+        if tick >= 9:
+            hear(late, *ticks[tick], *words(said))
+        full = [w for w in words(said) if w.message.state]
+        state = full[-1] if full else state
+    assert state is not None
+    assert late.done_tick == 13
+    tick = list(ticks)[14]
+    before = flown(hear(first, *ticks[tick]))
+    hear(late, *ticks[tick])
+    assert flown(hear(late, named(ticks[tick], "standby", "s", 2))) == before
+    for tick in list(ticks)[15:18]:
+        changed = [
+            named(ticks[tick], "standby", "s", 2, 0) if r.topic is topics.TICK else r for r in ticks[tick]
+        ]
+        assert flown(hear(late, *changed)) == flown(hear(first, *ticks[tick]))
+
+
+def test_who_is_named_before_any_state_came_begins_anew_and_says_so(scenario: Scenario, ticks: Any) -> None:
+    late = member(scenario, "standby", "s")
+    assert not flown(hear(late, *ticks[9]))
+    said = hear(late, named(ticks[9], "standby", "s", 2))
+    assert any(t is topics.EVENT and m.what.startswith("begins anew") for t, m in said)
+    assert [m.tick for t, m in said if t is topics.WRENCH] == [9, 9]
+
+
+def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Scenario, ticks: Any) -> None:
+    first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
+    answers: list[Any] = []
+    for tick in list(ticks)[:14]:
+        if tick == 10:
+            first.operate(
+                OperatorCommand(command="goto", chaser=0, offset_m=(-1.2, 0.0, 0.0)), answers.append
+            )
+        said = hear(first, *ticks[tick])
+        hear(second, *ticks[tick], *words(said))
+    assert [a.accepted for a in answers] == [True]
+    assert second.flight.guidance.chasers[0].phase == first.flight.guidance.chasers[0].phase == "goto"
+
+
+# -- the state ----------------------------------------------------------------------------------------------
+
+
+def memory(scenario: Scenario) -> tuple[Controller, Memory]:
+    one = member(scenario, "controller", "c")
+    return one, one._memory
+
+
+def test_a_state_is_bounded_and_the_same_again_after_it_was_taken_over(
+    scenario: Scenario, ticks: Any
+) -> None:
+    one, told = memory(scenario)
+    other, taken = memory(scenario)
+    for tick in list(ticks)[:20]:
+        hear(one, *ticks[tick])
+    state = told.told()
+    assert 1000 < len(state) < 200_000
+    taken.recall(state)
+    assert taken.told() == state
+    one.flight.guidance.chasers[0] = other.flight.guidance.chasers[1]
+    assert told.told() != state
+
+
+@pytest.mark.parametrize("spoil", ["bytes", "class", "missing", "chasers", "nan", "key"])
+def test_what_is_no_state_is_refused_whole(scenario: Scenario, ticks: Any, spoil: str) -> None:
+    one, told = memory(scenario)
+    for tick in list(ticks)[:5]:
+        hear(one, *ticks[tick])
+    state = told.told()
+    values = msgspec.msgpack.decode(state)
+    parts = dict(values[1])
+    if spoil == "bytes":
+        bad = state[: len(state) // 2]
+    else:
+        match spoil:
+            case "class":
+                values[1][0][1] = ["object", "Popen", {"args": "true"}]
+            case "missing":
+                values[1] = [p for p in values[1] if p[0] != "history"]
+            case "chasers":
+                guidance = dict(parts["guidance"][1])
+                guidance["chasers"][1].pop()
+            case "nan":
+                values[1][0][1] = ["array", "f", [1], np.array([np.nan]).tobytes()]
+            case "key":
+                values[1].append([["list", []], 1])
+        bad = msgspec.msgpack.encode(values)
+    with pytest.raises(NoMemory):
+        told.recall(bad)
+    assert told.told() == state
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        None,
+        3,
+        -0.5,
+        "text",
+        (1, (2.0, [3])),
+        {"a": {1: 2}, (1, 2): (3,)},
+        {1, 2},
+        frozenset({(1, 2)}),
+        np.arange(6.0).reshape(2, 3),
+        np.array([True, False]),
+        np.zeros((0, 3)),
+        OperatorCommand(command="hold", chaser=1),
+    ],
+    ids=str,
+)
+def test_plain_values_come_back_as_they_were(value: Any) -> None:
+    again = plain.understood(
+        msgspec.msgpack.decode(msgspec.msgpack.encode(plain.told(value, CLASSES))), CLASSES
+    )
+    assert type(again) is type(value)
+    np.testing.assert_equal(again, value)
+
+
+@pytest.mark.parametrize(
+    "value", [object(), Path("x"), b"bytes", {1: object()}, np.array(["text"])], ids=repr
+)
+def test_what_is_not_plain_is_not_told(value: Any) -> None:
+    with pytest.raises(plain.NotPlain):
+        plain.told(value, CLASSES)
+
+
+# -- whom it listens to -------------------------------------------------------------------------------------
+
+
+def tick(number: int, commander: str, instance: str, term: int, revision: int = 0) -> Tick:
+    return Tick(
+        tick=number,
+        revision=revision,
+        pictures=False,
+        chasers=(),
+        controller=bool(commander),
+        commander=commander,
+        instance=instance,
+        term=term,
+    )
+
+
+def test_the_command_is_of_the_very_start_that_is_named() -> None:
+    shadow = Shadow("standby", instance="s2")
+    shadow.note(tick(0, "standby", "s1", 1))
+    assert not shadow.commands
+    shadow.note(tick(0, "standby", "s2", 2, 1))
+    assert shadow.commands
+    assert shadow.commands_at(0)
+    shadow.note(tick(0, "controller", "c", 1))  # late: it is of before
+    assert shadow.commands
+    shadow.note(tick(1, "controller", "c", 3))
+    assert not shadow.commands_at(0)
+
+
+def test_missed_ticks_make_a_follower_ask_for_the_state() -> None:
+    for realtime, missed in ((False, 1), (True, 11)):
+        shadow = Shadow("standby", realtime=realtime, instance="s")
+        for number in range(3):
+            shadow.note(tick(number, "controller", "c", 1))
+        assert not shadow.wants_state(2, 2)
+        shadow.note(tick(3 + missed, "controller", "c", 1))
+        assert shadow.wants_state(3 + missed, 2)
+        shadow.caught_up(3 + missed)
+        assert not shadow.wants_state(4 + missed, 3 + missed)
+
+
+def test_words_are_of_one_tick_in_lockstep_and_of_all_in_real_time() -> None:
+    hold = OperatorCommand(command="hold", chaser=0)
+    for realtime, expected in ((False, ()), (True, (hold,))):
+        shadow = Shadow("standby", realtime=realtime)
+        shadow.words = {3: (hold,), 4: ()}
+        assert shadow.operated(4) == expected
+        assert not shadow.operated(5)
+
+
+def test_a_word_is_a_message_like_any_other() -> None:
+    assert topics.may_read("controller", topics.STATE)
+    assert not topics.may_read("chaser", topics.STATE)
+    assert topics.STATE.kind is ControllerState

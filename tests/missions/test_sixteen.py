@@ -1,0 +1,32 @@
+"""The scenario ``sixteen-chasers``: laid out as it says, and held without a distance below the limit."""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_controller.evaluation.closed_loop import fly_offline
+from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_protocol.scenario import load_scenario
+from harness import ROOT
+
+PATH = ROOT / "scenarios" / "sixteen-chasers.toml"
+
+
+def test_two_rings_of_eight_as_the_file_says() -> None:
+    places = np.array([c.position_m for c in load_scenario(PATH).chasers])
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.2435, atol=1e-4)
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=-1) + 9.0 * np.eye(16)
+    np.testing.assert_allclose(gaps.min(axis=1), 0.8419, atol=1e-4)
+    assert (places[:, 2] > 0.0).sum() == 8
+
+
+def test_the_first_seconds_on_perfect_knowledge() -> None:
+    """From their scattered starts all come nearer to their places, and nobody to anybody."""
+    mission = load_scenario(PATH, ("duration_s=8.0", "settling_s=1.0"))
+    trace, truth = fly_offline(mission), PerfectEstimator(mission.target)
+    there = np.array([truth.estimate_at(round(t * 1e9)).position_m for t in trace.time_s])
+    places = trace.states[:, :, :3]
+    gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9.0 * np.eye(16)
+    assert gaps.min() > 0.6
+    assert np.linalg.norm(places - there[:, None], axis=-1).min() > 1.0
+    assert trace.failed_solves == 0
+    assert (trace.position_error_m[-1] < 0.6 * trace.position_error_m[0]).all()

@@ -1,0 +1,275 @@
+"""What the fault layer does to messages: pure, by simulated time, drawn from the seed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+from chaserdock_models import rotations
+from chaserdock_models.clock import Timing
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.fault_injection import FaultLayer, Lost, sender_of
+from chaserdock_protocol.messages import Image, Odometry, Sighting, WrenchCommand
+from chaserdock_protocol.scenario.faults import Fault
+from chaserdock_protocol.topics import Topic
+from message_samples import BY_TYPE
+
+TIMING = Timing(physics_hz=100, rate_hz=10, picture_hz=10, latency_steps=2)
+
+
+def fault(**values: Any) -> Fault:
+    return Fault.model_validate({"at_s": 1.0, **values})
+
+
+def layer(name: str, *faults: Fault, lockstep: bool = True, seed: int = 0, **options: Any) -> FaultLayer:
+    return FaultLayer(faults, name, TIMING, seed, lockstep, **options)
+
+
+def message(kind: type[msgspec.Struct], tick: int, chaser: int = 0) -> Any:
+    """The sample of a kind as one of a tick."""
+    return msgspec.structs.replace(
+        BY_TYPE[kind], tick=tick, sim_time_ns=TIMING.tick_time_ns(tick), chaser=chaser, seq=tick
+    )
+
+
+def heard(
+    on: FaultLayer, topic: Topic, kind: type[msgspec.Struct], ticks: range, chaser: int = 0
+) -> list[Any]:
+    """What comes of a message a tick; a Lost as the negative tick."""
+    out = []
+    for tick in ticks:
+        sent = message(kind, tick, chaser)
+        for came in on.incoming(topic, str(chaser), sent, codec.encode(sent)):
+            out.append(-came.tick if isinstance(came, Lost) else came.tick)
+    return out
+
+
+def test_drop_lasts_as_long_as_it_should() -> None:
+    on = layer("chaser/0", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3))
+    assert heard(on, topics.WRENCH, WrenchCommand, range(7, 16)) == [7, 8, 9, -10, -11, -12, 13, 14, 15]
+    assert on.count == {"drop": 3}
+
+
+def test_in_real_time_nothing_stands_in_for_what_is_lost() -> None:
+    drop = fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3)
+    on = layer("chaser/0", drop, lockstep=False)
+    assert heard(on, topics.WRENCH, WrenchCommand, range(8, 15)) == [8, 9, 13, 14]
+
+
+def test_other_topics_and_processes_are_left_alone() -> None:
+    drop = fault(kind="drop", process="controller", topic="sighting", peer="chaser/1", duration_s=1.0)
+    ticks = range(9, 13)
+    assert heard(layer("controller", drop), topics.SIGHTING, Sighting, ticks, 1) == [9, -10, -11, -12]
+    assert heard(layer("controller", drop), topics.SIGHTING, Sighting, ticks, 2) == list(ticks)
+    assert heard(layer("controller", drop), topics.ODOMETRY, Odometry, ticks, 1) == list(ticks)
+    assert heard(layer("chaser/1", drop), topics.WRENCH, WrenchCommand, ticks, 1) == list(ticks)
+
+
+def test_delay_keeps_the_order_of_a_key() -> None:
+    on = layer(
+        "chaser/0", fault(kind="delay", process="chaser/0", topic="wrench", duration_s=0.3, delay_s=0.2)
+    )
+    assert heard(on, topics.WRENCH, WrenchCommand, range(9, 16)) == [9, -10, -11, 10, -12, 11, 13, 12, 14, 15]
+
+
+def test_reorder_lets_one_overtake() -> None:
+    on = layer("controller", fault(kind="reorder", process="controller", topic="sighting", duration_s=0.1))
+    assert heard(on, topics.SIGHTING, Sighting, range(9, 13)) == [9, -10, 11, 10, 12]
+
+
+def test_duplicate() -> None:
+    on = layer("chaser/0", fault(kind="duplicate", process="chaser/0", topic="image", duration_s=0.2))
+    assert heard(on, topics.IMAGE, Image, range(9, 13)) == [9, 10, 10, 11, 11, 12]
+
+
+def test_share_is_drawn_from_the_seed_and_the_tick_alone() -> None:
+    drop = fault(kind="drop", process="chaser/0", topic="wrench", duration_s=100.0, share=0.3)
+    ticks = range(10, 1010)
+    one = heard(layer("chaser/0", drop), topics.WRENCH, WrenchCommand, ticks)
+    assert one == heard(layer("chaser/0", drop), topics.WRENCH, WrenchCommand, ticks)
+    assert one != heard(layer("chaser/0", drop, seed=1), topics.WRENCH, WrenchCommand, ticks)
+    assert 240 < sum(tick < 0 for tick in one) < 360
+    # Whatever came before: the same ticks are lost.
+    assert one[500:] == heard(layer("chaser/0", drop), topics.WRENCH, WrenchCommand, range(510, 1010))
+
+
+def test_corrupt_gives_nothing_or_a_sound_message() -> None:
+    on = layer("chaser/0", fault(kind="corrupt", process="chaser/0", topic="wrench", duration_s=50.0))
+    lost = changed = 0
+    for tick in range(10, 500):
+        sent = message(WrenchCommand, tick)
+        (came,) = on.incoming(topics.WRENCH, "0", sent, codec.encode(sent))
+        if isinstance(came, Lost):
+            lost += 1
+        else:
+            codec.check_numbers(came)
+            assert (came.tick, came.chaser) == (tick, 0)
+            changed += came != sent
+    assert lost > 300
+    assert changed > 0
+
+
+@pytest.mark.parametrize(
+    ("receiver", "topic", "kind", "chaser", "hit"),
+    [
+        ("chaser/0", topics.WRENCH, WrenchCommand, 0, True),
+        ("controller", topics.SIGHTING, Sighting, 0, True),
+        ("controller", topics.ODOMETRY, Odometry, 0, True),  # the chaser's telemetry
+        ("controller", topics.SIGHTING, Sighting, 1, False),
+        ("chaser/1", topics.WRENCH, WrenchCommand, 1, False),
+        ("chaser/0", topics.ODOMETRY, Odometry, 0, False),  # its own sensor, from the world
+        ("chaser/0", topics.IMAGE, Image, 0, False),
+    ],
+)
+def test_a_link_is_cut_at_both_ends(
+    receiver: str, topic: Topic, kind: type[msgspec.Struct], chaser: int, hit: bool
+) -> None:
+    on = layer(receiver, fault(kind="cut", process="chaser/0", peer="controller", duration_s=0.1))
+    assert heard(on, topic, kind, range(10, 11), chaser) == ([-10] if hit else [10])
+
+
+def test_cut_off_from_everybody() -> None:
+    cut = fault(kind="cut", process="chaser/0", duration_s=0.1)
+    assert heard(layer("chaser/0", cut), topics.IMAGE, Image, range(10, 11)) == [-10]
+    assert heard(layer("chaser/1", cut), topics.IMAGE, Image, range(10, 11), 1) == [10]
+
+
+def test_what_the_test_bed_needs_is_never_faulty() -> None:
+    on = layer("chaser/0", fault(kind="cut", process="chaser/0", duration_s=10.0))
+    for topic, sample in ((topics.TICK, "Tick"), (topics.END, "MissionEnd")):
+        sent = msgspec.structs.replace(next(s for k, s in BY_TYPE.items() if k.__name__ == sample), tick=12)
+        assert on.incoming(topic, None, sent, codec.encode(sent)) == [sent]
+
+
+def test_camera_off() -> None:
+    on = layer("chaser/0", fault(kind="camera_off", process="chaser/0", duration_s=0.2))
+    assert heard(on, topics.IMAGE, Image, range(9, 13)) == [9, -10, -11, 12]
+    assert heard(on, topics.ODOMETRY, Odometry, range(9, 13)) == [9, 10, 11, 12]
+
+
+# -- what a process says ------------------------------------------------------------------------------------
+
+
+def said(on: FaultLayer, topic: Topic, sent: Any) -> list[Any]:
+    return on.outgoing(topic, sent.chaser, sent)
+
+
+def test_lying_sensor() -> None:
+    on = layer(
+        "chaser/0",
+        fault(
+            kind="lying_sensor",
+            process="chaser/0",
+            duration_s=1.0,
+            offset_m=[0.1, 0.0, 0.0],
+            rotation_deg=[0, 0, 90],
+        ),
+    )
+    sent = message(Sighting, 12)
+    (lie,) = said(on, topics.SIGHTING, sent)
+    for told, true in zip(lie.solutions, sent.solutions, strict=True):
+        assert np.allclose(np.subtract(told.position_m, true.position_m), [0.1, 0.0, 0.0])
+        assert math.isclose(
+            float(rotations.angle_between(told.q_wxyz, true.q_wxyz)), math.pi / 2, abs_tol=1e-9
+        )
+    codec.check_numbers(lie)
+    assert said(on, topics.SIGHTING, message(Sighting, 20)) == [message(Sighting, 20)]
+    assert said(on, topics.SIGHTING, message(Sighting, 9)) == [message(Sighting, 9)]
+
+
+def test_odometry_lie_is_the_worlds_to_tell() -> None:
+    lie = fault(kind="odometry_lie", process="chaser/1", duration_s=1.0, offset_m=[0.0, 0.0, 0.5])
+    sent = message(Odometry, 12, 1)
+    (told,) = said(layer("world", lie), topics.ODOMETRY, sent)
+    assert np.allclose(np.subtract(told.position_m, sent.position_m), [0.0, 0.0, 0.5])
+    assert said(layer("world", lie), topics.ODOMETRY, message(Odometry, 12, 0)) == [message(Odometry, 12, 0)]
+
+
+def test_clock_jump_moves_stamps_and_not_ticks() -> None:
+    on = layer("controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=5.0))
+    sent = message(WrenchCommand, 12)
+    (told,) = said(on, topics.WRENCH, sent)
+    assert told.tick == 12
+    assert (
+        told.effective_time_ns - sent.effective_time_ns == told.expires_ns - sent.expires_ns == 5_000_000_000
+    )
+    back = layer("controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=-5.0))
+    assert said(back, topics.WRENCH, sent)[0].sim_time_ns == 0
+
+
+def test_flood() -> None:
+    on = layer(
+        "chaser/0", fault(kind="flood", process="chaser/0", topic="sighting", duration_s=1.0, copies=50)
+    )
+    assert said(on, topics.SIGHTING, message(Sighting, 12)) == [message(Sighting, 12)] * 51
+
+
+# -- what happens to the process itself ----------------------------------------------------------------------
+
+
+def test_a_process_dies_once_before_anything_of_its_tick() -> None:
+    ends: list[str] = []
+    on = layer("controller", fault(kind="kill", process="controller"), end=lambda: ends.append("killed"))
+    for tick in range(8, 14):
+        sent = message(Odometry, tick)
+        on.incoming(topics.ODOMETRY, "0", sent, codec.encode(sent))
+        assert ends == (["killed"] if tick >= 10 else [])
+
+
+def test_one_that_was_started_again_lives_on() -> None:
+    ends: list[str] = []
+    on = layer("controller", fault(kind="kill", process="controller"), end=lambda: ends.append("killed"))
+    for tick in (10, 11, 12):
+        on.strike(tick)
+    assert ends == []
+
+
+def test_freeze_stops_for_so_long() -> None:
+    stops: list[float] = []
+    freeze = fault(kind="freeze", process="recorder", duration_s=1.5)
+    on = layer("recorder", freeze, stop=stops.append)
+    for tick in range(5, 30):
+        on.strike(tick)
+    assert stops == [1.5]
+    others = layer("controller", freeze, stop=stops.append)
+    for tick in range(5, 30):
+        others.strike(tick)
+    assert stops == [1.5]
+
+
+def test_begin_and_end_are_told() -> None:
+    on = layer("world", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3, share=0.5))
+    told = {tick: on.told_at(tick) for tick in range(20) if on.told_at(tick)}
+    assert told == {
+        10: [("fault begins", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],
+        13: [("fault ends", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],
+    }
+
+
+def test_senders() -> None:
+    assert sender_of(topics.ODOMETRY, "2", "controller") == "chaser/2"
+    assert sender_of(topics.ODOMETRY, "2", "chaser/2") == "world"
+    assert sender_of(topics.ACTUATORS, "1", "world") == "chaser/1"
+    assert sender_of(topics.WRENCH, "1", "chaser/1") == "controller"
+
+
+def test_went_on() -> None:
+    """Against the closed form: straight on, and turned about the body's own axis."""
+    still = Odometry(
+        tick=3,
+        sim_time_ns=1_000_000_000,
+        chaser=1,
+        position_m=(1.0, 2.0, 3.0),
+        velocity_m_s=(0.5, 0.0, -1.0),
+        q_wxyz=(1.0, 0.0, 0.0, 0.0),
+        omega_rad_s=(0.0, 0.0, math.pi / 2),
+    )
+    later = went_on(still, 5, 2_000_000_000)
+    assert (later.tick, later.sim_time_ns, later.chaser) == (5, 2_000_000_000, 1)
+    assert later.position_m == (1.5, 2.0, 2.0)
+    assert np.allclose(later.q_wxyz, [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])
+    assert later.velocity_m_s == still.velocity_m_s

@@ -1,0 +1,87 @@
+"""``[[fault]]`` tables: what is taken, and what each wrong one is told."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.scenario.overrides import ScenarioError
+
+ROOT = Path(__file__).resolve().parents[2]
+DRILL = ROOT / "scenarios" / "fault-drill.toml"
+
+GOOD = [
+    'kind = "kill", process = "controller"',
+    'kind = "kill", process = "recorder"',
+    'kind = "freeze", process = "world", duration_s = 2.0',
+    'kind = "cut", process = "chaser/0", peer = "controller", duration_s = 2.0',
+    'kind = "drop", process = "chaser/3", topic = "wrench", duration_s = 2.0, share = 0.5',
+    'kind = "delay", process = "world", topic = "actuators", duration_s = 2.0, delay_s = 0.3',
+    'kind = "duplicate", process = "controller", topic = "sighting", duration_s = 2.0, peer = "chaser/1"',
+    'kind = "reorder", process = "controller", topic = "odometry", duration_s = 2.0',
+    'kind = "corrupt", process = "chaser/0", topic = "image", duration_s = 2.0',
+    'kind = "flood", process = "world", topic = "image", duration_s = 2.0, copies = 10',
+    'kind = "clock_jump", process = "chaser/0", duration_s = 2.0, offset_s = -3.0',
+    'kind = "camera_off", process = "chaser/0", duration_s = 2.0',
+    'kind = "lying_sensor", process = "chaser/0", duration_s = 2.0, offset_m = [0.1, 0.0, 0.0]',
+    'kind = "odometry_lie", process = "chaser/0", duration_s = 2.0, rotation_deg = [0.0, 0.0, 5.0]',
+]
+BAD = [
+    ('kind = "bomb", process = "controller"', "fault.0.kind"),
+    ('kind = "kill", process = "world"', "kill cannot happen to world"),
+    ('kind = "kill", process = "moon"', "'moon' is no process"),
+    ('kind = "kill", process = "chaser/7"', "there is no chaser/7; this mission has chaser/0 to chaser/3"),
+    ('kind = "cut", process = "chaser/0", peer = "chaser/9", duration_s = 1', "there is no chaser/9"),
+    ('kind = "cut", process = "chaser/0", peer = "chaser/0", duration_s = 1', "nothing that counts comes to"),
+    ('kind = "freeze", process = "chaser/0"', "freeze needs duration_s"),
+    ('kind = "drop", process = "chaser/0", duration_s = 1', "drop needs topic"),
+    ('kind = "drop", process = "chaser/0", topic = "tick", duration_s = 1', "fault.0.topic"),
+    (
+        'kind = "drop", process = "chaser/0", topic = "sighting", duration_s = 1',
+        "chaser/0 receives no sighting",
+    ),
+    (
+        'kind = "flood", process = "chaser/0", topic = "wrench", copies = 3, duration_s = 1',
+        "publishes no wrench",
+    ),
+    ('kind = "drop", process = "chaser/0", topic = "wrench", duration_s = 1, share = 1.5', "fault.0.share"),
+    (
+        'kind = "camera_off", process = "chaser/0", duration_s = 1, share = 0.5',
+        "share does not go with camera_off",
+    ),
+    ('kind = "delay", process = "chaser/0", topic = "wrench", duration_s = 1', "delay needs delay_s"),
+    ('kind = "lying_sensor", process = "chaser/0", duration_s = 1', "needs offset_m or rotation_deg"),
+    ('kind = "drop", process = "controller", topic = "jets", duration_s = 1', "there are jets only with"),
+    ('kind = "drop", process = "chaser/0", topic = "docking", duration_s = 1', "a docking sensor only with"),
+    ('kind = "camera_off", process = "chaser/0", duration_s = -1', "fault.0.duration_s"),
+    ('kind = "camera_off", process = "chaser/0", duration_s = 1, colour = "red"', "fault.0.colour"),
+]
+
+
+@pytest.mark.parametrize("fault", GOOD)
+def test_good_ones_load_and_travel(fault: str) -> None:
+    scenario = load_scenario(DRILL, (f"fault=[{{{fault}, at_s = 1.0}}]",))
+    assert type(scenario).model_validate_json(scenario.model_dump_json()) == scenario
+    assert scenario.fault[0].text().startswith(str(scenario.fault[0].kind))
+
+
+@pytest.mark.parametrize(("fault", "words"), BAD)
+def test_wrong_ones_are_told(fault: str, words: str) -> None:
+    with pytest.raises(ScenarioError) as caught:
+        load_scenario(DRILL, (f"fault=[{{{fault}, at_s = 1.0}}]",))
+    assert words in str(caught.value)
+    assert "fault.0" in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_not_before_the_first_tick() -> None:
+    with pytest.raises(ScenarioError, match=r"fault\.0\.at_s"):
+        load_scenario(DRILL, ('fault=[{kind = "kill", process = "controller", at_s = 0.0}]',))
+
+
+def test_written_as_tables(tmp_path: Path) -> None:
+    text = DRILL.read_text() + '\n[[fault]]\nkind = "kill"\nat_s = 3.0\nprocess = "chaser/2"\n'
+    path = tmp_path / "drill.toml"
+    path.write_text(text)
+    assert load_scenario(path).fault[0].process == "chaser/2"

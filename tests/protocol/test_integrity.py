@@ -1,0 +1,115 @@
+"""Odometry that cannot be believed, and sightings that go on disagreeing."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from chaserdock_controller.ingest.odometry_validation import OdometryWatch
+from chaserdock_controller.ingest.sensor_consistency import Agreement
+from chaserdock_models import rotations
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.scenario import load_scenario
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+SCENARIO = load_scenario(Path(__file__).resolve().parents[2] / "scenarios" / "fault-drill.toml")
+TIMING = SCENARIO.timing
+
+
+def flown(tick: int, noise: float = 0.0, seed: int = 0) -> Odometry:
+    """A chaser on a curve under 0.01 m/s2, turning at 0.05 rad/s."""
+    t = TIMING.tick_time_ns(tick) / 1e9
+    off = np.random.default_rng(seed + tick).normal(0.0, 1.0, 3) * noise
+    return Odometry(
+        tick=tick,
+        sim_time_ns=TIMING.tick_time_ns(tick),
+        chaser=1,
+        position_m=vector(np.array([0.03 * t, 0.005 * t * t, -0.5]) + off),
+        velocity_m_s=(0.03, 0.01 * t, 0.0),
+        q_wxyz=vector(rotations.exp(np.array([0.0, 0.0, 0.05 * t]))),
+        omega_rad_s=(0.0, 0.0, 0.05),
+    )
+
+
+def lying(odometry: Odometry, off_m: tuple[float, float, float], turn_rad: float) -> Odometry:
+    return msgspec.structs.replace(
+        odometry,
+        position_m=vector(np.add(odometry.position_m, off_m)),
+        q_wxyz=vector(rotations.multiply(odometry.q_wxyz, rotations.exp(np.array([turn_rad, 0.0, 0.0])))),
+    )
+
+
+def test_honest_odometry_is_handed_on_as_it_is() -> None:
+    watch = OdometryWatch(SCENARIO)
+    for tick in [*range(50), *range(53, 60), 90]:  # some are missing
+        assert watch.believed(flown(tick)) == (flown(tick), [])
+
+
+def test_noise_that_the_scenario_admits_is_no_jump() -> None:
+    noisy = SCENARIO.model_copy(
+        update={"odometry": SCENARIO.odometry.model_copy(update={"position_noise_m": 0.02})}
+    )
+    watch = OdometryWatch(noisy)
+    assert [watch.believed(flown(tick, 0.02))[1] for tick in range(200)] == [[]] * 200
+
+
+@given(
+    off=st.tuples(*[st.floats(-0.5, 0.5)] * 3).filter(lambda v: math.hypot(*v) > 0.06),
+    turn=st.floats(-0.4, 0.4),
+)
+@settings(derandomize=True, deadline=None, max_examples=50)
+def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
+    off: tuple[float, float, float], turn: float
+) -> None:
+    watch, told = OdometryWatch(SCENARIO), []
+    for tick in range(60):
+        lie = 20 <= tick < 40
+        given_, events = watch.believed(lying(flown(tick), off, turn) if lie else flown(tick))
+        told += [(tick, level) for level, _ in events]
+        assert math.dist(given_.position_m, flown(tick).position_m) < 0.005
+        assert float(rotations.angle_between(given_.q_wxyz, flown(tick).q_wxyz)) < math.radians(0.5)
+        if not lie:
+            assert given_ == flown(tick)
+    assert told == [(20, "warning"), (40, "info")]
+
+
+def test_after_long_silence_anything_is_believed() -> None:
+    watch = OdometryWatch(SCENARIO)
+    watch.believed(flown(0))
+    far = lying(flown(30), (3.0, 0.0, 0.0), 0.0)
+    assert watch.believed(far) == (far, [])
+
+
+def test_agreement() -> None:
+    agreement, told = Agreement(), []
+    for tick in range(100):
+        now_s = tick / 16  # exact
+        rejected = {2} if 30 <= tick < 60 or tick in (10, 12, 80) else set()
+        seen = {0, 1, 2} if tick % 3 else {0, 2}
+        told += [(tick, level) for level, _ in agreement.observe(now_s, seen - rejected, rejected)]
+    assert told == [(40, "warning"), (70, "info")]
+
+
+def test_who_sees_nothing_does_not_disagree() -> None:
+    agreement = Agreement()
+    assert [agreement.observe(t / 10, (), ()) for t in range(50)] == [[]] * 50
+
+
+@pytest.mark.parametrize("gap", [1, 2, 5])
+def test_the_limit_grows_with_the_time_between(gap: int) -> None:
+    """What full thrust can do in the time is no jump."""
+    body = SCENARIO.chaser
+    dt = gap / SCENARIO.time.rate_hz
+    watch = OdometryWatch(SCENARIO)
+    first = flown(0)
+    watch.believed(first)
+    moved = 0.5 * body.force_max_N / body.mass_kg * dt**2
+    later = msgspec.structs.replace(
+        flown(gap), position_m=vector(np.add(first.position_m, [0.03 * dt + moved, moved, moved]))
+    )
+    assert watch.believed(later)[1] == []

@@ -1,0 +1,119 @@
+"""Recorders over real Zenoh: a log played and recorded again is the same; a killed one loses its last second at most."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+import subprocess
+import threading
+import time
+from collections import defaultdict
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.recording.log import read_scenario
+from chaserdock_protocol.recording.scan import files_of, stored_messages
+from chaserdock_protocol.transport import Link, Raw
+from harness import chaserdock, finished
+
+from chaserdock.launch.launcher import free_port
+from chaserdock.logs.info import info_of
+from chaserdock.logs.player import play, sent_again
+from chaserdock.logs.recover import recover
+
+GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
+KILLS = int(os.environ.get("CHASERDOCK_KILLS", "2"))
+
+
+def start_recorder(folder: Path, port: int, namespace: str, *options: str) -> subprocess.Popen[bytes]:
+    """The recorder process, which will join whoever plays on that port."""
+    where = ["-e", f"tcp/127.0.0.1:{port}", "--namespace", namespace]
+    return chaserdock("record", "--out", str(folder), *where, *options, stdout=subprocess.DEVNULL)
+
+
+def by_key(log: Path) -> dict[str, list[tuple[str, bytes]]]:
+    """Encodings and payloads of a log, key by key, in their order; without what its own recorder said."""
+    out: dict[str, list[tuple[str, bytes]]] = defaultdict(list)
+    for _, raw in sent_again(log):
+        out[raw.key].append((raw.encoding, raw.payload))
+    return dict(out)
+
+
+@pytest.mark.parametrize(
+    "options", [(), ("--rotate-s", "1"), ("--no-viewer",)], ids=["one file", "rotated", "bare"]
+)
+def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[str, ...]) -> None:
+    port = free_port()
+    recorder = start_recorder(tmp_path / "again", port, "again", *options)
+    try:
+        arguments = ("--namespace", "again", "-l", f"tcp/127.0.0.1:{port}")
+        status, said = finished("log", "play", str(GOLDEN), *arguments)
+        assert status == 0, said
+        assert recorder.wait(timeout=60) == 0
+    finally:
+        recorder.kill()
+        recorder.wait()
+    assert by_key(tmp_path / "again") == by_key(GOLDEN)
+    assert read_scenario(tmp_path / "again")[0] == read_scenario(GOLDEN)[0]
+    info = info_of(tmp_path / "again")
+    assert info.whole
+    assert (info.viewer > 100) == ("--no-viewer" not in options)
+    names = [path.name for path in files_of(tmp_path / "again")]
+    assert names == (
+        ["mission-0000.mcap", "mission-0001.mcap"] if "--rotate-s" in options else ["mission.mcap"]
+    )
+    for path in files_of(tmp_path / "again"):  # each stands for itself
+        assert read_scenario(path)[1]["run_id"] == read_scenario(GOLDEN)[1]["run_id"]
+
+
+def test_nobody_listens(tmp_path: Path) -> None:
+    arguments = ("--namespace", "nobody", "-l", "tcp/127.0.0.1:0", "--patience", "0.5")
+    status, said = finished("log", "play", str(GOLDEN), *arguments)
+    assert (status, "Traceback" in said) == (2, False)
+    assert "no recorder came within 0.5 s" in said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(KILLS))
+def test_killed_recorder_loses_the_last_second_at_most(tmp_path: Path, seed: int) -> None:
+    """SIGKILL at a random moment of a flight at a quarter of its speed; what was sent a second before is recovered."""
+    port, sent = free_port(), []
+    recorder = start_recorder(tmp_path / "killed", port, "killed")
+    killed_s: list[float] = []
+    over = threading.Event()
+
+    def note(raw: Raw) -> None:
+        sent.append((time.monotonic(), raw.key, raw.payload))
+
+    def kill() -> None:
+        while not sent and not over.is_set():
+            time.sleep(0.01)
+        over.wait(random.Random(seed).uniform(0.3, 4.0))
+        killed_s.append(time.monotonic())
+        recorder.send_signal(signal.SIGKILL)
+        over.set()
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    try:
+        play(GOLDEN, Link("killed", (), (f"tcp/127.0.0.1:{port}",)), 0.25, 60.0, note, over.is_set)
+    finally:
+        over.set()
+        killer.join()
+        recorder.wait()
+    recover(tmp_path / "killed" / "mission.mcap", tmp_path / "whole.mcap")
+    held: dict[str, list[bytes]] = defaultdict(list)
+    for channel, message in stored_messages(tmp_path / "whole.mcap"):
+        held[channel.topic].append(message.data)
+    due: dict[str, list[bytes]] = defaultdict(list)
+    for when_s, key, payload in sent:
+        if when_s < killed_s[0] - 1.0:
+            due[key].append(payload)
+    for key, payloads in due.items():
+        assert held[key][: len(payloads)] == payloads, key
+    everything = {(key, payload) for _, key, payload in sent}
+    for key, payloads in held.items():  # and nothing is there that was not sent
+        if not key.startswith(("/viewer/", "recorder/")):
+            assert {(key, p) for p in payloads} <= everything
+    assert not info_of(tmp_path / "whole.mcap").whole

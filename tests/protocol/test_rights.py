@@ -1,0 +1,197 @@
+"""Rights: every wrong identity on every key is dropped by the router, every right one gets through."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import zenoh
+from chaserdock_protocol import topics
+from chaserdock_protocol.transport import access_control as rights
+from chaserdock_protocol.transport.access_control import Identity, access_control
+from chaserdock_protocol.transport.node import zenoh_config
+from mission_keys import (
+    CHASERS,
+    EVERYONE,
+    PATIENCE_S,
+    PUBLISHERS,
+    client,
+    keys_with_owners,
+    make_keys,
+    router_with_rights,
+)
+
+SETTLE_S = 0.5
+
+
+def readers_of(key: str) -> set[str]:
+    """Processes that the table lets read a concrete key; of what is one chaser's, that chaser alone."""
+    found = topics.topic_of_key(key)
+    assert found is not None
+    topic, place = found
+    return {
+        w.process
+        for w in EVERYONE
+        if topics.may_read(w.role, topic)
+        and not (w.role == "chaser" and "{chaser}" in topic.key and w.process != f"chaser/{place}")
+    }
+
+
+@dataclass
+class Mission:
+    keys: Path
+    endpoint: str
+    sessions: dict[str, zenoh.Session]
+
+
+@pytest.fixture(scope="module")
+def mission(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Mission]:
+    keys = make_keys(tmp_path_factory.mktemp("keys"))
+    with router_with_rights(keys) as endpoint:
+        sessions = {w.process: zenoh.open(zenoh_config(client(keys, w.process, endpoint))) for w in EVERYONE}
+        yield Mission(keys, endpoint, sessions)
+        for session in sessions.values():
+            session.close()
+
+
+def test_every_wrong_identity_on_every_key_is_dropped(mission: Mission) -> None:
+    """The table: keys by identities. The recorder may read all, so whatever gets through reaches it."""
+    arrived: set[tuple[str, str]] = set()
+    subscriber = mission.sessions["recorder"].declare_subscriber(
+        "**", lambda s: arrived.add((str(s.key_expr), s.payload.to_string()))
+    )
+    own: set[tuple[str, str]] = set()
+    time.sleep(SETTLE_S)
+    table = keys_with_owners()
+    assert len(table) > 50
+    for name, session in mission.sessions.items():
+        for key, _ in table:
+            session.put(key, name)
+            # Declared publishers and deletions go other ways through the router's rules.
+            publisher = session.declare_publisher(key)
+            publisher.put(f"{name} declared")
+            publisher.delete()
+            publisher.undeclare()
+            if name == "recorder":  # its own session hears itself without any router
+                own |= {(key, name), (key, f"{name} declared"), (key, "")}
+    time.sleep(4 * SETTLE_S)
+    subscriber.undeclare()
+    allowed = {(key, owner + how) for key, owner in table for how in ("", " declared")}
+    assert arrived - own == allowed - own
+
+
+def test_every_key_reaches_its_readers_and_nobody_else(mission: Mission) -> None:
+    arrived: dict[str, set[str]] = {w.process: set() for w in EVERYONE}
+    subscribers = []
+    for name, session in mission.sessions.items():
+        heard = arrived[name]
+        callback = lambda s, heard=heard: heard.add(str(s.key_expr))  # noqa: E731
+        # The key itself, what lies around it, and everything.
+        expressions = {key for key, _ in keys_with_owners()} | {"**", "truth/**", "*/body/target", "world/*"}
+        subscribers += [session.declare_subscriber(expression, callback) for expression in expressions]
+    time.sleep(4 * SETTLE_S)
+    for key, owner in keys_with_owners():
+        mission.sessions[owner].put(key, owner)
+    time.sleep(4 * SETTLE_S)
+    for subscriber in subscribers:
+        subscriber.undeclare()
+    for name, heard in arrived.items():
+        own = {key for key, owner in keys_with_owners() if owner == name}
+        meant = {key for key, _ in keys_with_owners() if name in readers_of(key)}
+        assert heard - own == meant - own, name
+        if name in (*topics.CONTROLLERS, *(f"chaser/{i}" for i in range(CHASERS))):
+            assert not any(key.startswith("truth") for key in heard), name
+
+
+@pytest.mark.parametrize("query", rights.QUERIES, ids=lambda q: q.key)
+def test_only_its_answerer_answers_a_query_and_only_those_meant_may_ask(
+    query: rights.Query, mission: Mission
+) -> None:
+    def answer(name: str):
+        def arrived(asked: zenoh.Query) -> None:
+            asked.reply(query.key, name)
+            asked.drop()
+
+        return arrived
+
+    offered = [
+        session.declare_queryable(query.key, answer(name))
+        for name, session in mission.sessions.items()
+        if name != "operator"  # a session answers itself without any router
+    ]
+    time.sleep(SETTLE_S)
+    for who in EVERYONE:
+        meant = {query.answerer} - {who.process} if who.role in query.askers else set()
+        deadline = time.monotonic() + PATIENCE_S
+        while True:
+            replies = mission.sessions[who.process].get(query.key, timeout=0.5, target=zenoh.QueryTarget.ALL)
+            answers = {r.ok.payload.to_string() for r in replies if r.ok is not None} - {who.process}
+            answers = {"controller" if name == "standby" else name for name in answers}  # either may
+            if not answers < meant or time.monotonic() > deadline:
+                break  # a slow machine's answers may still be on their way; what is too much stays too much
+        assert answers == meant, who
+    for queryable in offered:
+        queryable.undeclare()
+
+
+def test_nobody_lives_under_anothers_name(mission: Mission) -> None:
+    tokens = [
+        session.liveliness().declare_token(topics.LIVE_KEY.format(process=other))
+        for name, session in mission.sessions.items()
+        for other in (*PUBLISHERS, "chaser/9")
+        if name not in rights.LOOK_ON and other != name  # a session sees its own tokens without any router
+    ]
+    own = mission.sessions["chaser/1"].liveliness().declare_token("live/chaser/1")
+    time.sleep(SETTLE_S)
+    replies = list(mission.sessions["analysis"].liveliness().get("live/**", timeout=2.0))
+    assert {str(r.ok.key_expr) for r in replies if r.ok is not None} == {"live/chaser/1"}
+    for token in (*tokens, own):
+        token.undeclare()
+
+
+def test_without_a_certificate_of_the_mission_nobody_connects(mission: Mission, tmp_path: Path) -> None:
+    link = client(mission.keys, "chaser/0", mission.endpoint)
+    strangers = make_keys(tmp_path / "strangers")
+    foreign = client(strangers, "chaser/0", mission.endpoint)
+    own_ca = client(mission.keys, "chaser/0", mission.endpoint).tls
+    assert own_ca is not None
+    assert foreign.tls is not None
+    # Trusts our router, but its own certificate is of another mission.
+    mixed = replace(foreign, tls=replace(foreign.tls, ca=own_ca.ca))
+    for wrong in (foreign, mixed, replace(link, tls=None)):
+        config = zenoh_config(wrong)
+        config.insert_json5("connect/timeout_ms", "1500")
+        config.insert_json5("connect/exit_on_failure", "true")
+        if wrong.tls is None:
+            config.insert_json5("transport/link/tls", f'{{root_ca_certificate: "{own_ca.ca}"}}')
+        with pytest.raises(zenoh.ZError):
+            zenoh.open(config).close()
+    config = zenoh_config(link)
+    config.insert_json5("connect/exit_on_failure", "true")
+    zenoh.open(config).close()  # the right one gets in that way
+
+
+def test_every_query_key_has_its_rights() -> None:
+    keys = {v for k, v in vars(topics).items() if k.endswith("_KEY") and v != topics.LIVE_KEY}
+    assert keys == {q.key for q in rights.QUERIES}
+
+
+def test_rules_are_of_one_namespace_and_default_to_no() -> None:
+    section = access_control("apollo", 2)
+    assert section["default_permission"] == "deny"
+    assert all(key.startswith("apollo/") for rule in section["rules"] for key in rule["key_exprs"])
+    assert all(rule["permission"] == "allow" for rule in section["rules"])
+    named = {name for policy in section["policies"] for name in policy["rules"]}
+    assert named == {rule["id"] for rule in section["rules"]}
+
+
+def test_a_chaser_commands_nothing_and_reads_no_truth() -> None:
+    chaser = Identity("chaser/1", "chaser")
+    assert {key.rpartition("/")[0] for key in rights.writes(chaser)} == {"chaser/1"}
+    for who in EVERYONE:
+        truth = [key for key in rights.reads(who) if key == "**" or key.startswith("truth")]
+        assert bool(truth) == (who.role in ("recorder", "analysis", "viewer")), who
+        assert any(key.endswith("/wrench") for key in rights.writes(who)) == (who.role == "controller")

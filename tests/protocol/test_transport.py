@@ -1,0 +1,77 @@
+"""The Zenoh configuration that a link becomes: safe by default, a user's own file respected."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol import topics
+from chaserdock_protocol.transport import Link, Node, TransportError
+from chaserdock_protocol.transport.node import zenoh_config
+
+
+def test_defaults_are_safe() -> None:
+    config = zenoh_config(Link("run-1"))
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+    assert json.loads(config.get_json("transport/shared_memory/enabled")) is False
+    assert json.loads(config.get_json("listen/endpoints")) == ["tcp/127.0.0.1:0"]
+    assert json.loads(config.get_json("namespace")) == "run-1"
+    assert json.loads(config.get_json("connect/timeout_ms")) == -1
+
+
+@pytest.mark.parametrize("name", ["", "a/b", "a*", "@x", "a b", "$*"])
+def test_namespace_is_one_word(name: str) -> None:
+    with pytest.raises(TransportError, match="must be one word"):
+        zenoh_config(Link(name))
+
+
+def test_a_file_says_where_and_its_own_patience_counts(tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text('{ mode: "client", connect: { endpoints: ["tcp/127.0.0.1:7"], timeout_ms: 1234 } }')
+    config = zenoh_config(Link("run-1", connect=("tcp/ignored:1",), config=file))
+    assert json.loads(config.get_json("mode")) == "client"
+    assert json.loads(config.get_json("connect/endpoints")) == ["tcp/127.0.0.1:7"]
+    assert json.loads(config.get_json("connect/timeout_ms")) == 1234
+    assert json.loads(config.get_json("connect/exit_on_failure")) is False
+    assert json.loads(config.get_json("scouting/multicast/enabled")) is False
+
+
+def test_a_bad_file_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "zenoh.json5"
+    file.write_text("{ mode: ")
+    with pytest.raises(TransportError, match=r"zenoh\.json5"):
+        zenoh_config(Link("run-1", config=file))
+
+
+def test_a_bad_endpoint_is_told() -> None:
+    with pytest.raises(TransportError):
+        zenoh_config(Link("run-1", listen=("nonsense",)))
+
+
+def congestion_of(node: Node, topic: topics.Topic, place: int | str | None = None) -> str:
+    key = node.advertise(topic, place)
+    return str(node._publishers[key].congestion_control).rpartition(".")[2]
+
+
+def test_who_waits_for_slow_readers() -> None:
+    """In lock-step everyone. In real time nobody, but for what is said once at the end."""
+    node = Node("world", "world", Link(namespace="waits"))
+    try:
+        assert congestion_of(node, topics.TICK) == "BLOCK"
+        node.waits = False
+        for topic, place in ((topics.IMAGE, 0), (topics.ODOMETRY, 0), (topics.EVENT, "world")):
+            assert congestion_of(node, topic, place) == "DROP"
+        assert congestion_of(node, topics.END) == "BLOCK"
+        assert congestion_of(node, topics.FAREWELL, "world") == "BLOCK"
+    finally:
+        node.close()
+
+
+def test_queues_are_as_long_as_can_be() -> None:
+    """What is droppable is dropped for one reader, and only when that one has not read for long."""
+    config = zenoh_config(Link())
+    sizes = json.loads(config.get_json("transport/link/tx/queue/size"))
+    assert set(sizes.values()) == {16}
+    drop = json.loads(config.get_json("transport/link/tx/queue/congestion_control/drop"))
+    assert drop == {"wait_before_drop": 2000, "max_wait_before_drop_fragments": 4000}

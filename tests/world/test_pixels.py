@@ -1,0 +1,108 @@
+"""The kernels that work on a picture's pixels: to the bit what OpenCV and NumPy give, from every instruction set."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+from chaserdock_models.camera import Camera
+from chaserdock_models.native.build import X86_64
+from chaserdock_world.rendering import background as sky
+from chaserdock_world.rendering import effects
+from chaserdock_world.rendering import supersampling as samples
+from chaserdock_world.rendering.effects import CameraEffects, Effects, blurred
+from chaserdock_world.rendering.native import LIBRARY
+from chaserdock_world.rendering.supersampling import spread, take_means
+from numpy.typing import NDArray
+
+Picture = NDArray[np.uint8]
+
+SIZES = [(480, 640), (64, 64), (65, 67), (70, 96), (64, 161), (217, 333), (3, 5), (1, 1), (2, 40), (40, 2)]
+
+
+@pytest.fixture(params=[number for number, _ in X86_64], autouse=True)
+def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    if LIBRARY.level == 0 or request.param > LIBRARY.level:
+        pytest.skip(f"this processor has no copy {request.param}")
+    own = LIBRARY.function
+    for module in (effects, samples, sky):
+        monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, request.param))
+
+
+def pictures(size: tuple[int, int]) -> list[Picture]:
+    """Noise, space with a few stars and a patch of noise, all white, black and white."""
+    rng = np.random.default_rng(size)
+    noise = rng.integers(0, 256, size, dtype=np.uint8)
+    space = np.full(size, 4, dtype=np.uint8)
+    space[: size[0] // 3, : size[1] // 2] = noise[: size[0] // 3, : size[1] // 2]
+    space[rng.integers(0, size[0], 8), rng.integers(0, size[1], 8)] = rng.integers(0, 256, 8)
+    white = np.full(size, 255, dtype=np.uint8)
+    return [noise, space, white, np.where(noise > 127, white, np.uint8(0))]
+
+
+@pytest.mark.parametrize("sigma_px", [0.05, 0.34, 0.6, 0.9, 1.4, 2.0, 5.0, 10.6, 10.7])
+def test_a_blur_is_opencvs(sigma_px: float) -> None:
+    width = 2 * int(np.ceil(3.0 * sigma_px)) + 1
+    for size in SIZES:
+        for picture in pictures(size):
+            expected = cv2.GaussianBlur(picture, (width, width), sigma_px, borderType=cv2.BORDER_REPLICATE)
+            np.testing.assert_array_equal(blurred(picture, sigma_px), expected, f"{size}")
+
+
+@pytest.mark.parametrize("size", [(480, 640), (33, 97)])
+@pytest.mark.parametrize(("read", "shot"), [(1.5, 0.025), (0.0, 0.5), (60.0, 2.0), (3000.0, 0.0)])
+def test_noise_is_that_of_its_formula(size: tuple[int, int], read: float, shot: float) -> None:
+    camera = CameraEffects(size[1], size[0], Effects(1.0, 0.0, read, shot), seed=3)
+    assert camera._bank is not None
+    for number, picture in enumerate(pictures(size)):
+        seeds = np.random.SeedSequence([3, 1, 2, number]).generate_state(3)
+        row, column = seeds[0] % 252, seeds[1] % 257
+        white = camera._bank[row : row + size[0], column : column + size[1]].astype(np.float32)
+        scale = np.float32((1.0 if seeds[2] & 1 else -1.0) * camera._to_levels)
+        noise = np.clip(camera._sigma[picture].astype(np.float32) * white * scale, -255.0, 255.0)
+        expected = np.clip(picture + np.rint(noise), 0.0, 255.0).astype(np.uint8)
+        np.testing.assert_array_equal(camera.apply(picture, 2, number), expected)
+
+
+@pytest.mark.parametrize("number", [2, 4])
+def test_samples_and_their_means_are_as_opencv_resizes(number: int) -> None:
+    rng = np.random.default_rng(number)
+    for rows, columns in SIZES:
+        canvas = rng.integers(0, 256, (rows + 5, columns + 7), dtype=np.uint8)
+        before, size = canvas.copy(), (number * columns, number * rows)
+        view = canvas[2 : 2 + rows, 3 : 3 + columns]
+        fine = spread(view, number)
+        np.testing.assert_array_equal(fine, cv2.resize(view, size, interpolation=cv2.INTER_NEAREST))
+        take_means(fine, number, view)
+        np.testing.assert_array_equal(canvas, before)  # what is not painted on stays what it was
+        fine = rng.integers(0, 256, fine.shape, dtype=np.uint8)
+        take_means(fine, number, view)
+        expected = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
+        before[2 : 2 + rows, 3 : 3 + columns] = expected
+        np.testing.assert_array_equal(canvas, before)
+
+
+def test_samples_that_do_not_fit_are_refused() -> None:
+    view = np.zeros((4, 6), dtype=np.uint8)
+    with pytest.raises(ValueError, match="3 samples"):
+        spread(view, 3)
+    with pytest.raises(ValueError, match="strides"):
+        spread(view[:, ::2], 2)
+    with pytest.raises(ValueError, match="not 2 samples"):
+        take_means(np.zeros((8, 10), dtype=np.uint8), 2, view)
+
+
+def test_stars_are_where_the_camera_projects_them() -> None:
+    rng = np.random.default_rng(4)
+    for camera in (Camera.from_hfov(640, 480, 1.0), Camera.from_hfov(64, 64, 2.6)):
+        origin, size = np.array([-9.0, -7.0]), (camera.width_px + 11, camera.height_px + 8)
+        seen = sky.Sky(camera, origin, size)
+        for q in rng.normal(size=(20, 4)):
+            q = q / np.linalg.norm(q)
+            expected = np.full(size[::-1], sky.SPACE_LEVEL, dtype=np.uint8)
+            stars = seen._stars @ sky.rotations.to_matrix(q)
+            for star, level in zip(stars, seen._star_levels, strict=True):
+                column, row = np.rint(camera.project_ideal(star) - origin)
+                if star[2] > 0.1 and 0 <= column < size[0] and 0 <= row < size[1]:
+                    expected[int(row), int(column)] = level
+            np.testing.assert_array_equal(seen.background(q), expected)

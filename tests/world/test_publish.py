@@ -1,0 +1,399 @@
+"""Figures, report page and film of recorded flights: whole, cut short, or with hardly anything in them."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import av
+import cv2
+import numpy as np
+import pytest
+from chaserdock_models import rotations
+from chaserdock_models.targets import target_model
+from chaserdock_protocol import messages as m
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import encode
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.recording.log import LogError, LogWriter
+from flight_cases import scenario
+from harness import SHORT, finished, run
+
+from chaserdock.analysis.chase_camera import Viewpoint, draw
+from chaserdock.analysis.figures import KINDS, jets, write_figures
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.images import columns_for, pairs, shots
+from chaserdock.analysis.plots import Nothing
+from chaserdock.analysis.report import report_of, table, write_report
+from chaserdock.analysis.scene import scene_of
+from chaserdock.analysis.time_series import LOOKS, Inputs, Looks, Traces, load_traces
+from chaserdock.analysis.video import frames, write_video
+
+TICK_NS = 1_000_000_000 // 15
+SIZE = {"width_px": 96, "height_px": 64}
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A real, short flight of two chasers: its folder."""
+    out = tmp_path_factory.mktemp("flown") / "run"
+    status, said = run("two-chaser-tracking", out, *SHORT, "duration_s=3.0", "settling_s=1.0")
+    assert status == 0, said
+    return out
+
+
+def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> None:
+    writer.write(
+        topic.key_of(place), m.encoding_of(type(message)), encode(message), 10**18 + message.sim_time_ns
+    )
+
+
+def made_log(path: Path, ticks: int, seen: bool = False, chasers: int = 1, truth: bool = True) -> Path:
+    """A log with pictures of nothing: chaser i at -1 - i m, at rest, and a target that drifts along z."""
+    values = {"description": "made <&>", "duration_s": 2.0, "camera": SIZE}
+    names = [{"position_m": [-1.0 - i, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for i in range(chasers)]
+    writer = LogWriter(path)
+    writer.describe(scenario(**values, chasers=names).model_dump_json(), {"mode": "lockstep"})
+    for k in range(ticks):
+        head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * TICK_NS}
+        rest: dict[str, Any] = {"velocity_m_s": (0, 0, 0), "q_wxyz": (1, 0, 0, 0), "omega_rad_s": (0, 0, 0)}
+        if truth:
+            body = m.BodyTruth(**head, **rest, body="target", position_m=(0.0, 0.0, 0.03 * k / 15))
+            put(writer, topics.TRUTH_BODY, "target", body)
+        for i in range(chasers):
+            if truth:
+                body = m.BodyTruth(
+                    **head,
+                    **rest,
+                    body=f"chaser/{i}",
+                    position_m=(-1.0 - i, 0, 0),
+                    impulse_N_s=(0.1, 0.0, 0.0),
+                )
+                put(writer, topics.TRUTH_BODY, f"chaser/{i}", body)
+            picture = m.Image(**head, chaser=i, **SIZE, encoding="mono8", data=bytes(96 * 64))
+            put(writer, topics.IMAGE, i, picture)
+            sighting = m.Sighting(
+                **head,
+                chaser=i,
+                status="seen" if seen else "nothing",
+                solutions=(),
+                marker_ids=(0,) if seen else (),
+                corners_px=(10.0, 10.0, 20.0, 10.0, 20.0, 20.0, 10.0, 20.0) if seen else (),
+                rejected_ids=(),
+            )
+            put(writer, topics.SIGHTING, i, sighting)
+    writer.close()
+    return path
+
+
+class Page(HTMLParser):
+    """What a page refers to, its ids and its embedded data."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.ids: list[str] = []
+        self.references: list[str] = []
+        self.open: list[str] = []
+        self.data = ""
+        self.words = ""
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.open.append(tag)
+        for name, value in attrs:
+            if name == "id":
+                self.ids.append(value or "")
+            elif name in ("src", "href", "xlink:href", "srcset", "action", "data", "poster"):
+                self.references.append(value or "")
+
+    def handle_data(self, data: str) -> None:
+        if self.open and self.open[-1] == "script" and data.lstrip().startswith('{"times"'):
+            self.data = data
+        else:
+            self.words += data
+
+
+def checked(text: str) -> Page:
+    """A page that refers to nothing outside itself, has every id once and every target of its links."""
+    page = Page(text)
+    assert len(page.ids) == len(set(page.ids))
+    for reference in page.references:
+        assert reference.startswith(("#", "data:")), reference
+        assert not reference.startswith("#") or reference[1:] in page.ids, reference
+    for inside in re.findall(r"url\(([^)]*)\)", text):
+        assert inside.startswith("#"), inside
+        assert inside[1:] in page.ids, inside
+    assert "@import" not in text
+    assert "default-src 'none'" in text
+    # Not even a name space or a comment names a host, so nothing can be fetched by a slip.
+    assert re.findall(r"https?://[^\s\"'<]*", re.sub(r"<pre>.*?</pre>", "", text, flags=re.DOTALL)) == []
+    return page
+
+
+@pytest.fixture(scope="module")
+def page(flown: Path) -> Page:
+    return checked(report_of(flown / "mission.mcap"))
+
+
+def test_a_page_has_every_figure_and_refers_to_nothing_outside(flown: Path, page: Page) -> None:
+    drawn = {i for i in page.ids if i.startswith("figure-")}
+    assert drawn >= {f"figure-{k.name}" for k in KINDS if k.name != "jets"}
+    assert {"replay-section", "events", "scenario", "versions"} <= set(page.ids)
+    assert json.loads((flown / "summary.json").read_text())["digest"] in page.words
+
+
+def test_the_replay_shows_the_recorded_motion(flown: Path, page: Page) -> None:
+    data = json.loads(page.data)
+    truth = load_flight(flown / "mission.mcap").truth
+    assert np.all(np.diff(data["times"]) > 0)
+    assert data["times"][-1] == pytest.approx(truth["target"].time_s[-1], abs=1e-3)
+    assert [c["id"] for c in data["chasers"]] == [0, 1]
+    for body, name in ((data["target"], "target"), (data["chasers"][1], "chaser/1")):
+        rows = np.searchsorted(truth[name].time_s, np.array(data["times"]) - 1e-3)
+        np.testing.assert_allclose(np.reshape(body["p"], (-1, 3)), truth[name].position_m[rows], atol=1e-4)
+        np.testing.assert_allclose(np.reshape(body["q"], (-1, 4)), truth[name].q_wxyz[rows], atol=1e-4)
+    assert set(data["pictures"]["chasers"]) == {"0", "1"}
+    for urls in data["pictures"]["chasers"].values():
+        assert len(urls) == len(data["pictures"]["times"]) > 0
+        assert all(url.startswith("data:image/jpeg;base64,") for url in urls)
+
+
+def test_equal_logs_give_equal_pages(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 4)
+    assert report_of(log) == report_of(log)
+
+
+def test_a_log_cut_off_gives_a_page(flown: Path, tmp_path: Path) -> None:
+    whole = (flown / "mission.mcap").read_bytes()
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole[: int(0.6 * len(whole))])
+    page = checked(report_of(cut))
+    assert "not successful" in page.words
+    assert "ended at" in page.words
+
+
+def test_a_flight_that_never_saw_the_target_gives_a_page_that_says_so(tmp_path: Path) -> None:
+    page = checked(report_of(made_log(tmp_path / "blind.mcap", 8)))
+    assert {"figure-tracking", "figure-cameras", "figure-inputs", "replay"} <= set(page.ids)
+    assert "figure-estimate" not in page.ids
+    assert "target was never estimated" in page.words
+    assert "made <&>" in page.words  # escaped on the way, or it would be gone
+
+
+@pytest.mark.parametrize("ticks", [0, 1])
+def test_a_flight_aborted_at_once_gives_a_page(tmp_path: Path, ticks: int) -> None:
+    page = checked(report_of(made_log(tmp_path / "aborted.mcap", ticks)))
+    assert "ended at 0.00 s of 2 s" in page.words
+    assert ("replay" in page.ids) == (ticks > 0)
+
+
+def test_a_log_without_truth_gives_a_page_that_says_so(tmp_path: Path) -> None:
+    page = checked(report_of(made_log(tmp_path / "dark.mcap", 5, truth=False)))
+    assert "no ground truth of the target" in page.words
+    assert "figure-cameras" in page.ids
+
+
+def test_tables_escape_what_they_show() -> None:
+    assert "&lt;b&gt;" in table(("<b>",), [("<b>", "&")])
+    assert "<b>" not in table(("<b>",), [("<b>", "&")])
+
+
+@pytest.mark.skipif(
+    shutil.which("chromium") is None, reason="no chromium on PATH: structure alone is checked"
+)
+def test_a_browser_runs_the_replay(tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    page.write_text(report_of(made_log(tmp_path / "a.mcap", 5, chasers=2)), encoding="utf-8")
+    options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
+    command = ["chromium", *options, f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
+    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    assert '<span id="replay-clock">0.0 s</span>' in dom
+    assert re.search(r'<tr id="replay-row-1"><th[^>]*>chaser 1</th><td>–</td><td>2.000 m</td>', dom)  # noqa: RUF001
+
+
+# -- figures ------------------------------------------------------------------------------------------------
+
+
+def test_figures_are_files_of_the_format(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 8, chasers=2)
+    for ending, begins in (("svg", b"<?xml"), ("pdf", b"%PDF")):
+        files, missing = write_figures(log, tmp_path / ending, ending)
+        assert {f.stem for f in files} | set(missing) == {k.name for k in KINDS}
+        assert {"tracking", "docking", "separation", "inputs", "cameras"} <= {f.stem for f in files}
+        assert all(f.read_bytes().startswith(begins) for f in files)
+        if ending == "svg":
+            assert all(ElementTree.parse(f).getroot().tag.endswith("svg") for f in files)
+
+
+def test_inputs_are_the_impulses_over_the_ticks(tmp_path: Path) -> None:
+    given = load_traces(made_log(tmp_path / "a.mcap", 5), [0]).inputs[0]
+    assert given.edges_s.shape == (5,)
+    np.testing.assert_allclose(given.force_N, np.tile([1.5, 0.0, 0.0], (4, 1)), rtol=1e-6)
+    assert given.jet_duty.shape == (4, 0)
+
+
+def test_pictures_have_their_fate(tmp_path: Path) -> None:
+    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).looks[0]
+    assert {LOOKS[code] for code in nothing.code} == {"nothing"}
+    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).looks[0]
+    assert list(seen.stretches()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
+    np.testing.assert_array_equal(seen.time_s, [k * TICK_NS / 1e9 for k in range(4)])
+
+
+def test_stretches_end_where_the_fate_changes_and_at_gaps() -> None:
+    looks = Looks(np.array([0.0, 1.0, 2.0, 3.0, 7.0]), np.array([0, 0, 2, 2, 2]))
+    assert list(looks.stretches()) == [(0.0, 1.0, "used"), (2.0, 7.0, "nothing")]
+    assert list(looks.stretches(1.5)) == [(0.0, 1.0, "used"), (2.0, 3.0, "nothing"), (7.0, 7.0, "nothing")]
+    assert list(Looks(np.zeros(0), np.zeros(0, dtype=np.intp)).stretches()) == []
+
+
+def test_inputs_of_several_ticks_are_means_over_all_of_them(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 8)
+    one, three = (load_traces(log, [0], every).inputs[0] for every in (1, 3))
+    np.testing.assert_array_equal(three.edges_s, one.edges_s[::3])
+    np.testing.assert_allclose(three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12)
+
+
+def test_jets_are_drawn_where_there_are_any(tmp_path: Path) -> None:
+    flight = load_flight(made_log(tmp_path / "a.mcap", 5))
+    traces = load_traces(tmp_path / "a.mcap", [0])
+    with pytest.raises(Nothing, match="no jets"):
+        jets(flight, traces)
+    duty = np.linspace(0.0, 1.0, 24).reshape(2, 12)
+    given = Inputs(np.array([0.0, 1.0, 2.0]), np.zeros((2, 3)), np.zeros((2, 3)), duty)
+    figure = jets(flight, Traces({0: given}, {}, {}))
+    drawn: Any = figure.axes[0].collections[0]
+    np.testing.assert_array_equal(np.reshape(drawn.get_array(), (12, 2)), duty.T)
+
+
+# -- pictures and film ----------------------------------------------------------------------------------------
+
+
+def test_pictures_come_with_the_sighting_of_the_same_exposure(flown: Path) -> None:
+    found = list(pairs(flown / "mission.mcap", 2))
+    counts = load_flight(flown / "mission.mcap").counts
+    assert len(found) == counts["world/chaser/0/image"] + counts["world/chaser/1/image"]
+    for image, sighting in found:
+        assert sighting is not None
+        assert (sighting.chaser, sighting.sim_time_ns) == (image.chaser, image.sim_time_ns)
+
+
+def test_shots_hold_the_latest_pictures_and_no_later_one(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 16, chasers=2)
+    found = list(shots(log, 2, 0.25))
+    assert [time_s for time_s, _ in found] == [0.0, 0.25, 0.5, 0.75, 1.0]
+    for time_s, latest in found:
+        assert set(latest) == {0, 1}
+        for image, _ in latest.values():
+            assert 0.0 <= time_s - image.sim_time_ns / 1e9 < 1 / 15 + 1e-6
+
+
+def test_pictures_fit_their_place() -> None:
+    for number in range(1, 17):
+        columns, width = columns_for(number, 16 / 9, 480, 720)
+        rows = -(-number // columns)
+        assert columns * width <= 480
+        assert rows * width * 9 / 16 <= 720
+
+
+@pytest.mark.parametrize("model", ["paper", "servicer"])
+@pytest.mark.parametrize(
+    ("azimuth", "elevation", "face"),
+    [(0, 0, 0), (180, 0, 1), (90, 0, 2), (-90, 0, 3), (0, 90, 4), (0, -90, 5)],
+)
+def test_the_drawn_target_bears_its_markers(model: str, azimuth: float, elevation: float, face: int) -> None:
+    """Drawn face-on, a face shows exactly the markers that lie on it, neither mirrored nor turned over."""
+    wanted = target_model(model)
+    scene = scene_of(scenario(target={"model": model}))
+    view = Viewpoint(np.zeros(3), 1.2, np.radians(azimuth), np.radians(elevation), 1200, 1200)
+    pose = (np.zeros(3), rotations.IDENTITY)
+    picture = draw(scene, view, view.axes()[2], pose, {}, {}, frozenset())
+    table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, wanted.dictionary))
+    corners, ids, _ = cv2.aruco.ArucoDetector(table).detectMarkers(picture)
+    normal = view.axes()[2]
+    there = {k.id for k in wanted.markers if k.normal_trf() @ normal > 0.99}
+    assert ids is not None
+    assert set(np.ravel(ids).tolist()) == there
+    for marker_id, found in zip(np.ravel(ids).tolist(), corners, strict=True):
+        marker = wanted.marker(int(marker_id))
+        assert marker is not None
+        expected, _ = view.see(marker.corners_trf_m())
+        np.testing.assert_allclose(np.reshape(found, (4, 2)), expected, atol=2.0)
+
+
+def test_a_film_plays(flown: Path, tmp_path: Path) -> None:
+    out = tmp_path / "film.mp4"
+    number = write_video(flown, out, speed=2.0, fps=10, width_px=640, height_px=360)
+    with av.open(str(out)) as container:
+        stream: Any = container.streams.video[0]
+        assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
+        assert (stream.width, stream.height, stream.average_rate) == (640, 360, 10)
+        pictures = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+    assert len(pictures) == number == 16  # 3 s at double speed, both ends
+    assert np.mean(np.abs(pictures[0].astype(float) - pictures[-1])) > 0.3  # something moves
+
+
+def test_a_film_of_a_part(tmp_path: Path) -> None:
+    """Frames from the first time named to the last; a part without length, or behind the end, is no film."""
+    log = made_log(tmp_path / "a.mcap", 8)
+    every = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180)]
+    part = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180, (every[2], every[5]))]
+    assert part == pytest.approx(every[2:6])
+    with pytest.raises(ChaserdockError, match="no length"):
+        write_video(log, tmp_path / "a.webp", part_s=(2.0, 2.0))
+    with pytest.raises(LogError, match="no picture after 100 s"):
+        write_video(log, tmp_path / "a.webp", part_s=(100.0, 200.0))
+    assert not (tmp_path / "a.webp").exists()
+
+
+def test_a_film_for_a_web_page(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 8)
+    for name, begins in (("a.webp", b"RIFF"), ("a.gif", b"GIF89a")):
+        assert write_video(log, tmp_path / name, width_px=320, height_px=180) == 8
+        assert (tmp_path / name).read_bytes().startswith(begins)
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "fault"), [("a.avi", (320, 180), "must end in"), ("a.mp4", (321, 180), "must be even")]
+)
+def test_an_impossible_film_is_refused(tmp_path: Path, name: str, size: tuple[int, int], fault: str) -> None:
+    log = made_log(tmp_path / "a.mcap", 2)
+    with pytest.raises(ChaserdockError, match=fault):
+        write_video(log, tmp_path / name, width_px=size[0], height_px=size[1])
+    assert not (tmp_path / name).exists()
+
+
+def test_a_film_of_nothing_is_refused(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", 0)
+    with pytest.raises(LogError, match="nothing to film"):
+        write_video(log, tmp_path / "a.mp4")
+    assert not (tmp_path / "a.mp4").exists()
+
+
+def test_the_program_says_what_is_wrong(tmp_path: Path) -> None:
+    status, said = finished("report", str(tmp_path))
+    assert (status, "holds no log" in said, "Traceback" in said) == (2, True, False)
+
+
+def test_a_log_that_is_not_there_is_named(tmp_path: Path) -> None:
+    for make in (report_of_path, figures_of_path, film_of_path):
+        with pytest.raises(ChaserdockError, match="none: cannot be read: No such file"):
+            make(tmp_path / "none", tmp_path)
+
+
+def report_of_path(log: Path, out: Path) -> None:
+    write_report(log, out / "a.html")
+
+
+def figures_of_path(log: Path, out: Path) -> None:
+    write_figures(log, out, "svg")
+
+
+def film_of_path(log: Path, out: Path) -> None:
+    write_video(log, out / "a.mp4")

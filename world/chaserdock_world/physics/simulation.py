@@ -1,0 +1,300 @@
+"""The PyBullet adapter: the only module that knows its conventions.
+
+PyBullet orders quaternions x, y, z, w and gives angular velocity in world axes; everything that leaves this module is
+scalar first and has body rates. There is no gravity, damping or sleeping.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.docking_geometry import Motion, view_of
+from chaserdock_models.rotations import Array
+from chaserdock_models.targets import TargetModel
+from chaserdock_protocol.messages import Latch
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.bodies import cuboid_inertia
+
+from .bullet import connect, pybullet
+from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
+from .latch import ProbeLatch
+
+TARGET = "target"
+PROBE_RADIUS_M = 0.006
+_Z_TO_X_XYZW = [0.0, 0.5**0.5, 0.0, 0.5**0.5]
+# A springy touch: restitution 0.4 and half a millimetre deep at 1 cm/s (shared notes, docking).
+_CONTACT = {"contactStiffness": 1e4, "contactDamping": 100.0}
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """Position (3,) and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) in body axes."""
+
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+
+
+class Physics:
+    """The bodies of a scenario in a PyBullet world of their own; ``advance`` moves them on."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.step_count = 0
+        self._scenario = scenario
+        self._prescribed = scenario.target.motion != "torque_free"
+        # How often Bullet's copy of a prescribed target is moved along; its ``state`` is exact at any step.
+        self._steps_per_move = max(1, scenario.time.physics_hz // 120)
+        self._bullet = connect()
+        self._client: int = self._bullet._client  # the wrapper is too slow for what happens every step
+        self._bullet.setGravity(0, 0, 0)
+        self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)
+        self._bodies: dict[str, int] = {TARGET: self._add_target(scenario)}
+        for i in range(len(scenario.chasers)):
+            self._bodies[f"chaser/{i}"] = self._add_chaser(scenario, i)
+        # Bodies whose motion is Bullet's, with their principal moments of inertia.
+        self._free = {f"chaser/{i}": scenario.chaser.inertia for i in range(len(scenario.chasers))}
+        if not self._prescribed:
+            self._free[TARGET] = self._target_inertia(scenario)
+        self._names = {number: name for name, number in self._bodies.items()}
+        hz, docking = scenario.time.physics_hz, scenario.docking
+        ports = docking.ports if docking.kind == "capture" else ()
+        self.latches = {f"chaser/{p.chaser}": ProbeLatch(p.chaser, p, docking.tolerances, hz) for p in ports}
+        self._joints: dict[str, int] = {}
+        # Of every free body at the beginning of the last step, as Bullet gives them: pose and rates.
+        self._before: dict[int, tuple[Any, Any]] = {}
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of all bodies: ``target``, ``chaser/0``, …"""
+        return tuple(self._bodies)
+
+    def _add(self, shape: int, mass_kg: float, inertia: tuple[float, float, float], state: BodyState) -> int:
+        body = self._bullet.createMultiBody(
+            baseMass=mass_kg,
+            baseCollisionShapeIndex=shape,
+            basePosition=state.position_m.tolist(),
+            baseOrientation=_xyzw(state.q_wxyz),
+        )
+        self._bullet.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6)
+        if mass_kg > 0:
+            self._bullet.changeDynamics(body, -1, localInertiaDiagonal=list(inertia))
+        if self._scenario.docking.kind == "capture":
+            self._bullet.changeDynamics(body, -1, **_CONTACT)
+        self._set_velocity(body, state)
+        return body
+
+    def _set_velocity(self, body: int, state: BodyState) -> None:
+        omega_world = rotations.rotate(state.q_wxyz, state.omega_rad_s)
+        pybullet.resetBaseVelocity(body, state.velocity_m_s.tolist(), omega_world.tolist(), self._client)
+
+    def _add_target(self, scenario: Scenario) -> int:
+        target, model = scenario.target, scenario.target_model()
+        mass = 0.0 if self._prescribed else target.mass_kg
+        inertia = self._target_inertia(scenario)
+        return self._add(self._box_shape(model), mass, inertia, prescribed_state(scenario, 0.0))
+
+    @staticmethod
+    def _target_inertia(scenario: Scenario) -> tuple[float, float, float]:
+        target, model = scenario.target, scenario.target_model()
+        return target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, model.size_m)
+
+    def _box_shape(self, model: TargetModel) -> int:
+        boxes = model.boxes
+        return self._bullet.createCollisionShapeArray(
+            shapeTypes=[pybullet.GEOM_BOX] * len(boxes),
+            halfExtents=[[s / 2 for s in box.size_m] for box in boxes],
+            collisionFramePositions=[list(box.position_m) for box in boxes],
+            collisionFrameOrientations=[_xyzw(np.asarray(box.q_wxyz)) for box in boxes],
+        )
+
+    def _add_chaser(self, scenario: Scenario, i: int) -> int:
+        body = scenario.chaser
+        half = [s / 2 for s in body.size_m]
+        if scenario.docking.kind == "capture":
+            # The probe: a rod from the body's front to the tip, both ends round; massless, part of the body.
+            length = body.probe_reach_m - half[0] - PROBE_RADIUS_M
+            shape = self._bullet.createCollisionShapeArray(
+                shapeTypes=[pybullet.GEOM_BOX, pybullet.GEOM_CAPSULE],
+                halfExtents=[half, [0.0, 0.0, 0.0]],
+                radii=[0.0, PROBE_RADIUS_M],
+                lengths=[0.0, length],
+                collisionFramePositions=[[0.0, 0.0, 0.0], [half[0] + length / 2, 0.0, 0.0]],
+                collisionFrameOrientations=[[0.0, 0.0, 0.0, 1.0], _Z_TO_X_XYZW],
+            )
+        else:
+            shape = self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
+        position, attitude = scenario.start_pose(i)
+        state = BodyState(position, np.asarray(scenario.chasers[i].start_velocity_m_s), attitude, np.zeros(3))
+        return self._add(shape, body.mass_kg, body.inertia, state)
+
+    def state(self, name: str) -> BodyState:
+        """State of a body now; the prescribed target's is exact."""
+        if name == TARGET and self._prescribed:
+            return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
+        body = self._bodies[name]
+        client = self._client
+        return _state_of(
+            pybullet.getBasePositionAndOrientation(body, client), pybullet.getBaseVelocity(body, client)
+        )
+
+    def place(self, name: str, state: BodyState) -> None:
+        """Puts a body into a state, touching or not: for tests and for what starts in the middle of a mission."""
+        body = self._bodies[name]
+        position, attitude = state.position_m.tolist(), _xyzw(state.q_wxyz)
+        pybullet.resetBasePositionAndOrientation(body, position, attitude, self._client)
+        self._set_velocity(body, state)
+
+    def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
+        """Makes ``steps`` physics steps under constant wrenches; returns the pairs of bodies that touched.
+
+        ``wrenches`` maps a chaser's name to force and torque (6,) in its body axes, N and N m.
+        """
+        still = np.zeros(6)
+        pushes = []
+        for name, inertia in self._free.items():
+            wrench = wrenches.get(name, still)
+            pushes.append((self._bodies[name], inertia, wrench[:3].tolist(), wrench[3:].tolist()))
+        step_s = 1.0 / self._scenario.time.physics_hz
+        moves = self._prescribed and self._scenario.target.motion != "static"
+        touched: set[tuple[str, str]] = set()
+        frame, client = pybullet.LINK_FRAME, self._client
+        force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
+        pose_of, rates_of = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
+        before = self._before
+        for _ in range(steps):
+            for name, latch in self.latches.items():
+                if latch.obey(self.step_count):
+                    self._let_go(name)
+            held = {self._bodies[name] for name in (*self._joints, TARGET)} if self._joints else ()
+            # Bullet forgets external forces after every step.
+            for body, inertia, force, torque in pushes:
+                pose, rates = pose_of(body, client), rates_of(body, client)
+                if body in held:
+                    last = before.get(body, (pose, rates))[1]
+                    x, y, z = midpoint_torque_of_rates(inertia, pose[1], rates[1], last[1])
+                else:
+                    x, y, z = midpoint_torque(inertia, pose[1], rates[1], torque, step_s)
+                before[body] = pose, rates
+                force_on(body, -1, force, (0, 0, 0), frame, client)
+                torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
+            pybullet.stepSimulation(client)
+            self.step_count += 1
+            # A bounce lasts a single step: look after every one.
+            if pybullet.getContactPoints(physicsClientId=client):
+                pairs, tips = self._touching()
+                touched.update(pairs)
+                self._judge(tips)
+            if moves and self.step_count % self._steps_per_move == 0:
+                self._move_target()
+        return touched
+
+    def _move_target(self) -> None:
+        self.place(TARGET, self.state(TARGET))
+
+    def contacts(self) -> tuple[tuple[str, str], ...]:
+        """Pairs of bodies that touched or overlapped in the last step, sorted; a probe's tip on the target is none."""
+        return self._touching()[0]
+
+    def _touching(self) -> tuple[tuple[tuple[str, str], ...], set[str]]:
+        """As ``contacts``, and the chasers whose probe's tip touched the target."""
+        pairs, tips = set(), set()
+        for c in self._bullet.getContactPoints():
+            # Bullet stops bodies at a distance (c[8]) of zero, give or take rounding: the force (c[9]) tells as well.
+            if not (c[8] <= 0.0 or c[9] > 0.0):
+                continue
+            for name, other, point in ((c[1], c[2], c[5]), (c[2], c[1], c[6])):
+                if self._names[other] == TARGET and self._is_tip(self._names[name], point):
+                    tips.add(self._names[name])
+                    break
+            else:
+                pairs.add(tuple(sorted((self._names[c[1]], self._names[c[2]]))))
+        return tuple(sorted((a, b) for a, b in pairs)), tips
+
+    def _is_tip(self, name: str, point_m: tuple[float, float, float]) -> bool:
+        """Whether a point (3,), WRF, of a chaser's surface is on the round end of its probe."""
+        if name not in self.latches:
+            return False
+        s = self.state(name)
+        ahead_m = float(rotations.rotate_inverse(s.q_wxyz, np.array(point_m) - s.position_m)[0])
+        return ahead_m > self._scenario.chaser.probe_reach_m - 2.0 * PROBE_RADIUS_M
+
+    def command_latch(self, chaser: int, told: Latch, effective_step: int) -> None:
+        """Tells a chaser's latch what to do from ``effective_step`` on; a chaser without a port has none."""
+        latch = self.latches.get(f"chaser/{chaser}")
+        if latch is not None:
+            latch.command(told, effective_step)
+
+    def _judge(self, tips: set[str]) -> None:
+        """Puts the touches of the last step to the latches of these chasers."""
+        for name in sorted(tips):
+            chaser, target = (_state_of(*self._before[self._bodies[n]]) for n in (name, TARGET))
+            latch = self.latches[name]
+            q_off = np.asarray(self._scenario.chasers[latch.chaser].q_wxyz)
+            reach_m = self._scenario.chaser.probe_reach_m
+            view = view_of(latch.port, reach_m, q_off, _motion(chaser), _motion(target))
+            if latch.touch(self.step_count - 1, view):
+                self._hold_on(name)
+
+    def _hold_on(self, name: str) -> None:
+        """Fixes a chaser to the target as they stand now, by the tip."""
+        chaser, target = self.state(name), self.state(TARGET)
+        tip = np.array([self._scenario.chaser.probe_reach_m, 0.0, 0.0])
+        tip_world = chaser.position_m + rotations.rotate(chaser.q_wxyz, tip)
+        relative = rotations.multiply(rotations.conjugate(target.q_wxyz), chaser.q_wxyz)
+        a, b = self._bodies[TARGET], self._bodies[name]
+        self._joints[name] = self._bullet.createConstraint(
+            parentBodyUniqueId=a,
+            parentLinkIndex=-1,
+            childBodyUniqueId=b,
+            childLinkIndex=-1,
+            jointType=pybullet.JOINT_FIXED,
+            jointAxis=[0, 0, 0],
+            parentFramePosition=rotations.rotate_inverse(
+                target.q_wxyz, tip_world - target.position_m
+            ).tolist(),
+            childFramePosition=tip.tolist(),
+            parentFrameOrientation=_xyzw(relative),
+            childFrameOrientation=[0.0, 0.0, 0.0, 1.0],
+        )
+        # What is one body now cannot touch itself: the spring of the touch would work against the joint.
+        self._bullet.setCollisionFilterPair(a, b, -1, -1, 0)
+        self._before.clear()  # the rates have jumped
+
+    def _let_go(self, name: str) -> None:
+        self._bullet.removeConstraint(self._joints.pop(name))
+        self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 1)
+
+    def close(self) -> None:
+        """Frees the PyBullet world."""
+        self._bullet.disconnect()
+
+
+def _state_of(pose: Any, rates: Any) -> BodyState:
+    """From what Bullet gives: position and attitude, velocity and rate in world axes."""
+    (position, xyzw), (velocity, omega_world) = pose, rates
+    q = rotations.normalize([xyzw[3], *xyzw[:3]])
+    return BodyState(np.array(position), np.array(velocity), q, rotations.rotate_inverse(q, omega_world))
+
+
+def _motion(s: BodyState) -> Motion:
+    return Motion(s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s)
+
+
+def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:
+    """The target's state at a simulated time under constant rates (exact); at zero, its initial state."""
+    target = scenario.target
+    still = target.motion == "static"
+    velocity = np.zeros(3) if still else np.asarray(target.velocity_m_s)
+    omega = np.zeros(3) if still else np.asarray(target.omega_rad_s)
+    position = np.asarray(target.position_m) + velocity * time_s
+    attitude = rotations.integrate(target.q_wxyz, omega, time_s)
+    return BodyState(position, velocity, attitude, omega)
+
+
+def _xyzw(q_wxyz: Array) -> list[float]:
+    w, x, y, z = np.asarray(q_wxyz, dtype=float).tolist()
+    return [x, y, z, w]

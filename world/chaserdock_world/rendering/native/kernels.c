@@ -1,0 +1,7 @@
+/* The kernels of rendering, compiled once per instruction set (LEVEL). See base.h. */
+#include "base.h"
+#include "elementary.h"
+#include "scene.c"
+#include "noise.c"
+#include "blur.c"
+#include "samples.c"

@@ -1,0 +1,192 @@
+"""Pictures of textured cuboids, exactly projected: each visible face is warped with OpenCV, supersampled.
+
+Order of painting: boxes do not overlap, so between any two there is a separating plane; the one on the
+camera's side of it can hide the other and is painted later.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from chaserdock_models.rotations import Array
+from chaserdock_models.targets import Box, TargetModel
+from numpy.typing import ArrayLike, NDArray
+
+from . import textures
+from .background import Earth, Light, Sky
+from .dirty_rects import Rectangle, patches
+from .lens import Lens
+from .scene_geometry import Frustum, Obstacle, Shapes, paint_order, see_faces, shapes_of, texture_place
+from .supersampling import spread, take_means
+
+# Samples a pixel along each axis: the most that keep the samples of the painted patch below the limit.
+# (Textures are area averages, so even one sample a pixel puts corners to within 0.03 px.)
+_SAMPLES = ((4, 500_000), (2, 1_000_000))
+
+DAYLIGHT = Light()
+
+
+def chaser_boxes(
+    size_m: tuple[float, float, float] = (0.25, 0.25, 0.05), probe_reach_m: float = 0.35
+) -> tuple[Box, ...]:
+    """Boxes, in CRF, of a chaser: its body and a thin docking probe along +X up to ``probe_reach_m``.
+
+    Raises ValueError when the probe does not reach beyond the body.
+    """
+    front = size_m[0] / 2.0
+    if probe_reach_m <= front:
+        raise ValueError(f"the probe ({probe_reach_m} m) must reach beyond the body's front ({front} m)")
+    length = probe_reach_m - front
+    probe = Box((length, 0.012, 0.012), (front + length / 2.0, 0.0, 0.0), shade=0.45)
+    return (Box(size_m, shade=0.3), probe)
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What is to be painted: seen boxes by the number of their shape, their ``faces``, and the grey level of each face at
+    reflectance 1."""
+
+    shapes: Shapes
+    of_box: list[int]
+    faces: NDArray[np.void]
+    levels: list[float]
+
+
+class Renderer:
+    """Draws what ``camera`` sees of a target and of other bodies.
+
+    Keeps textures and lookup tables, no state: equal arguments give equal pictures. Raises ValueError when
+    the camera's distortion cannot be inverted everywhere in the picture.
+    """
+
+    def __init__(self, camera: Camera, model: TargetModel, earth: Earth | None = None):
+        self.camera = camera
+        self.model = model
+        # By box, face and the halvings of its resolution across and up; coarser ones are made when needed.
+        self._textures: dict[tuple[int, int, int, int], NDArray[np.uint8] | None] = {
+            (index, face, 0, 0): textures.finest_texture(model, index, face)
+            for index in range(len(model.boxes))
+            for face in range(6)
+        }
+        # The canvas is the ideal picture; with lens distortion it reaches beyond the frame.
+        self._lens = Lens(camera)
+        self._origin, self._size = self._lens.origin_px, self._lens.size_px
+        self._sky = Sky(camera, self._origin, self._size, earth)
+        self._frustum = Frustum(camera, self._origin, self._size)
+
+    def render(
+        self,
+        camera_position_w_m: ArrayLike,
+        camera_q_w_irf_wxyz: ArrayLike,
+        target_p_w_m: ArrayLike,
+        target_q_w_trf_wxyz: ArrayLike,
+        obstacles: Sequence[Obstacle] = (),
+        light: Light = DAYLIGHT,
+    ) -> NDArray[np.uint8]:
+        """Picture (h, w), uint8, of the target and the ``obstacles``, lens distortion included.
+
+        ``camera_position_w_m`` (3,), ``camera_q_w_irf_wxyz`` (4,): see `Camera.irf_pose_in_world`.
+        ``light``: a face turned from the sun lies in its own (attached) shadow; no shadows are cast.
+        """
+        q_w_irf = np.asarray(camera_q_w_irf_wxyz, dtype=float)
+        position = np.asarray(camera_position_w_m, dtype=float)
+        to_sun = rotations.rotate_inverse(q_w_irf, light.direction_w)
+
+        bodies: list[Obstacle] = [(self.model.boxes, target_p_w_m, target_q_w_trf_wxyz), *obstacles]
+        shapes = shapes_of(tuple(tuple(boxes) for boxes, _, _ in bodies))
+        poses = np.array([np.concatenate([p, q]) for _, p, q in bodies], dtype=float)
+        seen, faces = see_faces(self._frustum, shapes, np.concatenate([position, q_w_irf]), poses)
+        canvas = self._sky.background(q_w_irf, light)
+        if not len(seen):
+            return self._lens.distorted(canvas)
+        levels = [
+            light.level(cosine, -centre, normal)
+            for cosine, centre, normal in zip(
+                (faces["normal"] @ to_sun).tolist(), faces["centre"], faces["normal"], strict=True
+            )
+        ]
+        of_box: list[list[int]] = [[] for _ in range(len(seen))]
+        for k, box in enumerate(faces["box"].tolist()):
+            of_box[int(box)].append(k)
+        order = paint_order(seen)
+        scene = _Scene(shapes, seen["shape"].astype(int).tolist(), faces, levels)
+        for patch, members in patches(self._covered(seen["low_px"], seen["high_px"])):
+            self._paint(canvas, patch, scene, [k for i in order if i in members for k in of_box[i]])
+        return self._lens.distorted(canvas)
+
+    def _covered(self, low: Array, high: Array) -> list[Rectangle]:
+        """The pixels of the canvas that outlines between ``low`` and ``high`` (n, 2) can touch."""
+        least = np.maximum(np.floor(low).astype(int) - 1, 0).tolist()
+        most = np.minimum(np.ceil(high).astype(int) + 2, self._size).tolist()
+        return [(x0, y0, x1, y1) for (x0, y0), (x1, y1) in zip(least, most, strict=True)]
+
+    def _paint(self, canvas: NDArray[np.uint8], patch: Rectangle, scene: _Scene, faces: list[int]) -> None:
+        """Paints faces, back to front, onto a supersampled copy of the ``patch`` of the canvas that they cover."""
+        x0, y0, x1, y1 = patch
+        if x1 <= x0 or y1 <= y0:
+            return
+        view = canvas[y0:y1, x0:x1]
+        samples = next((n for n, limit in _SAMPLES if n * n * view.size <= limit), 1)
+        fine = spread(view, samples) if samples > 1 else view
+        for k in faces:
+            face, shape = scene.faces[k], scene.of_box[int(scene.faces["box"][k])]
+            # Ideal pixel of the camera -> sample of the fine patch; pixel centres are integers in both.
+            outline = (face["outline_px"][: int(face["count"])] - (x0, y0)) * samples + (samples - 1) / 2.0
+            side, number = int(face["side"]), scene.shapes.numbers[shape]
+            if scene.shapes.bodies[shape] == 0 and self._texture(number, side, 0, 0) is not None:
+                self._paint_texture(fine, scene, k, number, (samples, x0, y0), outline)
+            else:
+                value = min(255, round(scene.levels[k] * scene.shapes.shades[shape]))
+                fixed = np.rint(outline * 16.0).astype(np.int32)
+                cv2.fillConvexPoly(fine, fixed, value, cv2.LINE_8, 4)
+        if samples > 1:
+            take_means(fine, samples, view)
+
+    def _paint_texture(
+        self,
+        patch: NDArray[np.uint8],
+        scene: _Scene,
+        k: int,
+        box: int,
+        at: tuple[int, int, int],
+        outline: Array,
+    ) -> None:
+        """Face ``k``, of the target's ``box``, onto the ``patch`` that has ``at[0]`` samples a pixel from ``at[1:]`` on."""
+        face, finest = scene.faces[k], self._texture(box, int(scene.faces["side"][k]), 0, 0)
+        assert finest is not None
+        place = texture_place(self._frustum, scene.faces[k : k + 1], at, patch.shape, finest.shape)
+        if place is None:
+            return
+        (x0, y0, x1, y1), halved, homography = place
+        texture = self._texture(box, int(face["side"]), *halved)
+        assert texture is not None
+        roi = patch[y0:y1, x0:x1]
+        size = (x1 - x0, y1 - y0)
+        lit = cv2.convertScaleAbs(texture, alpha=scene.levels[k] / 255.0)
+        flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+        if face["in_front"]:
+            # A transparent border blends over half a texel on either side of the face's edge.
+            cv2.warpPerspective(lit, homography, size, roi, flags, cv2.BORDER_TRANSPARENT)
+            return
+        # Part of the face is behind the camera, where the homography mirrors it: paint the rest alone.
+        warped = cv2.warpPerspective(lit, homography, size, None, flags, cv2.BORDER_REPLICATE)
+        mask = np.zeros(roi.shape, dtype=np.uint8)
+        cv2.fillConvexPoly(mask, np.rint((outline - (x0, y0)) * 16.0).astype(np.int32), 255, cv2.LINE_8, 4)
+        cv2.copyTo(warped, mask, roi)
+
+    def _texture(self, box_index: int, face: int, level_x: int, level_y: int) -> NDArray[np.uint8] | None:
+        key = (box_index, face, level_x, level_y)
+        if key not in self._textures:
+            finest = self._textures[box_index, face, 0, 0]
+            if finest is None:
+                return None
+            size = (max(2, finest.shape[1] >> level_x), max(2, finest.shape[0] >> level_y))
+            # The mean over the area again, so that edges stay where they are.
+            coarse = cv2.resize(finest, size, interpolation=cv2.INTER_AREA)
+            self._textures[key] = np.asarray(coarse, dtype=np.uint8)
+        return self._textures[key]

@@ -1,0 +1,103 @@
+"""What the world tells at the beginning of a tick: odometry to those who fly, the truth to the log."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from chaserdock_models.clock import Timing
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import BodyTruth, DockingStatus, Odometry, WorldTruth
+from chaserdock_protocol.transport import Node
+
+from chaserdock_world.actuators.ideal import Actuators
+from chaserdock_world.physics.latch import ProbeLatch
+from chaserdock_world.physics.simulation import BodyState
+
+from .errors import Navigation
+
+
+def odometry_of(chaser: int, state: BodyState, tick: int, time_ns: int) -> Odometry:
+    """A chaser's own state as its navigation gives it."""
+    return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **_state_fields(state))
+
+
+def publish_odometry(
+    node: Node, states: dict[str, BodyState], tick: int, timing: Timing, navigation: Navigation
+) -> None:
+    """Every chaser's own state, as its navigation knows it."""
+    for name, state in states.items():
+        if not name.startswith("chaser/"):
+            continue
+        chaser = int(name.partition("/")[2])
+        known = navigation.sensed(chaser, tick, state)
+        node.publish(topics.ODOMETRY, odometry_of(chaser, known, tick, timing.tick_time_ns(tick)), chaser)
+
+
+def docking_status(latch: ProbeLatch, tick: int, time_ns: int) -> DockingStatus:
+    """What a chaser's docking sensor says of the time since the last tick."""
+    return DockingStatus(
+        tick=tick,
+        sim_time_ns=time_ns,
+        chaser=latch.chaser,
+        contact=latch.touched,
+        armed=latch.armed,
+        latched=latch.latched,
+    )
+
+
+def publish_docking(node: Node, latches: dict[str, ProbeLatch], tick: int, timing: Timing) -> None:
+    """What the docking sensors say, of the chasers that have a port."""
+    for latch in latches.values():
+        node.publish(topics.DOCKING, docking_status(latch, tick, timing.tick_time_ns(tick)), latch.chaser)
+
+
+def publish_truth(
+    node: Node,
+    states: dict[str, BodyState],
+    tick: int,
+    timing: Timing,
+    actuators: Mapping[str, Actuators],
+    contacts: set[tuple[str, str]],
+    latches: dict[str, ProbeLatch],
+) -> None:
+    """Ground truth of all bodies, and what happened since the last tick; the latches' touches are taken."""
+    time_ns = timing.tick_time_ns(tick)
+    saturated, late = [], 0
+    for name, state in states.items():
+        given: dict[str, Any] = {}
+        if name in actuators:
+            took = actuators[name].take(timing.step_of_tick(tick))
+            given = {
+                "impulse_N_s": vector(took.impulse[:3]),
+                "angular_impulse_N_m_s": vector(took.impulse[3:]),
+                "absolute_impulse_N_s": took.absolute_impulse_N_s,
+                "jet_impulse_N_s": took.jet_impulse_N_s,
+                "jet_open_s": took.jet_open_s,
+                "propellant_kg": took.propellant_kg,
+            }
+            late += took.late
+            if took.saturated:
+                saturated.append(int(name.partition("/")[2]))
+        message = BodyTruth(tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **given)
+        node.publish(topics.TRUTH_BODY, message, name)
+    world = WorldTruth(
+        tick=tick,
+        sim_time_ns=time_ns,
+        contacts=tuple(sorted(contacts)),
+        saturated=tuple(saturated),
+        late_commands=late,
+        latched=tuple(latch.chaser for latch in latches.values() if latch.latched),
+        touches=tuple(touch for latch in latches.values() for touch in latch.take()),
+    )
+    node.publish(topics.TRUTH_WORLD, world)
+
+
+def _state_fields(state: BodyState) -> dict[str, Any]:
+    return {
+        "position_m": vector(state.position_m),
+        "velocity_m_s": vector(state.velocity_m_s),
+        "q_wxyz": vector(state.q_wxyz),
+        "omega_rad_s": vector(state.omega_rad_s),
+    }

@@ -1,6 +1,6 @@
 """A campaign killed half way, resumed, and flown once more on a cluster: ``python benchmarks/campaign.py [--quick]``.
 
-200 seeds (``--runs``) of a shortened ``single`` with small pictures, two at a time. With half of the results there the
+200 seeds (``--runs``) of a shortened ``single`` with small images, two at a time. With half of the results there the
 program and all it has started are killed with kill -9; started again it must fly the rest and nothing twice. The same
 file then goes to a Dask cluster of two worker processes on this machine. Tables are compared row by row, whole.
 ``--out`` keeps the folders, and what is there already is not flown again.

@@ -1,4 +1,4 @@
-"""A whole mission in one process, without pictures: world physics, jets, chasers' pilots and controller, for figures
+"""A whole mission in one process, without images: world physics, thrusters, chasers' pilots and controller, for figures
 that need many flights. The target is seen exactly, or with Gaussian noise; everything else is what flies."""
 
 from __future__ import annotations
@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
-from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_controller.core import Flight, Inputs
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ActuatorCommand, JetReport, Odometry, PoseSolution, Sighting
+from chaserdock_protocol.messages import ActuatorCommand, Odometry, PoseSolution, Sighting, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.thrusters import actuators_of
@@ -26,12 +26,12 @@ _SIGMA_M, _SIGMA_RAD = 1e-4, 1e-4
 @dataclass
 class Record:
     """One chaser's flight by tick: time (K,) s, errors (K,) m and rad from its reference on the true target; what its
-    jets gave, (K, n) N s; totals; commands; what was told, as (time, text)."""
+    thrusters gave, (K, n) N s; totals; commands; what was told, as (time, text)."""
 
     time_s: list[float] = field(default_factory=list)
     position_m: list[float] = field(default_factory=list)
     angle_rad: list[float] = field(default_factory=list)
-    jets_N_s: list[tuple[float, ...]] = field(default_factory=list)
+    thrusters_N_s: list[tuple[float, ...]] = field(default_factory=list)
     absolute_impulse_N_s: float = 0.0
     propellant_kg: float = 0.0
     commands: list[ActuatorCommand] = field(default_factory=list)
@@ -45,9 +45,9 @@ class Record:
             float(np.sqrt(np.mean(np.square(np.array(x)[span])))) for x in (self.position_m, self.angle_rad)
         )  # type: ignore[return-value]
 
-    def jet_impulse_N_s(self) -> float:
-        """What all jets gave together."""
-        return float(np.sum(self.jets_N_s)) if self.jets_N_s else 0.0
+    def thruster_impulse_N_s(self) -> float:
+        """What all thrusters gave together."""
+        return float(np.sum(self.thrusters_N_s)) if self.thrusters_N_s else 0.0
 
 
 def fly(
@@ -62,8 +62,8 @@ def fly(
     physics, timing = Physics(scenario), scenario.timing
     numbers = range(len(scenario.chasers))
     actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in numbers}
-    jets = scenario.chaser.actuation == "thrusters"
-    pilots = {i: JetPilot(scenario, i) for i in numbers} if jets else {}
+    thrusters = scenario.chaser.actuation == "thrusters"
+    pilots = {i: ThrusterController(scenario, i) for i in numbers} if thrusters else {}
     flight = Flight(scenario, time.perf_counter)
     records = {i: Record() for i in numbers}
     offsets = {i: scenario.chasers[i].position_m for i in numbers}
@@ -72,7 +72,7 @@ def fly(
             now_ns, step = timing.tick_time_ns(tick), timing.step_of_tick(tick)
             target = physics.state("target")
             odometry: dict[int, Odometry] = {}
-            reports: dict[int, JetReport] = {}
+            reports: dict[int, ThrusterReport] = {}
             sightings = []
             for i in numbers:
                 state = physics.state(f"chaser/{i}")
@@ -80,17 +80,17 @@ def fly(
                 took = actuators[f"chaser/{i}"].take(step)
                 records[i].absolute_impulse_N_s += took.absolute_impulse_N_s
                 records[i].propellant_kg += took.propellant_kg
-                records[i].jets_N_s.append(took.jet_impulse_N_s)
+                records[i].thrusters_N_s.append(took.thruster_impulse_N_s)
                 if i in pilots:
                     reports[i] = pilots[i].observe(odometry[i])
                     told = pilots[i].drain_events()
                     records[i].events += [(now_ns / 1e9, f"{what}: {detail}") for _, what, detail in told]
-                if timing.has_pictures(tick):
+                if timing.has_images(tick):
                     noise = rng.normal(size=6) * ([noise_m] * 3 + [noise_rad] * 3)
                     sightings.append(
                         _sighting(scenario, i, tick, now_ns, state, target, noise, noise_m, noise_rad)
                     )
-            out = flight.step(Inputs(tick, now_ns, odometry, tuple(sightings), jets=reports))
+            out = flight.step(Inputs(tick, now_ns, odometry, tuple(sightings), thrusters=reports))
             for i, command in out.wrenches.items():
                 if i in out.references:
                     offsets[i] = out.references[i].offset_m

@@ -5,7 +5,7 @@ and tells how long (wall time) until every process was expected again in a tick,
 without one, and whether the mission was a success. The faults: ``crash`` of a chaser (its process killed, Docker starts it
 again), ``kill`` of a chaser (``docker kill``: Docker does not start that again, so ``docker start`` follows after 2 s),
 ``pause`` of a chaser for 5 s, ``disconnect`` of a chaser from the network for 5 s, ``router`` restarted,
-``controller`` crashed. ``--quick``: 120 s of two chasers, small pictures (a shorter one may end before a container is back).
+``controller`` crashed. ``--quick``: 120 s of two chasers, small images (a shorter one may end before a container is back).
 """
 
 from __future__ import annotations

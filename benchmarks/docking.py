@@ -2,10 +2,10 @@
 [--aborts-seen N] [--failures N] [--results FILE]``.
 
 Flies ``docking-contact`` many times in one process: from seeded starts, at target rates from zero to three times the
-paper's about any axis. ``--flights`` with a statistical eye (2 mm and 0.1 degrees of white noise, every tenth picture
-blind), ``--seen`` with rendered pictures and the real perception, ``--aborts`` aborted at a random time (``--aborts-seen``
-with pictures), with a second approach after every fifth; ``--failures`` with a jet that sticks open, and as many with
-one that sticks shut, untold, jet after jet: at ``--failed-at``, or at a random time between 2 and 24 s. The approach is
+paper's about any axis. ``--flights`` with a statistical eye (2 mm and 0.1 degrees of white noise, every tenth image
+blind), ``--seen`` with rendered images and the real perception, ``--aborts`` aborted at a random time (``--aborts-seen``
+with images), with a second approach after every fifth; ``--failures`` with a thruster that sticks open, and as many with
+one that sticks shut, untold, thruster after thruster: at ``--failed-at``, or at a random time between 2 and 24 s. The approach is
 commanded at ``--approach-at``. ``--first`` is the first seed. Prints outcomes by cause, and figures at contact.
 
 ``--results FILE`` appends every flight to FILE (JSON lines) and takes what is there already: a batch that was stopped
@@ -130,7 +130,7 @@ def abort_figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
 
 
 def noisy(scenario: Scenario) -> Eye:
-    """Sees the target's true pose with 2 mm and 0.1 degrees of noise, and in every tenth picture nothing."""
+    """Sees the target's true pose with 2 mm and 0.1 degrees of noise, and in every tenth image nothing."""
     return statistical_eye(scenario, scenario.seed, 0.002, math.radians(0.1), blind=0.1)
 
 
@@ -145,7 +145,7 @@ def main() -> None:
     parser.add_argument("--failed-at", type=float, help="s; at random by default")
     parser.add_argument("--approach-at", type=float, default=APPROACH_AT_S, help="s; not for aborts")
     parser.add_argument("--actuation", choices=("thrusters", "ideal"), default="thrusters")
-    parser.add_argument("--rate", type=int, help="Hz, of control and pictures; the scenario's by default")
+    parser.add_argument("--rate", type=int, help="Hz, of control and images; the scenario's by default")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="changes the scenario"
     )

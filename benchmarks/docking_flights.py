@@ -27,7 +27,7 @@ REACHED_M = 0.05
 
 
 Failure = tuple[str, int, float]
-"""Of a jet: kind, number, time in s."""
+"""Of a thruster: kind, number, time in s."""
 
 
 def mission(
@@ -55,10 +55,10 @@ def mission(
         "chaser.actuation": actuation,
     }
     if rate_hz is not None:
-        values |= {"time.rate_hz": rate_hz, "time.picture_hz": rate_hz}
+        values |= {"time.rate_hz": rate_hz, "time.image_hz": rate_hz}
     if failure is not None:
-        kind, jet, at_s = failure
-        values["jet_failure"] = f"[{{chaser=0,jet={jet},at_s={at_s},kind='{kind}'}}]"
+        kind, thruster, at_s = failure
+        values["thruster_failure"] = f"[{{chaser=0,thruster={thruster},at_s={at_s},kind='{kind}'}}]"
     overrides = [*(f"{key}={value}" for key, value in values.items()), *changes]
     scenario = load_scenario(ROOT / "scenarios" / "docking-contact.toml", tuple(overrides))
     chaser = scenario.chasers[0].model_copy(
@@ -141,7 +141,7 @@ class Conservation:
 @dataclass
 class Outcome:
     """How one flight ended. ``touch`` is the one at which the latch closed; ``peak_m`` the greatest distance from the
-    reference on the true target from the jet's ``failure`` on until it is captured."""
+    reference on the true target from the thruster's ``failure`` on until it is captured."""
 
     seed: int
     cause: str
@@ -158,18 +158,18 @@ class Outcome:
     failure: Failure | None = None
     peak_m: float | None = None
     verified_s: float | None = None
-    picture_share_seen: float | None = None
+    image_share_seen: float | None = None
 
     def found_s(self) -> float | None:
-        """How long after its failure the jet was found to have failed that way; None: never."""
+        """How long after its failure the thruster was found to have failed that way; None: never."""
         if self.failure is None:
             return None
-        kind, jet, at_s = self.failure
-        what = f"jet {jet} {kind.replace('_', ' ')}, found"
+        kind, thruster, at_s = self.failure
+        what = f"thruster {thruster} {kind.replace('_', ' ')}, found"
         return next((t - at_s for t, text in self.verdicts if text.startswith(what)), None)
 
     def false_alarms(self) -> int:
-        """Jets that were found to have failed in a way that they had not."""
+        """Thrusters that were found to have failed in a way that they had not."""
         told = [text for _, text in self.verdicts if ", found" in text]
         return len(told) - (self.found_s() is not None)
 
@@ -177,10 +177,12 @@ class Outcome:
         """The flight on its own, while the others still fly."""
         text = f"{self.seed}: {self.cause}"
         if self.failure is not None and self.peak_m is not None:
-            kind, jet, at_s = self.failure
+            kind, thruster, at_s = self.failure
             found_s = self.found_s()
             found = "not found" if found_s is None else f"found after {found_s:.2f} s"
-            text += f"; jet {jet} {kind} at {at_s:.2f} s, {found}, {self.peak_m * 1e3:.1f} mm at most"
+            text += (
+                f"; thruster {thruster} {kind} at {at_s:.2f} s, {found}, {self.peak_m * 1e3:.1f} mm at most"
+            )
         if (t := self.touch) is not None:
             text += f"; {t.lateral_m * 1e3:.2f} mm, {math.degrees(t.angle_rad):.3f} deg, {t.closing_m_s * 1e3:.2f} mm/s"
         if self.linear is not None and self.angular is not None:
@@ -218,7 +220,7 @@ def dock(
     """One approach until it is verified, given up or the time is over."""
     flight = Offline(scenario, eye_of(scenario))
     conservation, told, peak_m = Conservation(flight), False, 0.0
-    pictures, seen = 0, 0
+    images, seen = 0, 0
     while flight.time_s < approach_at_s + LIMIT_S and flight.phase(0) != "verified":
         now = not told and flight.time_s >= approach_at_s
         out = flight.step((order("approach"),) if now else ())
@@ -229,7 +231,7 @@ def dock(
             and flight.phase(0) not in ("latched", "verified")
         ):
             peak_m = max(peak_m, reference_error_m(flight))
-        pictures, seen = pictures + 1, seen + bool(out.target.accepted)
+        images, seen = images + 1, seen + bool(out.target.accepted)
     verified = flight.phase(0) == "verified"
     touch = next((t for t in flight.touches if t.latched), None)
     flight.close()
@@ -246,7 +248,7 @@ def dock(
         failure=failure,
         peak_m=None if failure is None else peak_m,
         verified_s=flight.time_s if verified else None,
-        picture_share_seen=seen / max(pictures, 1),
+        image_share_seen=seen / max(images, 1),
     )
 
 

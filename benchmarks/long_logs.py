@@ -1,7 +1,7 @@
 """How long the verbs on a log take, and what memory they need: on a log as it is, and on one of many hours.
 
 The long one is made of the given one by repetition: its ticks and times go on where the last repetition ended, and the
-pictures are left out (ten hours of them would be hundreds of gigabytes). Needs no mission of its own:
+images are left out (ten hours of them would be hundreds of gigabytes). Needs no mission of its own:
 
     chaserdock run four-chaser-docking --out runs/main
     python benchmarks/long_logs.py runs/main --hours 10
@@ -116,7 +116,7 @@ def main() -> None:
                 with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as apart:
                     number = apart.submit(repeat, options.log, long, hours).result()
                 size_MB = long.stat().st_size / 1e6
-                print(f"{label}: {number} messages, {size_MB:.0f} MB, without pictures")
+                print(f"{label}: {number} messages, {size_MB:.0f} MB, without images")
                 log = long
             else:
                 print(f"{options.log} {label}")

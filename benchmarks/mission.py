@@ -1,6 +1,6 @@
 """How fast the main job flies, and how well: ``python benchmarks/mission.py [--quick] [--json FILE]``.
 
-Flies ``four-chaser-docking`` in lock-step with everything on (pictures, recording), three times, each in its own
+Flies ``four-chaser-docking`` in lock-step with everything on (images, recording), three times, each in its own
 processes, and prints medians. ``--quick``: once, 30 s, without the docking.
 """
 

@@ -3,12 +3,12 @@
 Whole missions in one process (``offline.py``: the world, the eyes and the controller that fly, without Zenoh), or of the
 flight code on perfect knowledge (``chaserdock study``'s loop). Parts:
 
-- ``avoidance``: 20 seeded variations of ``collision-avoidance`` with pictures of 640 x 360 (``--full-pictures``: the
+- ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360 (``--full-images``: the
   scenario's own, four times as many pixels and so easier), every fourth exactly symmetric;
 - ``swap``: 20 of ``swap``, the target seen with noise of 2 mm and 0.1 degrees; seed 0 is exactly head-on;
-- ``swap-seen``: the first ``--seen`` of them with pictures;
+- ``swap-seen``: the first ``--seen`` of them with images;
 - ``tracking``: the paper's tumble on perfect knowledge, with and without feed-forward, and with stronger actuators;
-- ``tracking-seen``: the same with the scenarios' own pictures: the servicer, two chasers on the paper's target, stronger
+- ``tracking-seen``: the same with the scenarios' own images: the servicer, two chasers on the paper's target, stronger
   actuators;
 - ``table``: every row of the paper's single-chaser table on perfect knowledge.
 
@@ -51,7 +51,7 @@ def shipped(name: str, *overrides: str) -> Scenario:
     return load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
 
 
-def avoidance(seed: int, full_pictures: bool = False) -> Scenario:
+def avoidance(seed: int, full_images: bool = False) -> Scenario:
     """``collision-avoidance`` turned and scattered by the seed; every fourth seed exactly symmetric.
 
     Symmetric: chaser 0 at rest on an axis of TRF (another one each time), its goal exactly opposite, chaser 1 at right
@@ -84,7 +84,7 @@ def avoidance(seed: int, full_pictures: bool = False) -> Scenario:
     (entry,) = scenario.timeline
     return scenario.model_copy(
         update={
-            "camera": scenario.camera if full_pictures else scenario.camera.model_copy(update=SMALL),
+            "camera": scenario.camera if full_images else scenario.camera.model_copy(update=SMALL),
             "target": scenario.target.model_copy(update={"q_wxyz": tuple(attitude.tolist())}),
             "chasers": chasers,
             "timeline": (entry.model_copy(update={"offset_m": tuple(goal.tolist())}),),
@@ -229,7 +229,7 @@ def tracking(length_s: float) -> dict[str, float]:
 
 
 def seen(scenario: Scenario, gain: float = 1.0) -> tuple[float, float]:
-    """The worst chaser's steady errors from its reference pose on the true target, with pictures."""
+    """The worst chaser's steady errors from its reference pose on the true target, with images."""
     flight, n = Offline(scenario, seeing_eye(scenario), actuator_gain=gain), len(scenario.chasers)
     errors: list[list[tuple[float, float]]] = [[] for _ in range(n)]
     while flight.tick < scenario.ticks:
@@ -247,9 +247,9 @@ def seen(scenario: Scenario, gain: float = 1.0) -> tuple[float, float]:
 
 
 def tracking_seen(length_s: float) -> dict[str, float]:
-    """Steady errors at the paper's tumble with pictures; the worst chaser of each flight."""
+    """Steady errors at the paper's tumble with images; the worst chaser of each flight."""
     out: dict[str, float] = {}
-    print(f"tracking with pictures, worst chaser's RMS from {STEADY_FROM_S:g} s on")
+    print(f"tracking with images, worst chaser's RMS from {STEADY_FROM_S:g} s on")
     length = f"duration_s={length_s}"
     for name, scenario, gain in (
         ("servicer", shipped("single", "target.model='servicer'", length), 1.0),
@@ -303,14 +303,14 @@ def main() -> None:
     parser.add_argument("--part", action="append", choices=PARTS, help="repeatable; all by default")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--flights", type=int, default=20, help="how many seeds")
-    parser.add_argument("--seen", type=int, default=2, help="how many seeds of swap with pictures")
-    parser.add_argument("--full-pictures", action="store_true", help="the scenario's own in avoidance")
+    parser.add_argument("--seen", type=int, default=2, help="how many seeds of swap with images")
+    parser.add_argument("--full-images", action="store_true", help="the scenario's own in avoidance")
     options = parser.parse_args()
     flights, length_s = (2, 60.0) if options.quick else (options.flights, 120.0)
     seeds = range(options.first, options.first + flights)
     run: dict[str, Callable[[], dict[str, float]]] = {
         "avoidance": lambda: variations(
-            "avoidance", seeds, lambda seed: avoidance(seed, options.full_pictures), seeing_eye
+            "avoidance", seeds, lambda seed: avoidance(seed, options.full_images), seeing_eye
         ),
         "swap": lambda: variations("swap", seeds, swap, noisy),
         "swap-seen": lambda: variations("swap-seen", seeds[: options.seen], swap, seeing_eye),

@@ -1,7 +1,7 @@
 """Missions in one process, without Zenoh: world, eyes and controller called in turn, tick by tick.
 
 The same code flies as in the processes; what is left out is what carries messages. Eyes are given, so that a
-statistical model can stand in for pictures; chasers have jets or not, and jets fail, as the scenario has it.
+statistical model can stand in for images; chasers have thrusters or not, and thrusters fail, as the scenario has it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
-from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_controller.core import Flight, Inputs, Outputs
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
@@ -34,14 +34,14 @@ Eye = Callable[[int, int, int, States], Sighting]
 
 
 def seeing_eye(scenario: Scenario) -> Eye:
-    """Real pictures, rendered and searched for markers as in the chaser's process."""
+    """Real images, rendered and searched for markers as in the chaser's process."""
     cameras = Cameras(scenario)
     perception = make_perception(scenario)
     last: dict[int, Sighting] = {}
 
     def see(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
-        number = tick // scenario.timing.ticks_per_picture
-        image = cameras.picture(chaser, number, tick, time_ns, states)
+        number = tick // scenario.timing.ticks_per_image
+        image = cameras.image(chaser, number, tick, time_ns, states)
         last[chaser] = look(perception, image, prediction_from(last.get(chaser)))
         return last[chaser]
 
@@ -51,7 +51,7 @@ def seeing_eye(scenario: Scenario) -> Eye:
 def statistical_eye(
     scenario: Scenario, seed: int, position_m: float, attitude_rad: float, blind: float = 0.0
 ) -> Eye:
-    """The target's true pose with white noise of these sigmas an axis; in the share ``blind`` of pictures, nothing."""
+    """The target's true pose with white noise of these sigmas an axis; in the share ``blind`` of images, nothing."""
     rng = np.random.default_rng([seed, 0xE1E])
     camera = scenario.camera_model()
     covariance = vector(np.diag([position_m**2] * 3 + [attitude_rad**2] * 3))
@@ -86,7 +86,7 @@ class Offline:
     ``actuator_gain``: what ideal actuators give of what they are asked for.
 
     ``touched``: pairs of bodies that touched since the start, but for a probe's tip on the target; ``events``, with
-    what the chasers found of their jets (``verdicts``); ``propellant_kg``, of all chasers.
+    what the chasers found of their thrusters (``verdicts``); ``propellant_kg``, of all chasers.
     """
 
     scenario: Scenario
@@ -105,8 +105,8 @@ class Offline:
         self.physics = Physics(s)
         self.flight = Flight(s, lambda: 0.0)
         self.actuators = {f"chaser/{i}": actuators_of(s, i) for i in range(len(s.chasers))}
-        jets = s.chaser.actuation == "thrusters"
-        self.pilots = {i: JetPilot(s, i) for i in range(len(s.chasers))} if jets else {}
+        thrusters = s.chaser.actuation == "thrusters"
+        self.pilots = {i: ThrusterController(s, i) for i in range(len(s.chasers))} if thrusters else {}
 
     @property
     def time_s(self) -> float:
@@ -134,7 +134,7 @@ class Offline:
             self.verdicts += [
                 (time_ns / 1e9, f"{what}, {detail}") for _, what, detail in pilot.drain_events()
             ]
-        seen = tuple(self.eye(i, tick, time_ns, states) for i in chasers) if timing.has_pictures(tick) else ()
+        seen = tuple(self.eye(i, tick, time_ns, states) for i in chasers) if timing.has_images(tick) else ()
         out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, reports, docking))
         for i, wrench in out.wrenches.items():
             command = passed_on(wrench)

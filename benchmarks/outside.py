@@ -1,4 +1,4 @@
-"""What other people's programs make of a log: ``python benchmarks/outside.py LOG [--tools DIR] [--picture PNG]
+"""What other people's programs make of a log: ``python benchmarks/outside.py LOG [--tools DIR] [--image PNG]
 [--json FILE]``.
 
 Installs evo, pymcap-cli, mcap and rerun into a virtual environment of their own (``--tools``: kept there, else made anew
@@ -7,7 +7,7 @@ in a temporary folder; none of them is a dependency), and asks each about the lo
 - evo_ape on the tracks that ``chaserdock log tracks`` wrote: our root mean squares to 1 %;
 - pymcap-cli doctor: no error;
 - mcap's own reader: a schema for every channel, every message readable;
-- rerun without a window: takes a picture of itself with the log open (``--picture``; look at it). Without a graphics card it
+- rerun without a window: takes an image of itself with the log open (``--image``; look at it). Without a graphics card it
   needs Mesa's Vulkan (Debian: mesa-vulkan-drivers).
 
 Status 1 when one of them does not agree.
@@ -116,20 +116,20 @@ def plain_reader(programs: Path, log: Path) -> Answer:
     return "mcap's reader", told, without == 0 and read == stated > 0
 
 
-def rerun(programs: Path, log: Path, picture: Path) -> Answer:
+def rerun(programs: Path, log: Path, image: Path) -> Answer:
     """Whether rerun draws something with the log open."""
-    picture.unlink(missing_ok=True)
+    image.unlink(missing_ok=True)
     call(
-        programs / "rerun", "--headless", "--renderer", "vulkan", log, "--screenshot-to", picture,
+        programs / "rerun", "--headless", "--renderer", "vulkan", log, "--screenshot-to", image,
         "--window-size", "900x560", RUST_LOG="off",
     )  # fmt: skip
-    drawn = cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE) if picture.exists() else None
+    drawn = cv2.imread(str(image), cv2.IMREAD_GRAYSCALE) if image.exists() else None
     if drawn is None:
-        return "rerun", "took no picture", False
+        return "rerun", "took no image", False
     levels = len(np.unique(drawn))
     return (
         "rerun",
-        f"{drawn.shape[1]} x {drawn.shape[0]} pixels, {levels} grey levels: {picture}",
+        f"{drawn.shape[1]} x {drawn.shape[0]} pixels, {levels} grey levels: {image}",
         levels > 64,
     )
 
@@ -138,14 +138,14 @@ def main() -> int:
     parser = options_of(__doc__)
     parser.add_argument("log", type=Path, metavar="LOG", help="mission.mcap")
     parser.add_argument("--tools", type=Path, metavar="DIR", help="virtual environment of the tools, kept")
-    parser.add_argument("--picture", type=Path, metavar="PNG", default=Path("rerun.png"))
+    parser.add_argument("--image", type=Path, metavar="PNG", default=Path("rerun.png"))
     options = parser.parse_args()
     log: Path = options.log.resolve()
     with tempfile.TemporaryDirectory() as name:
         work = Path(name)
         programs = tools_in((options.tools or work / "tools").resolve())
         answers = [*evo(programs, log, work / "tracks"), doctor(programs, log), plain_reader(programs, log)]
-        answers.append(rerun(programs, log, options.picture.resolve()))
+        answers.append(rerun(programs, log, options.image.resolve()))
     for asked, told, good in answers:
         print(f"{asked:20}  {told}  {'agrees' if good else 'DOES NOT'}")
     write_json(options.json, {asked: told for asked, told, _ in answers})

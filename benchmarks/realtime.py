@@ -1,10 +1,10 @@
 """Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--flights 1] [--only SUBJECT] [--seconds 5]
 [--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
 
-Flies ``four-chaser-docking`` in real time with ticks and pictures at 30 Hz, 640 x 480, every process on this machine, and
-measures from a picture's sending to the sending of the actuator command that answers it (both stamps are the senders');
-the pictures of a tick are sent together, as cameras do that expose at once. Beside it, from the tick's sending, when
-the pictures have still to be drawn, to that command.
+Flies ``four-chaser-docking`` in real time with ticks and images at 30 Hz, 640 x 480, every process on this machine, and
+measures from an image's sending to the sending of the actuator command that answers it (both stamps are the senders');
+the images of a tick are sent together, as cameras do that expose at once. Beside it, from the tick's sending, when
+the images have still to be drawn, to that command.
 A flight for each subject, ``recorder`` and ``viewer`` (the recorder runs in both; the viewer is asked for by one client that
 reads all it gets). In windows of ``--seconds`` that take turns in the same flight, the subject is left as it is, frozen
 (SIGSTOP), left as it is, and slow (runs for a tenth of the time): what the machine does meanwhile touches all of them.
@@ -50,7 +50,7 @@ SUBJECTS = ("recorder", "viewer")
 LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",
-    f"time.picture_hz={RATE_HZ}",
+    f"time.image_hz={RATE_HZ}",
     "camera.width_px=640",
     "camera.height_px=480",
     "timeline=[]",
@@ -59,7 +59,7 @@ OVERRIDES = (
 
 
 class Head(msgspec.Struct):
-    """What is read of a tick, a picture or an actuator command."""
+    """What is read of a tick, an image or an actuator command."""
 
     tick: int
     chaser: int = -1
@@ -71,10 +71,10 @@ _head = msgspec.msgpack.Decoder(Head)
 
 @dataclass
 class Ear:
-    """When ticks, pictures and commands were sent, by tick or by chaser and tick (wall clock, ns)."""
+    """When ticks, images and commands were sent, by tick or by chaser and tick (wall clock, ns)."""
 
     ticks: dict[int, int] = field(default_factory=dict)
-    pictures: dict[tuple[int, int], int] = field(default_factory=dict)
+    images: dict[tuple[int, int], int] = field(default_factory=dict)
     commands: dict[tuple[int, int], int] = field(default_factory=dict)
     last_tick: int = -1
 
@@ -85,7 +85,7 @@ class Ear:
         if raw.key == topics.TICK.key:
             self.ticks.setdefault(head.tick, raw.sent_ns)
         elif raw.key.endswith("/image"):
-            self.pictures[head.chaser, head.tick] = raw.sent_ns
+            self.images[head.chaser, head.tick] = raw.sent_ns
             self.last_tick = max(self.last_tick, head.tick)
         elif head.source == "command":
             self.commands.setdefault((head.chaser, head.tick), raw.sent_ns)
@@ -103,7 +103,7 @@ class Window:
 
 @dataclass(frozen=True)
 class Flown:
-    """All windows of one condition: latencies of all commands from picture and from tick (s), how many ticks of chasers had
+    """All windows of one condition: latencies of all commands from image and from tick (s), how many ticks of chasers had
     no command."""
 
     latency_s: np.ndarray
@@ -224,9 +224,7 @@ def fly(subject: str, seconds: float, rounds: int, keep: Path | None = None) -> 
 def together(windows: list[Window], ear: Ear) -> Flown:
     """What the ear heard in these windows."""
     keys = [(i, tick) for w in windows for tick in range(w.first, w.last + 1) for i in range(CHASERS)]
-    latency = [
-        (ear.commands[k] - ear.pictures[k]) / 1e9 for k in keys if k in ear.commands and k in ear.pictures
-    ]
+    latency = [(ear.commands[k] - ear.images[k]) / 1e9 for k in keys if k in ear.commands and k in ear.images]
     share = {name: float(np.mean([w.cpu_share[name] for w in windows])) for name in windows[0].cpu_share}
     lost = sum(k not in ear.commands for k in keys)
     since_tick = [
@@ -236,7 +234,7 @@ def together(windows: list[Window], ear: Ear) -> Flown:
 
 
 def wait_for(ear: Ear, tick: int, fleet: Fleet, hub: Node) -> None:
-    """Waits until a tick's pictures have been sent; raises SystemExit when a process ends before."""
+    """Waits until a tick's images have been sent; raises SystemExit when a process ends before."""
     while ear.last_tick < tick:
         received = hub.receive(0.05)
         dead = [c.last_words() for c in fleet.children if c.process.poll() is not None]

@@ -73,7 +73,7 @@ def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
     import offline
 
     clock = Clock()
-    kept = [(offline, "look"), (chaserdock_world.rendering.cameras.Cameras, "picture")]
+    kept = [(offline, "look"), (chaserdock_world.rendering.cameras.Cameras, "image")]
     before = [getattr(owner, name) for owner, name in kept]
     for (owner, name), part in zip(kept, ("perceive", "render"), strict=True):
         clock.wrap(owner, name, part)

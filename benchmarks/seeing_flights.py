@@ -1,7 +1,7 @@
-"""What flights with pictures show of the target's estimate: ``python benchmarks/seeing_flights.py PART [--json FILE]``.
+"""What flights with images show of the target's estimate: ``python benchmarks/seeing_flights.py PART [--json FILE]``.
 
 Parts: ``exact`` (all effects, cameras as calibrated; both targets, one and two chasers; the paper's perception and
-estimator on the same pictures), ``errors`` (calibration errors drawn for each seed, heavy noise), ``calibrate`` (the
+estimator on the same images), ``errors`` (calibration errors drawn for each seed, heavy noise), ``calibrate`` (the
 manoeuvre that finds a camera's mounting), ``acquire`` (starts off the reference, the target often out of view), ``faults``.
 
 One line of JSON a flight goes to ``--flights FILE``; flights that are there already are not flown again, so that a run
@@ -119,7 +119,7 @@ def figures(flown: Flown, from_s: float) -> Row:
 
 
 def paper_of(scenario: Scenario) -> dict[str, Scenario]:
-    """The paper's perception and estimator on the same pictures."""
+    """The paper's perception and estimator on the same images."""
     return {"paper": changed(scenario, perception={"name": "paper"}, estimator={"name": "paper"})}
 
 
@@ -210,7 +210,7 @@ def fault(which: str, seed: int) -> Row:
         camera |= {"sun_direction": (1.0, -0.1, 0.12), "effects": camera["effects"] | {"glare": 3000.0}}
         scenario = changed(scenario, camera=camera)
 
-    def on_picture(image: Image) -> Image | None:
+    def on_image(image: Image) -> Image | None:
         t = image.sim_time_ns / 1e9
         dark = (which == "one_blind" and image.chaser == 1 and 8.0 <= t < 28.0) or (
             which == "both_blind" and 8.0 <= t < 13.0
@@ -230,7 +230,7 @@ def fault(which: str, seed: int) -> Row:
         )
         return msgspec.structs.replace(s, solutions=lies)
 
-    flown = fly(scenario, on_picture=on_picture, on_sighting=on_sighting)
+    flown = fly(scenario, on_image=on_image, on_sighting=on_sighting)
     named = any(level == "warning" and "chaser 2" in text for _, level, text in flown.events)
     return figures(flown, SETTLED_S) | {
         "max_m": flown.estimates.largest("position_m", 1.0),

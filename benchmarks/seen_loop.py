@@ -1,7 +1,7 @@
-"""A whole flight in one process, pictures and all: world physics, cameras, the chasers' perception, fusion, guidance and
+"""A whole flight in one process, images and all: world physics, cameras, the chasers' perception, fusion, guidance and
 NMPC, for figures of what is seen that need many flights. Everything is what flies; only the network is left out.
 
-Beside the flight, ``shadows`` (fusion by other scenarios, with their perception) see the same pictures and steer nothing.
+Beside the flight, ``shadows`` (fusion by other scenarios, with their perception) see the same images and steer nothing.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.sensors.errors import Navigation
 from chaserdock_world.sensors.publish import odometry_of
 
-OnPicture = Callable[[Image], Image | None]
-"""What becomes of a picture on its way to perception; None: it never comes."""
+OnImage = Callable[[Image], Image | None]
+"""What becomes of an image on its way to perception; None: it never comes."""
 OnSighting = Callable[[Sighting], Sighting]
 """What a chaser reports instead of what it saw."""
 
@@ -102,7 +102,7 @@ class Flown:
 
 
 class _Shadow:
-    """Perception and fusion of another scenario on the same pictures."""
+    """Perception and fusion of another scenario on the same images."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
@@ -114,7 +114,7 @@ class _Shadow:
 def fly(
     scenario: Scenario,
     shadows: Mapping[str, Scenario] | None = None,
-    on_picture: OnPicture | None = None,
+    on_image: OnImage | None = None,
     on_sighting: OnSighting | None = None,
     commands: Callable[[float], tuple[OperatorCommand, ...]] = lambda now_s: (),
     until: Callable[[float, Estimates], bool] = lambda now_s, estimates: False,
@@ -144,12 +144,12 @@ def fly(
             }
             sightings: list[Sighting] = []
             aside: dict[str, list[Sighting]] = {name: [] for name in beside}
-            for i in numbers if timing.has_pictures(tick) else ():
-                picture = cameras.picture(i, tick // timing.ticks_per_picture, tick, now_ns, states)
-                given = picture if on_picture is None else on_picture(picture)
+            for i in numbers if timing.has_images(tick) else ():
+                image = cameras.image(i, tick // timing.ticks_per_image, tick, now_ns, states)
+                given = image if on_image is None else on_image(image)
                 if given is None:
                     blind = msgspec.structs.replace(
-                        picture, encoding="mono8", data=bytes(picture.width_px * picture.height_px)
+                        image, encoding="mono8", data=bytes(image.width_px * image.height_px)
                     )
                     given = blind
                 before[i] = look(perceptions[i], given, prediction_from(before.get(i)))

@@ -1,8 +1,8 @@
-"""Jets measured: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART ...]``.
+"""Thrusters measured: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART ...]``.
 
 Parts: ``allocation`` (random wrenches), ``pulses`` (given against asked for), ``tracking`` (perfect state, the paper's
-rates), ``failures`` (every jet of tetra12 stuck on, and stuck off, untold, at 30 s), ``healthy`` (false alarms).
-Flights are those of ``closed_loop``: everything that flies, without pictures. ``--quick``: fewer and shorter.
+rates), ``failures`` (every thruster of tetra12 stuck on, and stuck off, untold, at 30 s), ``healthy`` (false alarms).
+Flights are those of ``closed_loop``: everything that flies, without images. ``--quick``: fewer and shorter.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.0
 
 
 VARIANTS: dict[str, dict[str, Any]] = {
-    "untested": {"jet_test_s": 0.0},
+    "untested": {"thruster_test_s": 0.0},
     "carrier_15_hz": {"modulation": {"carrier_hz": 15}},
     "schmitt": {"modulation": {"modulator": "schmitt"}},
 }
@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **changes: Any) -> Scenario:
-    """One chaser a metre from the target, with jets unless said otherwise."""
+    """One chaser a metre from the target, with thrusters unless said otherwise."""
     chaser = {"body": body, "actuation": "thrusters", **changes.pop("chaser", {})}
     start = {
         "start_offset_m": [-0.1, 0.02, 0.0],
@@ -50,7 +50,7 @@ def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **chan
     values: dict[str, Any] = {
         "name": "bench",
         "duration_s": duration_s,
-        "time": {"rate_hz": rate_hz, "picture_hz": rate_hz},
+        "time": {"rate_hz": rate_hz, "image_hz": rate_hz},
         "chaser": chaser,
         "chasers": [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0], **start}],
     }
@@ -58,7 +58,7 @@ def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **chan
 
 
 def allocation(quick: bool) -> dict[str, float]:
-    """Wrenches that jets can give, up to full thrust of all, reproduced; and how long that takes."""
+    """Wrenches that thrusters can give, up to full thrust of all, reproduced; and how long that takes."""
     out: dict[str, float] = {}
     for body in ("tetra12", "slider"):
         rng = np.random.default_rng(1)
@@ -86,7 +86,7 @@ def allocation(quick: bool) -> dict[str, float]:
 
 def pulses(quick: bool) -> dict[str, float]:
     """Thrusts asked for at random, new every tick: greatest difference of impulse given and asked for, over any whole
-    number of carrier periods that makes a second, in minimum pulses of the jet.
+    number of carrier periods that makes a second, in minimum pulses of the thruster.
 
     ``less_late``: without what was asked for within a period after its pulse had been sent. Where every tick begins a
     period there is none.
@@ -107,7 +107,7 @@ def pulses(quick: bool) -> dict[str, float]:
             begin, end = timing.effective_ns(tick), timing.effective_ns(tick + 1)
             asked.append(asked[-1] + thrusts * (end - begin) * 1e-9)
             for p in modulator.pulses(thrusts, full, begin, end):
-                valves.pulse(p.jet, p.open_ns, p.close_ns)
+                valves.pulse(p.thruster, p.open_ns, p.close_ns)
         # Where periods and ticks begin together, every whole second of the carrier is one of the ticks, too.
         edges = np.array([timing.effective_ns(k * rate_hz) for k in range(1, ticks // rate_hz)], dtype=float)
         total = Asked(
@@ -141,7 +141,7 @@ class Asked:
 
 
 def tracking(quick: bool) -> dict[str, float]:
-    """Steady errors with jets, perfect state, and what that costs beside ideal actuation."""
+    """Steady errors with thrusters, perfect state, and what that costs beside ideal actuation."""
     out: dict[str, float] = {}
     duration_s = 40.0 if quick else 120.0
     for body in ("tetra12", "slider"):
@@ -157,38 +157,38 @@ def tracking(quick: bool) -> dict[str, float]:
             out |= {
                 f"{name}_position_rms_m": position,
                 f"{name}_orientation_rms_deg": math.degrees(angle),
-                f"{name}_jet_impulse_N_s": record.jet_impulse_N_s(),
+                f"{name}_thruster_impulse_N_s": record.thruster_impulse_N_s(),
                 f"{name}_propellant_kg": record.propellant_kg,
             }
     return out
 
 
-def _isolated_s(record: Record, jet: int) -> float:
-    """When a jet's shut-off valve was closed after its failure, s from then; infinite if never."""
-    times = [c.effective_time_ns / 1e9 - FAILED_AT_S for c in record.commands if jet in c.isolated]
+def _isolated_s(record: Record, thruster: int) -> float:
+    """When a thruster's shut-off valve was closed after its failure, s from then; infinite if never."""
+    times = [c.effective_time_ns / 1e9 - FAILED_AT_S for c in record.commands if thruster in c.isolated]
     return times[0] if times else math.inf
 
 
 def failures(quick: bool) -> dict[str, float]:
-    """Every jet fails untold at 30 s: when the right one is shut off, how many wrong ones are, the errors after."""
+    """Every thruster fails untold at 30 s: when the right one is shut off, how many wrong ones are, the errors after."""
     out: dict[str, float] = {}
-    jets = (0, 5, 10) if quick else range(12)
+    thrusters = (0, 5, 10) if quick else range(12)
     for kind in ("stuck_on", "stuck_off"):
         delays, wrong, peaks, final = [], 0, [], []
-        for jet in jets:
-            failure = {"chaser": 0, "jet": jet, "at_s": FAILED_AT_S, "kind": kind}
-            record = fly(scenario(80.0 if kind == "stuck_off" else 60.0, jet_failure=[failure]))[0]
-            delays.append(_isolated_s(record, jet))
-            wrong += len({j for c in record.commands for j in c.isolated} - {jet})
+        for thruster in thrusters:
+            failure = {"chaser": 0, "thruster": thruster, "at_s": FAILED_AT_S, "kind": kind}
+            record = fly(scenario(80.0 if kind == "stuck_off" else 60.0, thruster_failure=[failure]))[0]
+            delays.append(_isolated_s(record, thruster))
+            wrong += len({j for c in record.commands for j in c.isolated} - {thruster})
             late = np.array(record.time_s) >= FAILED_AT_S
             peaks.append((max(np.array(record.position_m)[late]), max(np.array(record.angle_rad)[late])))
             final.append(record.rms(record.time_s[-1] - 10.0)[0])
-            print(f"  {kind} jet {jet}: isolated after {delays[-1]:.3f} s, peak {peaks[-1][0] * 1e3:.1f} mm, "
+            print(f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, peak {peaks[-1][0] * 1e3:.1f} mm, "
                   f"{math.degrees(peaks[-1][1]):.2f} deg; {record.events}", file=sys.stderr)  # fmt: skip
         out |= {
             f"failures_{kind}_flights": float(len(delays)),
             f"failures_{kind}_isolated": float(np.isfinite(delays).sum()),
-            f"failures_{kind}_wrong_jets": float(wrong),
+            f"failures_{kind}_wrong_thrusters": float(wrong),
             f"failures_{kind}_median_time_to_isolation_s": float(np.median(delays)),
             f"failures_{kind}_max_time_to_isolation_s": float(max(delays)),
             f"failures_{kind}_max_peak_position_m": float(max(p for p, _ in peaks)),

@@ -30,7 +30,7 @@ EYE, AHEAD = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)
 GROSS_M, GROSS_RAD = 0.1, np.deg2rad(10.0)
 JPEG_QUALITY = 85
-# A face turned to the camera, upright: its right is the picture's right, its up the picture's up.
+# A face turned to the camera, upright: its right is the image's right, its up the image's up.
 FACING = rotations.from_matrix(np.diag([1.0, -1.0, -1.0]))
 
 Figures = dict[str, float]
@@ -38,7 +38,7 @@ Figures = dict[str, float]
 
 @dataclass
 class View:
-    """One picture with the pose of the target (IRF) that it shows."""
+    """One image with the pose of the target (IRF) that it shows."""
 
     image: NDArray[np.uint8]
     position: Array
@@ -57,7 +57,7 @@ class Bench:
         self.count = 0
 
     def view(self, position: Array, q: Array, to_sun: Array) -> View:
-        """A picture with all default effects, compressed and decompressed as between the processes."""
+        """An image with all default effects, compressed and decompressed as between the processes."""
         exact = self.renderer.render(EYE, AHEAD, position, q, (), Light(tuple(to_sun.tolist())))
         taken = self.effects.apply(exact, 0, self.count)
         self.count += 1
@@ -66,7 +66,7 @@ class Bench:
         return View(image, position, q, self._whole_markers(position, q))
 
     def _whole_markers(self, position: Array, q: Array) -> int:
-        """How many markers face the camera with all of their corners in the picture."""
+        """How many markers face the camera with all of their corners in the image."""
         corners = rotations.rotate(q, np.array([m.corners_trf_m() for m in self.model.markers])) + position
         normals = rotations.rotate(q, np.array([m.normal_trf() for m in self.model.markers]))
         px = self.camera.project(corners)
@@ -78,7 +78,7 @@ class Bench:
         return Perception(self.camera, self.model, method)
 
     def random_views(self, count: int, near_m: float, far_m: float, seed: int) -> Iterator[View]:
-        """Any attitude, the centre in the middle 40 % of the picture each way, the sun anywhere."""
+        """Any attitude, the centre in the middle 40 % of the image each way, the sun anywhere."""
         generator = np.random.default_rng(seed)
         size = np.array([self.camera.width_px, self.camera.height_px])
         for _ in range(count):
@@ -209,7 +209,7 @@ def reach(count: int) -> Figures:
 
 
 def near_views(count: int) -> Figures:
-    """Any attitude with the centre at 0.28 to 0.45 m, where the body fills the picture."""
+    """Any attitude with the centre at 0.28 to 0.45 m, where the body fills the image."""
     bench, tally = Bench("servicer"), Tally()
     perception = bench.perception()
     for view in bench.random_views(count, 0.28, 0.45, 8):

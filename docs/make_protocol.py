@@ -22,7 +22,7 @@ from msgspec import inspect as shapes
 PAGE = Path(__file__).with_name("protocol.md")
 _RATES = {
     "tick": "every tick",
-    "picture": "every tick with pictures",
+    "image": "every tick with images",
     "second": "each second of simulated time",
     "presence": f"each {EARLY_PERIOD_S:g} s of wall time until the first tick, then each {STEADY_PERIOD_S:g} s",
     "event": "when it happens",
@@ -70,10 +70,10 @@ with the world and all chasers, a chaser with the world and the controller; a st
 
 ## A tick in lock-step
 1. The world publishes the odometry of every chaser (and its docking sensor's word, if it has a port), then
-   `Tick`, then, if `pictures`, an image for every chaser in `chasers`. Messages on different keys may come in
+   `Tick`, then, if `images`, an image for every chaser in `chasers`. Messages on different keys may come in
    any order.
 2. A chaser answers its image with a `Sighting`, also when it sees nothing. With thrusters it answers its
-   odometry with a `JetReport`.
+   odometry with a `ThrusterReport`.
 3. When for each chaser in `chasers` odometry, and what else is due, has come, the controller answers with one
    `WrenchCommand` each, a `TargetEstimate`, and last a `SolverStatus`. All carry the tick's `tick` and
    `sim_time_ns`. `effective_time_ns` is when the command acts: physics step `tick * physics_hz / rate_hz +
@@ -211,7 +211,7 @@ def page() -> str:
     for key, asked, answered in (
         (topics.JOIN_KEY, messages.JoinRequest, messages.JoinReply),
         (topics.OPERATE_KEY, messages.OperatorCommand, messages.CommandReply),
-        (topics.JET_FAULT_KEY, messages.JetFaultCommand, messages.CommandReply),
+        (topics.THRUSTER_FAULT_KEY, messages.ThrusterFaultCommand, messages.CommandReply),
     ):
         names = [f"[{k.__name__}](#{k.__name__.lower()}) v{messages.VERSION[k]}" for k in (asked, answered)]
         parts.append(f"| `{key}` | {' | '.join(names)} |")

@@ -67,7 +67,7 @@ class Stage:
         return place if file.suffix == ".md" else f"{place}.md"
 
     def add(self, file: Path) -> None:
-        """A page or picture; a source file becomes a page that shows it. Raises SiteError for a link to nowhere."""
+        """A page or image; a source file becomes a page that shows it. Raises SiteError for a link to nowhere."""
         if file in self._staged:
             return
         self._staged.add(file)

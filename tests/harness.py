@@ -26,7 +26,7 @@ SHORT = (
     "success.steady_position_rms_m=0.2",
     "success.steady_orientation_rms_deg=10.0",
 )
-"""Turns a shipped scenario into a short one with small pictures."""
+"""Turns a shipped scenario into a short one with small images."""
 
 
 def chaserdock(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:

@@ -27,7 +27,7 @@ def flight(ticks: int) -> Iterator[tuple[topics.Topic, int | str | None, m.Messa
     """What a short mission with two chasers would publish."""
     for k in range(ticks):
         head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * 66_666_666}
-        yield topics.TICK, None, m.Tick(**head, pictures=True, chasers=(0, 1), controller=True)
+        yield topics.TICK, None, m.Tick(**head, images=True, chasers=(0, 1), controller=True)
         for i in (0, 1):
             state = {
                 "position_m": (float(k), float(i), 0.5),
@@ -37,11 +37,11 @@ def flight(ticks: int) -> Iterator[tuple[topics.Topic, int | str | None, m.Messa
             }
             yield topics.ODOMETRY, i, m.Odometry(**head, chaser=i, **state)
             yield topics.TRUTH_BODY, f"chaser/{i}", m.BodyTruth(**head, body=f"chaser/{i}", **state)
-        picture = bytes((k * 7 + j * j) % 251 for j in range(64))
+        image = bytes((k * 7 + j * j) % 251 for j in range(64))
         yield (
             topics.IMAGE,
             1,
-            m.Image(**head, chaser=1, width_px=8, height_px=8, encoding="mono8", data=picture),
+            m.Image(**head, chaser=1, width_px=8, height_px=8, encoding="mono8", data=image),
         )
 
 

@@ -1,7 +1,7 @@
 """Records the golden logs anew: ``python tests/make_golden.py``. Only after a deliberate change of what processes answer.
 
-``two-chasers``: pictures through commands, of every process. ``capture``: one chaser docks on jets and is verified; for the
-controller and the pilot, without pictures and truth.
+``two-chasers``: images through commands, of every process. ``capture``: one chaser docks on thrusters and is verified; for the
+controller and the pilot, without images and truth.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from harness import ROOT, run
 
 GOLDEN = ROOT / "tests" / "golden"
-PICTURES = ("camera.width_px=480", "camera.height_px=270", "camera.effects.jpeg_quality=85")
+IMAGES = ("camera.width_px=480", "camera.height_px=270", "camera.effects.jpeg_quality=85")
 TWO_CHASERS = (
     "duration_s=1.2",
     "settling_s=0.5",
-    *PICTURES,
+    *IMAGES,
     "timeline=[{at_s=0.6,command='approach',chasers=[0]}]",
 )
 CAPTURE = (
@@ -28,17 +28,17 @@ CAPTURE = (
     "settling_s=0.5",
     "steady_until_s=1.0",
     "time.rate_hz=5",
-    "time.picture_hz=5",
+    "time.image_hz=5",
     "controller.horizon_s=2.0",
     "docking.entry_m=0.2",
     "docking.final_m=0.06",
-    *PICTURES,
+    *IMAGES,
     "timeline=[{at_s=1.0,command='approach',chasers=[0]}]",
 )
 
 
 def for_the_controller(log: Path, out: Path) -> None:
-    """A copy without pictures, truth and the viewers' layer."""
+    """A copy without images, truth and the viewers' layer."""
     scenario, run = read_scenario(log)
     out.unlink(missing_ok=True)
     writer = LogWriter(out)

@@ -1,4 +1,4 @@
-"""Builders shared by the tests of jets."""
+"""Builders shared by the tests of thrusters."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from flight_cases import odometry
 
 
 def mission(body: str = "tetra12", **changes: Any) -> Scenario:
-    """One chaser with jets, a metre from the target."""
+    """One chaser with thrusters, a metre from the target."""
     chaser = {"body": body, "actuation": "thrusters", **changes.pop("chaser", {})}
     values: dict[str, Any] = {
-        "name": "jets",
+        "name": "thrusters",
         "duration_s": 10.0,
         "chaser": chaser,
         "chasers": [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],

@@ -18,7 +18,7 @@ _LOOKS: dict[Look, str] = {
     "used": SERIES[2],
     "rejected": SERIES[1],
     "nothing": "#d9dce1",
-    "bad picture": LIMIT,
+    "bad image": LIMIT,
     "unanswered": SERIES[3],
 }
 
@@ -94,9 +94,9 @@ def consistency(flight: Flight, _: Traces) -> Figure:
 
 
 def _bars(axes: Axes, looks: Looks, row: float, period_s: float) -> None:
-    """One row of the raster: a bar for each stretch of pictures with the same fate.
+    """One row of the raster: a bar for each stretch of images with the same fate.
 
-    A gap between pictures (a camera that was out) stays empty.
+    A gap between images (a camera that was out) stays empty.
     """
     spans: dict[Look, list[tuple[float, float]]] = {}
     for first_s, last_s, look in looks.stretches(1.5 * period_s):
@@ -107,8 +107,8 @@ def _bars(axes: Axes, looks: Looks, row: float, period_s: float) -> None:
 
 def cameras(flight: Flight, traces: Traces) -> Figure:
     if not traces.looks:
-        raise Nothing("the log holds no picture")
-    period_s = 1.0 / flight.scenario.time.picture_hz
+        raise Nothing("the log holds no image")
+    period_s = 1.0 / flight.scenario.time.image_hz
     figure, (top, bottom) = new_figure(2, sharex=True, height=2.0)
     for row, (i, looks) in enumerate(traces.looks.items()):
         _bars(top, looks, row, period_s)
@@ -181,7 +181,7 @@ def solver(flight: Flight, _: Traces) -> Figure:
 
 def latency(_: Flight, traces: Traces) -> Figure:
     if not traces.latency:
-        raise Nothing("no picture in this log was answered by an actuator command")
+        raise Nothing("no image in this log was answered by an actuator command")
     figure, left, right = _time_and_share("latency / ms")
     for i, rows in traces.latency.items():
         values = np.maximum(rows[:, 1], 1e-6)

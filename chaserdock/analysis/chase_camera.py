@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from .plots import colour
 from .scene import Face, Scene
 
-Picture = NDArray[np.uint8]
+Pixels = NDArray[np.uint8]
 Pose = tuple[Array, Array]
 """Position (3,) WRF and attitude (4,) body to WRF."""
 
@@ -65,16 +65,16 @@ def _fixed(px: Array) -> NDArray[np.int32]:
     return np.round(np.clip(px, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
 
 
-def _fill(picture: Picture, px: Array, bgr: Array) -> None:
-    cv2.fillConvexPoly(picture, _fixed(px), np.clip(bgr, 0, 255).tolist(), cv2.LINE_AA, _SHIFT)
+def _fill(image: Pixels, px: Array, bgr: Array) -> None:
+    cv2.fillConvexPoly(image, _fixed(px), np.clip(bgr, 0, 255).tolist(), cv2.LINE_AA, _SHIFT)
 
 
 def _lines(
-    picture: Picture, view: Viewpoint, points_m: Array, bgr: Sequence[float], closed: bool = False
+    image: Pixels, view: Viewpoint, points_m: Array, bgr: Sequence[float], closed: bool = False
 ) -> None:
     px, depth = view.see(points_m)
     if len(px) > 1 and np.all(depth > _NEAR_M):
-        cv2.polylines(picture, [_fixed(px)], closed, bgr, 1, cv2.LINE_AA, _SHIFT)
+        cv2.polylines(image, [_fixed(px)], closed, bgr, 1, cv2.LINE_AA, _SHIFT)
 
 
 def draw(
@@ -85,16 +85,16 @@ def draw(
     chasers: dict[int, Pose],
     paths: dict[int | None, Array],
     seeing: frozenset[int],
-) -> Picture:
-    """The picture (height, width, 3), BGR, of target and chasers.
+) -> Pixels:
+    """The image (height, width, 3), BGR, of target and chasers.
 
     ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
-    under None. ``seeing``: chasers whose picture was used; their cameras' outlines are brighter.
+    under None. ``seeing``: chasers whose image was used; their cameras' outlines are brighter.
     """
-    picture = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
+    image = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
     for body, points in paths.items():
         shade = _TARGET_PATH if body is None else (0.75 * tint(body)).tolist()
-        _lines(picture, view, points, shade)
+        _lines(image, view, points, shade)
     bodies: list[tuple[Pose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
     bodies += [(pose, scene.chaser, tint(i)) for i, pose in chasers.items()]
     eye = view.centre_m + view.axes()[2] * view.distance_m
@@ -113,19 +113,19 @@ def draw(
         if np.any(depth <= _NEAR_M):
             continue
         bgr = np.full(3, float(face.grey)) if hue is None else hue * (0.3 + 0.75 * face.grey / 128.0)
-        _fill(picture, px, bgr * light)
+        _fill(image, px, bgr * light)
         for quad, grey in face.decals:
             px, _ = view.see(rotations.rotate(attitude, quad) + position)
-            _fill(picture, px, np.full(3, grey * light))
+            _fill(image, px, np.full(3, grey * light))
     for i, (position, attitude) in chasers.items():
         strength = 1.0 if i in seeing else 0.4
         bgr = (strength * tint(i)).tolist()
         far = rotations.rotate(attitude, scene.camera_corners_m) + position
         origin = rotations.rotate(attitude, scene.camera_origin_m) + position
         for corner in far:
-            _lines(picture, view, np.stack([origin, corner]), bgr)
-        _lines(picture, view, far, bgr, closed=True)
+            _lines(image, view, np.stack([origin, corner]), bgr)
+        _lines(image, view, far, bgr, closed=True)
         (x, y), _ = view.see(position)
         place = (round(float(np.clip(x, -1e4, 1e4))) + 22, round(float(np.clip(y, -1e4, 1e4))) - 20)
-        cv2.putText(picture, str(i), place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
-    return picture
+        cv2.putText(image, str(i), place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
+    return image

@@ -219,23 +219,23 @@ def inputs(flight: Flight, traces: Traces) -> Figure:
     return figure
 
 
-def jets(_: Flight, traces: Traces) -> Figure:
-    firing = {i: t for i, t in traces.inputs.items() if t.jet_duty.shape[1]}
+def thrusters(_: Flight, traces: Traces) -> Figure:
+    firing = {i: t for i, t in traces.inputs.items() if t.thruster_duty.shape[1]}
     if not firing:
-        raise Nothing("the actuators were ideal: there are no jets, or the log does not tell of them")
+        raise Nothing("the actuators were ideal: there are no thrusters, or the log does not tell of them")
     figure, axes = new_figure(len(firing), height=1.9, sharex=True)
     for a, (i, given) in zip(axes, firing.items(), strict=True):
-        number = given.jet_duty.shape[1]
+        number = given.thruster_duty.shape[1]
         mesh: Any = a.pcolormesh(
             given.edges_s,
             np.arange(number + 1) - 0.5,
-            given.jet_duty.T,
+            given.thruster_duty.T,
             cmap="cividis_r",
             vmin=0.0,
             vmax=1.0,
             rasterized=True,
         )
-        a.set(ylabel=f"chaser {i}\njet")
+        a.set(ylabel=f"chaser {i}\nthruster")
         figure.colorbar(mesh, ax=a, label="share open", pad=0.01)
         a.grid(False)
     axes[-1].set_xlabel("time / s")
@@ -284,7 +284,9 @@ KINDS: tuple[Kind, ...] = (
         "Force and torque that the actuators gave, body axes, mean over each tick; dashed: the actuators' limits.",
         inputs,
     ),
-    Kind("jets", "Thruster firings", "Share of each tick that each jet's valve was open.", jets),
+    Kind(
+        "thrusters", "Thruster firings", "Share of each tick that each thruster's valve was open.", thrusters
+    ),
     Kind(
         "estimate",
         "Errors of the target estimate",
@@ -302,7 +304,7 @@ KINDS: tuple[Kind, ...] = (
     Kind(
         "cameras",
         "What each camera saw",
-        "Top: what became of each picture. Below: markers that a used pose was computed from.",
+        "Top: what became of each image. Below: markers that a used pose was computed from.",
         cameras,
     ),
     Kind(
@@ -314,7 +316,7 @@ KINDS: tuple[Kind, ...] = (
     Kind(
         "latency",
         "Latency",
-        "Wall clock from a picture's publication to the actuator command that answers its tick. In lock-step it shows "
+        "Wall clock from an image's publication to the actuator command that answers its tick. In lock-step it shows "
         "the machine's load and changes nothing in the flight.",
         latency,
     ),

@@ -121,7 +121,7 @@ class World:
 
 @dataclass
 class Flight:
-    """What a log holds, without the pictures. Mappings by body name or chaser.
+    """What a log holds, without the images. Mappings by body name or chaser.
 
     ``estimates`` has the fused estimate's motion as ``target``; ``estimate_known`` (K,): whether the target was known.
     ``expected_commands``: how many actuator commands all ticks together waited for.
@@ -131,7 +131,7 @@ class Flight:
     run: dict[str, str]
     truth: Tracks
     absolute_impulse_N_s: dict[str, float]
-    jet_impulse_N_s: dict[str, float]
+    thruster_impulse_N_s: dict[str, float]
     propellant_kg: dict[str, float]
     estimates: Tracks
     estimate_known: NDArray[np.bool_]
@@ -201,7 +201,7 @@ def _motion() -> Columns:
 class _Collector:
     bodies: dict[str, Columns] = field(default_factory=lambda: defaultdict(_motion))
     impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    jet_impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
+    thruster_impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     propellant: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     target: Columns = field(default_factory=_motion)
     known: bytearray = field(default_factory=bytearray)
@@ -277,7 +277,7 @@ class _Collector:
     def _body(self, message: BodyTruth) -> None:
         _add_motion(self.bodies[message.body], message)
         self.impulse[message.body] += message.absolute_impulse_N_s
-        self.jet_impulse[message.body] += sum(message.jet_impulse_N_s)
+        self.thruster_impulse[message.body] += sum(message.thruster_impulse_N_s)
         self.propellant[message.body] += message.propellant_kg
 
 
@@ -310,7 +310,7 @@ def load_flight(log: LogSource) -> Flight:
         run=run,
         truth=Tracks(dict(c.bodies)),
         absolute_impulse_N_s=dict(c.impulse),
-        jet_impulse_N_s=dict(c.jet_impulse),
+        thruster_impulse_N_s=dict(c.thruster_impulse),
         propellant_kg=dict(c.propellant),
         estimates=Tracks({"target": c.target}),
         estimate_known=np.frombuffer(c.known, dtype=np.bool_),

@@ -1,4 +1,4 @@
-"""The cameras' pictures of a log in step with what was found in them, a few at a time, never all in memory."""
+"""The cameras' images of a log in step with what was found in them, a few at a time, never all in memory."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ _HELD = 4
 
 
 def pairs(log: Path, chasers: int) -> Iterator[Pair]:
-    """Every picture with the sighting of the same exposure, or None where the log has none; each chaser's by time.
+    """Every image with the sighting of the same exposure, or None where the log has none; each chaser's by time.
 
-    A log's order is that of arrival: a sighting may lie a little before its picture, or behind the next one. Holds at most
-    a few pictures a chaser; raises LogError where the log cannot be read.
+    A log's order is that of arrival: a sighting may lie a little before its image, or behind the next one. Holds at most
+    a few images a chaser; raises LogError where the log cannot be read.
     """
     waiting: dict[int, deque[Image]] = defaultdict(deque)
     early: dict[int, dict[int, Sighting]] = defaultdict(dict)
@@ -46,10 +46,10 @@ def pairs(log: Path, chasers: int) -> Iterator[Pair]:
 def shots(
     log: Path, chasers: int, every_s: float, first_s: float = 0.0
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
-    """At ``first_s`` and then ``every_s`` (simulated seconds): the time and each chaser's latest picture up to then.
+    """At ``first_s`` and then ``every_s`` (simulated seconds): the time and each chaser's latest image up to then.
 
-    The last one comes at or after the end of the pictures; none does where that is before ``first_s``. Where
-    the log's order is not that of time, a chaser's picture may be one older than it could be.
+    The last one comes at or after the end of the images; none does where that is before ``first_s``. Where
+    the log's order is not that of time, a chaser's image may be one older than it could be.
     """
     latest: dict[int, Pair] = {}
     number, time_s = 0, -math.inf
@@ -65,7 +65,7 @@ def shots(
 
 
 def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tuple[int, int]:
-    """In how many columns ``number`` pictures of this aspect (width over height) get largest, and how wide each then is."""
+    """In how many columns ``number`` images of this aspect (width over height) get largest, and how wide each then is."""
     best = (1, 1)
     for columns in range(1, number + 1):
         rows = math.ceil(number / columns)

@@ -1,4 +1,4 @@
-"""Data of the page's 3-D replay: a flight thinned to what an eye can follow, faces, and small camera pictures."""
+"""Data of the page's 3-D replay: a flight thinned to what an eye can follow, faces, and small camera images."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
     return {"p": _numbers(track.position_m[rows], 4), "q": _numbers(track.q_wxyz[rows], 4)}
 
 
-def replay_data(flight: Flight, traces: Traces, pictures: dict[str, Any]) -> dict[str, Any]:
-    """Plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases, what became of pictures.
+def replay_data(flight: Flight, traces: Traces, images: dict[str, Any]) -> dict[str, Any]:
+    """Plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases, what became of images.
 
     Bodies' rows are those of ``times``, at most 1200 and evenly spread; a body that was lost has fewer.
     """
@@ -88,14 +88,14 @@ def replay_data(flight: Flight, traces: Traces, pictures: dict[str, Any]) -> dic
             "camera_origin": _numbers(scene.camera_origin_m, 4),
             "camera_corners": _numbers(scene.camera_corners_m, 4),
         },
-        "pictures": pictures,
+        "images": images,
     }
 
 
-def small_pictures(log: Path, flight: Flight) -> dict[str, Any]:
-    """Camera pictures with detections, as data URLs, at most 120 a chaser: ``times`` (s) and ``chasers`` by number.
+def small_images(log: Path, flight: Flight) -> dict[str, Any]:
+    """Camera images with detections, as data URLs, at most 120 a chaser: ``times`` (s) and ``chasers`` by number.
 
-    An empty text stands where a chaser had no readable picture.
+    An empty text stands where a chaser had no readable image.
     """
     number = len(flight.scenario.chasers)
     every_s = max(1.0, flight.scenario.duration_s / _MOST_SHOTS)
@@ -110,8 +110,8 @@ def small_pictures(log: Path, flight: Flight) -> dict[str, Any]:
 
 def _data_url(flight: Flight, pair: Pair) -> str:
     try:
-        picture = view(flight.scenario, *pair, _SHOT_WIDTH_PX)
+        image = view(flight.scenario, *pair, _SHOT_WIDTH_PX)
     except LogError:
         return ""
-    _, data = cv2.imencode(".jpg", picture, [cv2.IMWRITE_JPEG_QUALITY, 72])
+    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 72])
     return "data:image/jpeg;base64," + base64.b64encode(data.tobytes()).decode()

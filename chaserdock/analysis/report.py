@@ -20,7 +20,7 @@ from chaserdock_protocol.errors import ChaserdockError
 from .figures import drawn
 from .flight import Flight, load_flight
 from .plots import step_of, to_inline_svg
-from .replay_scene import replay_data, small_pictures
+from .replay_scene import replay_data, small_images
 from .summary import summary_of
 from .time_series import load_traces
 
@@ -61,7 +61,7 @@ def report_of(log: Path) -> str:
         )
     replay, script = "", ""
     if "target" in flight.truth:
-        data = replay_data(flight, traces, small_pictures(log, flight))
+        data = replay_data(flight, traces, small_images(log, flight))
         replay = _replay(data)
         # "</" would end the script element, wherever it stood.
         text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
@@ -218,10 +218,10 @@ def _numbers(flight: Flight, result: dict[str, Any]) -> str:
 
 def _replay(data: dict[str, Any]) -> str:
     end = data["times"][-1]
-    seen = list(data["pictures"]["chasers"])
+    seen = list(data["images"]["chasers"])
     columns = 1 if len(seen) <= 4 else 2
     width = 256 if len(seen) <= 2 else 210 if len(seen) == 3 else 190
-    images = "".join(f'<img data-chaser="{i}" alt="picture of chaser {i}">' for i in seen)
+    images = "".join(f'<img data-chaser="{i}" alt="image of chaser {i}">' for i in seen)
     views = (
         f'<div id="replay-views" style="grid-template-columns: repeat({columns}, 1fr); width: {width * columns}px">'
         f"{images}</div>"
@@ -241,10 +241,10 @@ def _replay(data: dict[str, Any]) -> str:
 <label>speed <select id="replay-speed">{speeds}</select></label>
 <label><input id="replay-ride" type="checkbox"> ride on the target</label></div>
 <div class="wide"><table>
-<thead><tr><th></th><th>phase</th><th>to the target</th><th>position error</th><th>picture</th></tr></thead>
+<thead><tr><th></th><th>phase</th><th>to the target</th><th>position error</th><th>image</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
 <p class="faint">Drag to turn, wheel to zoom; arrow keys, +, − and space do the same. Ground truth. A camera's outline is
-bright while its picture is used; chaser colours are the figures'.</p>
+bright while its image is used; chaser colours are the figures'.</p>
 </div>"""  # noqa: RUF001
 
 

@@ -1,4 +1,4 @@
-"""What every camera saw at one moment of a recorded flight, with the detections drawn, as one picture."""
+"""What every camera saw at one moment of a recorded flight, with the detections drawn, as one image."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_agents.chaser.sighting import BadPicture, decode_picture
+from chaserdock_agents.chaser.sighting import BadImage, decode_image
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
@@ -22,9 +22,9 @@ _AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
-    """BGR mosaic of all chasers' pictures exposed at or just before ``at_s``, each ``width_px`` wide.
+    """BGR mosaic of all chasers' images exposed at or just before ``at_s``, each ``width_px`` wide.
 
-    Raises LogError when the log cannot be read or holds no picture up to then.
+    Raises LogError when the log cannot be read or holds no image up to then.
     """
     scenario = scenario_from_json(read_scenario(log)[0], f"{log}: scenario")
     numbers = range(len(scenario.chasers))
@@ -37,7 +37,7 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
             continue
         (images if isinstance(message, Image) else sightings)[message.chaser] = message
     if not images:
-        raise LogError(f"{log}: holds no picture up to {at_s:g} s")
+        raise LogError(f"{log}: holds no image up to {at_s:g} s")
     views = [view(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
     columns = math.ceil(math.sqrt(len(views)))
     blank = np.zeros_like(views[0])
@@ -47,12 +47,12 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
 
 
 def view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int) -> NDArray[np.uint8]:
-    """BGR picture ``width_px`` wide with the sighting's markers and pose drawn; raises LogError for a bad picture."""
+    """BGR image ``width_px`` wide with the sighting's markers and pose drawn; raises LogError for a bad image."""
     try:
-        grey = decode_picture(image)
-    except BadPicture as error:
+        grey = decode_image(image)
+    except BadImage as error:
         raise LogError(
-            f"picture of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}"
+            f"image of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}"
         ) from None
     # People see the dark side of things better after a gamma correction; the cameras had no such luck.
     gamma = np.array([255 * (v / 255) ** 0.6 for v in range(256)]).astype(np.uint8)
@@ -70,7 +70,7 @@ def view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: 
     seen = f"{count} marker{'s' if count > 1 else ''}" if count else "sees nothing"
     text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen}"
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
-    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # a small picture gets small words
+    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # a small image gets small words
     cv2.putText(view, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
     return np.asarray(view, dtype=np.uint8)
 

@@ -178,7 +178,7 @@ def summary_of(flight: Flight) -> dict[str, Any]:
             "reached_time_s": reached_time(flight, i),
             "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
             "impulse_N_s": flight.absolute_impulse_N_s[name],
-            "jet_impulse_N_s": flight.jet_impulse_N_s[name],
+            "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
         }
         if (capture := capture_of(flight, i)) is not None:

@@ -1,4 +1,4 @@
-"""What figures need of a log beyond ``flight``: inputs, latencies and pictures over time."""
+"""What figures need of a log beyond ``flight``: inputs, latencies and images over time."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from .columns import Columns
 
-Look = Literal["used", "rejected", "nothing", "bad picture", "unanswered"]
-"""What became of a picture: its sighting was used, or refused by the fusion; nothing was seen in it; it could not be
+Look = Literal["used", "rejected", "nothing", "bad image", "unanswered"]
+"""What became of an image: its sighting was used, or refused by the fusion; nothing was seen in it; it could not be
 read; or no sighting of it is in the log."""
 LOOKS: tuple[Look, ...] = get_args(Look)
 _FATES: dict[str, Look] = {"seen": "used", "nothing": "nothing"}
@@ -27,13 +27,13 @@ _FATES: dict[str, Look] = {"seen": "used", "nothing": "nothing"}
 
 @dataclass
 class Looks:
-    """A chaser's pictures by exposure: times (K,) s and places in ``LOOKS`` (K,)."""
+    """A chaser's images by exposure: times (K,) s and places in ``LOOKS`` (K,)."""
 
     time_s: Array
     code: NDArray[np.intp]
 
     def stretches(self, gap_s: float = np.inf) -> Iterator[tuple[float, float, Look]]:
-        """First and last exposure (s) of each run of pictures with the same fate; a gap of more than ``gap_s`` ends one."""
+        """First and last exposure (s) of each run of images with the same fate; a gap of more than ``gap_s`` ends one."""
         if not len(self.code):
             return
         breaks = np.flatnonzero((np.diff(self.code) != 0) | (np.diff(self.time_s) > gap_s)) + 1
@@ -47,13 +47,13 @@ class Inputs:
     """What a chaser's actuators gave, intervals along the first axis, body axes.
 
     ``edges_s`` (K + 1,) bound the intervals over which ``force_N`` and ``torque_N_m`` (K, 3) are means;
-    ``jet_duty`` (K, J) is the share of it that each jet was open, with J = 0 without thrusters.
+    ``thruster_duty`` (K, J) is the share of it that each thruster was open, with J = 0 without thrusters.
     """
 
     edges_s: Array
     force_N: Array
     torque_N_m: Array
-    jet_duty: Array
+    thruster_duty: Array
 
 
 @dataclass
@@ -75,7 +75,7 @@ class _Given:
     ticks: int = 0
 
     def take(self, m: BodyTruth) -> None:
-        given = np.array([*m.impulse_N_s, *m.angular_impulse_N_m_s, *m.jet_open_s])
+        given = np.array([*m.impulse_N_s, *m.angular_impulse_N_m_s, *m.thruster_open_s])
         if self.rows is None:
             self.rows = Columns(1 + len(given))
             self.rows.add((m.sim_time_ns / 1e9,), np.zeros(len(given)))
@@ -102,7 +102,7 @@ class _Collector:
     given: dict[int, _Given] = field(default_factory=dict)
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
     latency: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(2)))
-    pictures: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
+    images: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
     sightings: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
     fates: dict[int, bytearray] = field(default_factory=lambda: defaultdict(bytearray))
     refused: dict[int, array[int]] = field(default_factory=lambda: defaultdict(lambda: array("q")))
@@ -115,20 +115,20 @@ class _Collector:
                 self.given.setdefault(i, _Given(self.every)).take(message)
         elif record.topic is topics.IMAGE:
             self.sent[message.chaser, message.tick] = record.sent_ns
-            self.pictures[message.chaser].append(message.sim_time_ns)
+            self.images[message.chaser].append(message.sim_time_ns)
         elif record.topic is topics.ACTUATORS:
             begun = self.sent.pop((message.chaser, message.tick), None)
             if begun is not None:
                 self.latency[message.chaser].add((message.sim_time_ns / 1e9, (record.sent_ns - begun) / 1e9))
         elif record.topic is topics.SIGHTING:
             self.sightings[message.chaser].append(message.sim_time_ns)
-            self.fates[message.chaser].append(LOOKS.index(_FATES.get(message.status, "bad picture")))
+            self.fates[message.chaser].append(LOOKS.index(_FATES.get(message.status, "bad image")))
         elif record.topic is topics.TARGET:
             for chaser in message.rejected:
                 self.refused[chaser].append(message.sim_time_ns)
 
     def looks(self, chaser: int) -> Looks:
-        time_ns = np.unique(np.array(self.pictures[chaser], dtype=np.int64))
+        time_ns = np.unique(np.array(self.images[chaser], dtype=np.int64))
         code = np.full(len(time_ns), LOOKS.index("unanswered"), dtype=np.intp)
         seen_ns = np.array(self.sightings[chaser], dtype=np.int64)
         place = np.searchsorted(time_ns, seen_ns)
@@ -140,7 +140,7 @@ class _Collector:
 
 
 def load_traces(log: LogSource, chasers: Iterable[int], every: int = 1) -> Traces:
-    """The traces of a log, inputs as means over ``every`` ticks; raises LogError where it cannot be read. Holds no picture
+    """The traces of a log, inputs as means over ``every`` ticks; raises LogError where it cannot be read. Holds no image
     in memory."""
     numbers = list(chasers)
     keys = [topics.TARGET.key_of()]
@@ -154,5 +154,5 @@ def load_traces(log: LogSource, chasers: Iterable[int], every: int = 1) -> Trace
     return Traces(
         inputs={i: given for i, given in inputs.items() if given is not None},
         latency={i: rows.table() for i, rows in sorted(c.latency.items())},
-        looks={i: c.looks(i) for i in sorted(c.pictures)},
+        looks={i: c.looks(i) for i in sorted(c.images)},
     )

@@ -14,7 +14,7 @@ import numpy as np
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError
 
-from .chase_camera import Picture, Pose, Viewpoint, draw, tint
+from .chase_camera import Pixels, Pose, Viewpoint, draw, tint
 from .columns import nanoseconds
 from .flight import Flight, Track, load_flight
 from .images import Pair, columns_for, shots
@@ -45,7 +45,7 @@ def write_video(
 
     ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds a second of film; ``part_s``: the
     simulated times of the first and last frame; ``quality``: of .webp, 0 to 100; ``told`` hears of each frame's
-    simulated time. Raises LogError for a log that cannot be read or holds no motion or picture, and
+    simulated time. Raises LogError for a log that cannot be read or holds no motion or image, and
     ChaserdockError for a size or file that cannot be.
     """
     ending = out.suffix.lower()
@@ -73,9 +73,9 @@ def write_video(
                 stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
             for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
                 told(time_s)
-                picture = av.VideoFrame.from_ndarray(frame, format="bgr24")
-                picture.pts = number
-                container.mux(stream.encode(picture))
+                image = av.VideoFrame.from_ndarray(frame, format="bgr24")
+                image.pts = number
+                container.mux(stream.encode(image))
                 number += 1
             if number:
                 container.mux(stream.encode())
@@ -84,7 +84,7 @@ def write_video(
     if not number:
         out.unlink(missing_ok=True)
         begun = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
-        raise LogError(f"{log}: holds no picture{begun}; there is nothing to film")
+        raise LogError(f"{log}: holds no image{begun}; there is nothing to film")
     return number
 
 
@@ -95,7 +95,7 @@ def frames(
     width_px: int,
     height_px: int,
     part_s: tuple[float, float] = (0.0, math.inf),
-) -> Iterator[tuple[float, Picture]]:
+) -> Iterator[tuple[float, Pixels]]:
     """Simulated time (s) and film frame (height, width, 3), BGR, ``every_s`` of simulated time within ``part_s``."""
     number = len(flight.scenario.chasers)
     camera = flight.scenario.camera
@@ -113,21 +113,21 @@ def frames(
         for i in range(number):
             x = width_px - side_px + (i % columns) * shot_px
             y = top + (i // columns) * shot_height_px
-            picture = _camera(flight, i, latest.get(i), shot_px)
-            h = min(len(picture), height_px - y)
-            frame[y : y + h, x : x + shot_px] = picture[:h]
+            image = _camera(flight, i, latest.get(i), shot_px)
+            h = min(len(image), height_px - y)
+            frame[y : y + h, x : x + shot_px] = image[:h]
             cv2.rectangle(frame, (x + 1, y + 1), (x + shot_px - 2, y + h - 2), tint(i).tolist(), 2)
         yield time_s, frame
 
 
-def _camera(flight: Flight, chaser: int, pair: Pair | None, width_px: int) -> Picture:
+def _camera(flight: Flight, chaser: int, pair: Pair | None, width_px: int) -> Pixels:
     height = round(width_px * flight.scenario.camera.height_px / flight.scenario.camera.width_px)
-    said = "no picture yet"
+    said = "no image yet"
     if pair is not None:
         try:
             return view(flight.scenario, *pair, width_px)
         except LogError:
-            said = "unreadable picture"
+            said = "unreadable image"
     empty = np.full((height, width_px, 3), 24, dtype=np.uint8)
     cv2.putText(
         empty, f"chaser {chaser}  {said}", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA
@@ -136,7 +136,7 @@ def _camera(flight: Flight, chaser: int, pair: Pair | None, width_px: int) -> Pi
 
 
 class _Director:
-    """Knows the flight and where to look at it from; one picture a time."""
+    """Knows the flight and where to look at it from; one image a time."""
 
     def __init__(self, flight: Flight, width_px: int, height_px: int, part_s: tuple[float, float]) -> None:
         self.flight = flight
@@ -163,7 +163,7 @@ class _Director:
             if (s := flight.sightings.get(i)) is not None
         }
 
-    def shoot(self, time_s: float) -> Picture:
+    def shoot(self, time_s: float) -> Pixels:
         """The mission from outside at a simulated time, with clock and phases."""
         chasers = {i: _pose(own, time_s) for i, own in self.chasers.items()}
         paths: dict[int | None, Any] = {None: _trail(self.target, time_s)}
@@ -172,13 +172,13 @@ class _Director:
         look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
         time_ns = round(_time_of(self.target, time_s) * 1e9)
         seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
-        picture = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
-        self._write(picture, time_s)
-        return picture
+        image = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
+        self._write(image, time_s)
+        return image
 
-    def _write(self, picture: Picture, time_s: float) -> None:
+    def _write(self, image: Pixels, time_s: float) -> None:
         def put(text: str, x: int, y: int, bgr: Any, size: float = 0.5) -> None:
-            cv2.putText(picture, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, bgr, 1, cv2.LINE_AA)
+            cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, bgr, 1, cv2.LINE_AA)
 
         put(f"{self.flight.scenario.name}", _MARGIN_PX + 4, 24, _INK, 0.6)
         put(f"t = {time_s:6.1f} s", _MARGIN_PX + 4, 48, _INK, 0.6)
@@ -201,7 +201,7 @@ def _time_of(track: Track, time_s: float) -> float:
 
 
 def _pose(track: Track, time_s: float) -> Pose:
-    """The pose at the last tick up to a time: what a picture of that time shows."""
+    """The pose at the last tick up to a time: what an image of that time shows."""
     row = _row(track, time_s)
     return track.position_m[row], track.q_wxyz[row]
 

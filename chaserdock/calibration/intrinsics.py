@@ -1,6 +1,6 @@
-"""A camera's matrix and lens from pictures of a board, with OpenCV.
+"""A camera's matrix and lens from images of a board, with OpenCV.
 
-A picture that fits the others badly is left out, and named: its root mean square is over three times the median
+An image that fits the others badly is left out, and named: its root mean square is over three times the median
 and over half a pixel. (Not a cure for a board that is not flat.)
 """
 
@@ -17,18 +17,18 @@ from chaserdock_agents.chaser.perception.detect import dictionary_of
 from chaserdock_models.rotations import Array
 from numpy.typing import NDArray
 
-LEAST_PICTURES = 6
+LEAST_IMAGES = 6
 _LEAST_CORNERS = 8
 _ODD_TIMES, _ODD_PX = 3.0, 0.5
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 class BadBoard(Exception):
-    """A board that cannot be, or a folder without pictures."""
+    """A board that cannot be, or a folder without images."""
 
 
 class TooFew(Exception):
-    """Too few usable pictures; the text says why the others are not."""
+    """Too few usable images; the text says why the others are not."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Board:
 @dataclass(frozen=True)
 class Calibration:
     """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard deviation of fx, fy,
-    cx, cy, pixels; ``rms_px``: by picture used; ``left_out``: by picture, why."""
+    cx, cy, pixels; ``rms_px``: by image used; ``left_out``: by image, why."""
 
     width_px: int
     height_px: int
@@ -82,38 +82,38 @@ def board_of(text: str, square_m: float, marker_m: float, dictionary: str) -> Bo
 
 
 def calibrate_folder(folder: Path, board: Board) -> Calibration:
-    """Calibration from all pictures in a folder. Raises BadBoard when there are none, TooFew when too few are good."""
+    """Calibration from all images in a folder. Raises BadBoard when there are none, TooFew when too few are good."""
     paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
     if not paths:
-        raise BadBoard(f"{folder}: no pictures ({', '.join(_SUFFIXES)}) there")
-    pictures: dict[str, NDArray[np.uint8] | None] = {}
+        raise BadBoard(f"{folder}: no images ({', '.join(_SUFFIXES)}) there")
+    images: dict[str, NDArray[np.uint8] | None] = {}
     for path in paths:
-        picture: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        pictures[path.name] = picture
-    return calibrate(pictures, board)
+        image: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        images[path.name] = image
+    return calibrate(images, board)
 
 
-def calibrate(pictures: dict[str, NDArray[np.uint8] | None], board: Board) -> Calibration:
-    """Calibration from grey pictures by name (None: unreadable). Raises TooFew."""
+def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Calibration:
+    """Calibration from grey images by name (None: unreadable). Raises TooFew."""
     left_out: dict[str, str] = {}
     views: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
-    shapes = [p.shape for p in pictures.values() if p is not None]
+    shapes = [p.shape for p in images.values() if p is not None]
     usual = max(sorted(set(shapes)), key=shapes.count) if shapes else (0, 0)
-    for name, picture in pictures.items():
-        if picture is None:
-            left_out[name] = "not a picture"
-        elif picture.shape != usual:
-            left_out[name] = f"{picture.shape[1]} x {picture.shape[0]}, others {usual[1]} x {usual[0]}"
+    for name, image in images.items():
+        if image is None:
+            left_out[name] = "not an image"
+        elif image.shape != usual:
+            left_out[name] = f"{image.shape[1]} x {image.shape[0]}, others {usual[1]} x {usual[0]}"
         else:
-            points, px = find_board(picture, board)
+            points, px = find_board(image, board)
             if len(px) < _LEAST_CORNERS:
                 left_out[name] = f"{len(px)} corners of the board found, {_LEAST_CORNERS} needed"
             else:
                 views[name] = (points, px)
     while True:
-        if len(views) < LEAST_PICTURES:
+        if len(views) < LEAST_IMAGES:
             reasons = "".join(f"\n{name}: {reason}" for name, reason in left_out.items())
-            raise TooFew(f"{len(views)} usable pictures, at least {LEAST_PICTURES} are needed{reasons}")
+            raise TooFew(f"{len(views)} usable images, at least {LEAST_IMAGES} are needed{reasons}")
         points = [v[0] for v in views.values()]
         px = [v[1] for v in views.values()]
         size = (usual[1], usual[0])
@@ -139,7 +139,7 @@ def calibrate(pictures: dict[str, NDArray[np.uint8] | None], board: Board) -> Ca
 
 
 def find_board(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Corners found, in the board's axes (n, 3), metres, and in the picture (n, 2), pixels."""
+    """Corners found, in the board's axes (n, 3), metres, and in the image (n, 2), pixels."""
     none = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32)
     if board.charuco is None:
         find: Any = cv2.findChessboardCornersSB

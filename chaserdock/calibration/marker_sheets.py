@@ -107,8 +107,8 @@ def marker_bits(dictionary: str, marker_id: int) -> NDArray[np.int64]:
     table = dictionary_of(dictionary)
     if not 0 <= marker_id < len(table.bytesList):
         raise ValueError(f"{dictionary} has no marker {marker_id}")
-    picture = cv2.aruco.generateImageMarker(table, marker_id, table.markerSize + 2, borderBits=1)
-    return (np.asarray(picture) > 0).astype(np.int64)
+    image = cv2.aruco.generateImageMarker(table, marker_id, table.markerSize + 2, borderBits=1)
+    return (np.asarray(image) > 0).astype(np.int64)
 
 
 def _svg(sheet: Sheet) -> str:

@@ -38,7 +38,7 @@ def markers(
 
 
 def calibrate(
-    folder: Annotated[Path, typer.Argument(help="folder of pictures (.png, .jpg) of one board")],
+    folder: Annotated[Path, typer.Argument(help="folder of images (.png, .jpg) of one board")],
     out: Annotated[Path, typer.Option(help="calibration file to write: .yaml, .json or .xml")],
     board: Annotated[
         str, typer.Option(help="chessboard COLUMNSxROWS inner corners, or charuco COLUMNSxROWS squares")
@@ -47,7 +47,7 @@ def calibrate(
     marker: Annotated[float, typer.Option(help="charuco: edge of a marker, metres")] = 0.022,
     dictionary: Annotated[str, typer.Option(help="charuco: ArUco dictionary")] = "DICT_4X4_50",
 ) -> None:
-    """Calibrate a camera from pictures of a board; status 1 when too few of them are usable."""
+    """Calibrate a camera from images of a board; status 1 when too few of them are usable."""
     from chaserdock.calibration.intrinsics import (
         BadBoard,
         TooFew,
@@ -70,7 +70,7 @@ def calibrate(
     for name, reason in result.left_out.items():
         print(f"{name}: left out: {reason}")
     print(
-        f"{len(result.rms_px)} pictures, RMS {result.total_rms_px:.3f} px; "
+        f"{len(result.rms_px)} images, RMS {result.total_rms_px:.3f} px; "
         f"fx {result.matrix[0, 0]:.2f} +- {result.sigma[0]:.2f}, fy {result.matrix[1, 1]:.2f} +- {result.sigma[1]:.2f}, "
         f"cx {result.matrix[0, 2]:.2f} +- {result.sigma[2]:.2f}, cy {result.matrix[1, 2]:.2f} +- {result.sigma[3]:.2f} px"
     )

@@ -29,8 +29,8 @@ def command(
     offset: Annotated[
         tuple[float, float, float] | None, typer.Option(help="goto: where, in the target's frame, metres")
     ] = None,
-    jet: Annotated[
-        int | None, typer.Option(min=0, max=254, help="isolate, restore: which jet, from 0")
+    thruster: Annotated[
+        int | None, typer.Option(min=0, max=254, help="isolate, restore: which thruster, from 0")
     ] = None,
     operator: Annotated[str, typer.Option(help="who asks, for the log")] = "",
     before: Annotated[
@@ -50,7 +50,7 @@ def command(
     from chaserdock.launch.operator import send_command
 
     link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
-    reply = send_command(link, what.value, number, offset, timeout, jet, operator, before)
+    reply = send_command(link, what.value, number, offset, timeout, thruster, operator, before)
     if as_json:
         answer = {"accepted": reply.accepted, "reason": reply.reason, "sim_time_s": reply.sim_time_ns / 1e9}
         print(json.dumps(answer, indent=2))
@@ -60,7 +60,7 @@ def command(
 
 
 class Kind(StrEnum):
-    """How a jet fails, or that it works again."""
+    """How a thruster fails, or that it works again."""
 
     stuck_on = "stuck_on"
     stuck_off = "stuck_off"
@@ -68,9 +68,9 @@ class Kind(StrEnum):
     healthy = "healthy"
 
 
-def jet_fault(
+def thruster_fault(
     number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
-    jet: Annotated[int, typer.Argument(min=0, max=254, help="which jet, from 0")],
+    thruster: Annotated[int, typer.Argument(min=0, max=254, help="which thruster, from 0")],
     kind: Annotated[Kind, typer.Argument(help="how it fails; healthy mends it")],
     factor: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="weak: what is left of its thrust")
@@ -83,13 +83,13 @@ def jet_fault(
     keys: KeysOpt = None,
     timeout: Annotated[float, typer.Option(help="seconds to wait for the answer")] = 5.0,
 ) -> None:
-    """Make a jet of a running mission fail, for a test; status 1 when refused, 2 when nobody answers.
+    """Make a thruster of a running mission fail, for a test; status 1 when refused, 2 when nobody answers.
 
-    Only where the scenario allows it: chaser.jet_faults_by_command. The chaser is not told.
+    Only where the scenario allows it: chaser.thruster_faults_by_command. The chaser is not told.
     """
-    from chaserdock.launch.operator import send_jet_fault
+    from chaserdock.launch.operator import send_thruster_fault
 
     link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
-    reply = send_jet_fault(link, number, jet, kind.value, factor, timeout, operator)
+    reply = send_thruster_fault(link, number, thruster, kind.value, factor, timeout, operator)
     print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
     raise typer.Exit(0 if reply.accepted else 1)

@@ -81,12 +81,12 @@ def export(
     format: Annotated[
         Format, typer.Option(help="parquet keeps types and units; csv opens anywhere")
     ] = Format.parquet,
-    pictures: Annotated[bool, typer.Option("--pictures", help="with the pictures' bytes")] = False,
+    images: Annotated[bool, typer.Option("--images", help="with the images' bytes")] = False,
 ) -> None:
     """Write one table a topic, all chasers together."""
     from chaserdock.logs.export import export as write
 
-    for name, rows in write(_source(log), out, format.value, pictures).items():
+    for name, rows in write(_source(log), out, format.value, images).items():
         print(f"{out / name}: {rows} rows")
 
 

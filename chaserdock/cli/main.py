@@ -18,7 +18,7 @@ from chaserdock.exit_codes import FAILED
 from . import logs
 from .calibration import calibrate, markers
 from .campaign import campaign
-from .command import command, jet_fault
+from .command import command, thruster_fault
 from .conformance import check
 from .network import judge, keys, router, status
 from .options import fail
@@ -51,7 +51,7 @@ for verb in (
     controller,
     record,
     command,
-    jet_fault,
+    thruster_fault,
     summary,
     snapshot,
     campaign,

@@ -60,9 +60,9 @@ def video(
         float, typer.Option("--from", min=0.0, help="simulated time of the first frame, s")
     ] = 0.0,
     to_s: Annotated[float, typer.Option("--to", help="simulated time of the last frame, s")] = float("inf"),
-    quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: fewer bytes to better pictures")] = 60,
+    quality: Annotated[int, typer.Option(min=0, max=100, help=".webp: fewer bytes to better images")] = 60,
 ) -> None:
-    """Film a recorded flight: the mission from outside beside the cameras' pictures with what was found in them."""
+    """Film a recorded flight: the mission from outside beside the cameras' images with what was found in them."""
     from chaserdock.analysis.video import write_video
 
     number = write_video(log, out, speed, fps, width, height, (from_s, to_s), quality)

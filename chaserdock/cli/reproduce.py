@@ -36,7 +36,7 @@ def study(
     ],
     out: Annotated[Path, typer.Option(help="results are appended here")],
 ) -> None:
-    """Fly the controller by itself on perfect knowledge, without pictures: a file of cases."""
+    """Fly the controller by itself on perfect knowledge, without images: a file of cases."""
     found = [e for e in entry_points(group="chaserdock.studies") if e.name == "controller"]
     if not found:
         raise fail("no study of the controller is installed")

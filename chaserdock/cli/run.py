@@ -24,8 +24,8 @@ def summary(log: Annotated[Path, typer.Argument(help="a mission.mcap")]) -> None
 def snapshot(
     log: Annotated[Path, typer.Argument(help="a mission.mcap")],
     at: Annotated[float, typer.Option(help="simulated time, seconds")],
-    out: Annotated[Path, typer.Option(help="picture to write: .png or .jpg")],
-    width: Annotated[int, typer.Option(min=64, max=4096, help="width of one camera's picture, pixels")] = 640,
+    out: Annotated[Path, typer.Option(help="image to write: .png or .jpg")],
+    width: Annotated[int, typer.Option(min=64, max=4096, help="width of one camera's image, pixels")] = 640,
 ) -> None:
     """Draw what every camera saw at a moment of a recorded flight, detections included."""
     import cv2

@@ -49,7 +49,7 @@ def view(
     lease_ms: LeaseOpt = 60_000,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """Show a running mission, or a log, in a web browser: scene, pictures, plots, phases, commands."""
+    """Show a running mission, or a log, in a web browser: scene, images, plots, phases, commands."""
     from chaserdock.viewer.live import ViewOptions, view_live
 
     options = ViewOptions(host, port, dark, truth)

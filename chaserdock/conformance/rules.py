@@ -45,8 +45,8 @@ def duties_of(role: Role, chaser: int | None, turn: Turn, thrusters: bool) -> di
         return {**wrenches, topics.TARGET.key_of(): topics.TARGET, topics.SOLVER.key_of(): topics.SOLVER}
     own = [
         topics.ACTUATORS,
-        *([topics.SIGHTING] if tick.pictures else []),
-        *([topics.JETS] if thrusters else []),
+        *([topics.SIGHTING] if tick.images else []),
+        *([topics.THRUSTERS] if thrusters else []),
     ]
     return {topic.key_of(chaser): topic for topic in own}
 
@@ -117,13 +117,13 @@ class Ledger:
         except Rejected as refused:
             self.find(raw.key, _WORDS.get(refused.reason, refused.reason), refused.detail)
             return
-        self._number(raw.key, message, topic.rate in ("tick", "picture"))
+        self._number(raw.key, message, topic.rate in ("tick", "image"))
         match message:
             case Presence():
                 self._presence(raw.key, message)
             case Farewell():
                 self._farewell(raw.key, message)
-            case _ if topic.rate in ("tick", "picture"):
+            case _ if topic.rate in ("tick", "image"):
                 self._answer(raw.key, topic, message)
 
     def _own_topic(self, key: str) -> Topic | None:

@@ -25,7 +25,7 @@ class CheckError(ChaserdockError):
 class Turn:
     """One tick: the world's messages in ``opening``, then what the others answered to it in ``answers``.
 
-    ``exposure_ns``: the time of the process' own picture, None without one.
+    ``exposure_ns``: the time of the process' own image, None without one.
     """
 
     tick: Tick
@@ -73,7 +73,7 @@ def topics_told(role: Role) -> list[Topic]:
     told = [
         t
         for t in topics.TOPICS
-        if role in t.readers and t.writer not in ("any", role) and t.rate in ("tick", "picture")
+        if role in t.readers and t.writer not in ("any", role) and t.rate in ("tick", "image")
     ]
     return sorted(told, key=lambda t: (t.writer != "world", t is not topics.TICK, topics.TOPICS.index(t)))
 

@@ -6,7 +6,7 @@ import time
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import CommandReply, JetFaultCommand, JetState, OperatorCommand
+from chaserdock_protocol.messages import CommandReply, OperatorCommand, ThrusterFaultCommand, ThrusterState
 from chaserdock_protocol.transport import Link, Node
 from msgspec import Struct
 
@@ -21,7 +21,7 @@ def send_command(
     chaser: int,
     offset_m: tuple[float, float, float] | None,
     timeout_s: float,
-    jet: int | None = None,
+    thruster: int | None = None,
     operator: str = "",
     before_s: float | None = None,
 ) -> CommandReply:
@@ -29,33 +29,35 @@ def send_command(
     ``before_s``; raises OperatorError when nobody answers in time, TransportError."""
     if (command == "goto") != (offset_m is not None):
         raise OperatorError("--offset X Y Z goes with goto, and goto needs it")
-    if (command in ("isolate", "restore")) != (jet is not None):
-        raise OperatorError("--jet N goes with isolate and restore, and these need it")
+    if (command in ("isolate", "restore")) != (thruster is not None):
+        raise OperatorError("--thruster N goes with isolate and restore, and these need it")
     request = OperatorCommand(
         command=command,  # type: ignore[arg-type]
         chaser=chaser,
         offset_m=offset_m,
-        jet=jet,
+        thruster=thruster,
         operator=operator,
         expires_ns=None if before_s is None else round(before_s * 1e9),
     )
     return _answer(link, topics.OPERATE_KEY, request, timeout_s, "controller")
 
 
-def send_jet_fault(
+def send_thruster_fault(
     link: Link,
     chaser: int,
-    jet: int,
-    kind: JetState,
+    thruster: int,
+    kind: ThrusterState,
     factor: float | None,
     timeout_s: float,
     operator: str = "",
 ) -> CommandReply:
-    """Has the world make a jet fail; raises OperatorError when nobody answers in time, TransportError."""
+    """Has the world make a thruster fail; raises OperatorError when nobody answers in time, TransportError."""
     if (kind == "weak") != (factor is not None):
         raise OperatorError("--factor goes with weak, and weak needs it")
-    request = JetFaultCommand(chaser=chaser, jet=jet, kind=kind, factor=factor, operator=operator)
-    return _answer(link, topics.JET_FAULT_KEY, request, timeout_s, "world")
+    request = ThrusterFaultCommand(
+        chaser=chaser, thruster=thruster, kind=kind, factor=factor, operator=operator
+    )
+    return _answer(link, topics.THRUSTER_FAULT_KEY, request, timeout_s, "world")
 
 
 def _answer(link: Link, key: str, request: Struct, timeout_s: float, who: str) -> CommandReply:

@@ -15,7 +15,7 @@ from chaserdock_protocol.recording.log import LogError, LogSource, read_log
 from .tables import TopicTable
 
 Format = Literal["parquet", "csv"]
-_ROWS, _PICTURE_ROWS = 4096, 64
+_ROWS, _IMAGE_ROWS = 4096, 64
 
 
 class _ParquetFile:
@@ -51,10 +51,10 @@ def _cell(value: Any) -> Any:
     return value.hex() if isinstance(value, bytes) else value
 
 
-def export(log: LogSource, folder: Path, format: Format, pictures: bool = False) -> dict[str, int]:
+def export(log: LogSource, folder: Path, format: Format, images: bool = False) -> dict[str, int]:
     """Writes every topic of a log into ``folder``, which is made; rows by file name.
 
-    ``pictures``: with the pictures' bytes. Raises LogError when the log or the files cannot be used.
+    ``images``: with the images' bytes. Raises LogError when the log or the files cannot be used.
     """
     tables: dict[str, TopicTable] = {}
     files: dict[str, Any] = {}
@@ -75,9 +75,9 @@ def export(log: LogSource, folder: Path, format: Format, pictures: bool = False)
         for record in read_log(log):
             table = tables.get(record.topic.key)
             if table is None:
-                table = tables[record.topic.key] = TopicTable(record.topic, pictures)
+                table = tables[record.topic.key] = TopicTable(record.topic, images)
             table.add(record)
-            if table.number >= (_PICTURE_ROWS if pictures else _ROWS):
+            if table.number >= (_IMAGE_ROWS if images else _ROWS):
                 put(table)
         for table in tables.values():
             put(table)

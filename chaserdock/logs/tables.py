@@ -3,7 +3,7 @@
 Columns: ``key``, ``sent_ns`` (the sender's wall clock), ``time_s`` (simulated), then the message's fields. Vectors become
 ``position_m_x`` …, quaternions ``q_w`` …; lists of numbers stay lists; dictionaries become JSON text. Lists of structures
 (the solutions of a sighting) become a table of their own, with ``key``, ``seq``, ``tick``, ``time_s`` and ``index``.
-Pictures' bytes are left out (``data_bytes`` tells how many) unless asked for.
+Images' bytes are left out (``data_bytes`` tells how many) unless asked for.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _plain(kind: inspect.Type) -> pa.DataType | None:
     return None
 
 
-def _columns(kind: type[msgspec.Struct], pictures: bool) -> tuple[list[Column], list[str]]:
+def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], list[str]]:
     """Columns of a structure, and the names of its fields that become tables of their own."""
     columns: list[Column] = []
     children: list[str] = []
@@ -89,7 +89,7 @@ def _columns(kind: type[msgspec.Struct], pictures: bool) -> tuple[list[Column], 
                     columns.append((f"{stem}_{axis}", pa.float64(), _item(name, k)))
             case inspect.VarTupleType(item_type=inspect.StructType()):
                 children.append(name)
-            case inspect.BytesType() if not pictures:
+            case inspect.BytesType() if not images:
                 columns.append(
                     (f"{name}_bytes", pa.int64(), lambda message, n=name: len(getattr(message, n)))
                 )
@@ -151,8 +151,8 @@ def table_name(topic: Topic) -> str:
 class TopicTable:
     """The table of a topic and those of its lists of structures (``children``, by field)."""
 
-    def __init__(self, topic: Topic, pictures: bool = False) -> None:
-        columns, children = _columns(topic.kind, pictures)
+    def __init__(self, topic: Topic, images: bool = False) -> None:
+        columns, children = _columns(topic.kind, images)
         head: list[Column] = [
             ("key", pa.string(), lambda r: r.key),
             ("sent_ns", pa.int64(), lambda r: r.sent_ns),
@@ -162,7 +162,7 @@ class TopicTable:
         self._rows = Rows([*head, *((n, t, _of_message(reader)) for n, t, reader in columns)])
         self.children: dict[str, Rows] = {}
         for name in children:
-            inner = _columns(_element(topic.kind, name), pictures)[0]
+            inner = _columns(_element(topic.kind, name), images)[0]
             self.children[name] = Rows(
                 [
                     ("key", pa.string(), lambda r: r[0].key),

@@ -1,4 +1,4 @@
-"""What `reproduce` flies, as data: missions with pictures, and studies of the controller on perfect knowledge."""
+"""What `reproduce` flies, as data: missions with images, and studies of the controller on perfect knowledge."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCENARIO = "paper-single"
 """The scenario of every single-chaser run: the paper's settings and its baseline row."""
 
 INFERRED = "inferred"
-"""The start of ``paper-single``, from which every row is flown with pictures."""
+"""The start of ``paper-single``, from which every row is flown with images."""
 
 _ROLLED = "chasers.0.start_rotation_rad=[0.575, 0.0, 0.0]"
 STARTS: dict[str, tuple[str, ...]] = {
@@ -37,7 +37,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "controller.integrator='rk4'",
         "controller.feed_forward=true",
         "time.rate_hz=15",
-        "time.picture_hz=15",
+        "time.image_hz=15",
         "time.latency_s=0.0333333333333333",
     ),
 }
@@ -78,7 +78,7 @@ _PAPER_VIEW = (
     "camera.width_px=1280",
     "camera.height_px=720",
     "time.rate_hz=30",
-    "time.picture_hz=30",
+    "time.image_hz=30",
     "time.latency_s=0.0",
     "controller.integrator='euler'",
     "controller.feed_forward=false",
@@ -86,10 +86,10 @@ _PAPER_VIEW = (
 
 
 def missions(quick: bool, duration_s: float) -> tuple[Mission, ...]:
-    """The flights with pictures; the table first."""
+    """The flights with images; the table first."""
     seeds, length = range(1 if quick else 3), f"duration_s={duration_s}"
     out: list[Mission] = []
-    # From the other starts perfect knowledge says what the rows do (studies); pictures confirm the baseline. The quick
+    # From the other starts perfect knowledge says what the rows do (studies); images confirm the baseline. The quick
     # table has our defaults where the paper gives no reason to look at more.
     for start, turned in STARTS.items():
         for column, settings in COLUMNS.items():
@@ -114,8 +114,8 @@ _INGREDIENTS: dict[str, tuple[str, ...]] = {
     "RK4 in place of Euler": ("controller.integrator='rk4'",),
     "feed-forward in place of u_ref = 0": ("controller.feed_forward=true",),
     "latency of 1/30 s, compensated": ("time.latency_s=0.0333333333333333",),
-    "control at 15 Hz": ("time.rate_hz=15", "time.picture_hz=15"),
-    "control at 10 Hz": ("time.rate_hz=10", "time.picture_hz=10"),
+    "control at 15 Hz": ("time.rate_hz=15", "time.image_hz=15"),
+    "control at 10 Hz": ("time.rate_hz=10", "time.image_hz=10"),
     "force weight times 4": ("controller.weight_force=14.0",),
     "force weight by 4": ("controller.weight_force=0.875",),
     "final weights by 4": (

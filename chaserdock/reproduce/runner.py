@@ -148,7 +148,7 @@ class Runner:
     @staticmethod
     def _effort(mission: Mission) -> float:
         scenario = scenario_of(mission)[1]
-        return scenario.duration_s * scenario.time.picture_hz * len(scenario.chasers)
+        return scenario.duration_s * scenario.time.image_hz * len(scenario.chasers)
 
     def _told(self, name: str, begun_s: float, what: str) -> None:
         with self._lock:

@@ -88,7 +88,7 @@ def mean(errors: Sequence[Errors]) -> Errors:
 
 
 def flown(plan: Plan, results: Results, group: str) -> Errors | None:
-    """The average of a group's runs with pictures; None if the plan has none of that group or not all are flown."""
+    """The average of a group's runs with images; None if the plan has none of that group or not all are flown."""
     members: list[Mission] = [m for m in plan.missions if m.group == group]
     if not members or any(m.name not in results.missions for m in members):
         return None
@@ -110,7 +110,7 @@ def _ratio(label: str, ours: float, paper: float, low: float, high: float, how: 
 
 
 def requirements(plan: Plan, results: Results, start: str) -> list[Requirement] | None:
-    """What a reproduction from ``start`` is to show, with pictures where the plan has them, else on perfect knowledge.
+    """What a reproduction from ``start`` is to show, with images where the plan has them, else on perfect knowledge.
 
     None if not all of it is flown.
     """
@@ -124,7 +124,7 @@ def requirements(plan: Plan, results: Results, start: str) -> list[Requirement] 
     def best(group: str) -> tuple[Errors, str]:
         seen = flown(plan, results, group)
         if seen is not None:
-            return seen, "with pictures"
+            return seen, "with images"
         return errors_of_study(results.studies[group]), "perfect knowledge"
 
     for row, group in zip(ROWS, groups, strict=False):

@@ -29,13 +29,13 @@ def how_measured(plan: Plan, results: Results) -> Section:
         "away from a chaser that waits behind it (receding: reference pose of the paper's chaser 0) and towards one that "
         "waits in front of it (closing: its chaser 3). And about which axis the chaser is turned. The inferred start is in "
         "front of the target, rolled and yawed together (rotation vector 0.42, 0, -0.3927 rad; the target is still in the "
-        "picture), because there both figures of the baseline come out: these two are fitted, the other rows are not. "
+        "image), because there both figures of the baseline come out: these two are fitted, the other rows are not. "
         "Beside it stand two starts that are rolled alone (0.575 rad about the body's X), closing and receding; further "
         "ones are in the table on the start.",
-        "With pictures: a world process renders 1280 x 720 pictures, a chaser process sees the markers, a controller "
+        "With images: a world process renders 1280 x 720 images, a chaser process sees the markers, a controller "
         "process estimates and plans (`chaserdock run`). Perfect knowledge: the same flight code in one process with "
         "the target's true state in place of the estimate (`chaserdock study`).",
-        "Paper's settings: 30 Hz control and pictures, forward Euler in the prediction, u_ref = 0, no latency; weights, "
+        "Paper's settings: 30 Hz control and images, forward Euler in the prediction, u_ref = 0, no latency; weights, "
         "body, target and camera as everywhere. Our default: RK4, feed-forward, 15 Hz, 1/30 s from exposure to "
         "actuation.",
         "Least possible: the smallest position MSE of any controller under 2 N along each body axis for a chaser of 30 kg "
@@ -45,7 +45,7 @@ def how_measured(plan: Plan, results: Results) -> Section:
     ]
     if missing or missing_studies:
         parts.append(
-            f"NOT COMPLETE: {missing} of {len(plan.missions)} runs with pictures and {missing_studies} of "
+            f"NOT COMPLETE: {missing} of {len(plan.missions)} runs with images and {missing_studies} of "
             f"{len(plan.studies)} on perfect knowledge are not flown yet. The same command goes on with them."
         )
     return Section("What was flown, and how it is measured", tuple(parts))

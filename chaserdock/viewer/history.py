@@ -120,7 +120,7 @@ class History:
         self._target: TargetEstimate | None = None
 
     def exposed(self, chaser: int, tick: int, sent_ns: int) -> None:
-        """A picture was sent at a wall clock's ``sent_ns``."""
+        """An image was sent at a wall clock's ``sent_ns``."""
         _keep(self._exposed[chaser], tick, sent_ns)
 
     def take(self, topic: Topic, message: Any, sent_ns: int) -> None:

@@ -1,4 +1,4 @@
-"""A log as the viewer reads it: read through once, then opened at any moment. Pictures stay in the file."""
+"""A log as the viewer reads it: read through once, then opened at any moment. Images stay in the file."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _CHUNKS_KEPT = 24
 
 
 class _Exposure(msgspec.Struct):
-    """What is read of a picture when it is not looked at."""
+    """What is read of an image when it is not looked at."""
 
     tick: int
     chaser: int

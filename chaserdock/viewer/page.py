@@ -1,4 +1,4 @@
-"""The page round the scene: state, commands, pictures, plots, what happened, and a time line on a log."""
+"""The page round the scene: state, commands, images, plots, what happened, and a time line on a log."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ from .snapshot import Now
 COMMANDS = ("approach", "hold", "retreat", "abort")
 Command = Callable[[str, int], None]
 
-_PICTURE_PX = 400
+_IMAGE_PX = 400
 _SLOW_S = 0.5
-_PICTURES_S = 0.25
+_IMAGES_S = 0.25
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
 _COLOURS = {"approach": "green", "hold": "blue", "retreat": "orange", "abort": "red"}
 
@@ -66,10 +66,10 @@ class Page:
         self._slider: Any = None
         self._drawn_s = -math.inf
         self._plotted_s = -math.inf
-        self._pictures_s = -math.inf
-        self._picture_waits = False
+        self._images_s = -math.inf
+        self._image_waits = False
         self._shown_images: dict[int, tuple[int, bool]] = {}
-        self._next_picture = 0
+        self._next_image = 0
         server.scene.reset()
         server.gui.reset()
         self._theme(dark)
@@ -168,17 +168,17 @@ class Page:
 
     def _left_panels(self, truth: bool) -> None:
         gui, scenario = self._server.gui, self._scenario
-        pictures, plots = gui.add_panel(), gui.add_panel()
-        pictures.dock_left()
-        pictures.set_width(360)
+        images, plots = gui.add_panel(), gui.add_panel()
+        images.dock_left()
+        images.set_width(360)
         number, camera = len(scenario.chasers), scenario.camera_model()
         self._columns = 1 if number == 1 else 2 if number <= 8 else 3
-        self._tile = (round(_PICTURE_PX * camera.height_px / camera.width_px), _PICTURE_PX)
+        self._tile = (round(_IMAGE_PX * camera.height_px / camera.width_px), _IMAGE_PX)
         rows = -(-number // self._columns)
         self._mosaic = np.full((rows * self._tile[0], self._columns * self._tile[1], 3), 60, np.uint8)
-        with pictures.add_tab("Cameras"):
-            self._pictures = gui.add_image(self._mosaic, format="jpeg", jpeg_quality=70)
-        plots.dock_below(pictures)
+        with images.add_tab("Cameras"):
+            self._images = gui.add_image(self._mosaic, format="jpeg", jpeg_quality=70)
+        plots.dock_below(images)
         with plots.add_tab("Plots"):
             for plot in plots_of(len(scenario.chasers), truth):
                 self._plots.append((plot, self._chart(plot)))
@@ -211,7 +211,7 @@ class Page:
         self._answer.content = text
 
     def draw(self, now: Now, history: History, mode: str, speed: float | None, lost: set[str]) -> None:
-        """The present: the scene and one chaser's picture each time, words and plots twice a second."""
+        """The present: the scene and one chaser's image each time, words and plots twice a second."""
         slow = time.monotonic() - self._drawn_s >= _SLOW_S
         with self._server.atomic():
             self._stage.draw(now, history, slow)
@@ -220,7 +220,7 @@ class Page:
             if slow:
                 self._drawn_s = time.monotonic()
                 self._write(now, history, mode, speed, lost)
-        self._draw_picture(now)
+        self._draw_image(now)
 
     def _write(self, now: Now, history: History, mode: str, speed: float | None, lost: set[str]) -> None:
         for element, text in (
@@ -236,7 +236,7 @@ class Page:
             for plot, chart in self._plots:
                 chart.data = points_of(plot, history, 0.0, now.time_s())
 
-    def _draw_picture(self, now: Now) -> None:
+    def _draw_image(self, now: Now) -> None:
         for i in self._in_turn():
             image = now.chasers[i].image
             if image is None:
@@ -247,22 +247,22 @@ class Page:
                 self._shown_images[i] = version
                 row, column = (i // self._columns) * self._tile[0], (i % self._columns) * self._tile[1]
                 place = np.s_[row : row + self._tile[0], column : column + self._tile[1]]
-                self._mosaic[place] = self._picture(image, sighting)
-                self._picture_waits = True
+                self._mosaic[place] = self._image(image, sighting)
+                self._image_waits = True
                 break
-        if self._picture_waits and time.monotonic() - self._pictures_s >= _PICTURES_S:
-            self._picture_waits, self._pictures_s = False, time.monotonic()
-            self._pictures.image = self._mosaic
+        if self._image_waits and time.monotonic() - self._images_s >= _IMAGES_S:
+            self._image_waits, self._images_s = False, time.monotonic()
+            self._images.image = self._mosaic
 
     def _in_turn(self) -> Iterator[int]:
         number = len(self._scenario.chasers)
-        first, self._next_picture = self._next_picture, (self._next_picture + 1) % number
+        first, self._next_image = self._next_image, (self._next_image + 1) % number
         yield from ((first + k) % number for k in range(number))
 
-    def _picture(self, image: Image, sighting: Any) -> Any:
-        """RGB, the size of a tile; black for a damaged one, of which the table says "bad picture"."""
+    def _image(self, image: Image, sighting: Any) -> Any:
+        """RGB, the size of a tile; black for a damaged one, of which the table says "bad image"."""
         try:
-            drawn = view(self._scenario, image, sighting, _PICTURE_PX)[:, :, ::-1]
+            drawn = view(self._scenario, image, sighting, _IMAGE_PX)[:, :, ::-1]
         except LogError:
             drawn = np.zeros((*self._tile, 3), np.uint8)
         return drawn if drawn.shape[:2] == self._tile else cv2.resize(drawn, self._tile[::-1])

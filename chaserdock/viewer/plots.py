@@ -62,7 +62,7 @@ def plots_of(chasers: int, truth: bool) -> tuple[Plot, ...]:
         Plot("orientation error, deg", each("orientation_error_deg")),
         *((Plot("error of the target's estimate", estimate),) if truth else ()),
         Plot("solve time, ms", (("controller", COLOURS[0], "solve_ms", None),)),
-        Plot("picture to command, ms of wall time", each("latency_ms")),
+        Plot("image to command, ms of wall time", each("latency_ms")),
     )
 
 

@@ -15,7 +15,6 @@ from chaserdock_protocol.messages import (
     BodyTruth,
     DockingStatus,
     Image,
-    JetReport,
     MissionEnd,
     Odometry,
     Plan,
@@ -23,6 +22,7 @@ from chaserdock_protocol.messages import (
     Sighting,
     SolverStatus,
     TargetEstimate,
+    ThrusterReport,
     Tick,
     WrenchCommand,
 )
@@ -36,7 +36,7 @@ OF_CHASERS = (
     topics.SIGHTING,
     topics.WRENCH,
     topics.ACTUATORS,
-    topics.JETS,
+    topics.THRUSTERS,
     topics.REFERENCE,
     topics.PLAN,
 )
@@ -72,7 +72,7 @@ class ChaserNow:
     sighting: Sighting | None = None
     wrench: WrenchCommand | None = None
     actuators: ActuatorCommand | None = None
-    jets: JetReport | None = None
+    thrusters: ThrusterReport | None = None
     _odometries: OrderedDict[int, Odometry] = field(default_factory=OrderedDict)
     _sightings: OrderedDict[int, Sighting] = field(default_factory=OrderedDict)
 
@@ -97,8 +97,8 @@ class ChaserNow:
                 self.wrench = message
             case ActuatorCommand():
                 self.actuators = message
-            case JetReport():
-                self.jets = message
+            case ThrusterReport():
+                self.thrusters = message
 
     def error(self) -> tuple[float, float] | None:
         """Distance (m) and angle (rad) of the chaser from its reference, by its own odometry; None while unknown."""
@@ -110,7 +110,7 @@ class ChaserNow:
         return away_m, float(rotations.angle_between(there.q_wxyz, here.q_wxyz))
 
     def sighting_in(self, image: Image) -> Sighting | None:
-        """What was found in that picture, if that is known."""
+        """What was found in that image, if that is known."""
         return self._sightings.get(image.sim_time_ns)
 
 

@@ -78,10 +78,14 @@ def faults(now: Now, history: History, lost: set[str]) -> str:
             out.append(
                 f"chaser {i} flies by itself ({chaser.actuators.source}): it has no command it can trust"
             )
-        if chaser.jets is not None:
-            bad = [f"{k} {s.replace('_', ' ')}" for k, s in enumerate(chaser.jets.jets) if s != "healthy"]
+        if chaser.thrusters is not None:
+            bad = [
+                f"{k} {s.replace('_', ' ')}"
+                for k, s in enumerate(chaser.thrusters.thrusters)
+                if s != "healthy"
+            ]
             if bad:
-                out.append(f"chaser {i}: jet {', '.join(bad)}")
+                out.append(f"chaser {i}: thruster {', '.join(bad)}")
     if now.tick is not None and not now.tick.controller:
         out.append("the controller takes no part")
     if now.solver is not None:

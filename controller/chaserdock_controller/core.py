@@ -41,7 +41,7 @@ from chaserdock_controller.output.latency_compensation import (
 )
 from chaserdock_controller.output.message_builders import in_words, plan_message, target_message
 from chaserdock_controller.output.quantization import in_steps
-from chaserdock_controller.output.thruster_state import JET_COMMANDS, JetDesk
+from chaserdock_controller.output.thruster_state import THRUSTER_COMMANDS, ThrusterCommandHandler
 
 from .estimation import geometry
 from .guidance import reference
@@ -71,7 +71,7 @@ class Flight:
     ) -> None:
         self.scenario = scenario
         self.guidance = Guidance(scenario)
-        self._jets = JetDesk(scenario)
+        self._thrusters = ThrusterCommandHandler(scenario)
         self._now_s = now_s
         self._camera = scenario.camera_model()
         self.estimator = estimator or estimator_of(scenario)
@@ -120,8 +120,8 @@ class Flight:
         commands = (*self.guidance.due_commands(now_s), *inputs.commands)
         self.guidance.expect(commands)
         for command in commands:
-            if command.command in JET_COMMANDS:
-                answer = self._jets.command(command, now_s)
+            if command.command in THRUSTER_COMMANDS:
+                answer = self._thrusters.command(command, now_s)
             else:
                 answer = self.guidance.command(command, now_s)
             out.replies.append(
@@ -149,8 +149,8 @@ class Flight:
         """The estimation of ``step`` alone: the fused state and its message. Once a tick, by ``step`` or instead of it."""
         for odometry in inputs.odometry.values():
             self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
-        self._jets.take(inputs.jets)
-        given = self._jets.given(inputs.tick)
+        self._thrusters.take(inputs.thrusters)
+        given = self._thrusters.given(inputs.tick)
         self._captures.feel(inputs.docking, inputs.odometry, self._history, inputs.time_ns, given)
         fused = self.estimator.update(self._measurements(inputs.sightings), inputs.time_ns)
         if fused.status in ("tracking", "predicting"):
@@ -255,7 +255,7 @@ class Flight:
     def _send(
         self, i: int, inputs: Inputs, effective_ns: int, mode: Mode, wrench: Array, out: Outputs
     ) -> None:
-        wrench = in_steps(wrench, self._jets.limits(i))
+        wrench = in_steps(wrench, self._thrusters.limits(i))
         self._history.add(i, effective_ns, wrench)
         out.wrenches[i] = WrenchCommand(
             tick=inputs.tick,
@@ -267,8 +267,8 @@ class Flight:
             force_N=vector(wrench[:3]),
             torque_N_m=vector(wrench[3:]),
             latch=self.guidance.latch(i),
-            isolated=self._jets.isolated(i),
-            trusted=self._jets.trusted(i),
+            isolated=self._thrusters.isolated(i),
+            trusted=self._thrusters.trusted(i),
             free=self.guidance.is_free(i),
         )
 
@@ -279,7 +279,7 @@ class Flight:
         nodes, middles = self._captures.path(ahead, p.dt_s, p.stages)
         states = []
         for i in ids:
-            coming = self._jets.coming(i, inputs.tick)
+            coming = self._thrusters.coming(i, inputs.tick)
             if coming is None:
                 state = predict_state(inputs.odometry[i], self._history, effective_ns, s.chaser)
             else:
@@ -300,7 +300,7 @@ class Flight:
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
-        limits = np.array([self._jets.limits(i) for i in ids])
+        limits = np.array([self._thrusters.limits(i) for i in ids])
         for row, i in enumerate(ids):
             if self._is_held(i):  # it gives nobody room: no more than what follows the target's motion
                 limits[row] = np.minimum(limits[row], 1.2 * np.abs(u_ref[row]).max(axis=0) + 1e-3)

@@ -9,7 +9,6 @@ from chaserdock_protocol.messages import (
     CommandReply,
     DockingStatus,
     Event,
-    JetReport,
     Odometry,
     OperatorCommand,
     Plan,
@@ -17,6 +16,7 @@ from chaserdock_protocol.messages import (
     Sighting,
     SolverStatus,
     TargetEstimate,
+    ThrusterReport,
     WrenchCommand,
 )
 
@@ -30,7 +30,7 @@ class Inputs:
     odometry: dict[int, Odometry]
     sightings: tuple[Sighting, ...]
     commands: tuple[OperatorCommand, ...] = ()
-    jets: Mapping[int, JetReport] = field(default_factory=dict)
+    thrusters: Mapping[int, ThrusterReport] = field(default_factory=dict)
     docking: Mapping[int, DockingStatus] = field(default_factory=dict)
 
 

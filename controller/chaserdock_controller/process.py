@@ -17,7 +17,6 @@ from chaserdock_protocol.messages import (
     ControllerState,
     DockingStatus,
     Event,
-    JetReport,
     JoinReply,
     Level,
     MissionEnd,
@@ -25,6 +24,7 @@ from chaserdock_protocol.messages import (
     OperatorCommand,
     Presence,
     Sighting,
+    ThrusterReport,
     Tick,
 )
 from chaserdock_protocol.process import ProcessOptions, Stop, built
@@ -85,7 +85,7 @@ class Controller:
     done_tick: int = -1
     now_s: Callable[[], float] = time.monotonic
     _odometry: dict[int, Odometry] = field(default_factory=dict)
-    _jets: dict[int, JetReport] = field(default_factory=dict)
+    _thrusters: dict[int, ThrusterReport] = field(default_factory=dict)
     _docking: dict[int, DockingStatus] = field(default_factory=dict)
     _seen: set[tuple[int, int]] = field(default_factory=set)
     _used: dict[tuple[int, int], bool] = field(default_factory=dict)
@@ -118,7 +118,7 @@ class Controller:
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
-        told = (topics.TICK, topics.END, topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.JETS)
+        told = (topics.TICK, topics.END, topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.THRUSTERS)
         for topic in (*told, topics.STATE):
             node.subscribe(topic)
         self.teller = PresenceTeller(node, instance)
@@ -233,8 +233,8 @@ class Controller:
                 self._docking[docking.chaser] = docking
             case Sighting() as sighting:
                 self._see(sighting)
-            case JetReport() as report:
-                self._jets[report.chaser] = report
+            case ThrusterReport() as report:
+                self._thrusters[report.chaser] = report
             case Presence() as presence:
                 self.teller.take(presence)
             case MissionEnd():
@@ -256,7 +256,7 @@ class Controller:
         self.node.publish(topics.EVENT, event, self.name)
 
     def _see(self, sighting: Sighting) -> None:
-        """Takes a sighting, each picture's once: twice the same is no more evidence."""
+        """Takes a sighting, each image's once: twice the same is no more evidence."""
         key = (sighting.tick, sighting.chaser)
         if sighting.solutions and self._used.get(key):
             self.node.counts.stale += 1
@@ -270,16 +270,18 @@ class Controller:
         self._missed.add((topic.key, chaser, tick))
 
     def _complete(self, tick: Tick) -> bool:
-        def there(topic: Topic, known: Mapping[int, Odometry | JetReport | DockingStatus], i: int) -> bool:
+        def there(
+            topic: Topic, known: Mapping[int, Odometry | ThrusterReport | DockingStatus], i: int
+        ) -> bool:
             return (i in known and known[i].tick == tick.tick) or (topic.key, i, tick.tick) in self._missed
 
-        jets = self.scenario.chaser.actuation == "thrusters"
+        thrusters = self.scenario.chaser.actuation == "thrusters"
         return all(
             there(topics.ODOMETRY, self._odometry, i)
-            and (not jets or there(topics.JETS, self._jets, i))
+            and (not thrusters or there(topics.THRUSTERS, self._thrusters, i))
             and (self._ports[i] is None or there(topics.DOCKING, self._docking, i))
             and (
-                not tick.pictures
+                not tick.images
                 or (tick.tick, i) in self._seen
                 or (topics.SIGHTING.key, i, tick.tick) in self._missed
             )
@@ -311,7 +313,13 @@ class Controller:
         commands = tuple(c for c, _ in asked)
         out = self.flight.step(
             Inputs(
-                tick.tick, tick.sim_time_ns, here, tuple(self._sightings), commands, dict(self._jets), docking
+                tick.tick,
+                tick.sim_time_ns,
+                here,
+                tuple(self._sightings),
+                commands,
+                dict(self._thrusters),
+                docking,
             )
         )
         for (command, answer), reply in zip(asked, out.replies[len(out.replies) - len(asked) :], strict=True):

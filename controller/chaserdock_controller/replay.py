@@ -85,7 +85,7 @@ def play_fusion(scenario: Scenario, recorded: Iterable[Received]) -> Iterator[Sa
     return _play(scenario, recorded, lambda: _FusionAlone(_flight_of(scenario)))
 
 
-_INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING, topics.JETS, topics.DOCKING)
+_INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING, topics.THRUSTERS, topics.DOCKING)
 FUSION = Stage("controller", _INPUTS, (topics.TARGET,), play_fusion)
 CONTROLLER = Stage(
     "controller",

@@ -223,8 +223,8 @@ class Controller:
             here = [i for i in tick["chasers"] if odometry.get(i, {}).get("tick") == now]
             looked = [i for i in tick["chasers"] if sightings.get(i, {}).get("tick") == now]
             # Lock-step: answer when everything that belongs to this tick has come.
-            if len(here) == len(tick["chasers"]) and (not tick["pictures"] or len(looked) == len(here)):
-                self.answer(scenario, tick, target, odometry, sightings if tick["pictures"] else {})
+            if len(here) == len(tick["chasers"]) and (not tick["images"] or len(looked) == len(here)):
+                self.answer(scenario, tick, target, odometry, sightings if tick["images"] else {})
                 done = now
         self.over.set()
         self.teller.join()  # what it still says is to be in the counts

@@ -1,6 +1,6 @@
 """Pinhole camera with Brown-Conrady lens distortion, and where it is mounted on the chaser.
 
-Pixel centres lie at integer coordinates: the picture covers (-0.5, width - 0.5) x (-0.5, height - 0.5).
+Pixel centres lie at integer coordinates: the image covers (-0.5, width - 0.5) x (-0.5, height - 0.5).
 "Ideal" pixels are those of the same camera matrix without lens distortion. Distortion model and order
 of its coefficients as in OpenCV: D. C. Brown, "Decentering distortion of lenses", 1966.
 """
@@ -25,7 +25,7 @@ Q_CRF_IRF_FORWARD_WXYZ: tuple[float, float, float, float] = (0.5, -0.5, 0.5, -0.
 class Camera:
     """One camera and its mounting.
 
-    ``width_px``, ``height_px``: picture size. ``fx_px``, ``fy_px``, ``cx_px``, ``cy_px``: camera matrix.
+    ``width_px``, ``height_px``: image size. ``fx_px``, ``fy_px``, ``cx_px``, ``cy_px``: camera matrix.
     ``distortion``: (k1, k2, p1, p2[, k3]), dimensionless, or empty for none.
     ``position_crf_m``: optical centre in CRF. ``q_crf_irf_wxyz``: rotation IRF -> CRF.
     Raises ValueError for sizes or focal lengths that are not positive and a wrong number of coefficients.
@@ -43,7 +43,7 @@ class Camera:
 
     def __post_init__(self) -> None:
         if self.width_px <= 0 or self.height_px <= 0:
-            raise ValueError(f"picture size must be positive: {self.width_px} x {self.height_px}")
+            raise ValueError(f"image size must be positive: {self.width_px} x {self.height_px}")
         if not (self.fx_px > 0.0 and self.fy_px > 0.0):
             raise ValueError(f"focal lengths must be positive: {self.fx_px}, {self.fy_px}")
         if len(self.distortion) not in (0, 4, 5):
@@ -95,7 +95,7 @@ class Camera:
         return points[..., :2] / z * self._focal + self._centre
 
     def distort(self, ideal_px: ArrayLike) -> Array:
-        """Ideal pixels (..., 2) to pixels in the distorted picture (..., 2)."""
+        """Ideal pixels (..., 2) to pixels in the distorted image (..., 2)."""
         ideal_px = np.asarray(ideal_px, dtype=float)
         if not self.distortion:
             return ideal_px.copy()
@@ -103,10 +103,10 @@ class Camera:
         return self._distort_normalized((ideal_px - centre) / focal) * focal + centre
 
     def undistort(self, px: ArrayLike) -> Array:
-        """Pixels in the distorted picture (..., 2) to ideal pixels (..., 2).
+        """Pixels in the distorted image (..., 2) to ideal pixels (..., 2).
 
         Fixed-point iteration to convergence (1e-9 px); NaN where there is none, i.e. outside the part of
-        the picture in which the distortion can be inverted.
+        the image in which the distortion can be inverted.
         """
         px = np.asarray(px, dtype=float)
         if not self.distortion:

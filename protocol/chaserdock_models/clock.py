@@ -9,13 +9,13 @@ from dataclasses import dataclass
 class Timing:
     """Physics steps, ticks and latencies of a mission.
 
-    ``rate_hz`` ticks a second and ``picture_hz`` pictures a second, both whole divisors of ``physics_hz`` (pictures
+    ``rate_hz`` ticks a second and ``image_hz`` images a second, both whole divisors of ``physics_hz`` (images
     of ticks, too). ``latency_steps`` is the time from exposure to actuation in physics steps.
     """
 
     physics_hz: int
     rate_hz: int
-    picture_hz: int
+    image_hz: int
     latency_steps: int
 
     @property
@@ -23,8 +23,8 @@ class Timing:
         return self.physics_hz // self.rate_hz
 
     @property
-    def ticks_per_picture(self) -> int:
-        return self.rate_hz // self.picture_hz
+    def ticks_per_image(self) -> int:
+        return self.rate_hz // self.image_hz
 
     def step_of_tick(self, tick: int) -> int:
         return tick * self.steps_per_tick
@@ -47,5 +47,5 @@ class Timing:
     def ticks_in(self, duration_s: float) -> int:
         return round(duration_s * self.rate_hz)
 
-    def has_pictures(self, tick: int) -> bool:
-        return tick % self.ticks_per_picture == 0
+    def has_images(self, tick: int) -> bool:
+        return tick % self.ticks_per_image == 0

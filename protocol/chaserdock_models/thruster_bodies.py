@@ -1,4 +1,4 @@
-"""The bodies that are shipped with jets, as data: defaults of the scenario's section ``chaser``."""
+"""The bodies that are shipped with thrusters, as data: defaults of the scenario's section ``chaser``."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 def _tetra12() -> dict[str, Any]:
-    """Three 1.5 N jets on each of four corners of a cube: one jet under the 12 rotations of the tetrahedron.
+    """Three 1.5 N thrusters on each of four corners of a cube: one thruster under the 12 rotations of the tetrahedron.
 
-    Any one jet can be lost, stuck off or on, and all six degrees of freedom stay controllable.
+    Any one thruster can be lost, stuck off or on, and all six degrees of freedom stay controllable.
     """
     arm_m, direction = 0.163, (-0.525, -0.525, 0.669)
     length = math.hypot(*direction)
-    jets = [
+    thrusters = [
         {
             "position_m": tuple(arm_m * sign for sign in signs),
             "direction": tuple(s * direction[axis] / length for s, axis in zip(signs, turn, strict=True)),
@@ -32,17 +32,17 @@ def _tetra12() -> dict[str, Any]:
         "inertia_kg_m2": (0.315,) * 3,
         "force_max_N": 1.5,
         "torque_max_N_m": 0.15,
-        "thrusters": tuple(jets),
+        "thrusters": tuple(thrusters),
     }
 
 
 def _slider() -> dict[str, Any]:
-    """The paper's body with four 2.3 N jets on each corner of its plate: two inward in the plane, one up, one down.
+    """The paper's body with four 2.3 N thrusters on each corner of its plate: two inward in the plane, one up, one down.
 
-    The paper's 2 N and 0.05 N m on all axes at once are kept with any one jet lost.
+    The paper's 2 N and 0.05 N m on all axes at once are kept with any one thruster lost.
     """
     arm_m = 0.125
-    jets = [
+    thrusters = [
         {"position_m": (x * arm_m, y * arm_m, 0.0), "direction": direction, "thrust_N": 2.3, **_FAST}
         for x, y in ((1, 1), (-1, 1), (-1, -1), (1, -1))
         for direction in ((-x, 0.0, 0.0), (0.0, -y, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, -1.0))
@@ -52,7 +52,7 @@ def _slider() -> dict[str, Any]:
         "size_m": (0.25, 0.25, 0.05),
         "force_max_N": 2.0,
         "torque_max_N_m": 0.05,
-        "thrusters": tuple(jets),
+        "thrusters": tuple(thrusters),
     }
 
 

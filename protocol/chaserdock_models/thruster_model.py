@@ -1,4 +1,4 @@
-"""What a body's jets give, from when their valves open and close: the world's jets, and a chaser's idea of its own.
+"""What a body's thrusters give, from when their valves open and close: the world's thrusters, and a chaser's idea of its own.
 
 Times are whole nanoseconds of simulated time. A valve is open where a pulse, or a failure, opens it and its shut-off
 valve is not closed. Thrust rises linearly within ``rise_s`` of the opening and falls linearly within ``fall_s`` of the
@@ -66,8 +66,8 @@ def without(spans: Sequence[Span], cut: Span) -> list[Span]:
     return out
 
 
-class _Jet:
-    """One jet: pulses asked for, how it has failed, when its shut-off valve was closed."""
+class _Thruster:
+    """One thruster: pulses asked for, how it has failed, when its shut-off valve was closed."""
 
     def __init__(self, thruster: Thruster) -> None:
         self.rise_ns, self.fall_ns = _ns(thruster.rise_s), _ns(thruster.fall_s)
@@ -77,7 +77,7 @@ class _Jet:
         self.failure: tuple[FailureKind, int, float] | None = None
 
     def open_spans(self) -> list[Span]:
-        """When the jet's valves are open."""
+        """When the thruster's valves are open."""
         spans = joined(self.pulses, self.fall_ns)
         if self.failure is not None:
             kind, at_ns, _ = self.failure
@@ -103,83 +103,88 @@ class _Jet:
 
 
 class Valves:
-    """All jets of one body, by their number."""
+    """All thrusters of one body, by their number."""
 
     def __init__(self, thrusters: Sequence[Thruster]) -> None:
-        self._jets = [_Jet(t) for t in thrusters]
+        self._thrusters = [_Thruster(t) for t in thrusters]
         self._thrust_N = np.array([t.thrust_N for t in thrusters])
         self._exhaust_m_s = np.array([t.isp_s * G0_M_S2 for t in thrusters])
         self._table: tuple[Array, ...] | None = None
 
-    def pulse(self, jet: int, open_ns: int, close_ns: int) -> bool:
-        """Opens a jet's valve for a while; False where that cannot be: no such jet, or too short a time."""
-        if not 0 <= jet < len(self._jets) or close_ns - open_ns < self._jets[jet].shortest_ns:
+    def pulse(self, thruster: int, open_ns: int, close_ns: int) -> bool:
+        """Opens a thruster's valve for a while; False where that cannot be: no such thruster, or too short a time."""
+        if (
+            not 0 <= thruster < len(self._thrusters)
+            or close_ns - open_ns < self._thrusters[thruster].shortest_ns
+        ):
             return False
-        insort(self._jets[jet].pulses, (open_ns, close_ns))
+        insort(self._thrusters[thruster].pulses, (open_ns, close_ns))
         self._table = None
         return True
 
     def stop(self, at_ns: int) -> None:
         """No pulse lasts longer than until ``at_ns``."""
-        for jet in self._jets:
-            jet.pulses = without(jet.pulses, (at_ns, math.inf))
+        for thruster in self._thrusters:
+            thruster.pulses = without(thruster.pulses, (at_ns, math.inf))
         self._table = None
 
-    def set_shut(self, jets: Sequence[int], at_ns: int) -> None:
-        """From ``at_ns`` on the shut-off valves of these jets are closed, all others open."""
-        for k, jet in enumerate(self._jets):
-            is_shut = bool(jet.shut) and jet.shut[-1][1] == math.inf
-            if is_shut == (k in jets):
+    def set_shut(self, thrusters: Sequence[int], at_ns: int) -> None:
+        """From ``at_ns`` on the shut-off valves of these thrusters are closed, all others open."""
+        for k, thruster in enumerate(self._thrusters):
+            is_shut = bool(thruster.shut) and thruster.shut[-1][1] == math.inf
+            if is_shut == (k in thrusters):
                 continue
             if is_shut:
-                jet.shut[-1] = (jet.shut[-1][0], max(float(at_ns), jet.shut[-1][0]))
+                thruster.shut[-1] = (thruster.shut[-1][0], max(float(at_ns), thruster.shut[-1][0]))
             else:
-                jet.shut.append((float(at_ns), math.inf))
+                thruster.shut.append((float(at_ns), math.inf))
             self._table = None
 
     def shut_at(self, time_ns: int) -> tuple[int, ...]:
-        """The jets whose shut-off valve is closed then."""
-        return tuple(k for k, j in enumerate(self._jets) if any(b <= time_ns < e for b, e in j.shut))
+        """The thrusters whose shut-off valve is closed then."""
+        return tuple(k for k, j in enumerate(self._thrusters) if any(b <= time_ns < e for b, e in j.shut))
 
-    def fail(self, jet: int, kind: FailureKind | None, at_ns: int, factor: float | None = None) -> None:
-        """From ``at_ns`` on a jet fails in a way; None: it never did. ``factor`` goes with ``weak``."""
-        self._jets[jet].failure = None if kind is None else (kind, at_ns, 1.0 if factor is None else factor)
+    def fail(self, thruster: int, kind: FailureKind | None, at_ns: int, factor: float | None = None) -> None:
+        """From ``at_ns`` on a thruster fails in a way; None: it never did. ``factor`` goes with ``weak``."""
+        self._thrusters[thruster].failure = (
+            None if kind is None else (kind, at_ns, 1.0 if factor is None else factor)
+        )
         self._table = None
 
     def forget_before(self, time_ns: int) -> None:
         """Drops what has no effect after ``time_ns``: nobody will ask for what was before."""
-        for jet in self._jets:
-            jet.forget_before(time_ns)
+        for thruster in self._thrusters:
+            thruster.forget_before(time_ns)
         self._table = None
 
     def _spans(self) -> tuple[Array, ...]:
-        """Columns of all openings: jet, begin, end, rise, fall (ns), factor."""
+        """Columns of all openings: thruster, begin, end, rise, fall (ns), factor."""
         if self._table is None:
             rows = [
-                (k, begin, end, jet.rise_ns, jet.fall_ns, jet.factor(begin))
-                for k, jet in enumerate(self._jets)
-                for begin, end in jet.open_spans()
+                (k, begin, end, thruster.rise_ns, thruster.fall_ns, thruster.factor(begin))
+                for k, thruster in enumerate(self._thrusters)
+                for begin, end in thruster.open_spans()
             ]
             self._table = tuple(np.array(rows, dtype=float).reshape(-1, 6).T)
         return self._table
 
     def impulses(self, edges_ns: Array) -> Array:
-        """N s given by every jet between successive times: (K + 1,) whole nanoseconds -> (K, n)."""
-        jet, begin, end, rise, fall, factor = self._spans()
-        out = np.zeros((len(edges_ns) - 1, len(self._jets)))
-        if len(jet):
+        """N s given by every thruster between successive times: (K + 1,) whole nanoseconds -> (K, n)."""
+        thruster, begin, end, rise, fall, factor = self._spans()
+        out = np.zeros((len(edges_ns) - 1, len(self._thrusters)))
+        if len(thruster):
             t = np.asarray(edges_ns, dtype=float)[:, None]
             full_ns = factor * np.diff(_ramp(t - begin, rise) - _ramp(t - end, fall), axis=0)
-            number = jet.astype(int)
+            number = thruster.astype(int)
             np.add.at(out.T, number, full_ns.T * (1e-9 * self._thrust_N[number, None]))
         return out
 
     def open_s(self, from_ns: int, to_ns: int) -> Array:
-        """How long every jet's valves are open between two times, (n,) s."""
-        out = np.zeros(len(self._jets))
-        jet, begin, end = self._spans()[:3]
+        """How long every thruster's valves are open between two times, (n,) s."""
+        out = np.zeros(len(self._thrusters))
+        thruster, begin, end = self._spans()[:3]
         np.add.at(
-            out, jet.astype(int), np.clip(np.minimum(end, to_ns) - np.maximum(begin, from_ns), 0.0, None)
+            out, thruster.astype(int), np.clip(np.minimum(end, to_ns) - np.maximum(begin, from_ns), 0.0, None)
         )
         return out * 1e-9
 

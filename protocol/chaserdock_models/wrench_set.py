@@ -1,6 +1,6 @@
-"""What forces and torques a body's jets can give at once. Pure functions; SI units, body axes (CRF).
+"""What forces and torques a body's thrusters can give at once. Pure functions; SI units, body axes (CRF).
 
-The set {B f, 0 <= f <= f_max} is a zonotope: every facet of it is parallel to five of the jets' wrenches, so the
+The set {B f, 0 <= f <= f_max} is a zonotope: every facet of it is parallel to five of the thrusters' wrenches, so the
 normals of all facets come from all choices of five (P. McMullen, "On zonotopes", Trans. AMS 159, 1971).
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from .rotations import Array
 
 
-class Jet(Protocol):
+class Thruster(Protocol):
     """The part of a thruster that this module needs: place (m) and unit direction of its force, CRF."""
 
     @property
@@ -26,10 +26,10 @@ class Jet(Protocol):
     def direction(self) -> tuple[float, float, float]: ...
 
 
-def wrench_matrix(jets: Sequence[Jet]) -> Array:
-    """(6, n): force and torque about the centre of mass for 1 N of each jet's thrust."""
-    directions = np.array([jet.direction for jet in jets], dtype=float).reshape(-1, 3)
-    places = np.array([jet.position_m for jet in jets], dtype=float).reshape(-1, 3)
+def wrench_matrix(thrusters: Sequence[Thruster]) -> Array:
+    """(6, n): force and torque about the centre of mass for 1 N of each thruster's thrust."""
+    directions = np.array([thruster.direction for thruster in thrusters], dtype=float).reshape(-1, 3)
+    places = np.array([thruster.position_m for thruster in thrusters], dtype=float).reshape(-1, 3)
     return np.concatenate([directions.T, np.cross(places, directions).T])
 
 

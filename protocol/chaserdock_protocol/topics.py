@@ -29,7 +29,7 @@ _KNOW_THE_TRUTH: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
 class Topic:
     """A key with one ``{chaser}`` or ``{process}`` place at most, and what goes over it. There is one of each.
 
-    ``rate`` is per tick (``tick``), per tick with pictures (``picture``), once a second of simulated time
+    ``rate`` is per tick (``tick``), per tick with images (``image``), once a second of simulated time
     (``second``), of wall time (``presence``), or when something happens (``event``).
     """
 
@@ -37,7 +37,7 @@ class Topic:
     kind: type[Struct]
     writer: Role | Literal["any"]
     readers: frozenset[Role]
-    rate: Literal["tick", "picture", "second", "presence", "event"]
+    rate: Literal["tick", "image", "second", "presence", "event"]
     qos: Qos
 
     def key_of(self, place: int | str | None = None) -> str:
@@ -62,7 +62,7 @@ def _topic(key, kind, writer, readers, rate, qos) -> Topic:
 
 TICK = _topic("world/tick", m.Tick, "world", {"chaser", "controller"}, "tick", "state")
 END = _topic("world/end", m.MissionEnd, "world", {"chaser", "controller"}, "event", "event")
-IMAGE = _topic("world/chaser/{chaser}/image", m.Image, "world", {"chaser"}, "picture", "bulk")
+IMAGE = _topic("world/chaser/{chaser}/image", m.Image, "world", {"chaser"}, "image", "bulk")
 ODOMETRY = _topic(
     "world/chaser/{chaser}/odometry", m.Odometry, "world", {"chaser", "controller"}, "tick", "state"
 )
@@ -71,9 +71,9 @@ DOCKING = _topic(
 )
 TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _KNOW_THE_TRUTH, "tick", "state")
 TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _KNOW_THE_TRUTH, "tick", "state")
-SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "picture", "state")
+SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
-JETS = _topic("chaser/{chaser}/jets", m.JetReport, "chaser", {"controller"}, "tick", "state")
+THRUSTERS = _topic("chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state")
 WRENCH = _topic(
     "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
 )
@@ -101,7 +101,7 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH_WORLD,
     SIGHTING,
     ACTUATORS,
-    JETS,
+    THRUSTERS,
     WRENCH,
     REFERENCE,
     PLAN,
@@ -126,8 +126,8 @@ JOIN_KEY = "world/join"
 """Query: JoinRequest -> JoinReply."""
 OPERATE_KEY = "controller/operate"
 """Query: OperatorCommand -> CommandReply."""
-JET_FAULT_KEY = "world/jet_fault"
-"""Query: JetFaultCommand -> CommandReply."""
+THRUSTER_FAULT_KEY = "world/thruster_fault"
+"""Query: ThrusterFaultCommand -> CommandReply."""
 LIVE_KEY = "live/{process}"
 """Liveliness token of a process."""
 

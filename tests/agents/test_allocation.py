@@ -37,8 +37,8 @@ def test_exact_to_a_billionth_inside_the_feasible_set(body: str) -> None:
 
 @given(st.sampled_from(BODIES), st.integers(0, 2**31), st.sets(st.integers(0, 11), max_size=2))
 @quick
-def test_closest_outside_and_jets_that_are_out_stay_out(body: str, seed: int, out: set[int]) -> None:
-    """The optimality conditions of the closest point: no jet that could still give more, or less, would help."""
+def test_closest_outside_and_thrusters_that_are_out_stay_out(body: str, seed: int, out: set[int]) -> None:
+    """The optimality conditions of the closest point: no thruster that could still give more, or less, would help."""
     allocator, full, limits = CASES[body]
     allowed = full.copy()
     allowed[list(out)] = 0.0
@@ -84,7 +84,7 @@ def test_numbers_that_are_none_are_refused() -> None:
             allocator.allocate(wrench, limits)
 
 
-def test_a_lost_jet_costs_its_share_of_the_box_only() -> None:
+def test_a_lost_thruster_costs_its_share_of_the_box_only() -> None:
     """Every corner of the limits that the pilot would tell the controller is still given exactly."""
     allocator, full, limits = CASES["slider"]
     corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T * limits

@@ -204,7 +204,7 @@ def tick_of(scenario: Scenario, tick: int, commander: str, term: int, revision: 
         tick=tick,
         revision=revision,
         sim_time_ns=scenario.timing.tick_time_ns(tick),
-        pictures=False,
+        images=False,
         chasers=(0,),
         controller=bool(commander),
         term=term,

@@ -1,4 +1,4 @@
-"""From a picture message to a sighting message: whatever is in the message, there is an answer."""
+"""From an image message to a sighting message: whatever is in the message, there is an answer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import Perception
-from chaserdock_agents.chaser.sighting import BadPicture, decode_picture, look, prediction_from
+from chaserdock_agents.chaser.sighting import BadImage, decode_image, look, prediction_from
 from chaserdock_models import rotations
 from chaserdock_models.targets import target_model
 from chaserdock_protocol import codec
@@ -43,7 +43,7 @@ def perception() -> Perception:
 
 
 def view(jpeg_quality: int = 92) -> tuple[Image, np.ndarray, np.ndarray]:
-    """A picture of the target, slightly turned, and where the target is in it."""
+    """An image of the target, slightly turned, and where the target is in it."""
     s = scenario(jpeg_quality)
     still = np.zeros(3)
     q = rotations.exp([0.1, 0.25, -0.2])
@@ -51,7 +51,7 @@ def view(jpeg_quality: int = 92) -> tuple[Image, np.ndarray, np.ndarray]:
         "target": BodyState(np.zeros(3), still, q, still),
         "chaser/0": BodyState(np.array([-1.5, 0.05, -0.1]), still, rotations.IDENTITY, still),
     }
-    image = Cameras(s).picture(0, 0, 4, 266_666_666, states)
+    image = Cameras(s).image(0, 0, 4, 266_666_666, states)
     position, attitude = s.camera_model().irf_pose_in_world(
         states["chaser/0"].position_m, states["chaser/0"].q_wxyz
     )
@@ -64,8 +64,8 @@ def message(data: bytes, encoding: Any = "jpeg", **changes: Any) -> Image:
     return Image(tick=4, sim_time_ns=266_666_666, chaser=3, encoding=encoding, data=data, **values)
 
 
-def jpeg(picture: np.ndarray) -> bytes:
-    return cv2.imencode(".jpg", picture)[1].tobytes()
+def jpeg(image: np.ndarray) -> bytes:
+    return cv2.imencode(".jpg", image)[1].tobytes()
 
 
 def checked(sighting: Sighting) -> Sighting:
@@ -87,7 +87,7 @@ BAD: list[tuple[str, Image]] = [
     ("empty", message(b"")),
     ("empty mono8", message(b"", "mono8")),
     ("one byte", message(b"\xff")),
-    ("text", message(b"this is no picture" * 100)),
+    ("text", message(b"this is no image" * 100)),
     ("zeros", message(bytes(10_000))),
     ("a JPEG's head alone", message(JPEG[:20])),
     ("a JPEG cut in the middle", message(JPEG[: len(JPEG) // 2])),
@@ -108,9 +108,9 @@ BAD: list[tuple[str, Image]] = [
 
 
 @pytest.mark.parametrize(("what", "image"), BAD, ids=[b[0] for b in BAD])
-def test_a_bad_picture_is_told_and_seen_as_nothing(perception: Perception, what: str, image: Image) -> None:
+def test_a_bad_image_is_told_and_seen_as_nothing(perception: Perception, what: str, image: Image) -> None:
     sighting = checked(look(perception, image, None))
-    assert sighting.status == "bad_picture"
+    assert sighting.status == "bad_image"
     assert sighting.solutions == ()
     assert sighting.marker_ids == ()
     assert sighting.corners_px == ()
@@ -126,18 +126,18 @@ def test_damaged_jpegs_never_raise_anything_else(data: st.DataObject) -> None:
     for _ in range(data.draw(st.integers(1, 5))):
         damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
     try:
-        picture = decode_picture(message(bytes(damaged), width_px=64, height_px=64))
-    except BadPicture:
+        image = decode_image(message(bytes(damaged), width_px=64, height_px=64))
+    except BadImage:
         return
-    assert picture.shape == (64, 64)
-    assert picture.dtype == np.uint8
+    assert image.shape == (64, 64)
+    assert image.dtype == np.uint8
 
 
 @pytest.mark.parametrize("encoding", ["jpeg", "mono8"])
 @pytest.mark.parametrize("grey", [0, 128, 255])
-def test_an_even_picture_holds_nothing(perception: Perception, encoding: str, grey: int) -> None:
-    picture = np.full((HEIGHT, WIDTH), grey, dtype=np.uint8)
-    data = jpeg(picture) if encoding == "jpeg" else picture.tobytes()
+def test_an_even_image_holds_nothing(perception: Perception, encoding: str, grey: int) -> None:
+    image = np.full((HEIGHT, WIDTH), grey, dtype=np.uint8)
+    data = jpeg(image) if encoding == "jpeg" else image.tobytes()
     sighting = checked(look(perception, message(data, encoding), None))
     assert sighting.status == "nothing"
     assert sighting.solutions == ()
@@ -149,10 +149,10 @@ def test_noise_holds_nothing(perception: Perception) -> None:
     assert look(perception, message(NOISE.tobytes(), "mono8"), None).status == "nothing"
 
 
-def test_pictures_are_decoded_row_by_row() -> None:
-    np.testing.assert_array_equal(decode_picture(message(NOISE.tobytes(), "mono8")), NOISE)
+def test_images_are_decoded_row_by_row() -> None:
+    np.testing.assert_array_equal(decode_image(message(NOISE.tobytes(), "mono8")), NOISE)
     smooth = cv2.GaussianBlur(NOISE, (0, 0), 8.0)
-    np.testing.assert_allclose(decode_picture(message(jpeg(smooth))).astype(int), smooth.astype(int), atol=6)
+    np.testing.assert_allclose(decode_image(message(jpeg(smooth))).astype(int), smooth.astype(int), atol=6)
 
 
 @pytest.mark.parametrize("jpeg_quality", [0, 92])
@@ -166,7 +166,7 @@ def test_the_target_is_seen_where_it_is(perception: Perception, jpeg_quality: in
     assert np.linalg.norm(np.subtract(best.position_m, position)) < 0.005
     assert rotations.angle_between(np.array(best.q_wxyz), attitude) < np.radians(0.5)
     assert len(sighting.corners_px) == 8 * len(sighting.marker_ids)
-    # Each used marker's corners lie in the picture, u first.
+    # Each used marker's corners lie in the image, u first.
     corners = np.reshape(sighting.corners_px, (-1, 2))
     assert np.all(corners >= -0.5)
     assert np.all(corners <= [WIDTH - 0.5, HEIGHT - 0.5])
@@ -182,7 +182,7 @@ def test_where_it_looked_before_changes_nothing_but_the_time_it_takes(perception
         prediction_from(blind),
         (position + 0.3, attitude),  # wrong
         (np.array([0.0, 0.0, -5.0]), attitude),  # behind the camera
-        (np.array([100.0, 0.0, 1.0]), attitude),  # out of the picture
+        (np.array([100.0, 0.0, 1.0]), attitude),  # out of the image
     ):
         guided = look(perception, image, predicted)
         assert guided.status == "seen"
@@ -191,7 +191,7 @@ def test_where_it_looked_before_changes_nothing_but_the_time_it_takes(perception
         assert rotations.angle_between(np.array(a.q_wxyz), np.array(b.q_wxyz)) < np.radians(0.2)
 
 
-def test_equal_pictures_give_equal_sightings(perception: Perception) -> None:
+def test_equal_images_give_equal_sightings(perception: Perception) -> None:
     image, _, _ = view()
     again, _, _ = view()
     assert image == again

@@ -9,7 +9,7 @@ import pytest
 from chaserdock_agents.chaser.thrusters.modulation import Modulator
 from chaserdock_models.rotations import Array
 from chaserdock_models.thruster_model import Valves
-from chaserdock_protocol.messages import JetPulse
+from chaserdock_protocol.messages import ThrusterPulse
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -24,20 +24,23 @@ class Bench:
     """A modulator of tetra12 and what its pulses give."""
 
     def __init__(self, rate_hz: int, **modulation: Any) -> None:
-        s = mission(time={"rate_hz": rate_hz, "picture_hz": rate_hz}, chaser={"modulation": modulation})
-        self.timing, self.jets = s.timing, s.chaser.thrusters
-        self.full = thrusts_max(self.jets)
-        self.least = self.full * [t.min_on_s for t in self.jets]
-        self.modulator, self.valves = Modulator(self.jets, s.chaser.modulation, s.timing), Valves(self.jets)
+        s = mission(time={"rate_hz": rate_hz, "image_hz": rate_hz}, chaser={"modulation": modulation})
+        self.timing, self.layout = s.timing, s.chaser.thrusters
+        self.full = thrusts_max(self.layout)
+        self.least = self.full * [t.min_on_s for t in self.layout]
+        self.modulator, self.valves = (
+            Modulator(self.layout, s.chaser.modulation, s.timing),
+            Valves(self.layout),
+        )
         self.asked = [np.zeros(len(self.full))]
-        self.pulses: list[JetPulse] = []
+        self.pulses: list[ThrusterPulse] = []
 
-    def tick(self, tick: int, thrusts: Array, can: Array | None = None) -> list[JetPulse]:
+    def tick(self, tick: int, thrusts: Array, can: Array | None = None) -> list[ThrusterPulse]:
         begin, end = self.timing.effective_ns(tick), self.timing.effective_ns(tick + 1)
         out = self.modulator.pulses(thrusts, self.full if can is None else can, begin, end)
         self.asked.append(self.asked[-1] + thrusts * (end - begin) * 1e-9)
         for p in out:
-            assert self.valves.pulse(p.jet, p.open_ns, p.close_ns)
+            assert self.valves.pulse(p.thruster, p.open_ns, p.close_ns)
         self.pulses += out
         return out
 
@@ -121,8 +124,8 @@ def test_pulses_are_whole_steps_centred_long_enough_and_one_a_period(seed: int, 
         assert 10 * MS <= width <= 100 * MS
         middle = (p.open_ns + p.close_ns) / 2 - bench.timing.effective_ns(0)
         assert middle % (100 * MS) == pytest.approx(50 * MS, abs=2)
-        assert (p.jet, middle // MS) not in seen
-        seen.add((p.jet, middle // MS))
+        assert (p.thruster, middle // MS) not in seen
+        seen.add((p.thruster, middle // MS))
     assert len(seen) > 12 * 15
 
 
@@ -141,7 +144,7 @@ def test_too_little_waits_until_it_is_worth_a_pulse() -> None:
     times = []
     for tick in range(40):
         for p in bench.tick(tick, bench.full * np.eye(12)[4] * 0.01):
-            assert p.jet == 4
+            assert p.thruster == 4
             times.append(tick)
     assert times == [4, 14, 24, 34]
 
@@ -153,23 +156,23 @@ def test_without_carry_over_too_little_never_comes() -> None:
         assert bench.modulator.owed_N_s.max() <= 0.0
 
 
-def test_a_jet_that_cannot_gets_no_pulses_and_is_owed_nothing() -> None:
+def test_a_thruster_that_cannot_gets_no_pulses_and_is_owed_nothing() -> None:
     bench = Bench(10)
     can = bench.full.copy()
     can[3] = 0.0
     for tick in range(10):
-        assert 3 not in {p.jet for p in bench.tick(tick, bench.full * 0.3, can)}
+        assert 3 not in {p.thruster for p in bench.tick(tick, bench.full * 0.3, can)}
     assert bench.modulator.owed_N_s[3] == pytest.approx(0.0)
 
 
-def test_a_weak_jet_opens_longer() -> None:
+def test_a_weak_thruster_opens_longer() -> None:
     bench = Bench(10)
     can = bench.full * 0.5
     pulses = bench.tick(0, bench.full * 0.2, can)
     assert [p.close_ns - p.open_ns for p in pulses] == [40 * MS] * 12
 
 
-def test_a_jet_asked_for_too_much_is_not_behind_for_ever() -> None:
+def test_a_thruster_asked_for_too_much_is_not_behind_for_ever() -> None:
     bench = Bench(10)
     for tick in range(20):
         bench.tick(tick, bench.full * 2.0)

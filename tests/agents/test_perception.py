@@ -1,4 +1,4 @@
-"""Pose from rendered pictures: accuracy, consistency of the covariance, and pictures that should give nothing."""
+"""Pose from rendered images: accuracy, consistency of the covariance, and images that should give nothing."""
 
 import numpy as np
 import pytest
@@ -22,7 +22,7 @@ METHODS: tuple[Method, ...] = ("default", "paper")
 
 
 class Scene:
-    """A camera, a target, and what perception makes of pictures of it."""
+    """A camera, a target, and what perception makes of images of it."""
 
     def __init__(self, name, width=640, height=480, distortion=(), method: Method = "default"):
         self.camera = Camera.from_hfov(width, height, HFOV, distortion=distortion)
@@ -31,7 +31,7 @@ class Scene:
         self.effects = CameraEffects(width, height, Effects(), 11)
         self.perception = Perception(self.camera, self.model, method)
 
-    def picture(self, position, q, number=0, light=(-0.3, -0.5, -0.8)):
+    def image(self, position, q, number=0, light=(-0.3, -0.5, -0.8)):
         exact = self.renderer.render(EYE, AHEAD, position, q, (), Light(tuple(light)))
         return self.effects.apply(exact, 0, number)
 
@@ -43,7 +43,7 @@ class Scene:
             ideal = (px - (self.camera.cx_px, self.camera.cy_px)) / (self.camera.fx_px, self.camera.fy_px)
             position, q = np.append(ideal, 1.0) * z, rotations.normalize(generator.normal(size=4))
             light = rotations.rotate(rotations.normalize(generator.normal(size=4)), [0.0, 0.0, 1.0])
-            yield position, q, self.picture(position, q, number, light)
+            yield position, q, self.image(position, q, number, light)
 
 
 def error_of(solution, position, q):
@@ -88,10 +88,10 @@ def test_random_views(name, width, height, distortion, bounds):
     assert 0.1 < np.mean(nees) < 7.0
 
 
-def test_corners_are_reported_where_they_are_in_the_picture():
+def test_corners_are_reported_where_they_are_in_the_image():
     scene = Scene("servicer", distortion=LENS)
     position, q = np.array([0.1, -0.05, 0.9]), rotations.multiply(FACING, rotations.exp([0.3, 0.4, -0.2]))
-    sighting = scene.perception.estimate(scene.picture(position, q))
+    sighting = scene.perception.estimate(scene.image(position, q))
     assert len(sighting.marker_ids) >= 8
     assert sighting.corners_px.shape == (len(sighting.marker_ids), 4, 2)
     for marker_id, found in zip(sighting.marker_ids, sighting.corners_px, strict=True):
@@ -109,7 +109,7 @@ def test_fitted_sides_beat_contours_and_narrow_borders_do_not_bias_them():
     for number in range(6):
         position = np.array([0.05 * number - 0.1, 0.02, 1.6])
         q = rotations.multiply(FACING, rotations.exp([0.5 * number, 0.1 * number - 0.3, 0.2]))
-        image = scene.picture(position, q, number)
+        image = scene.image(position, q, number)
         found = detect.detect(image, detect.dictionary_of(scene.model.dictionary), None)
         assert 0 in found.ids
         k = found.ids.tolist().index(0)
@@ -129,7 +129,7 @@ def test_fitted_sides_beat_contours_and_narrow_borders_do_not_bias_them():
 def test_a_prediction_changes_where_is_looked_but_not_what_is_found():
     scene = Scene("paper", 1280, 720)
     position, q = np.array([0.1, 0.05, 1.0]), rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3]))
-    image = scene.picture(position, q)
+    image = scene.image(position, q)
     assert detect.region_of(scene.camera, scene.model, position, q) is not None
     plain = scene.perception.estimate(image)
     for offset in (
@@ -148,7 +148,7 @@ def test_a_prediction_changes_where_is_looked_but_not_what_is_found():
 def test_estimates_repeat_bit_for_bit_and_keep_no_memory():
     scene = Scene("servicer")
     position, q = np.array([0.0, 0.0, 1.0]), rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3]))
-    image, other = scene.picture(position, q), scene.picture(position, FACING)
+    image, other = scene.image(position, q), scene.image(position, FACING)
     before = image.copy()
     first = scene.perception.estimate(image)
     scene.perception.estimate(other)
@@ -160,7 +160,7 @@ def test_estimates_repeat_bit_for_bit_and_keep_no_memory():
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_pictures_of_nothing_give_nothing(method):
+def test_images_of_nothing_give_nothing(method):
     scene = Scene("servicer", method=method)
     noise = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     checks = (np.indices((480, 640)).sum(axis=0) // 40 % 2 * 255).astype(np.uint8)
@@ -172,10 +172,10 @@ def test_pictures_of_nothing_give_nothing(method):
 
 
 @pytest.mark.parametrize("name", ["paper", "servicer"])
-def test_a_mirrored_picture_gives_nothing(name):
+def test_a_mirrored_image_gives_nothing(name):
     scene = Scene(name)
     for number, turn in enumerate(([0.2, 0.5, 0.3], [0.0, 0.0, 0.0], [1.0, -0.4, 0.2])):
-        image = scene.picture(
+        image = scene.image(
             np.array([0.0, 0.0, 0.9]), rotations.multiply(FACING, rotations.exp(turn)), number
         )
         assert scene.perception.estimate(image).solutions
@@ -184,16 +184,16 @@ def test_a_mirrored_picture_gives_nothing(name):
 
 def test_markers_of_another_target_are_foreign():
     paper, servicer = Scene("paper"), Scene("servicer")
-    image = servicer.picture(np.array([0.0, 0.0, 0.9]), FACING)
+    image = servicer.image(np.array([0.0, 0.0, 0.9]), FACING)
     assert servicer.perception.estimate(image).solutions
     assert paper.perception.estimate(image).solutions == ()
 
 
-def test_two_equal_targets_in_one_picture_are_not_mixed_up():
+def test_two_equal_targets_in_one_image_are_not_mixed_up():
     """Every id twice: there is no telling which of the two is meant."""
     scene = Scene("paper", 1280, 720)
-    image = scene.picture(np.array([-0.15, 0.0, 0.9]), FACING)
-    image[:, 640:] = scene.picture(np.array([0.15, 0.0, 0.9]), FACING, 1)[:, 640:]
+    image = scene.image(np.array([-0.15, 0.0, 0.9]), FACING)
+    image[:, 640:] = scene.image(np.array([0.15, 0.0, 0.9]), FACING, 1)[:, 640:]
     sighting = scene.perception.estimate(image)
     assert sighting.solutions == ()
     assert sighting.rejected_ids == (0, 0)
@@ -202,7 +202,7 @@ def test_two_equal_targets_in_one_picture_are_not_mixed_up():
 def test_a_second_copy_of_one_marker_is_thrown_out_by_the_others():
     scene = Scene("servicer", 1280, 720)
     position, q = np.array([-0.2, 0.0, 1.0]), rotations.multiply(FACING, rotations.exp([0.0, 0.3, 0.2]))
-    image = scene.picture(position, q)
+    image = scene.image(position, q)
     marker = scene.model.markers[0]
     px = scene.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
     left, top = np.floor(px.min(axis=0)).astype(int) - 8
@@ -325,9 +325,9 @@ def test_the_papers_method_works_where_it_can_and_fails_where_epnp_does():
         [[0]],
     ],
 )
-def test_wrong_pictures_are_refused(image):
+def test_wrong_images_are_refused(image):
     scene = Scene("paper")
-    with pytest.raises(ValueError, match="picture"):
+    with pytest.raises(ValueError, match="image"):
         scene.perception.estimate(image)
 
 

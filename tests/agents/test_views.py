@@ -30,7 +30,7 @@ def _level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def poses(count: int) -> list[Pose]:
-    """Some far and in the picture, some at its edge, some with the camera inside the target or it behind."""
+    """Some far and in the image, some at its edge, some with the camera inside the target or it behind."""
     rng = np.random.default_rng(5)
     out = []
     for k in range(count):

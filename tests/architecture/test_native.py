@@ -95,7 +95,7 @@ def test_every_instruction_set_sees_the_same_bits(
 
 
 @pytest.mark.parametrize("number", LEVELS)
-def test_every_instruction_set_draws_the_same_picture(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_every_instruction_set_draws_the_same_image(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     if not has(number):
         pytest.skip(f"this processor has no copy {number}")
     renderer = Renderer(Camera.from_hfov(320, 240, 1.0), target_model("servicer"))
@@ -108,7 +108,7 @@ def test_every_instruction_set_draws_the_same_picture(number: int, monkeypatch: 
         return [renderer.render(eye, ahead, p, q / np.linalg.norm(q), [other]) for p, q in views]
 
     expected = drawn()
-    assert all(picture.max() > 60 for picture in expected)
+    assert all(image.max() > 60 for image in expected)
     own = rendering_native.function
     monkeypatch.setattr(faces, "function", lambda name, result=None: own(name, result, number))
     np.testing.assert_array_equal(drawn(), expected)

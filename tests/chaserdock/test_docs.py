@@ -126,8 +126,8 @@ def test_scenarios_in_the_docs_are_right() -> None:
             and not {"vary", "seeds"} & values.keys()
         ):
             values.get("camera", {}).pop("calibration", None)
-            jets = values.get("chaser", {}).pop("thrusters", None)
-            if jets is not None:
+            thrusters = values.get("chaser", {}).pop("thrusters", None)
+            if thrusters is not None:
                 values["chaser"].pop("actuation")
             parse_scenario(base | values, page)
             read += 1

@@ -64,7 +64,7 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
 
 
 def test_exported_files_hold_every_message_with_units(tmp_path: Path) -> None:
-    rows = export(GOLDEN, tmp_path / "parquet", "parquet", pictures=True)
+    rows = export(GOLDEN, tmp_path / "parquet", "parquet", images=True)
     assert rows["controller_target.parquet"] == 18
     assert sum(n for name, n in rows.items() if "solutions" not in name) == sum(
         count_messages(GOLDEN).values()
@@ -75,8 +75,8 @@ def test_exported_files_hold_every_message_with_units(tmp_path: Path) -> None:
     assert truth.schema.field("q_w").metadata is None
     expected = [r.message.velocity_m_s[0] for r in read_log(GOLDEN) if r.topic is topics.TRUTH_BODY]
     assert truth["velocity_m_s_x"].to_pylist() == expected
-    pictures = pq.read_table(tmp_path / "parquet" / "world_chaser_image.parquet")["data"].to_pylist()
-    assert pictures == [r.message.data for r in read_log(GOLDEN) if r.topic is topics.IMAGE]
+    images = pq.read_table(tmp_path / "parquet" / "world_chaser_image.parquet")["data"].to_pylist()
+    assert images == [r.message.data for r in read_log(GOLDEN) if r.topic is topics.IMAGE]
     assert open_log(GOLDEN).table("truth/body/{process}").equals(truth)
 
     assert {

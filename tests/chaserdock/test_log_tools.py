@@ -66,15 +66,15 @@ def test_viewer_layer_leaves_the_verbatim_one_alone(tmp_path: Path) -> None:
     assert [r.message for r in read_log(with_layer)] == [r.message for r in read_log(without)]
     assert count_messages(with_layer) == count_messages(without) == count_messages(GOLDEN)
     assert load_flight(with_layer).digest == load_flight(GOLDEN).digest
-    # The pictures' second copy lies in the same compressed chunk as the first.
-    pictures = sum(len(r.message.data) for r in read_log(GOLDEN) if r.topic is topics.IMAGE)
+    # The images' second copy lies in the same compressed chunk as the first.
+    images = sum(len(r.message.data) for r in read_log(GOLDEN) if r.topic is topics.IMAGE)
     grown = (with_layer / "mission.mcap").stat().st_size - (without / "mission.mcap").stat().st_size
-    assert grown < 0.25 * pictures
+    assert grown < 0.25 * images
 
 
-def test_viewers_get_schemas_pictures_and_frames(tmp_path: Path) -> None:
+def test_viewers_get_schemas_images_and_frames(tmp_path: Path) -> None:
     path = recorded(tmp_path) / "mission.mcap"
-    pictures = {
+    images = {
         (r.message.chaser, r.message.sim_time_ns): r.message.data
         for r in read_log(path)
         if r.topic is topics.IMAGE
@@ -90,7 +90,7 @@ def test_viewers_get_schemas_pictures_and_frames(tmp_path: Path) -> None:
     for i in (0, 1):
         shown = seen[f"/viewer/chaser/{i}/image foxglove.CompressedImage"]
         assert len(shown) == 18
-        assert all(pictures[i, message.log_time] in message.data for message in shown)
+        assert all(images[i, message.log_time] in message.data for message in shown)
         assert len(seen[f"/viewer/chaser/{i}/calibration foxglove.CameraCalibration"]) == 18
         assert len(seen[f"/viewer/chaser/{i}/measurement foxglove.PoseInFrame"]) == 18
         assert len(seen[f"/viewer/chaser/{i}/detections foxglove.ImageAnnotations"]) == 18

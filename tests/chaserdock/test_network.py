@@ -274,7 +274,7 @@ def test_a_member_passes_on_signals_and_leaves_nobody_behind(tmp_path: Path) -> 
 def test_status_tells_speed_and_who_is_in_the_tick() -> None:
     status = Status()
     ticks = [
-        Tick(tick=k, sim_time_ns=k * 500_000_000, pictures=True, chasers=(0, 2), controller=False)
+        Tick(tick=k, sim_time_ns=k * 500_000_000, images=True, chasers=(0, 2), controller=False)
         for k in range(4)
     ]
     for tick in ticks:

@@ -83,7 +83,7 @@ def test_paper_settings_are_the_papers() -> None:
         assert weights == (65.0, 35.0, 3.5, 40.0)
         assert (c.weight_final_position, c.weight_final_orientation) == (3250.0, 1750.0)
         assert (c.integrator, c.feed_forward) == ("euler", False)
-        assert (s.time.rate_hz, s.time.picture_hz) == (30, 30)
+        assert (s.time.rate_hz, s.time.image_hz) == (30, 30)
         assert (s.camera.width_px, s.camera.height_px, s.camera.hfov_deg) == (1280, 720, 60.0)
         assert (t.model, t.velocity_m_s, t.omega_rad_s) == (
             "paper",
@@ -300,7 +300,7 @@ def test_the_whole_page_of_a_complete_plan() -> None:
     assert "NOT COMPLETE" not in text
     for row in ROWS:
         assert f"| {row.label} | {row.position_mse_m2 * 1e2:.4g} | 1.64 | 1.64 |" in text
-    assert "| baseline: position MSE within 15 % | 1.000 of the paper's, with pictures | yes |" in text
+    assert "| baseline: position MSE within 15 % | 1.000 of the paper's, with images | yes |" in text
     checker = _Checker()
     checker.feed(html("t", parts))
     assert checker.open == []
@@ -311,7 +311,7 @@ def test_the_page_says_what_is_missing() -> None:
     p = plan(True)
     text = markdown("t", sections(p, Results({}, {})))
     n, k = len(p.missions), len(p.studies)
-    assert f"NOT COMPLETE: {n} of {n} runs with pictures and {k} of {k} on perfect knowledge" in text
+    assert f"NOT COMPLETE: {n} of {n} runs with images and {k} of {k} on perfect knowledge" in text
     assert "yes |" not in text
 
 
@@ -357,14 +357,14 @@ def test_bad_input_is_one_clear_line(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_cut_down_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two missions with small pictures and two studies; a second call flies nothing and writes the same page."""
+    """Two missions with small images and two studies; a second call flies nothing and writes the same page."""
     small = ("duration_s=25.0", "camera.width_px=480", "camera.height_px=270", "time.rate_hz=15")
     group = table_group(INFERRED, "paper", "baseline")
     runs = tuple(
-        Mission(f"{group}/{seed}", group, SCENARIO, seed, (*small, "time.picture_hz=15")) for seed in range(2)
+        Mission(f"{group}/{seed}", group, SCENARIO, seed, (*small, "time.image_hz=15")) for seed in range(2)
     )
     cases = tuple(
-        StudyCase(name=n, scenario=PATH, overrides=(*small, "time.picture_hz=15"), floor=True)
+        StudyCase(name=n, scenario=PATH, overrides=(*small, "time.image_hz=15"), floor=True)
         for n in (group, "start/again")
     )
     cut = Plan(True, 25.0, runs, cases)
@@ -375,7 +375,7 @@ def test_a_cut_down_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFix
     seen, perfect = flown(cut, results, group), errors_of_study(results.studies[group])
     assert seen is not None
     assert seen.failed == 0
-    # Seeing costs little, even with pictures in which the far start's marker is 20 pixels wide.
+    # Seeing costs little, even with images in which the far start's marker is 20 pixels wide.
     assert perfect.position < seen.position < 1.2 * perfect.position
     assert floor_of_study(results.studies[group]) < perfect.position
     assert fly_plan(cut, tmp_path, 2, False) == 0

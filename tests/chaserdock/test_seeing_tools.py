@@ -176,8 +176,8 @@ def test_a_target_file_that_cannot_be_is_told_so(change, told, tmp_path):
 TRUE = Camera(640, 480, 615.0, 612.0, 325.0, 236.0, (-0.22, 0.06, 8e-4, -5e-4, 0.0))
 
 
-def board_pictures(board, count, seed=3):
-    """The board, drawn flat, warped exactly into the ideal picture (4 samples a pixel), and distorted."""
+def board_images(board, count, seed=3):
+    """The board, drawn flat, warped exactly into the ideal image (4 samples a pixel), and distorted."""
     rows, columns = (6, 8)
     scale = 4000.0  # pixels a metre of the drawing
     if board.charuco is not None:
@@ -217,15 +217,15 @@ def board_pictures(board, count, seed=3):
 @pytest.mark.parametrize("kind", ["charuco 8x6", "chessboard 7x5"])
 def test_a_camera_is_calibrated_from_rendered_boards(kind, tmp_path):
     board = board_of(kind, 0.03, 0.022, "DICT_4X4_50")
-    pictures: dict = board_pictures(board, 14)
-    pictures["empty.png"] = np.zeros((480, 640), np.uint8)
-    pictures["small.png"] = np.zeros((100, 100), np.uint8)
-    pictures["broken.png"] = None
+    images: dict = board_images(board, 14)
+    images["empty.png"] = np.zeros((480, 640), np.uint8)
+    images["small.png"] = np.zeros((100, 100), np.uint8)
+    images["broken.png"] = None
     # A board bent in the middle: every corner found, and none where it should be.
-    bent = pictures["13.png"]
+    bent = images["13.png"]
     x, y = np.meshgrid(np.arange(640, dtype=np.float32), np.arange(480, dtype=np.float32))
-    pictures["bent.png"] = np.asarray(cv2.remap(bent, x + 6 * np.sin(y / 40), y, cv2.INTER_LINEAR), np.uint8)
-    found = calibrate(pictures, board)
+    images["bent.png"] = np.asarray(cv2.remap(bent, x + 6 * np.sin(y / 40), y, cv2.INTER_LINEAR), np.uint8)
+    found = calibrate(images, board)
     assert found.left_out.keys() == {"empty.png", "small.png", "broken.png", "bent.png"}
     assert "badly" in found.left_out["bent.png"]
     assert found.total_rms_px < 0.3
@@ -233,7 +233,7 @@ def test_a_camera_is_calibrated_from_rendered_boards(kind, tmp_path):
     matrix = found.matrix
     got = (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     assert np.abs(np.subtract(got, truth)).max() < 2.5
-    # What counts: where it puts pixels. All over the picture, but its corners, to half a pixel.
+    # What counts: where it puts pixels. All over the image, but its corners, to half a pixel.
     fx, fy, cx, cy = (float(v) for v in got)
     ours = Camera(640, 480, fx, fy, cx, cy, tuple(found.distortion.tolist()))
     rays = np.stack(
@@ -251,7 +251,7 @@ def test_a_camera_is_calibrated_from_rendered_boards(kind, tmp_path):
     assert camera.distortion == pytest.approx(tuple(found.distortion))
 
 
-def test_too_few_pictures_and_boards_that_cannot_be_are_told():
+def test_too_few_images_and_boards_that_cannot_be_are_told():
     board = board_of("charuco 8x6", 0.03, 0.022, "DICT_4X4_50")
     with pytest.raises(TooFew, match=r"0 usable[\s\S]*a\.png: 0 corners"):
         calibrate({"a.png": np.zeros((480, 640), np.uint8)}, board)

@@ -87,7 +87,7 @@ def test_faults_are_told(mission: LoggedMission) -> None:
     now, history = mission.at(1.0), mission.history
     assert words.faults(now, history, set()) == "none"
     assert "**chaser/1** is gone" in words.faults(now, history, {"chaser/1"})
-    now.take(topics.TICK, Tick(tick=20, pictures=True, chasers=(0,), controller=False))
+    now.take(topics.TICK, Tick(tick=20, images=True, chasers=(0,), controller=False))
     brake = ActuatorCommand(
         chaser=0, effective_time_ns=0, source="brake", force_N=(0, 0, 0), torque_N_m=(0, 0, 0)
     )
@@ -156,7 +156,7 @@ def test_what_happened_is_told_newest_first_and_once() -> None:
     assert history.lines_until(9.0, 1)[0].text == "the mission has ended: all flown"
 
 
-def test_latency_is_from_the_picture_to_the_command_of_its_tick(mission: LoggedMission) -> None:
+def test_latency_is_from_the_image_to_the_command_of_its_tick(mission: LoggedMission) -> None:
     history = History(1)
     history.exposed(0, 5, 1_000_000_000)
     command = ActuatorCommand(
@@ -325,7 +325,7 @@ def test_rights_show_the_truth_to_a_viewer_and_not_with_an_operators_keys(tmp_pa
             got: set[tuple[str, str]] = set()
             deadline = time.monotonic() + 60.0
             while got != wanted and time.monotonic() < deadline:
-                world.publish(topics.TICK, Tick(pictures=False, chasers=(), controller=False))
+                world.publish(topics.TICK, Tick(images=False, chasers=(), controller=False))
                 world.publish(topics.TRUTH_BODY, truth, "target")
                 world.publish(topics.EVENT, Event(process="world", level="info", what="x"), "world")
                 time.sleep(0.1)
@@ -346,12 +346,12 @@ def test_who_follows_gets_the_newest_and_never_holds_up_the_publisher() -> None:
         world.advertise(topics.TICK)
         deadline, got = time.monotonic() + 30.0, []
         while not got and time.monotonic() < deadline:  # until they know each other
-            world.publish(topics.TICK, Tick(tick=0, pictures=False, chasers=(), controller=False))
+            world.publish(topics.TICK, Tick(tick=0, images=False, chasers=(), controller=False))
             time.sleep(0.05)
             got = take()
         assert got
         for tick in range(1, 5001):
-            world.publish(topics.TICK, Tick(tick=tick, pictures=False, chasers=(), controller=False))
+            world.publish(topics.TICK, Tick(tick=tick, images=False, chasers=(), controller=False))
         last: list[int] = []
         while last[-1:] != [5000] and time.monotonic() < deadline:
             time.sleep(0.2)

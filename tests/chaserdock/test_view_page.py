@@ -131,10 +131,10 @@ def test_scene_moves_and_a_click_starts_a_docking(hand: ByHand, tmp_path: Path) 
         page.get_by_role("button", name="approach").first.wait_for()
         canvas = page.locator("canvas").first
         first = canvas.screenshot()
-        pictures = [first]
-        while pictures[-1] == first and len(pictures) < 20:
-            pictures.append(canvas.screenshot())
-        assert pictures[-1] != first
+        images = [first]
+        while images[-1] == first and len(images) < 20:
+            images.append(canvas.screenshot())
+        assert images[-1] != first
         page.get_by_role("button", name="approach").first.click()
         wait_for(page, r"approach chaser 0 .*accepted, phase approach")
         page.get_by_role("button", name="retreat").nth(1).click()

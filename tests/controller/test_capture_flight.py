@@ -45,10 +45,10 @@ def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
 
 
 @pytest.mark.slow
-def test_a_jet_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_slips() -> None:
-    """Jet 10 pulls, sticks shut and is not tested: the common body turns by another push than the one commanded."""
+def test_a_thruster_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_slips() -> None:
+    """Thruster 10 pulls, sticks shut and is not tested: the common body turns by another push than the one commanded."""
     failure = ("stuck_off", 10, 16.38)
-    scenario = mission(10, failure=failure, changes=("chaser.jet_test_s=0",))
+    scenario = mission(10, failure=failure, changes=("chaser.thruster_test_s=0",))
     outcome = dock(10, scenario, lambda s: statistical_eye(s, 10, 0.002, math.radians(0.1), 0.1), failure)
     assert outcome.found_s() is None  # or the test tests nothing
     assert outcome.cause == "verified at the first attempt"
@@ -56,7 +56,7 @@ def test_a_jet_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_slips() 
 
 @pytest.mark.slow
 def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
-    """The scenario as shipped, with noise in place of pictures."""
+    """The scenario as shipped, with noise in place of images."""
     scenario = load_scenario(ROOT / "scenarios" / "four-chaser-capture.toml")
     flight = Offline(scenario, statistical_eye(scenario, 1, 0.002, math.radians(0.1), 0.1))
     holding_on: dict[int, float] = {}

@@ -17,7 +17,7 @@ V = (0.0, 2.0, 0.0)
 
 @pytest.fixture
 def flight() -> Iterator[Offline]:
-    """A chaser with jets that holds before its port, two seconds into the mission."""
+    """A chaser with thrusters that holds before its port, two seconds into the mission."""
     s = scenario(chaser={"body": "tetra12", "actuation": "thrusters", "torque_max_N_m": 0.15})
     out = Offline(s, statistical_eye(s, 1, 0.002, math.radians(0.1)))
     while out.time_s < 2.0:
@@ -42,10 +42,10 @@ def ask(flight: Offline, *wishes: dict[str, Any]) -> list[tuple[bool, str]]:
     ("wish", "reason"),
     [
         ({"command": "approach", "chaser": 7}, "there is no chaser 7; this mission has 0 to 0"),
-        ({"command": "isolate", "chaser": 7, "jet": 0}, "there is no chaser 7; this mission has 0 to 0"),
-        ({"command": "isolate", "jet": 12}, "isolate needs a jet; this body has 0 to 11"),
+        ({"command": "isolate", "chaser": 7, "thruster": 0}, "there is no chaser 7; this mission has 0 to 0"),
+        ({"command": "isolate", "thruster": 12}, "isolate needs a thruster; this body has 0 to 11"),
         ({"command": "approach", "expires_ns": 10**9}, "stale: it was to be done by 1.00 s, it is 2.00 s"),
-        ({"command": "isolate", "jet": 1, "expires_ns": 10**9}, "stale: it was to be done by 1.00 s"),
+        ({"command": "isolate", "thruster": 1, "expires_ns": 10**9}, "stale: it was to be done by 1.00 s"),
         ({"command": "goto"}, "goto needs an offset"),
         ({"command": "goto", "offset_m": (0.1, 0.0, 0.0)}, "the offset is 0.1 m from the target"),
     ],
@@ -60,7 +60,7 @@ def test_what_cannot_be_is_refused(flight: Offline, wish: dict[str, Any], reason
 
 
 def test_twice_is_once(flight: Offline) -> None:
-    for what in ({"command": "approach"}, {"command": "isolate", "jet": 3}):
+    for what in ({"command": "approach"}, {"command": "isolate", "thruster": 3}):
         assert ask(flight, what)[0][0]
         since = flight.flight.guidance.chasers[0].since_s
         (again,) = ask(flight, what)
@@ -84,7 +84,7 @@ def test_in_a_wrong_phase(flight: Offline) -> None:
     [
         ({"command": "approach"}, {"command": "retreat"}),
         ({"command": "goto", "offset_m": V}, {"command": "goto", "offset_m": (0.0, -2.0, 0.0)}),
-        ({"command": "isolate", "jet": 3}, {"command": "restore", "jet": 3}),
+        ({"command": "isolate", "thruster": 3}, {"command": "restore", "thruster": 3}),
     ],
 )
 def test_of_two_operators_at_once_the_first_counts(

@@ -144,7 +144,7 @@ def test_measurement_jacobian_by_differences() -> None:
         )
 
 
-def test_a_camera_with_errors_measures_what_its_pictures_show() -> None:
+def test_a_camera_with_errors_measures_what_its_images_show() -> None:
     """The same points of the target through the true camera, as seen by one who is told the nominal one."""
     errors = np.array([0.004, -0.006, 0.005, 0.002, -0.003, 0.001, 0.002])
     told = Camera.from_hfov(1280, 720, math.radians(60.0))

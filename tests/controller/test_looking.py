@@ -50,7 +50,7 @@ def _odometry(chaser: int, tick: int, x: np.ndarray) -> Odometry:
 
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.floats(0.0, 2.0 * math.pi), st.floats(0.0, math.radians(50.0)))
-def test_whatever_is_within_50_degrees_comes_into_the_picture_within_14_seconds(
+def test_whatever_is_within_50_degrees_comes_into_the_image_within_14_seconds(
     azimuth: float, off_axis: float
 ) -> None:
     q_goal = rotations.exp(off_axis * np.array([0.0, math.cos(azimuth), math.sin(azimuth)]))
@@ -144,7 +144,7 @@ def test_a_flight_without_sightings_searches_and_says_so() -> None:
 # --- calibrating -----------------------------------------------------------------------------------
 
 
-def test_the_manoeuvre_begins_and_ends_at_rest_and_keeps_the_target_in_the_picture() -> None:
+def test_the_manoeuvre_begins_and_ends_at_rest_and_keeps_the_target_in_the_image() -> None:
     t = np.arange(-1.0, CALIBRATION_S + 1.0, 0.02)
     turns = calibration_turns(t)
     for k in (0, 25, 50, -1, -50):
@@ -174,7 +174,7 @@ def test_calibrate_is_refused_where_it_makes_no_sense() -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_turning_about_shows_the_mounting_and_flying_in_step_does_not(seed: int) -> None:
-    """One camera, white noise of 1 mm and 0.2 degrees a picture, mounted 0.3 degrees (one sigma) off."""
+    """One camera, white noise of 1 mm and 0.2 degrees an image, mounted 0.3 degrees (one sigma) off."""
     left = {}
     for manoeuvre in (True, False):
         rng = np.random.default_rng(seed)

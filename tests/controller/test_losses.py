@@ -44,7 +44,7 @@ def tick_of(scenario: Scenario, tick: int, chasers: tuple[int, ...]) -> Tick:
     return Tick(
         tick=tick,
         sim_time_ns=scenario.timing.tick_time_ns(tick),
-        pictures=True,
+        images=True,
         chasers=chasers,
         controller=True,
     )
@@ -110,13 +110,13 @@ def test_a_chaser_without_its_command_answers_once(
     assert any(t is topics.EVENT for t, _ in said)
 
 
-def test_a_lost_picture_is_no_sighting_and_is_told(chaser: Chaser, scenario: Scenario) -> None:
+def test_a_lost_image_is_no_sighting_and_is_told(chaser: Chaser, scenario: Scenario) -> None:
     ((topic, sighting),) = tell(chaser, topics.IMAGE, 0, lost(scenario, 4))
     assert topic is topics.SIGHTING
-    assert (sighting.tick, sighting.status, sighting.solutions) == (4, "bad_picture", ())
+    assert (sighting.tick, sighting.status, sighting.solutions) == (4, "bad_image", ())
 
 
-def test_a_picture_twice_is_looked_at_once(chaser: Chaser, scenario: Scenario) -> None:
+def test_a_image_twice_is_looked_at_once(chaser: Chaser, scenario: Scenario) -> None:
     image = Image(tick=3, chaser=0, width_px=8, height_px=8, encoding="mono8", data=bytes(64))
     first = [m for t, m in tell(chaser, topics.IMAGE, 0, image) if t is topics.SIGHTING]
     assert len(first) == 1

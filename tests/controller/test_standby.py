@@ -266,7 +266,7 @@ def tick(number: int, commander: str, instance: str, term: int, revision: int = 
     return Tick(
         tick=number,
         revision=revision,
-        pictures=False,
+        images=False,
         chasers=(),
         controller=bool(commander),
         commander=commander,

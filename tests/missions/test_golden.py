@@ -43,9 +43,9 @@ def records() -> dict[type, list[Record]]:
     return out
 
 
-def test_world_takes_the_same_pictures(scenario: Scenario, records: dict[type, list[Record]]) -> None:
+def test_world_takes_the_same_images(scenario: Scenario, records: dict[type, list[Record]]) -> None:
     """Rendered from the recorded truth: equal but for a grey level here and there."""
-    from chaserdock_agents.chaser.sighting import decode_picture
+    from chaserdock_agents.chaser.sighting import decode_image
     from chaserdock_protocol.messages import BodyTruth
 
     states: dict[int, dict[str, BodyState]] = defaultdict(dict)
@@ -56,8 +56,8 @@ def test_world_takes_the_same_pictures(scenario: Scenario, records: dict[type, l
     cameras = Cameras(scenario)
     for record in records[Image][:6]:
         then: Image = record.message
-        now = cameras.picture(then.chaser, then.tick, then.tick, then.sim_time_ns, states[then.tick])
-        apart = np.abs(decode_picture(now).astype(int) - decode_picture(then).astype(int))
+        now = cameras.image(then.chaser, then.tick, then.tick, then.sim_time_ns, states[then.tick])
+        apart = np.abs(decode_image(now).astype(int) - decode_image(then).astype(int))
         assert apart.mean() < 0.2
         assert np.mean(apart > 8) < 1e-3
 

@@ -112,14 +112,14 @@ def test_log_holds_every_topic_in_its_numbers(short_flight: Path) -> None:
         found = topic_of_key(key)
         assert found is not None, key
         # What is also told after the last tick comes once more.
-        if found[0].rate in ("tick", "picture"):
+        if found[0].rate in ("tick", "image"):
             assert ticks - 1 <= count <= ticks + 1, key
         elif found[0].rate == "second":
             assert 1 <= count <= 8, key
     held = {id(found[0]) for key in counts if (found := topic_of_key(key)) is not None}
     missing = {topic.key for topic in TOPICS if id(topic) not in held}
-    # Nobody commanded anything, there are no jets and no ports, and no controller stands by.
-    absent = (topics.COMMAND, topics.OPERATED, topics.JETS, topics.DOCKING, topics.STATE)
+    # Nobody commanded anything, there are no thrusters and no ports, and no controller stands by.
+    absent = (topics.COMMAND, topics.OPERATED, topics.THRUSTERS, topics.DOCKING, topics.STATE)
     assert missing == {t.key for t in absent}
 
 

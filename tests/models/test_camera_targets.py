@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 DISTORTION = (-0.25, 0.08, 1e-3, -5e-4, 0.01)
 
 
-def test_hfov_puts_its_edge_at_the_edge_of_the_picture():
+def test_hfov_puts_its_edge_at_the_edge_of_the_image():
     camera = Camera.from_hfov(640, 480, np.deg2rad(60.0))
     edge = camera.project([np.tan(np.deg2rad(30.0)), 0.0, 1.0])
     assert edge == pytest.approx([639.5, 239.5])

@@ -1,4 +1,4 @@
-"""The clock: steps, ticks, pictures and their times in whole nanoseconds."""
+"""The clock: steps, ticks, images and their times in whole nanoseconds."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ quick = settings(derandomize=True, deadline=None, max_examples=100)
 
 @st.composite
 def timings(draw: st.DrawFn) -> Timing:
-    picture_hz = draw(st.integers(1, 60))
-    rate_hz = picture_hz * draw(st.integers(1, 8))
+    image_hz = draw(st.integers(1, 60))
+    rate_hz = image_hz * draw(st.integers(1, 8))
     physics_hz = rate_hz * draw(st.integers(1, 200))
-    return Timing(physics_hz, rate_hz, picture_hz, draw(st.integers(0, 4 * physics_hz)))
+    return Timing(physics_hz, rate_hz, image_hz, draw(st.integers(0, 4 * physics_hz)))
 
 
 @given(timings(), st.integers(0, 10**9))
@@ -42,10 +42,10 @@ def test_ticks_are_whole_steps(timing: Timing, tick: int) -> None:
 
 @given(timings())
 @quick
-def test_pictures_come_at_their_rate(timing: Timing) -> None:
+def test_images_come_at_their_rate(timing: Timing) -> None:
     ticks = range(3 * timing.rate_hz)
-    assert sum(timing.has_pictures(t) for t in ticks) == 3 * timing.picture_hz
-    assert timing.has_pictures(0)
+    assert sum(timing.has_images(t) for t in ticks) == 3 * timing.image_hz
+    assert timing.has_images(0)
 
 
 @given(st.integers(0, 10**18))
@@ -58,7 +58,7 @@ def test_step_of_time_is_the_first_at_or_after(time_ns: int) -> None:
 
 
 def test_whole_seconds_are_exact_at_the_default_rates() -> None:
-    timing = Timing(physics_hz=1920, rate_hz=15, picture_hz=15, latency_steps=64)
+    timing = Timing(physics_hz=1920, rate_hz=15, image_hz=15, latency_steps=64)
     assert timing.ticks_in(120.0) == 1800
     assert timing.tick_time_ns(1800) == 120_000_000_000
     assert timing.effective_ns(0) == 33_333_333

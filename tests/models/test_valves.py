@@ -1,4 +1,4 @@
-"""Valves and what jets give through them, in closed form."""
+"""Valves and what thrusters give through them, in closed form."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ MS = 1_000_000
 quick = settings(derandomize=True, deadline=None, max_examples=80)
 
 
-def jet(rise_ms: float = 2.0, fall_ms: float = 2.0, thrust_N: float = 2.0) -> Thruster:
+def thruster(rise_ms: float = 2.0, fall_ms: float = 2.0, thrust_N: float = 2.0) -> Thruster:
     return Thruster(
         position_m=(0.0, 0.0, 0.0),
         direction=(1.0, 0.0, 0.0),
@@ -31,13 +31,13 @@ def given_N_s(valves: Valves, from_ms: float = 0.0, to_ms: float = 10_000.0) -> 
 
 def test_a_pulse_gives_thrust_times_width_and_half_of_fall_less_rise() -> None:
     for rise, fall in ((0.0, 0.0), (2.0, 2.0), (1.0, 5.0), (6.0, 0.0)):
-        valves = Valves([jet(rise, fall)])
+        valves = Valves([thruster(rise, fall)])
         assert valves.pulse(0, 100 * MS, 140 * MS)
         assert given_N_s(valves)[0] == pytest.approx(2.0 * (0.040 + (fall - rise) / 2e3), rel=1e-12)
 
 
 def test_thrust_rises_and_falls_linearly() -> None:
-    valves = Valves([jet(4.0, 8.0)])
+    valves = Valves([thruster(4.0, 8.0)])
     valves.pulse(0, 100 * MS, 120 * MS)
     edges = np.arange(99.0, 131.0) * MS
     force_N = valves.impulses(edges)[:, 0] / 1e-3
@@ -57,7 +57,7 @@ def test_thrust_rises_and_falls_linearly() -> None:
 def test_no_splitting_of_time_changes_what_is_given_and_never_more_than_full_thrust(
     pulses: list[tuple[int, int]], cuts: list[int], failure, shut_ms: int | None
 ) -> None:
-    valves = Valves([jet()])
+    valves = Valves([thruster()])
     for begin, width in pulses:
         assert valves.pulse(0, begin * MS, (begin + width) * MS)
     valves.fail(0, failure, 400 * MS, 0.5)
@@ -71,7 +71,7 @@ def test_no_splitting_of_time_changes_what_is_given_and_never_more_than_full_thr
 
 
 def test_pulses_that_touch_are_one_and_short_ones_none() -> None:
-    valves = Valves([jet()])
+    valves = Valves([thruster()])
     assert valves.pulse(0, 0, 100 * MS)
     assert valves.pulse(0, 101 * MS, 200 * MS)  # a gap of 1 ms: no time to fall
     assert not valves.pulse(0, 300 * MS, 309 * MS)
@@ -82,7 +82,7 @@ def test_pulses_that_touch_are_one_and_short_ones_none() -> None:
 
 
 def test_stuck_on_thrusts_until_its_shut_off_valve_closes_and_again_when_it_opens() -> None:
-    valves = Valves([jet(), jet()])
+    valves = Valves([thruster(), thruster()])
     valves.fail(0, "stuck_on", 100 * MS)
     valves.pulse(0, 150 * MS, 160 * MS)  # asked for or not
     valves.set_shut([0], 200 * MS)
@@ -96,7 +96,7 @@ def test_stuck_on_thrusts_until_its_shut_off_valve_closes_and_again_when_it_open
 
 
 def test_stuck_off_and_weak() -> None:
-    valves = Valves([jet(), jet()])
+    valves = Valves([thruster(), thruster()])
     for k in range(2):
         valves.pulse(k, 0, 100 * MS)
         valves.pulse(k, 200 * MS, 300 * MS)
@@ -108,7 +108,7 @@ def test_stuck_off_and_weak() -> None:
 
 
 def test_stop_ends_pulses_but_not_what_is_stuck() -> None:
-    valves = Valves([jet(), jet()])
+    valves = Valves([thruster(), thruster()])
     valves.pulse(0, 0, 500 * MS)
     valves.fail(1, "stuck_on", 0)
     valves.stop(100 * MS)
@@ -116,14 +116,14 @@ def test_stop_ends_pulses_but_not_what_is_stuck() -> None:
 
 
 def test_propellant_is_impulse_by_exhaust_velocity() -> None:
-    valves = Valves([jet(), jet()])
+    valves = Valves([thruster(), thruster()])
     assert valves.propellant_kg(np.array([3.0, 4.0])) == pytest.approx(7.0 / (100.0 * G0_M_S2))
 
 
 @given(st.lists(st.integers(100, 3000), max_size=5))
 @quick
 def test_forgetting_changes_nothing_that_comes(pulses: list[int]) -> None:
-    valves, other = Valves([jet()]), Valves([jet()])
+    valves, other = Valves([thruster()]), Valves([thruster()])
     for v in (valves, other):
         for begin in pulses:
             v.pulse(0, begin * MS, (begin + 50) * MS)

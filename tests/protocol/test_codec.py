@@ -56,7 +56,7 @@ def test_there_is_a_sample_of_every_message() -> None:
     assert len(SAMPLES) == len(m.VERSION)
     # Every message type of the module stands in the table; parts of messages never stand alone.
     types = {t for t in vars(m).values() if isinstance(t, type) and issubclass(t, msgspec.Struct)}
-    parts = {m.CameraCalibration, m.PoseSolution, m.ProbeTouch, m.JetPulse}
+    parts = {m.CameraCalibration, m.PoseSolution, m.ProbeTouch, m.ThrusterPulse}
     assert types - set(m.VERSION) - {msgspec.Struct, m.Message} - parts == set()
 
 
@@ -195,7 +195,7 @@ def test_every_quaternion_must_be_of_unit_length() -> None:
         (m.Odometry, "tick", -2),
         (m.Odometry, "tick", True),
         (m.Odometry, "sim_time_ns", -1),
-        (m.Tick, "pictures", 1),
+        (m.Tick, "images", 1),
         (m.Tick, "chasers", [0, 300]),
         (m.TargetEstimate, "covariance", list(EYE12[:-1])),
         (m.TargetEstimate, "covariance", list(EYE6)),

@@ -100,7 +100,7 @@ COMMAND = WrenchCommand(
     commander="standby",
     instance="s1",
 )
-TICK = Tick(tick=9, pictures=False, chasers=(0,), controller=True, term=2, commander="standby", instance="s1")
+TICK = Tick(tick=9, images=False, chasers=(0,), controller=True, term=2, commander="standby", instance="s1")
 
 
 @pytest.mark.parametrize(
@@ -126,7 +126,7 @@ def test_which_commands_are_stale(
 
 
 def test_without_terms_everybody_is_heard_as_before() -> None:
-    old = Tick(tick=9, pictures=False, chasers=(0,), controller=True)
+    old = Tick(tick=9, images=False, chasers=(0,), controller=True)
     assert stale_term(msgspec.structs.replace(COMMAND, term=0, commander="", instance=""), old, 0) is None
 
 

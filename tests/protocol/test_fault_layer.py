@@ -18,7 +18,7 @@ from chaserdock_protocol.scenario.faults import Fault
 from chaserdock_protocol.topics import Topic
 from message_samples import BY_TYPE
 
-TIMING = Timing(physics_hz=100, rate_hz=10, picture_hz=10, latency_steps=2)
+TIMING = Timing(physics_hz=100, rate_hz=10, image_hz=10, latency_steps=2)
 
 
 def fault(**values: Any) -> Fault:

@@ -52,7 +52,10 @@ BAD = [
     ),
     ('kind = "delay", process = "chaser/0", topic = "wrench", duration_s = 1', "delay needs delay_s"),
     ('kind = "lying_sensor", process = "chaser/0", duration_s = 1', "needs offset_m or rotation_deg"),
-    ('kind = "drop", process = "controller", topic = "jets", duration_s = 1', "there are jets only with"),
+    (
+        'kind = "drop", process = "controller", topic = "thrusters", duration_s = 1',
+        "there are thrusters only with",
+    ),
     ('kind = "drop", process = "chaser/0", topic = "docking", duration_s = 1', "a docking sensor only with"),
     ('kind = "camera_off", process = "chaser/0", duration_s = -1', "fault.0.duration_s"),
     ('kind = "camera_off", process = "chaser/0", duration_s = 1, colour = "red"', "fault.0.colour"),

@@ -106,7 +106,7 @@ def test_start_pose_is_the_reference_moved_in_trf_and_turned_in_crf() -> None:
 
 def test_latency_and_rates_become_whole_steps() -> None:
     timing = parse_scenario(good(), "x").timing
-    assert (timing.physics_hz, timing.rate_hz, timing.picture_hz) == (960, 15, 15)
+    assert (timing.physics_hz, timing.rate_hz, timing.image_hz) == (960, 15, 15)
     assert timing.latency_steps == 32
 
 
@@ -195,9 +195,9 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("chaser.inertia_kg_m2", [1.0, 1.0, 2.1], "chaser", "inertia_kg_m2"),
     ("target.inertia_kg_m2", [1.0, 5.0, 1.0], "target", "inertia_kg_m2"),
     ("chaser.inertia_kg_m2", [1.0, 0.0, 1.0], "chaser.inertia_kg_m2.1", "greater than 0"),
-    ("time.rate_hz", 16, "time", "multiple of picture_hz (16, 15)"),
+    ("time.rate_hz", 16, "time", "multiple of image_hz (16, 15)"),
     ("time.rate_hz", 45, "time", "multiple of rate_hz (960, 45)"),
-    ("time.picture_hz", 2, "time", "multiple of picture_hz (15, 2)"),
+    ("time.image_hz", 2, "time", "multiple of image_hz (15, 2)"),
     ("time.rate_hz", 0, "time.rate_hz", "greater than or equal to 1"),
     ("time.rate_hz", 7.5, "time.rate_hz", "whole number"),
     ("timeline.0.chasers", [0, 2], "timeline.0.chasers", "there is no chaser 2"),
@@ -273,14 +273,14 @@ def test_limits_themselves_are_allowed() -> None:
     parse_scenario(changed("chaser.inertia_kg_m2", [1.0, 1.0, 2.0]), "x")
     parse_scenario(changed("timeline.0.chasers", [0, 1]), "x")
     parse_scenario(changed("controller.horizon_s", 0.1), "x")
-    parse_scenario(changed("time.picture_hz", 5), "x")
+    parse_scenario(changed("time.image_hz", 5), "x")
 
 
 @given(st.integers(1, 240), st.integers(1, 240), st.integers(60, 4000))
 @settings(derandomize=True, deadline=None, max_examples=100)
-def test_rates_are_accepted_exactly_when_they_divide(rate_hz: int, picture_hz: int, physics_hz: int) -> None:
-    values = good() | {"time": {"rate_hz": rate_hz, "picture_hz": picture_hz, "physics_hz": physics_hz}}
-    divides = physics_hz % rate_hz == 0 and rate_hz % picture_hz == 0
+def test_rates_are_accepted_exactly_when_they_divide(rate_hz: int, image_hz: int, physics_hz: int) -> None:
+    values = good() | {"time": {"rate_hz": rate_hz, "image_hz": image_hz, "physics_hz": physics_hz}}
+    divides = physics_hz % rate_hz == 0 and rate_hz % image_hz == 0
     try:
         scenario = parse_scenario(values, "x")
     except ScenarioError:

@@ -1,4 +1,4 @@
-"""Jets in scenario files: what is shipped can fly, and what cannot is told in one line."""
+"""Thrusters in scenario files: what is shipped can fly, and what cannot is told in one line."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from thruster_cases import box, mission
 
 from chaserdock.launch.scenario_files import find_scenario
 
-JET = {"position_m": [0.1, 0.0, 0.0], "direction": [0.0, 1.0, 0.0], "thrust_N": 1.0}
+THRUSTER = {"position_m": [0.1, 0.0, 0.0], "direction": [0.0, 1.0, 0.0], "thrust_N": 1.0}
 
 
 def pairs() -> list[dict[str, Any]]:
-    """Twelve jets in opposed pairs: at +-a e_i, thrusting +-e_(i+1)."""
+    """Twelve thrusters in opposed pairs: at +-a e_i, thrusting +-e_(i+1)."""
     out = []
     for axis in range(3):
         for place in (-0.163, 0.163):
@@ -28,8 +28,8 @@ def pairs() -> list[dict[str, Any]]:
     return out
 
 
-@pytest.mark.parametrize("name", ["single-thrusters", "jet-failure", "four-chaser-docking-thrusters"])
-def test_shipped_scenarios_fly_with_jets(name: str) -> None:
+@pytest.mark.parametrize("name", ["single-thrusters", "thruster-failure", "four-chaser-docking-thrusters"])
+def test_shipped_scenarios_fly_with_thrusters(name: str) -> None:
     path = find_scenario(name)
     assert path is not None
     s = load_scenario(path)
@@ -38,17 +38,17 @@ def test_shipped_scenarios_fly_with_jets(name: str) -> None:
     assert scenario_from_json(s.model_dump_json(), "the same") == s
 
 
-def jet_set(body: str) -> tuple[WrenchSet, np.ndarray, np.ndarray]:
+def thruster_set(body: str) -> tuple[WrenchSet, np.ndarray, np.ndarray]:
     s = mission(body)
     return wrench_set(wrench_matrix(s.chaser.thrusters)), thrusts_max(s.chaser.thrusters), box(s)
 
 
 @pytest.mark.parametrize(("body", "kept"), [("slider", 1.0), ("tetra12", 0.5)])
-def test_any_one_jet_can_be_lost(body: str, kept: float) -> None:
-    wrenches, full, limits = jet_set(body)
+def test_any_one_thruster_can_be_lost(body: str, kept: float) -> None:
+    wrenches, full, limits = thruster_set(body)
     assert wrenches.box_scale(full, limits) > 1.0
-    for jet in range(len(full)):
-        assert wrenches.box_scale(np.where(np.arange(len(full)) == jet, 0.0, full), limits) > kept
+    for thruster in range(len(full)):
+        assert wrenches.box_scale(np.where(np.arange(len(full)) == thruster, 0.0, full), limits) > kept
 
 
 def test_opposed_pairs_do_not_survive_one() -> None:
@@ -63,7 +63,7 @@ def test_the_scale_of_the_box_is_the_largest_that_fits() -> None:
     from chaserdock_agents.chaser.thrusters.allocation import Allocator
 
     s = mission()
-    wrenches, full, limits = jet_set("tetra12")
+    wrenches, full, limits = thruster_set("tetra12")
     scale, allocator = wrenches.box_scale(full, limits), Allocator(s.chaser.thrusters, limits)
     corners = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T * limits
     assert all(allocator.allocate(c * scale * 0.9999, full).exact for c in corners)
@@ -82,30 +82,30 @@ def test_a_body_of_ones_own_overrides_what_is_shipped() -> None:
     [
         ({"chaser": {"body": "cube"}}, "chaser.body"),
         ({"chaser": {"body": None}}, "thrusters needs thrusters"),
-        ({"chaser": {"thrusters": [JET] * 12}}, "no 6-DoF control"),
+        ({"chaser": {"thrusters": [THRUSTER] * 12}}, "no 6-DoF control"),
         ({"chaser": {"force_max_N": 9.0}}, "at most 0.2"),
-        ({"chaser": {"thrusters": [{**JET, "direction": [0, 2, 0]}]}}, "chaser.thrusters.0.direction: must be of unit"),
-        ({"chaser": {"thrusters": [{**JET, "thrust_N": -1}]}}, "chaser.thrusters.0.thrust_N"),
-        ({"chaser": {"thrusters": [{**JET, "min_on_s": 0.001}]}}, "min_on_s (0.001) must be at least rise_s"),
-        ({"chaser": {"thrusters": [JET] * 25}}, "chaser.thrusters"),
+        ({"chaser": {"thrusters": [{**THRUSTER, "direction": [0, 2, 0]}]}}, "chaser.thrusters.0.direction: must be of unit"),
+        ({"chaser": {"thrusters": [{**THRUSTER, "thrust_N": -1}]}}, "chaser.thrusters.0.thrust_N"),
+        ({"chaser": {"thrusters": [{**THRUSTER, "min_on_s": 0.001}]}}, "min_on_s (0.001) must be at least rise_s"),
+        ({"chaser": {"thrusters": [THRUSTER] * 25}}, "chaser.thrusters"),
         ({"chaser": {"modulation": {"carrier_hz": 7}}}, "multiple of chaser.modulation.carrier_hz (960, 7)"),
         ({"chaser": {"modulation": {"carrier_hz": 120}}}, "shorter than the shortest pulse"),
         ({"chaser": {"modulation": {"resolution_s": 0.2}}}, "at most half a carrier period"),
         ({"chaser": {"modulation": {"schmitt_off": 0.8}}}, "schmitt_off must be less"),
-        ({"jet_failure": [{"chaser": 1, "jet": 0, "at_s": 1, "kind": "stuck_on"}]}, "there is no chaser 1"),
-        ({"jet_failure": [{"chaser": 0, "jet": 12, "at_s": 1, "kind": "stuck_on"}]}, "there is no jet 12"),
-        ({"jet_failure": [{"chaser": 0, "jet": 0, "at_s": 1, "kind": "weak"}]}, "factor goes with"),
-        ({"jet_failure": [{"chaser": 0, "jet": 0, "at_s": 1, "kind": "loud"}]}, "jet_failure.0.kind"),
-        ({"jet_failure": [{"chaser": 0, "jet": 0, "at_s": t, "kind": "stuck_off"} for t in (1, 2)]}, "fails twice"),
+        ({"thruster_failure": [{"chaser": 1, "thruster": 0, "at_s": 1, "kind": "stuck_on"}]}, "there is no chaser 1"),
+        ({"thruster_failure": [{"chaser": 0, "thruster": 12, "at_s": 1, "kind": "stuck_on"}]}, "there is no thruster 12"),
+        ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "weak"}]}, "factor goes with"),
+        ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "loud"}]}, "thruster_failure.0.kind"),
+        ({"thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": t, "kind": "stuck_off"} for t in (1, 2)]}, "fails twice"),
         (
             {
                 "chaser": {"actuation": "ideal"},
-                "jet_failure": [{"chaser": 0, "jet": 0, "at_s": 1, "kind": "stuck_on"}],
+                "thruster_failure": [{"chaser": 0, "thruster": 0, "at_s": 1, "kind": "stuck_on"}],
             },
-            "jets fail only with",
+            "thrusters fail only with",
         ),
-        ({"timeline": [{"at_s": 1, "command": "isolate", "chasers": [0]}]}, "jet goes with"),
-        ({"timeline": [{"at_s": 1, "command": "hold", "chasers": [0], "jet": 1}]}, "jet goes with"),
+        ({"timeline": [{"at_s": 1, "command": "isolate", "chasers": [0]}]}, "thruster goes with"),
+        ({"timeline": [{"at_s": 1, "command": "hold", "chasers": [0], "thruster": 1}]}, "thruster goes with"),
     ],
 )  # fmt: skip
 def test_what_cannot_fly_is_told(changes: dict[str, Any], words: str) -> None:

@@ -38,31 +38,31 @@ def taken(*changes, omega=(0.0, 0.0, 0.0), time_ns=0):
 
 
 @pytest.mark.parametrize("renderer", ["exact", "pybullet"])
-def test_pictures_taken_at_once_are_those_taken_one_by_one(renderer):
+def test_images_taken_at_once_are_those_taken_one_by_one(renderer):
     scenario = load_scenario(SINGLE.with_name("four-chaser-docking.toml"), (f"camera.renderer='{renderer}'",))
     physics, cameras = Physics(scenario), Cameras(scenario)
     states = {name: physics.state(name) for name in physics.bodies}
     for chasers in ((0, 1, 2, 3), (1, 2, 3), (2,), ()):
-        one_by_one = [cameras.picture(i, 7, 7, 70_000_000, states) for i in chasers]
-        assert cameras.pictures(chasers, 7, 7, 70_000_000, states) == one_by_one
+        one_by_one = [cameras.image(i, 7, 7, 70_000_000, states) for i in chasers]
+        assert cameras.images(chasers, 7, 7, 70_000_000, states) == one_by_one
 
 
-def test_blur_is_the_mean_of_the_pictures_of_the_exposure():
+def test_blur_is_the_mean_of_the_images_of_the_exposure():
     omega, exposure_s = (0.0, 0.0, 0.4), 0.1
     scenario = scenario_with()
     cameras, at_rest = Cameras(scenario), states_of(scenario)
-    pictures = []
+    images = []
     for share in np.linspace(-0.5, 0.5, 21):
         turned = dict(at_rest)
         target = turned[TARGET]
         q = rotations.integrate(target.q_wxyz, np.array(omega), share * exposure_s)
         turned[TARGET] = BodyState(target.position_m, np.zeros(3), q, np.zeros(3))
-        pictures.append(cameras.taken(0, 0, 0, turned).astype(float))
+        images.append(cameras.taken(0, 0, 0, turned).astype(float))
     blurred = taken(f"camera.effects.exposure_s={exposure_s}", omega=omega)
-    mean = np.mean(pictures, axis=0)
-    assert np.abs(blurred - mean).mean() < 0.2 * np.abs(blurred - pictures[10]).mean()
+    mean = np.mean(images, axis=0)
+    assert np.abs(blurred - mean).mean() < 0.2 * np.abs(blurred - images[10]).mean()
     # Nothing moves: nothing is blurred, however long the exposure.
-    assert np.array_equal(taken(f"camera.effects.exposure_s={exposure_s}"), pictures[10])
+    assert np.array_equal(taken(f"camera.effects.exposure_s={exposure_s}"), images[10])
 
 
 def test_glare_falls_with_the_square_of_the_angle_and_ends_in_eclipse_and_behind_bodies():
@@ -99,7 +99,7 @@ def test_the_earth_is_where_it_is_said_to_be():
         "target.position_m=[0.0, 30.0, 0.0]", "camera.earth={direction=[0.0, 0.0, -1.0], radius_deg=84.0}"
     )
     camera = scenario_with().camera_model()
-    # Its limb is 6 degrees below the horizon, level in the picture.
+    # Its limb is 6 degrees below the horizon, level in the image.
     limb = camera.cy_px + camera.fy_px * np.tan(np.radians(6.0))
     assert np.median(image[: int(limb) - 6]) < 10
     assert np.median(image[int(limb) + 6 : int(limb) + 30, :200]) > 15
@@ -152,8 +152,8 @@ def test_odometry_has_the_stated_noise_about_the_stated_bias():
 def test_a_mounting_turned_to_the_left_sees_the_target_on_the_right():
     image, turned = taken(), taken("camera.mounting_rotation_deg=[0.0, 0.0, 5.0]")
 
-    def column(picture):
-        return np.average(np.arange(640), weights=np.where(picture > 60, 1.0, 0.0)[:350].sum(axis=0))
+    def column(pixels):
+        return np.average(np.arange(640), weights=np.where(pixels > 60, 1.0, 0.0)[:350].sum(axis=0))
 
     shift = scenario_with().camera_model().fx_px * np.tan(np.radians(5.0))
     assert column(turned) - column(image) == pytest.approx(shift, rel=0.1)
@@ -181,7 +181,7 @@ def test_cameras_that_cannot_be_are_told_so(change, told):
         scenario_with(change)
 
 
-def test_a_lens_that_folds_the_picture_is_told_so():
+def test_a_lens_that_folds_the_image_is_told_so():
     lens = "{width_px=640,height_px=480,fx_px=400.0,fy_px=400.0,cx_px=320.0,cy_px=240.0,distortion=[-0.9,0.0,0.0,0.0]}"
     with pytest.raises(ScenarioError, match="distortion"):
         Cameras(scenario_with(f"camera.intrinsics={lens}"))

@@ -1,4 +1,4 @@
-"""The kernels that work on a picture's pixels: to the bit what OpenCV and NumPy give, from every instruction set."""
+"""The kernels that work on an image's pixels: to the bit what OpenCV and NumPy give, from every instruction set."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from chaserdock_world.rendering.native import LIBRARY
 from chaserdock_world.rendering.supersampling import spread, take_means
 from numpy.typing import NDArray
 
-Picture = NDArray[np.uint8]
+Pixels = NDArray[np.uint8]
 
 SIZES = [(480, 640), (64, 64), (65, 67), (70, 96), (64, 161), (217, 333), (3, 5), (1, 1), (2, 40), (40, 2)]
 
@@ -29,7 +29,7 @@ def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
         monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, request.param))
 
 
-def pictures(size: tuple[int, int]) -> list[Picture]:
+def images(size: tuple[int, int]) -> list[Pixels]:
     """Noise, space with a few stars and a patch of noise, all white, black and white."""
     rng = np.random.default_rng(size)
     noise = rng.integers(0, 256, size, dtype=np.uint8)
@@ -44,9 +44,9 @@ def pictures(size: tuple[int, int]) -> list[Picture]:
 def test_a_blur_is_opencvs(sigma_px: float) -> None:
     width = 2 * int(np.ceil(3.0 * sigma_px)) + 1
     for size in SIZES:
-        for picture in pictures(size):
-            expected = cv2.GaussianBlur(picture, (width, width), sigma_px, borderType=cv2.BORDER_REPLICATE)
-            np.testing.assert_array_equal(blurred(picture, sigma_px), expected, f"{size}")
+        for image in images(size):
+            expected = cv2.GaussianBlur(image, (width, width), sigma_px, borderType=cv2.BORDER_REPLICATE)
+            np.testing.assert_array_equal(blurred(image, sigma_px), expected, f"{size}")
 
 
 @pytest.mark.parametrize("size", [(480, 640), (33, 97)])
@@ -54,14 +54,14 @@ def test_a_blur_is_opencvs(sigma_px: float) -> None:
 def test_noise_is_that_of_its_formula(size: tuple[int, int], read: float, shot: float) -> None:
     camera = CameraEffects(size[1], size[0], Effects(1.0, 0.0, read, shot), seed=3)
     assert camera._bank is not None
-    for number, picture in enumerate(pictures(size)):
+    for number, image in enumerate(images(size)):
         seeds = np.random.SeedSequence([3, 1, 2, number]).generate_state(3)
         row, column = seeds[0] % 252, seeds[1] % 257
         white = camera._bank[row : row + size[0], column : column + size[1]].astype(np.float32)
         scale = np.float32((1.0 if seeds[2] & 1 else -1.0) * camera._to_levels)
-        noise = np.clip(camera._sigma[picture].astype(np.float32) * white * scale, -255.0, 255.0)
-        expected = np.clip(picture + np.rint(noise), 0.0, 255.0).astype(np.uint8)
-        np.testing.assert_array_equal(camera.apply(picture, 2, number), expected)
+        noise = np.clip(camera._sigma[image].astype(np.float32) * white * scale, -255.0, 255.0)
+        expected = np.clip(image + np.rint(noise), 0.0, 255.0).astype(np.uint8)
+        np.testing.assert_array_equal(camera.apply(image, 2, number), expected)
 
 
 @pytest.mark.parametrize("number", [2, 4])

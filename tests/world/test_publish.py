@@ -26,7 +26,7 @@ from flight_cases import scenario
 from harness import SHORT, finished, run
 
 from chaserdock.analysis.chase_camera import Viewpoint, draw
-from chaserdock.analysis.figures import KINDS, jets, write_figures
+from chaserdock.analysis.figures import KINDS, thrusters, write_figures
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.images import columns_for, pairs, shots
 from chaserdock.analysis.plots import Nothing
@@ -55,7 +55,7 @@ def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> Non
 
 
 def made_log(path: Path, ticks: int, seen: bool = False, chasers: int = 1, truth: bool = True) -> Path:
-    """A log with pictures of nothing: chaser i at -1 - i m, at rest, and a target that drifts along z."""
+    """A log with images of nothing: chaser i at -1 - i m, at rest, and a target that drifts along z."""
     values = {"description": "made <&>", "duration_s": 2.0, "camera": SIZE}
     names = [{"position_m": [-1.0 - i, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for i in range(chasers)]
     writer = LogWriter(path)
@@ -76,8 +76,8 @@ def made_log(path: Path, ticks: int, seen: bool = False, chasers: int = 1, truth
                     impulse_N_s=(0.1, 0.0, 0.0),
                 )
                 put(writer, topics.TRUTH_BODY, f"chaser/{i}", body)
-            picture = m.Image(**head, chaser=i, **SIZE, encoding="mono8", data=bytes(96 * 64))
-            put(writer, topics.IMAGE, i, picture)
+            image = m.Image(**head, chaser=i, **SIZE, encoding="mono8", data=bytes(96 * 64))
+            put(writer, topics.IMAGE, i, image)
             sighting = m.Sighting(
                 **head,
                 chaser=i,
@@ -143,7 +143,7 @@ def page(flown: Path) -> Page:
 
 def test_a_page_has_every_figure_and_refers_to_nothing_outside(flown: Path, page: Page) -> None:
     drawn = {i for i in page.ids if i.startswith("figure-")}
-    assert drawn >= {f"figure-{k.name}" for k in KINDS if k.name != "jets"}
+    assert drawn >= {f"figure-{k.name}" for k in KINDS if k.name != "thrusters"}
     assert {"replay-section", "events", "scenario", "versions"} <= set(page.ids)
     assert json.loads((flown / "summary.json").read_text())["digest"] in page.words
 
@@ -158,9 +158,9 @@ def test_the_replay_shows_the_recorded_motion(flown: Path, page: Page) -> None:
         rows = np.searchsorted(truth[name].time_s, np.array(data["times"]) - 1e-3)
         np.testing.assert_allclose(np.reshape(body["p"], (-1, 3)), truth[name].position_m[rows], atol=1e-4)
         np.testing.assert_allclose(np.reshape(body["q"], (-1, 4)), truth[name].q_wxyz[rows], atol=1e-4)
-    assert set(data["pictures"]["chasers"]) == {"0", "1"}
-    for urls in data["pictures"]["chasers"].values():
-        assert len(urls) == len(data["pictures"]["times"]) > 0
+    assert set(data["images"]["chasers"]) == {"0", "1"}
+    for urls in data["images"]["chasers"].values():
+        assert len(urls) == len(data["images"]["times"]) > 0
         assert all(url.startswith("data:image/jpeg;base64,") for url in urls)
 
 
@@ -235,10 +235,10 @@ def test_inputs_are_the_impulses_over_the_ticks(tmp_path: Path) -> None:
     given = load_traces(made_log(tmp_path / "a.mcap", 5), [0]).inputs[0]
     assert given.edges_s.shape == (5,)
     np.testing.assert_allclose(given.force_N, np.tile([1.5, 0.0, 0.0], (4, 1)), rtol=1e-6)
-    assert given.jet_duty.shape == (4, 0)
+    assert given.thruster_duty.shape == (4, 0)
 
 
-def test_pictures_have_their_fate(tmp_path: Path) -> None:
+def test_images_have_their_fate(tmp_path: Path) -> None:
     nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).looks[0]
     assert {LOOKS[code] for code in nothing.code} == {"nothing"}
     seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).looks[0]
@@ -260,22 +260,22 @@ def test_inputs_of_several_ticks_are_means_over_all_of_them(tmp_path: Path) -> N
     np.testing.assert_allclose(three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12)
 
 
-def test_jets_are_drawn_where_there_are_any(tmp_path: Path) -> None:
+def test_thrusters_are_drawn_where_there_are_any(tmp_path: Path) -> None:
     flight = load_flight(made_log(tmp_path / "a.mcap", 5))
     traces = load_traces(tmp_path / "a.mcap", [0])
-    with pytest.raises(Nothing, match="no jets"):
-        jets(flight, traces)
+    with pytest.raises(Nothing, match="no thrusters"):
+        thrusters(flight, traces)
     duty = np.linspace(0.0, 1.0, 24).reshape(2, 12)
     given = Inputs(np.array([0.0, 1.0, 2.0]), np.zeros((2, 3)), np.zeros((2, 3)), duty)
-    figure = jets(flight, Traces({0: given}, {}, {}))
+    figure = thrusters(flight, Traces({0: given}, {}, {}))
     drawn: Any = figure.axes[0].collections[0]
     np.testing.assert_array_equal(np.reshape(drawn.get_array(), (12, 2)), duty.T)
 
 
-# -- pictures and film ----------------------------------------------------------------------------------------
+# -- images and film ----------------------------------------------------------------------------------------
 
 
-def test_pictures_come_with_the_sighting_of_the_same_exposure(flown: Path) -> None:
+def test_images_come_with_the_sighting_of_the_same_exposure(flown: Path) -> None:
     found = list(pairs(flown / "mission.mcap", 2))
     counts = load_flight(flown / "mission.mcap").counts
     assert len(found) == counts["world/chaser/0/image"] + counts["world/chaser/1/image"]
@@ -284,7 +284,7 @@ def test_pictures_come_with_the_sighting_of_the_same_exposure(flown: Path) -> No
         assert (sighting.chaser, sighting.sim_time_ns) == (image.chaser, image.sim_time_ns)
 
 
-def test_shots_hold_the_latest_pictures_and_no_later_one(tmp_path: Path) -> None:
+def test_shots_hold_the_latest_images_and_no_later_one(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 16, chasers=2)
     found = list(shots(log, 2, 0.25))
     assert [time_s for time_s, _ in found] == [0.0, 0.25, 0.5, 0.75, 1.0]
@@ -294,7 +294,7 @@ def test_shots_hold_the_latest_pictures_and_no_later_one(tmp_path: Path) -> None
             assert 0.0 <= time_s - image.sim_time_ns / 1e9 < 1 / 15 + 1e-6
 
 
-def test_pictures_fit_their_place() -> None:
+def test_images_fit_their_place() -> None:
     for number in range(1, 17):
         columns, width = columns_for(number, 16 / 9, 480, 720)
         rows = -(-number // columns)
@@ -313,9 +313,9 @@ def test_the_drawn_target_bears_its_markers(model: str, azimuth: float, elevatio
     scene = scene_of(scenario(target={"model": model}))
     view = Viewpoint(np.zeros(3), 1.2, np.radians(azimuth), np.radians(elevation), 1200, 1200)
     pose = (np.zeros(3), rotations.IDENTITY)
-    picture = draw(scene, view, view.axes()[2], pose, {}, {}, frozenset())
+    image = draw(scene, view, view.axes()[2], pose, {}, {}, frozenset())
     table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, wanted.dictionary))
-    corners, ids, _ = cv2.aruco.ArucoDetector(table).detectMarkers(picture)
+    corners, ids, _ = cv2.aruco.ArucoDetector(table).detectMarkers(image)
     normal = view.axes()[2]
     there = {k.id for k in wanted.markers if k.normal_trf() @ normal > 0.99}
     assert ids is not None
@@ -334,9 +334,9 @@ def test_a_film_plays(flown: Path, tmp_path: Path) -> None:
         stream: Any = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height, stream.average_rate) == (640, 360, 10)
-        pictures = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
-    assert len(pictures) == number == 16  # 3 s at double speed, both ends
-    assert np.mean(np.abs(pictures[0].astype(float) - pictures[-1])) > 0.3  # something moves
+        images = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
+    assert len(images) == number == 16  # 3 s at double speed, both ends
+    assert np.mean(np.abs(images[0].astype(float) - images[-1])) > 0.3  # something moves
 
 
 def test_a_film_of_a_part(tmp_path: Path) -> None:
@@ -347,7 +347,7 @@ def test_a_film_of_a_part(tmp_path: Path) -> None:
     assert part == pytest.approx(every[2:6])
     with pytest.raises(ChaserdockError, match="no length"):
         write_video(log, tmp_path / "a.webp", part_s=(2.0, 2.0))
-    with pytest.raises(LogError, match="no picture after 100 s"):
+    with pytest.raises(LogError, match="no image after 100 s"):
         write_video(log, tmp_path / "a.webp", part_s=(100.0, 200.0))
     assert not (tmp_path / "a.webp").exists()
 

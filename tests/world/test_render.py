@@ -1,4 +1,4 @@
-"""The rendered picture against projected truth, what hides what, and the camera's effects."""
+"""The rendered image against projected truth, what hides what, and the camera's effects."""
 
 import cv2
 import numpy as np
@@ -69,7 +69,7 @@ def test_corners_are_where_they_project_to(draw, camera, name):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_both_renderers_draw_the_same_picture(camera):
+def test_both_renderers_draw_the_same_image(camera):
     model = target_model("servicer")
     crowd = [
         (chaser_boxes(), [0.2, 0.1, 0.6], rotations.exp([0.2, 0.1, 0.3])),
@@ -200,7 +200,7 @@ def test_painted_order_agrees_with_ray_casting(seed):
 
 
 def placed(*boxes):
-    """Boxes (centre, half edges), as seen from the origin, whose pictures overlap."""
+    """Boxes (centre, half edges), as seen from the origin, whose images overlap."""
     out = np.zeros(len(boxes), dtype=SeenBox)
     for row, (centre, half) in zip(out, boxes, strict=True):
         row["centre"], row["half"], row["rotation"], row["high_px"] = centre, half, np.eye(3), 1.0
@@ -213,7 +213,7 @@ def test_a_wide_near_box_is_in_front_though_its_centre_is_farther():
     boxes = placed(wide, small)
     assert (hides(boxes, 0, 1), hides(boxes, 1, 0)) == (1, -1)
     assert paint_order(boxes) == [1, 0]
-    # Two boxes apart in the picture wait for nothing: the farther one first.
+    # Two boxes apart in the image wait for nothing: the farther one first.
     boxes["low_px"][1], boxes["high_px"][1] = 5.0, 6.0
     assert paint_order(boxes) == [0, 1]
 
@@ -275,7 +275,7 @@ def test_a_marked_face_that_reaches_behind_the_camera_is_right_where_it_is_seen(
     assert checked > 20
 
 
-def test_pictures_repeat_bit_for_bit_and_do_not_depend_on_what_came_before():
+def test_images_repeat_bit_for_bit_and_do_not_depend_on_what_came_before():
     model = target_model("paper")
     views = [([0.0, 0.0, z], turned(0.1 * z, 0.2, z)) for z in (0.4, 0.8, 1.6)]
     first, second = Renderer(CAMERA, model), Renderer(CAMERA, model)
@@ -297,7 +297,7 @@ def test_sunlit_faces_are_brighter():
         Light((0.0, 0.0, 0.0))
 
 
-def test_sixteen_chasers_make_a_picture():
+def test_sixteen_chasers_make_a_image():
     generator = np.random.default_rng(5)
     crowd = [
         (
@@ -336,7 +336,7 @@ def test_chaser_boxes_reach_as_far_as_they_say():
         chaser_boxes(probe_reach_m=0.1)
 
 
-def test_effects_repeat_by_chaser_and_picture_and_differ_between_them():
+def test_effects_repeat_by_chaser_and_image_and_differ_between_them():
     image = np.full((480, 640), 100, dtype=np.uint8)
     one, other = (CameraEffects(640, 480, Effects(), 42) for _ in range(2))
     a = one.apply(image, 0, 7)
@@ -360,7 +360,7 @@ def test_noise_has_the_stated_strength(level):
     assert noisy.var() == pytest.approx(4.0 + 0.05 * level + 1.0 / 12.0, rel=0.03)
 
 
-def test_effects_can_be_off_and_leave_the_picture_alone():
+def test_effects_can_be_off_and_leave_the_image_alone():
     image = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     before = image.copy()
     out = CameraEffects(640, 480, NO_EFFECTS, 1).apply(image, 0, 0)

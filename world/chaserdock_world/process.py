@@ -1,4 +1,4 @@
-"""The world process: owns simulated time, flies the bodies, takes the pictures, knows the truth.
+"""The world process: owns simulated time, flies the bodies, takes the images, knows the truth.
 
 Lock-step: a tick ends when every expected answer to it has come; nothing depends on the order of arrival or
 on the wall clock. Real time: a tick ends when the wall clock says so.
@@ -15,14 +15,14 @@ from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.fault_injection import layer_of
-from chaserdock_protocol.messages import JetFaultCommand, JoinReply, JoinRequest, MissionEnd
+from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd, ThrusterFaultCommand
 from chaserdock_protocol.process import ProcessOptions, Stop, built, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
 from chaserdock_protocol.transport.session import PresenceTeller, new_instance
 
 from chaserdock_world.actuators.ideal import Actuators, fly_to
-from chaserdock_world.actuators.operator_faults import JetFaultDesk
+from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
 from chaserdock_world.actuators.thrusters import actuators_of
 from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.lockstep.tick_barrier import Answers
@@ -34,7 +34,7 @@ from chaserdock_world.sensors.publish import publish_docking, publish_odometry, 
 
 def main(options: ProcessOptions) -> int:
     """Runs the world of ``options.scenario``; 0 when it was flown to its end, 1 when not, 2 for bad input."""
-    # Other processes need the cores, and OpenCV's idle threads spin between a picture's many short calls.
+    # Other processes need the cores, and OpenCV's idle threads spin between an image's many short calls.
     cv2.setNumThreads(1)
     node: Node | None = None
     try:
@@ -123,11 +123,11 @@ def expose(
     *,
     at_once: bool,
 ) -> None:
-    """Takes and sends the pictures of a tick: each when it is drawn, or all at once, as cameras do that expose at once."""
-    exposure = (tick // timing.ticks_per_picture, tick, timing.tick_time_ns(tick), states)
-    one_by_one = (cameras.picture(i, *exposure) for i in chasers)
-    for picture in cameras.pictures(chasers, *exposure) if at_once else one_by_one:
-        node.publish(topics.IMAGE, picture, picture.chaser)
+    """Takes and sends the images of a tick: each when it is drawn, or all at once, as cameras do that expose at once."""
+    exposure = (tick // timing.ticks_per_image, tick, timing.tick_time_ns(tick), states)
+    one_by_one = (cameras.image(i, *exposure) for i in chasers)
+    for image in cameras.images(chasers, *exposure) if at_once else one_by_one:
+        node.publish(topics.IMAGE, image, image.chaser)
 
 
 def pass_lockstep(
@@ -162,8 +162,8 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
     actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in range(len(scenario.chasers))}
     node.faults = layer_of(scenario, "world", lockstep=options.mode == "lockstep")
     answers = gather(scenario, options, node, actuators, physics)
-    faults = JetFaultDesk(scenario, actuators)
-    node.answer(topics.JET_FAULT_KEY, JetFaultCommand, faults.ask)
+    faults = ThrusterFaultHandler(scenario, actuators)
+    node.answer(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, faults.ask)
     say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
     started = answers.wait(
         lambda: not answers.missing_at_start(), stop, lambda: ", ".join(answers.missing_at_start())
@@ -184,11 +184,11 @@ def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> 
         publish_odometry(node, states, tick, timing, navigation)
         if tick == scenario.ticks:
             break
-        pictures = timing.has_pictures(tick)
-        answers.open(tick, pictures)
+        images = timing.has_images(tick)
+        answers.open(tick, images)
         for what, detail in faults.decide(tick, timing):
             answers.warn(what, detail)
-        if pictures:
+        if images:
             expose(node, cameras, answers.chasers, tick, timing, states, at_once=options.mode == "realtime")
         if options.mode == "lockstep":
             contacts = pass_lockstep(tick, answers, stop, timing, fly_to_step)

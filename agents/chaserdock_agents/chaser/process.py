@@ -1,4 +1,4 @@
-"""A chaser process: picture -> sighting, wrench command -> actuators. It never sees the truth."""
+"""A chaser process: image -> sighting, wrench command -> actuators. It never sees the truth."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
 
-from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 
 from .command_gate import brake, own_command, passed_on, refusal, stale_term
 from .fallback import Alone, LastWord, clear_m, goes_on, wrench_of
@@ -89,8 +89,10 @@ class Chaser:
         self._known_ns = 0
         self._looked: deque[int] = deque(maxlen=64)
         self._has_port = self.scenario.docking.port_of(self.number) is not None
-        self._jets = (
-            JetPilot(self.scenario, self.number) if self.scenario.chaser.actuation == "thrusters" else None
+        self._thrusters = (
+            ThrusterController(self.scenario, self.number)
+            if self.scenario.chaser.actuation == "thrusters"
+            else None
         )
         self._perception = make_perception(self.scenario)
 
@@ -100,8 +102,8 @@ class Chaser:
         self.realtime = realtime
         node.advertise(topics.SIGHTING, i)
         node.advertise(topics.ACTUATORS, i)
-        if self._jets is not None:
-            node.advertise(topics.JETS, i)
+        if self._thrusters is not None:
+            node.advertise(topics.THRUSTERS, i)
         node.subscribe(topics.IMAGE, i, latest=realtime)
         node.subscribe(topics.ODOMETRY, i, latest=realtime)
         node.subscribe(topics.DOCKING, i)
@@ -123,7 +125,7 @@ class Chaser:
                 self._know(odometry)
             case DockingStatus() as docking:
                 self.docking = docking
-                self._watch_jets()
+                self._watch_thrusters()
             case Plan() as plan:
                 self._plan = plan
                 if plan.tick == self._heeded_tick:  # it came after its command
@@ -135,7 +137,7 @@ class Chaser:
             case Tick() as tick:
                 self.tick = tick
                 self.teller.settled.set()
-                self._watch_jets()
+                self._watch_thrusters()
                 self._brake_if_alone()
                 if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
                     health = health_of(self.node, tick.tick, tick.sim_time_ns)
@@ -153,7 +155,7 @@ class Chaser:
             self.node.counts.stale += 1
             return
         self.odometry = odometry
-        self._watch_jets()
+        self._watch_thrusters()
         self._brake_if_alone()
         self._brake_if_forgotten(odometry)
 
@@ -164,12 +166,12 @@ class Chaser:
                 tick=lost.tick,
                 sim_time_ns=lost.sim_time_ns,
                 chaser=self.number,
-                status="bad_picture",
+                status="bad_image",
                 solutions=(),
                 marker_ids=(),
                 corners_px=(),
                 rejected_ids=(),
-                detail="no picture came",
+                detail="no image came",
             )
             self.node.publish(topics.SIGHTING, nothing, self.number)
         elif topic is topics.ODOMETRY and self.odometry is not None:
@@ -182,7 +184,7 @@ class Chaser:
                 else msgspec.structs.replace(before, contact=False)
             )
             self.docking = msgspec.structs.replace(still, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
-            self._watch_jets()
+            self._watch_thrusters()
         elif topic is topics.WRENCH:
             self._without_command(lost.tick)
 
@@ -199,23 +201,21 @@ class Chaser:
         begun_s = time.perf_counter()
         sighting = look(self._perception, image, prediction_from(self.sighting))
         took_s = time.perf_counter() - begun_s
-        if sighting.status == "bad_picture" and (
-            self.sighting is None or self.sighting.status != "bad_picture"
-        ):
-            self._warn("bad picture", sighting.detail, image.tick, image.sim_time_ns)
+        if sighting.status == "bad_image" and (self.sighting is None or self.sighting.status != "bad_image"):
+            self._warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
         self.sighting = sighting
         self.node.publish(
             topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number
         )
 
-    def _watch_jets(self) -> None:
-        """Tells the controller what the jets can do, and everyone what has been found of them.
+    def _watch_thrusters(self) -> None:
+        """Tells the controller what the thrusters can do, and everyone what has been found of them.
 
         Once a tick that is open, when it has brought the odometry and, with a docking sensor, its word, in whatever
         order. The last odometry belongs to no open tick, and may come after the mission's end or before it.
         """
         tick, odometry, docking = self.tick, self.odometry, self.docking
-        if self._jets is None or tick is None or odometry is None:
+        if self._thrusters is None or tick is None or odometry is None:
             return
         if odometry.tick != tick.tick or self._watched_tick >= tick.tick:
             return
@@ -223,8 +223,8 @@ class Chaser:
             return
         self._watched_tick = tick.tick
         touched = docking is not None and (docking.contact or docking.latched)
-        self.node.publish(topics.JETS, self._jets.observe(odometry, touched), self.number)
-        for level, what, detail in self._jets.drain_events():
+        self.node.publish(topics.THRUSTERS, self._thrusters.observe(odometry, touched), self.number)
+        for level, what, detail in self._thrusters.drain_events():
             self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
     def _fly(self, command: WrenchCommand) -> None:
@@ -247,8 +247,8 @@ class Chaser:
             self._term = command.term
             self._stale = False
             self._heed(command)
-            if self._jets is not None:
-                self._jets.heed(command)
+            if self._thrusters is not None:
+                self._thrusters.heed(command)
             self._send(passed_on(command))
             return
         self.node.counts.stale += 1
@@ -321,8 +321,8 @@ class Chaser:
         self._actuate(command)
 
     def _actuate(self, command: ActuatorCommand) -> None:
-        if self._jets is not None:
-            command = self._jets.fly(command)
+        if self._thrusters is not None:
+            command = self._thrusters.fly(command)
         self.node.publish(topics.ACTUATORS, command, self.number)
 
     def _warn(self, what: str, detail: str, tick: int, time_ns: int) -> None:

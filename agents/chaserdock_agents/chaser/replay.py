@@ -1,4 +1,4 @@
-"""The chasers' perception again, on recorded pictures: their processes' own code, with a tape for a network."""
+"""The chasers' perception again, on recorded images: their processes' own code, with a tape for a network."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a picture message to a sighting message. A pure function of picture, prediction and parameters."""
+"""From an image message to a sighting message. A pure function of image, prediction and parameters."""
 
 from __future__ import annotations
 
@@ -16,30 +16,30 @@ Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Where the target may be: position (3,) in IRF and rotation (4,) TRF to IRF."""
 
 
-class BadPicture(Exception):
-    """An image message that holds no picture of the stated size."""
+class BadImage(Exception):
+    """An image message that holds no image of the stated size."""
 
 
-def decode_picture(image: Image) -> NDArray[np.uint8]:
-    """Grey picture (height, width), uint8, of an image message; raises BadPicture."""
+def decode_image(image: Image) -> NDArray[np.uint8]:
+    """Grey image (height, width), uint8, of an image message; raises BadImage."""
     shape = (image.height_px, image.width_px)
     data = np.frombuffer(image.data, dtype=np.uint8)
     if image.encoding == "mono8":
         if data.size != shape[0] * shape[1]:
-            raise BadPicture(
-                f"{data.size} bytes, a mono8 picture of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
+            raise BadImage(
+                f"{data.size} bytes, a mono8 image of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
             )
         return data.reshape(shape)
     # Asked first, as OpenCV would take the memory for whatever size the header claims, and other formats too.
     size = _jpeg_size(image.data)
     if size is None:
-        raise BadPicture(f"{data.size} bytes that are no JPEG")
+        raise BadImage(f"{data.size} bytes that are no JPEG")
     if size != shape:
-        raise BadPicture(f"a JPEG of {size[1]} x {size[0]}, stated as {shape[1]} x {shape[0]}")
-    picture: Any = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
-    if picture is None or picture.shape != shape:
-        raise BadPicture(f"{data.size} bytes of a damaged JPEG")
-    return picture
+        raise BadImage(f"a JPEG of {size[1]} x {size[0]}, stated as {shape[1]} x {shape[0]}")
+    pixels: Any = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    if pixels is None or pixels.shape != shape:
+        raise BadImage(f"{data.size} bytes of a damaged JPEG")
+    return pixels
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
@@ -60,14 +60,14 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def look(perception: Sees, image: Image, predicted: Prediction | None) -> Sighting:
-    """What is seen of the target in a picture; ``wall_estimate_s`` is left for the caller."""
+    """What is seen of the target in an image; ``wall_estimate_s`` is left for the caller."""
     header: dict[str, Any] = {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
     try:
-        seen = perception.estimate(decode_picture(image), predicted)
-    except (BadPicture, ValueError) as error:
+        seen = perception.estimate(decode_image(image), predicted)
+    except (BadImage, ValueError) as error:
         return Sighting(
             **header,
-            status="bad_picture",
+            status="bad_image",
             solutions=(),
             marker_ids=(),
             corners_px=(),
@@ -94,7 +94,7 @@ def look(perception: Sees, image: Image, predicted: Prediction | None) -> Sighti
 
 
 def prediction_from(sighting: Sighting | None) -> Prediction | None:
-    """Where to look first in the next picture: where the target was last seen, if it was."""
+    """Where to look first in the next image: where the target was last seen, if it was."""
     if sighting is None or not sighting.solutions:
         return None
     best = sighting.solutions[0]

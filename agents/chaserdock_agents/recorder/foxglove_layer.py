@@ -4,7 +4,7 @@ Channels (all under ``/viewer/``) and what they show; times are simulated:
 
 - ``tf``: frames ``target`` and ``chaser/N`` as they truly were in ``world`` (WRF), ``chaser/N/camera`` (IRF) on each
   chaser, and ``target/estimate``, the fused estimate while there is one
-- ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: picture, camera, corners that were used
+- ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: image, camera, corners that were used
 - ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in WRF): poses
 - ``scene``: the bodies as boxes in their true frames; ``events``: what processes told
 """
@@ -106,7 +106,7 @@ class ViewerLayer:
     def _views(self, message: Any, stamp: fox.Timestamp) -> Iterator[tuple[str, Any]]:
         match message:
             case Image():
-                yield f"chaser/{message.chaser}/image", _picture(message, stamp)
+                yield f"chaser/{message.chaser}/image", _image(message, stamp)
                 frame = f"chaser/{message.chaser}/camera"
                 calibration = fox.CameraCalibration(timestamp=stamp, frame_id=frame, **self._calibration)
                 yield f"chaser/{message.chaser}/calibration", calibration
@@ -162,7 +162,7 @@ def _pose_in(stamp: fox.Timestamp, frame: str, p: Vector3, q: Quaternion) -> fox
     return fox.PoseInFrame(timestamp=stamp, frame_id=frame, pose=pose)
 
 
-def _picture(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawImage:
+def _image(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawImage:
     frame = f"chaser/{image.chaser}/camera"
     if image.encoding == "jpeg":
         return fox.CompressedImage(timestamp=stamp, frame_id=frame, data=image.data, format="jpeg")

@@ -52,7 +52,7 @@ def main(options: ProcessOptions) -> int:
 
 
 def _give_memory_back() -> None:
-    """Large pieces (pictures, chunks, a part's index) go back to the system when they are done with, for days on end.
+    """Large pieces (images, chunks, a part's index) go back to the system when they are done with, for days on end.
 
     Left to itself glibc keeps pieces as large as the largest one freed so far, in a heap for each thread, and a
     recorder grows for hours (``benchmarks/endurance.py``). Elsewhere there is nothing to set.
@@ -87,7 +87,7 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
     missing = recorder.missing()
     for key, number in missing.items():
         say("recorder", f"{number} messages of {key} never came")
-    # In real time pictures are dropped rather than waited for; anything else must be here.
+    # In real time images are dropped rather than waited for; anything else must be here.
     excused = {k for k in missing if mission.mode == "realtime" and k.endswith("/image")}
     return 1 if missing.keys() - excused else 0
 

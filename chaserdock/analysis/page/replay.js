@@ -68,7 +68,7 @@
     const up = [eye[1] * right[2] - eye[2] * right[1], eye[2] * right[0] - eye[0] * right[2], eye[0] * right[1] - eye[1] * right[0]];
     const reach = 3.1 * data.reach_m / zoom, focal = 1.25 * Math.min(width, height * 1.35);
     const centre = target.p;
-    function see(world) {  // picture x and y, and depth
+    function see(world) {  // image x and y, and depth
       const v = apply(turn, minus(world, centre));
       const depth = reach - dot(v, eye);
       return [width / 2 + focal * dot(v, right) / depth, height / 2 - focal * dot(v, up) / depth, depth];
@@ -142,7 +142,7 @@
       }
     }
 
-    // What each camera looks at, bright while its picture is used.
+    // What each camera looks at, bright while its image is used.
     data.chasers.forEach((c, k) => {
       const colour = css("--series-" + (c.id % 8));
       const origin = see(sum(apply(poses[k].m, data.scene.camera_origin), poses[k].p));
@@ -172,10 +172,10 @@
         return cell;
       }));
     });
-    const shot = at(data.pictures.times.map((t, k) => [t, k]), time);
+    const shot = at(data.images.times.map((t, k) => [t, k]), time);
     if (shot !== null) {
       for (const image of views.querySelectorAll("img")) {
-        const source = data.pictures.chasers[image.dataset.chaser][shot];
+        const source = data.images.chasers[image.dataset.chaser][shot];
         if (source && image.getAttribute("src") !== source) image.setAttribute("src", source);
       }
     }

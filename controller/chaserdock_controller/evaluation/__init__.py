@@ -1,1 +1,1 @@
-"""Studies of the controller by itself: the flight code as it is, without pictures and without processes."""
+"""Studies of the controller by itself: the flight code as it is, without images and without processes."""

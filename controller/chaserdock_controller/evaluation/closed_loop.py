@@ -1,4 +1,4 @@
-"""A mission of the flight code in one process: `Flight`, ideal actuators, rigid bodies. No pictures, no network.
+"""A mission of the flight code in one process: `Flight`, ideal actuators, rigid bodies. No images, no network.
 
 The same code as in flight decides (references, prediction, NMPC, resolution of commands); only the estimator is
 replaced by one that knows. Bodies move by RK4 in steps of at most 20 ms (`prediction.integrate`).

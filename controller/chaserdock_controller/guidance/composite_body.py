@@ -1,4 +1,4 @@
-"""What capture does to the controller's picture of the world: who holds on to the target, and how that moves then."""
+"""What capture does to the controller's image of the world: who holds on to the target, and how that moves then."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from . import reference
 from .docking import Senses
 
 # One sigma of what a touch, and the shock of a capture at the tolerances' speed, may do to the target's rates
-# (m/s, rad/s); share of the known effect of a pull that may be otherwise; and with jets, one of which may have failed
+# (m/s, rad/s); share of the known effect of a pull that may be otherwise; and with thrusters, one of which may have failed
 # unknown to all, share of the impulse that may be otherwise, wherever it acts.
 _TOUCH = Shock(0.005, 0.01)
 _PULL_UNKNOWN = 0.1
-_JETS_UNKNOWN = 1.0
+_THRUSTERS_UNKNOWN = 1.0
 
 
 def target_body(scenario: Scenario) -> TargetBody:
@@ -68,7 +68,7 @@ class Captures:
         else:
             for i in sorted(latched & odometry.keys()):
                 if i in given:
-                    self._pushed(odometry[i], given[i], now_ns, _JETS_UNKNOWN)
+                    self._pushed(odometry[i], given[i], now_ns, _THRUSTERS_UNKNOWN)
                 else:
                     self._pushed(odometry[i], self._commanded(i, history, now_ns), now_ns)
         self._changed |= changed

@@ -125,7 +125,7 @@ class Guidance:
         while self._due and self._due[0].at_s <= now_s + 1e-9:
             entry = self._due.pop(0)
             for chaser in entry.chasers:
-                wish = {"command": entry.command, "offset_m": entry.offset_m, "jet": entry.jet}
+                wish = {"command": entry.command, "offset_m": entry.offset_m, "thruster": entry.thruster}
                 out.append(OperatorCommand(chaser=chaser, **wish))
         return out
 

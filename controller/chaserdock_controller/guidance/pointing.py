@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 SEARCH_RATE_RAD_S = math.radians(15.0)
 """Mean rate at which the line of sight moves along a ring of the search."""
 _RING_SHARE = 0.9
-"""Rings grow by this share of the picture's height, so that each overlaps the one before."""
+"""Rings grow by this share of the image's height, so that each overlaps the one before."""
 _WIDEST_RAD = math.radians(170.0)
 
 CALIBRATION_S = 30.0
@@ -32,7 +32,7 @@ _STEP_S = 0.02
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Width and height of the picture as angles, rad."""
+    """Width and height of the image as angles, rad."""
     return (
         2.0 * math.atan(camera.width_px / 2.0 / camera.fx_px),
         2.0 * math.atan(camera.height_px / 2.0 / camera.fy_px),
@@ -43,7 +43,7 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
     """Yaw and pitch (about Z and Y of the body as the search found it) of the line of sight, ``time_s`` into a search.
 
     Ellipses about the first line of sight. After the k-th all within height/2 + k 0.9 height of it has been in the
-    picture, in every direction. The last one is repeated.
+    image, in every direction. The last one is repeated.
     """
     before, left_s, k = (0.0, 0.0), max(time_s, 0.0), 1
     while True:
@@ -56,7 +56,7 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
             math.pi * (yaw + pitch) * (1.0 + 3.0 * h / (10.0 + math.sqrt(4.0 - 3.0 * h))) / SEARCH_RATE_RAD_S
         )
         if left_s < out_s:
-            # Out along the pitch axis, where the picture is lowest.
+            # Out along the pitch axis, where the image is lowest.
             return 0.0, before[1] + (pitch - before[1]) * left_s / out_s
         left_s -= out_s
         if left_s < round_s or edge >= _WIDEST_RAD:

@@ -9,7 +9,7 @@ COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
 """Resolution of commands: 15 uN and 0.24 uN m, 17 and 18 bits of the paper's actuators.
 
 A command word is finite anyway. Here it also swallows what another SIMD level or BLAS changes in the last bits, which
-pictures in whole grey levels would otherwise blow up to their own noise.
+images in whole grey levels would otherwise blow up to their own noise.
 """
 
 

@@ -1,4 +1,4 @@
-"""What the controller knows of the chasers' jets: limits, impulse under way, and what operators want. No I/O."""
+"""What the controller knows of the chasers' thrusters: limits, impulse under way, and what operators want. No I/O."""
 
 from __future__ import annotations
 
@@ -7,29 +7,29 @@ from collections.abc import Mapping
 
 import numpy as np
 from chaserdock_models.rotations import Array
-from chaserdock_protocol.messages import JetReport, OperatorCommand
+from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 
 from chaserdock_controller.guidance.command_validation import why_stale
 from chaserdock_controller.guidance.phases import Answer
 
-JET_COMMANDS = ("isolate", "restore")
+THRUSTER_COMMANDS = ("isolate", "restore")
 
 
-class JetDesk:
+class ThrusterCommandHandler:
     """The newest report of every chaser, and the standing wishes of operators."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._chasers = len(scenario.chasers)
         body = scenario.chaser
-        self._jets = len(body.thrusters) if body.actuation == "thrusters" else 0
+        self._thrusters = len(body.thrusters) if body.actuation == "thrusters" else 0
         self._nominal = np.array([body.force_max_N] * 3 + [body.torque_max_N_m] * 3)
-        self._reports: dict[int, JetReport] = {}
+        self._reports: dict[int, ThrusterReport] = {}
         self._isolated: dict[int, set[int]] = {}
         self._trusted: dict[int, set[int]] = {}
         self._done: dict[tuple[int, int], tuple[float, OperatorCommand]] = {}
 
-    def take(self, reports: Mapping[int, JetReport]) -> None:
+    def take(self, reports: Mapping[int, ThrusterReport]) -> None:
         """Notes reports, by chaser."""
         self._reports.update(reports)
 
@@ -48,7 +48,7 @@ class JetDesk:
         return np.array([*report.coming_impulse_N_s, *report.coming_angular_impulse_N_m_s])
 
     def given(self, tick: int) -> dict[int, Array]:
-        """Impulse (6,), body axes, that jets gave from the tick before to ``tick``, of the chasers that tell."""
+        """Impulse (6,), body axes, that thrusters gave from the tick before to ``tick``, of the chasers that tell."""
         return {
             i: np.array([*r.given_impulse_N_s, *r.given_angular_impulse_N_m_s])
             for i, r in self._reports.items()
@@ -56,36 +56,40 @@ class JetDesk:
         }
 
     def isolated(self, chaser: int) -> tuple[int, ...]:
-        """Jets that an operator wants shut off."""
+        """Thrusters that an operator wants shut off."""
         return tuple(sorted(self._isolated.get(chaser, ())))
 
     def trusted(self, chaser: int) -> tuple[int, ...]:
-        """Jets that an operator vouches for."""
+        """Thrusters that an operator vouches for."""
         return tuple(sorted(self._trusted.get(chaser, ())))
 
     def command(self, command: OperatorCommand, now_s: float) -> Answer:
         """Does what an operator or the time line asks for, or says why not.
 
-        Of ``isolate`` and ``restore`` for one jet in one tick the first counts.
+        Of ``isolate`` and ``restore`` for one thruster in one tick the first counts.
         """
-        i, jet = command.chaser, command.jet
+        i, thruster = command.chaser, command.thruster
         if i >= self._chasers:
             return Answer(False, f"there is no chaser {i}; this mission has 0 to {self._chasers - 1}")
         if late := why_stale(command, now_s):
             return Answer(False, late)
-        if self._jets == 0:
-            return Answer(False, 'this mission\'s chasers fly without jets (chaser.actuation = "ideal")')
-        if jet is None or jet >= self._jets:
-            return Answer(False, f"{command.command} needs a jet; this body has 0 to {self._jets - 1}")
-        done_s, done = self._done.get((i, jet), (-math.inf, command))
+        if self._thrusters == 0:
+            return Answer(False, 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")')
+        if thruster is None or thruster >= self._thrusters:
+            return Answer(
+                False, f"{command.command} needs a thruster; this body has 0 to {self._thrusters - 1}"
+            )
+        done_s, done = self._done.get((i, thruster), (-math.inf, command))
         if done_s == now_s and done.command != command.command:
             whose = f" by {done.operator}" if done.operator else ""
             return Answer(False, f"{done.command}{whose} came first in this tick")
-        self._done[i, jet] = now_s, command
+        self._done[i, thruster] = now_s, command
         shut, trusted = self._isolated.setdefault(i, set()), self._trusted.setdefault(i, set())
         wanted, other = (shut, trusted) if command.command == "isolate" else (trusted, shut)
-        if jet in wanted:
-            return Answer(True, f"jet {jet} is already {'isolated' if wanted is shut else 'restored'}")
-        wanted.add(jet)
-        other.discard(jet)
-        return Answer(True, f"jet {jet} {'isolated' if wanted is shut else 'restored'}")
+        if thruster in wanted:
+            return Answer(
+                True, f"thruster {thruster} is already {'isolated' if wanted is shut else 'restored'}"
+            )
+        wanted.add(thruster)
+        other.discard(thruster)
+        return Answer(True, f"thruster {thruster} {'isolated' if wanted is shut else 'restored'}")

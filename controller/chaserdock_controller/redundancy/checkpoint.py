@@ -12,7 +12,7 @@ from typing import Any
 
 import msgspec
 from chaserdock_models.docking_geometry import PortView
-from chaserdock_protocol.messages import JetReport, Odometry, OperatorCommand
+from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 
 from chaserdock_controller.core import Flight
 from chaserdock_controller.estimation import Mekf
@@ -38,7 +38,7 @@ CLASSES: tuple[type, ...] = (
     Eye,
     FilterState,
     Glide,
-    JetReport,
+    ThrusterReport,
     Known,
     Measurement,
     MekfParameters,
@@ -56,7 +56,7 @@ CLASSES: tuple[type, ...] = (
 """What may be in a controller's state, beside numbers, texts and containers."""
 
 _GUIDANCE = ("chasers", "_leaving", "_sensed", "_places", "_done", "_due", "_seen_s", "_blind")
-_JETS = ("_reports", "_isolated", "_trusted", "_done")
+_THRUSTERS = ("_reports", "_isolated", "_trusted", "_done")
 _CAPTURES = ("body", "latched", "_changed")
 _FLIGHT = ("_odometry", "_last_solve_ns", "_troubled")
 
@@ -82,7 +82,7 @@ class Memory:
         parts: dict[str, Any] = {
             "flight": (lambda: flight, _FLIGHT),
             "guidance": (lambda: flight.guidance, _GUIDANCE),
-            "jets": (lambda: vars(flight)["_jets"], _JETS),
+            "thrusters": (lambda: vars(flight)["_thrusters"], _THRUSTERS),
             "captures": (lambda: vars(flight)["_captures"], _CAPTURES),
             "history": (lambda: vars(flight)["_history"], ("_sent",)),
             "searches": (lambda: vars(flight)["_searches"], ("_from",)),

@@ -8,10 +8,6 @@ from .fields import (
     ChaserIds,
     Count,
     Counts,
-    JetId,
-    JetPulse,
-    Jets,
-    JetState,
     Latch,
     Level,
     MarkerIds,
@@ -23,6 +19,10 @@ from .fields import (
     Square6,
     Square12,
     Text,
+    ThrusterId,
+    ThrusterPulse,
+    Thrusters,
+    ThrusterState,
     Vector3,
 )
 from .flight import (
@@ -35,7 +35,6 @@ from .flight import (
     Event,
     Health,
     Image,
-    JetReport,
     MissionEnd,
     Odometry,
     OperatorCommand,
@@ -45,6 +44,7 @@ from .flight import (
     Sighting,
     SolverStatus,
     TargetEstimate,
+    ThrusterReport,
     Tick,
     WorldTruth,
     WrenchCommand,
@@ -52,7 +52,7 @@ from .flight import (
     schema_of,
 )
 from .session import Farewell, JoinReply, JoinRequest, Presence
-from .thruster_fault import JetFaultCommand
+from .thruster_fault import ThrusterFaultCommand
 
 __all__ = [
     "GREATEST_COUNT",
@@ -71,12 +71,6 @@ __all__ = [
     "Farewell",
     "Health",
     "Image",
-    "JetFaultCommand",
-    "JetId",
-    "JetPulse",
-    "JetReport",
-    "JetState",
-    "Jets",
     "JoinReply",
     "JoinRequest",
     "Latch",
@@ -101,6 +95,12 @@ __all__ = [
     "Square12",
     "TargetEstimate",
     "Text",
+    "ThrusterFaultCommand",
+    "ThrusterId",
+    "ThrusterPulse",
+    "ThrusterReport",
+    "ThrusterState",
+    "Thrusters",
     "Tick",
     "Vector3",
     "WorldTruth",

@@ -14,10 +14,10 @@ Count = Annotated[int, Meta(ge=0, le=GREATEST_COUNT)]
 ChaserId = Annotated[int, Meta(ge=0, le=255)]
 ChaserIds = Annotated[tuple[ChaserId, ...], Meta(max_length=256)]
 MarkerIds = Annotated[tuple[Annotated[int, Meta(ge=0, le=2**31)], ...], Meta(max_length=1024)]
-JetId = Annotated[int, Meta(ge=0, le=254)]
-Jets = Annotated[tuple[JetId, ...], Meta(max_length=255)]
+ThrusterId = Annotated[int, Meta(ge=0, le=254)]
+Thrusters = Annotated[tuple[ThrusterId, ...], Meta(max_length=255)]
 Text = Annotated[str, Meta(max_length=2000)]
-JetState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
+ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
 Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
 Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
 Level = Literal["info", "warning", "error"]
@@ -92,9 +92,9 @@ class ProbeTouch(Struct, frozen=True, kw_only=True):
     refused: Text = ""
 
 
-class JetPulse(Struct, frozen=True, kw_only=True):
-    """A jet's valve is to be open between two times."""
+class ThrusterPulse(Struct, frozen=True, kw_only=True):
+    """A thruster's valve is to be open between two times."""
 
-    jet: JetId
+    thruster: ThrusterId
     open_ns: Count
     close_ns: Count

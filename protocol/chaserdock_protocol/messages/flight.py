@@ -6,7 +6,7 @@ meaning gets a new VERSION.
 
 Common fields: ``seq`` numbers the messages of one publisher on one key from 0 (set when published);
 ``tick`` is the world's tick the message belongs to; ``sim_time_ns`` is simulated time: for whatever
-derives from a picture, the time of its *exposure*. Nothing in these messages depends on a wall clock,
+derives from an image, the time of its *exposure*. Nothing in these messages depends on a wall clock,
 except fields whose name begins with ``wall_``.
 
 Units SI, radians; frames in the names: WRF world, CRF chaser body, TRF target body, IRF camera.
@@ -28,10 +28,6 @@ from .fields import (
     ChaserIds,
     Count,
     Counts,
-    JetId,
-    JetPulse,
-    Jets,
-    JetState,
     Latch,
     Level,
     MarkerIds,
@@ -42,10 +38,14 @@ from .fields import (
     Quaternion,
     Square12,
     Text,
+    ThrusterId,
+    ThrusterPulse,
+    Thrusters,
+    ThrusterState,
     Vector3,
 )
 from .session import Farewell, JoinReply, JoinRequest, Presence
-from .thruster_fault import JetFaultCommand
+from .thruster_fault import ThrusterFaultCommand
 
 
 class Tick(Message, frozen=True, kw_only=True):
@@ -57,7 +57,7 @@ class Tick(Message, frozen=True, kw_only=True):
     """
 
     revision: Count = 0
-    pictures: bool
+    images: bool
     chasers: ChaserIds
     controller: bool
     term: Count = 0
@@ -74,7 +74,7 @@ class MissionEnd(Message, frozen=True, kw_only=True):
 
 
 class Image(Message, frozen=True, kw_only=True):
-    """A picture of chaser ``chaser``'s camera; ``sim_time_ns`` is the middle of the exposure."""
+    """An image of chaser ``chaser``'s camera; ``sim_time_ns`` is the middle of the exposure."""
 
     chaser: ChaserId
     width_px: Annotated[int, Meta(ge=1, le=8192)]
@@ -108,7 +108,7 @@ class BodyTruth(Message, frozen=True, kw_only=True):
 
     ``impulse_N_s`` and ``angular_impulse_N_m_s`` are what its actuators gave it since the last tick, in
     body axes; ``absolute_impulse_N_s`` is the time integral of the sum of the force components' magnitudes.
-    With thrusters: ``jet_impulse_N_s`` that every jet gave, ``jet_open_s`` that its valves were open, and the
+    With thrusters: ``thruster_impulse_N_s`` that every thruster gave, ``thruster_open_s`` that its valves were open, and the
     ``propellant_kg`` that took, since the last tick (the body's mass stays what it is).
     """
 
@@ -120,8 +120,8 @@ class BodyTruth(Message, frozen=True, kw_only=True):
     impulse_N_s: Vector3 = (0.0, 0.0, 0.0)
     angular_impulse_N_m_s: Vector3 = (0.0, 0.0, 0.0)
     absolute_impulse_N_s: float = 0.0
-    jet_impulse_N_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
-    jet_open_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
+    thruster_impulse_N_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
+    thruster_open_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
     propellant_kg: float = 0.0
 
 
@@ -139,14 +139,14 @@ class WorldTruth(Message, frozen=True, kw_only=True):
 
 
 class Sighting(Message, frozen=True, kw_only=True):
-    """What a chaser saw of the target in one picture; no ``solutions`` means "I see nothing".
+    """What a chaser saw of the target in one image; no ``solutions`` means "I see nothing".
 
     The best solution comes first; a second one is there when a single small marker allows both.
-    ``corners_px`` are eight numbers a used marker: u, v of its four corners, in the picture as taken.
+    ``corners_px`` are eight numbers a used marker: u, v of its four corners, in the image as taken.
     """
 
     chaser: ChaserId
-    status: Literal["seen", "nothing", "bad_picture"]
+    status: Literal["seen", "nothing", "bad_image"]
     solutions: Annotated[tuple[PoseSolution, ...], Meta(max_length=4)]
     marker_ids: MarkerIds
     corners_px: Annotated[tuple[float, ...], Meta(max_length=8192)]
@@ -196,8 +196,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     the NMPC's plan, a safe command (``brake`` stops the chaser, ``coast`` gives nothing), the ``search`` for a target
     that nobody sees, the ``pull`` that verifies a latch, or ``none``: the controller has no command, as it does not know
     where the chaser is.
-    ``isolated``: jets whose shut-off valve an operator wants closed; ``trusted``: jets that an operator vouches for,
-    whatever the chaser has found. ``free``: nothing holds or touches the chaser, so that its motion shows its jets.
+    ``isolated``: thrusters whose shut-off valve an operator wants closed; ``trusted``: thrusters that an operator vouches for,
+    whatever the chaser has found. ``free``: nothing holds or touches the chaser, so that its motion shows its thrusters.
     ``term``, ``commander`` and ``instance``: as the ``Tick`` had them that gave the command to who sends this.
     """
 
@@ -207,8 +207,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     mode: Literal["nmpc", "brake", "coast", "pull", "search", "none"]
     force_N: Vector3
     torque_N_m: Vector3
-    isolated: Jets = ()
-    trusted: Jets = ()
+    isolated: Thrusters = ()
+    trusted: Thrusters = ()
     free: bool = True
     latch: Latch = "keep"
     term: Count = 0
@@ -248,7 +248,7 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     ``source`` is ``command`` when it passes on the controller's, of ``term``. When it has none that it can trust it flies
     its last ``plan`` to the end, then comes to rest (``brake``), then keeps clear of the target (``hold``).
     With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, and ``isolated``
-    the jets whose shut-off valves are closed from ``effective_time_ns`` on; force and torque say what was asked for.
+    the thrusters whose shut-off valves are closed from ``effective_time_ns`` on; force and torque say what was asked for.
     """
 
     chaser: ChaserId
@@ -257,17 +257,17 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     force_N: Vector3
     torque_N_m: Vector3
     latch: Latch = "keep"
-    pulses: Annotated[tuple[JetPulse, ...], Meta(max_length=10_000)] = ()
-    isolated: Jets = ()
+    pulses: Annotated[tuple[ThrusterPulse, ...], Meta(max_length=10_000)] = ()
+    isolated: Thrusters = ()
     term: Count = 0
 
 
-class JetReport(Message, frozen=True, kw_only=True):
-    """What a chaser's jets can do, as it knows them, at the time of the odometry of the same tick.
+class ThrusterReport(Message, frozen=True, kw_only=True):
+    """What a chaser's thrusters can do, as it knows them, at the time of the odometry of the same tick.
 
     ``force_max_N`` and ``torque_max_N_m`` are within reach on all body axes at once. ``coming_*`` is the impulse (body
     axes) that it will get from pulses under way, less what of them counts as the next command's; ``given_*`` is what
-    its jets should have given since the report before.
+    its thrusters should have given since the report before.
     """
 
     chaser: ChaserId
@@ -275,8 +275,8 @@ class JetReport(Message, frozen=True, kw_only=True):
     torque_max_N_m: Vector3
     coming_impulse_N_s: Vector3
     coming_angular_impulse_N_m_s: Vector3
-    jets: Annotated[tuple[JetState, ...], Meta(max_length=255)]
-    isolated: Jets = ()
+    thrusters: Annotated[tuple[ThrusterState, ...], Meta(max_length=255)]
+    isolated: Thrusters = ()
     given_impulse_N_s: Vector3 = (0.0, 0.0, 0.0)
     given_angular_impulse_N_m_s: Vector3 = (0.0, 0.0, 0.0)
 
@@ -312,13 +312,13 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     The controller publishes it again, with the tick it was obeyed or refused at: the log must hold all inputs.
 
     ``calibrate`` turns the chaser about while it watches the target, which shows how its camera is mounted.
-    ``isolate`` closes a jet's shut-off valve, ``restore`` opens it and vouches for the jet; ``jet`` goes with these.
+    ``isolate`` closes a thruster's shut-off valve, ``restore`` opens it and vouches for the thruster; ``thruster`` goes with these.
     """
 
     command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"]
     chaser: ChaserId
     offset_m: Vector3 | None = None
-    jet: JetId | None = None
+    thruster: ThrusterId | None = None
     operator: Text = ""
     expires_ns: Count | None = None
 
@@ -346,28 +346,28 @@ class ControllerState(Message, frozen=True, kw_only=True):
 
 
 VERSION: dict[type[Struct], int] = {
-    Tick: 1,
+    Tick: 2,
     MissionEnd: 1,
     Image: 1,
     Odometry: 1,
     DockingStatus: 1,
-    BodyTruth: 1,
+    BodyTruth: 2,
     WorldTruth: 1,
-    Sighting: 1,
+    Sighting: 2,
     TargetEstimate: 1,
     Reference: 1,
     WrenchCommand: 1,
     Plan: 1,
     SolverStatus: 1,
-    ActuatorCommand: 1,
-    JetReport: 1,
+    ActuatorCommand: 2,
+    ThrusterReport: 2,
     Event: 1,
     Health: 1,
     RecorderAck: 1,
-    OperatorCommand: 1,
-    JetFaultCommand: 1,
+    OperatorCommand: 2,
+    ThrusterFaultCommand: 2,
     CommandReply: 1,
-    ControllerState: 1,
+    ControllerState: 2,
     Presence: 1,
     Farewell: 1,
     JoinRequest: 1,

@@ -26,6 +26,7 @@ from mcap.records import Message as McapMessage
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.messages import encoding_of, schema_of
+from chaserdock_protocol.scenario.migrations import migrated
 from chaserdock_protocol.topics import Topic
 
 from . import provenance
@@ -299,7 +300,7 @@ def count_messages(source: LogSource) -> dict[str, int]:
 
 
 def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
-    """The resolved scenario (JSON) and the run's data and versions; raises LogError if the log lacks them.
+    """The resolved scenario (JSON, in the present format) and the run's data and versions; raises LogError if the log lacks them.
 
     All files of a rotated log must be parts of one run.
     """
@@ -309,7 +310,7 @@ def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
         data = _scenario_of(path)[0]
         if data.get("run_id") != first.get("run_id"):
             raise LogError(f"{path}: of another run than {files[0]}")
-    return scenario, first
+    return migrated(scenario), first
 
 
 def _scenario_of(path: Path) -> tuple[dict[str, str], str]:

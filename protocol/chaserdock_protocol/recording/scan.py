@@ -25,6 +25,8 @@ from mcap.writer import MCAP0_MAGIC
 
 from chaserdock_protocol.errors import ChaserdockError
 
+from .schema_migrations import current_key
+
 LogSource = Path | Sequence[Path]
 """A log file, a folder that holds a log (rotated or not), or the files of one log in their order."""
 
@@ -156,7 +158,9 @@ def chunk_records(content: bytes) -> list[McapMessage | Channel | Schema]:
             payload = data[begin + _MESSAGE.size : place]
             out.append(McapMessage(channel_id, log_time, payload, publish_time, sequence))
         elif opcode == Opcode.CHANNEL:
-            out.append(Channel.read(ReadDataStream(BytesIO(data[begin:place]))))
+            channel = Channel.read(ReadDataStream(BytesIO(data[begin:place])))
+            channel.topic = current_key(channel.topic)
+            out.append(channel)
         elif opcode == Opcode.SCHEMA:
             out.append(Schema.read(ReadDataStream(BytesIO(data[begin:place]))))
     return out

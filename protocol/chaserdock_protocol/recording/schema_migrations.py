@@ -1,8 +1,8 @@
-"""Messages of older versions in logs: what turns their fields into those of the next version.
+"""Migrate messages and keys of old logs to the present schema.
 
-On the wire only the present version is taken. When a message's meaning changes, its number in ``messages.VERSION``
-goes up by one, and the function that makes the new fields of the old ones is entered here; a log then reads as if it
-had been recorded today. A new field with a default needs none of this.
+On the wire only the present version of a message is accepted. When the meaning or the name of a field changes, the
+message's number in ``messages.VERSION`` goes up by one, and a function that converts the old fields is added here; a log
+then reads as if it had been recorded today. A new field with a default needs no migration.
 """
 
 from __future__ import annotations
@@ -20,10 +20,45 @@ from chaserdock_protocol.messages import VERSION, encoding_of
 T = TypeVar("T", bound=Struct)
 Upgrade = Callable[[dict[str, Any]], dict[str, Any]]
 
-UPGRADES: dict[tuple[str, int], Upgrade] = {}
+
+def _renamed(**names: str) -> Upgrade:
+    """Return an upgrade that renames fields, ``old="new"``."""
+    return lambda fields: {names.get(name, name): value for name, value in fields.items()}
+
+
+def _each(field: str, upgrade: Upgrade) -> Upgrade:
+    """Return an upgrade of the structures in list ``field``."""
+    return lambda fields: {**fields, field: [upgrade(item) for item in fields.get(field, ())]}
+
+
+def _bad_image(fields: dict[str, Any]) -> dict[str, Any]:
+    return {**fields, "status": "bad_image"} if fields.get("status") == "bad_picture" else fields
+
+
+UPGRADES: dict[tuple[str, int], Upgrade] = {
+    ("Tick", 1): _renamed(pictures="images"),
+    ("BodyTruth", 1): _renamed(jet_impulse_N_s="thruster_impulse_N_s", jet_open_s="thruster_open_s"),
+    ("Sighting", 1): _bad_image,
+    ("ActuatorCommand", 1): _each("pulses", _renamed(jet="thruster")),
+    ("ThrusterReport", 1): _renamed(jets="thrusters"),
+    ("ThrusterFaultCommand", 1): _renamed(jet="thruster"),
+    ("OperatorCommand", 1): _renamed(jet="thruster"),
+    ("ControllerState", 1): _each("operated", _renamed(jet="thruster")),
+}
 """(type, version) -> function from that version's fields, as plain values, to the next version's."""
 
+_RENAMED_TYPES = {"JetReport": "ThrusterReport", "JetFaultCommand": "ThrusterFaultCommand"}
+_RENAMED_KEYS = ((re.compile(r"chaser/(\d+)/jets"), r"chaser/\1/thrusters"),)
+
 _ENCODING = re.compile(r"application/msgpack;chaserdock\.(\w+)\.v(\d{1,6})")
+
+
+def current_key(key: str) -> str:
+    """Return the present name of a key that a log was recorded with."""
+    for pattern, name in _RENAMED_KEYS:
+        if pattern.fullmatch(key):
+            return pattern.sub(name, key)
+    return key
 
 
 def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
@@ -34,7 +69,11 @@ def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
     if encoding == encoding_of(kind):
         return decode(kind, payload, encoding)
     found = _ENCODING.fullmatch(encoding)
-    if found is None or found[1] != kind.__name__ or int(found[2]) > VERSION[kind]:
+    if (
+        found is None
+        or _RENAMED_TYPES.get(found[1], found[1]) != kind.__name__
+        or int(found[2]) > VERSION[kind]
+    ):
         raise Rejected("encoding", f"got {encoding!r}, expected {encoding_of(kind)!r} or an older version")
     if len(payload) > MAX_BYTES:
         raise Rejected("size", f"{len(payload)} bytes, at most {MAX_BYTES}")

@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 
 from .fields import Name, NotNegative, Positive, PositiveVector, Section, UnitQuaternion, Vector
 from .target import Geometry
-from .thrusters import MAX_JETS, Modulation, Thruster, check_layout
+from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
 
 class Target(Section):
@@ -63,9 +63,9 @@ def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[
 class Body(Section):
     """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's.
 
-    ``body`` names one that is shipped with jets, whose figures are then the defaults. ``actuation``: the commanded
-    wrench itself (``ideal``), or pulses of the jets. ``jet_test_s``: a jet of which its chaser has not seen for so long
-    that it works is tested where that may be; 0: never. ``jet_faults_by_command``: operators may make jets fail in
+    ``body`` names one that is shipped with thrusters, whose figures are then the defaults. ``actuation``: the commanded
+    wrench itself (``ideal``), or pulses of the thrusters. ``thruster_test_s``: a thruster of which its chaser has not seen for so long
+    that it works is tested where that may be; 0: never. ``thruster_faults_by_command``: operators may make thrusters fail in
     flight, for tests.
     """
 
@@ -77,10 +77,10 @@ class Body(Section):
     torque_max_N_m: Positive = 0.05
     probe_reach_m: Positive = 0.35
     actuation: Literal["ideal", "thrusters"] = "ideal"
-    thrusters: Annotated[tuple[Thruster, ...], Field(max_length=MAX_JETS)] = ()
+    thrusters: Annotated[tuple[Thruster, ...], Field(max_length=MAX_THRUSTERS)] = ()
     modulation: Modulation = Modulation()
-    jet_test_s: NotNegative = 10.0
-    jet_faults_by_command: bool = False
+    thruster_test_s: NotNegative = 10.0
+    thruster_faults_by_command: bool = False
 
     @model_validator(mode="before")
     @classmethod

@@ -15,10 +15,10 @@ Share = Annotated[float, AfterValidator(finite), Field(ge=0, le=1)]
 
 
 class Effects(Section):
-    """What the camera does to the exact picture: a gain of 1 and 0 elsewhere switch an effect off.
+    """What the camera does to the exact image: a gain of 1 and 0 elsewhere switch an effect off.
 
     Noise in grey levels (``read_noise``) and squared grey levels per grey level (``shot_noise``). ``exposure_s``:
-    motion blur of a shutter that is open so long, about the picture's time; the picture's level is ``gain``'s.
+    motion blur of a shutter that is open so long, about the image's time; the image's level is ``gain``'s.
     ``glare``: grey levels of stray light at one degree from the sun (it falls with the angle); the sun's disc
     itself is drawn when that is above 0.
     """

@@ -29,14 +29,14 @@ FaultKind = Literal[
     "lying_sensor",
     "odometry_lie",
 ]
-TopicName = Literal["image", "odometry", "docking", "sighting", "jets", "wrench", "actuators"]
+TopicName = Literal["image", "odometry", "docking", "sighting", "thrusters", "wrench", "actuators"]
 
 FAULTY_TOPICS: dict[str, Topic] = {
     "image": topics.IMAGE,
     "odometry": topics.ODOMETRY,
     "docking": topics.DOCKING,
     "sighting": topics.SIGHTING,
-    "jets": topics.JETS,
+    "thrusters": topics.THRUSTERS,
     "wrench": topics.WRENCH,
     "actuators": topics.ACTUATORS,
 }
@@ -168,7 +168,7 @@ def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:
                 raise ValueError(
                     f"fault.{k}: there is no {name}; this mission has chaser/0 to chaser/{chasers - 1}"
                 )
-        if fault.topic == "jets" and scenario.chaser.actuation != "thrusters":
-            raise ValueError(f'fault.{k}.topic: there are jets only with chaser.actuation = "thrusters"')
+        if fault.topic == "thrusters" and scenario.chaser.actuation != "thrusters":
+            raise ValueError(f'fault.{k}.topic: there are thrusters only with chaser.actuation = "thrusters"')
         if fault.topic == "docking" and not ports:
             raise ValueError(f"fault.{k}.topic: there is a docking sensor only with docking.ports")

@@ -27,16 +27,17 @@ from .docking import Docking
 from .faults import Fault, check_faults
 from .fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
 from .files import read_toml, resolve_files
+from .migrations import FORMAT, old_keys
 from .odometry import OdometrySection
 from .overrides import ScenarioError, explain, override
-from .thrusters import JetFailure, check_pulses
+from .thrusters import ThrusterFailure, check_pulses
 
 
 class Time(Section):
     """Rates and latencies of simulated time."""
 
     rate_hz: Annotated[int, Field(ge=1, le=240)] = 15
-    picture_hz: Annotated[int, Field(ge=1, le=240)] = 15
+    image_hz: Annotated[int, Field(ge=1, le=240)] = 15
     physics_hz: Annotated[int, Field(ge=60, le=20000)] = 960
     latency_s: NotNegative = 1.0 / 30.0
 
@@ -44,8 +45,8 @@ class Time(Section):
     def _divide(self) -> Time:
         if self.physics_hz % self.rate_hz:
             raise ValueError(f"physics_hz must be a multiple of rate_hz ({self.physics_hz}, {self.rate_hz})")
-        if self.rate_hz % self.picture_hz:
-            raise ValueError(f"rate_hz must be a multiple of picture_hz ({self.rate_hz}, {self.picture_hz})")
+        if self.rate_hz % self.image_hz:
+            raise ValueError(f"rate_hz must be a multiple of image_hz ({self.rate_hz}, {self.image_hz})")
         return self
 
 
@@ -53,7 +54,7 @@ class EstimatorSection(Section):
     """How sightings become the target's odometry; the numbers are ``mekf``'s.
 
     ``camera_bias_*``: one sigma of each camera's own calibration error (place of the lens, mounting, focal length),
-    which is then estimated. 0: the cameras are as calibrated, which is so in the world's pictures.
+    which is then estimated. 0: the cameras are as calibrated, which is so in the world's images.
     """
 
     name: Name = "mekf"
@@ -69,7 +70,7 @@ class EstimatorSection(Section):
 
 
 class PerceptionSection(Section):
-    """How a picture becomes a pose."""
+    """How an image becomes a pose."""
 
     name: Name = "default"
 
@@ -186,14 +187,14 @@ class TimelineEntry(Section):
     command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"]
     chasers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
     offset_m: Vector | None = None
-    jet: Annotated[int, Field(ge=0, le=254)] | None = None
+    thruster: Annotated[int, Field(ge=0, le=254)] | None = None
 
     @model_validator(mode="after")
     def _goto(self) -> TimelineEntry:
         if (self.command == "goto") != (self.offset_m is not None):
             raise ValueError("offset_m goes with the command goto, and goto needs it")
-        if (self.command in ("isolate", "restore")) != (self.jet is not None):
-            raise ValueError("jet goes with the commands isolate and restore, and these need it")
+        if (self.command in ("isolate", "restore")) != (self.thruster is not None):
+            raise ValueError("thruster goes with the commands isolate and restore, and these need it")
         return self
 
 
@@ -220,6 +221,7 @@ class Success(Section):
 class Scenario(Section):
     """A whole mission, resolved: what every process gets from the world."""
 
+    format: Literal[2] = FORMAT
     name: Name
     description: str = ""
     duration_s: Annotated[Positive, Field(le=MAX_DURATION_S)]
@@ -239,7 +241,7 @@ class Scenario(Section):
     docking: Docking = Docking()
     chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
     timeline: tuple[TimelineEntry, ...] = ()
-    jet_failure: tuple[JetFailure, ...] = ()
+    thruster_failure: tuple[ThrusterFailure, ...] = ()
     fault: Annotated[tuple[Fault, ...], Field(max_length=100)] = ()
     success: Success = Success()
 
@@ -282,7 +284,7 @@ class Scenario(Section):
         return Timing(
             physics_hz=self.time.physics_hz,
             rate_hz=self.time.rate_hz,
-            picture_hz=self.time.picture_hz,
+            image_hz=self.time.image_hz,
             latency_steps=round(self.time.latency_s * self.time.physics_hz),
         )
 
@@ -308,21 +310,26 @@ class Scenario(Section):
 
 
 def _check_failures(scenario: Scenario) -> None:
-    """Jets fail in this mission only where there are some."""
-    chasers, jets = len(scenario.chasers), len(scenario.chaser.thrusters)
-    if scenario.jet_failure and scenario.chaser.actuation != "thrusters":
-        raise ValueError('jet_failure: jets fail only with chaser.actuation = "thrusters"')
-    for k, failure in enumerate(scenario.jet_failure):
+    """Thrusters fail in this mission only where there are some."""
+    chasers, thrusters = len(scenario.chasers), len(scenario.chaser.thrusters)
+    if scenario.thruster_failure and scenario.chaser.actuation != "thrusters":
+        raise ValueError('thruster_failure: thrusters fail only with chaser.actuation = "thrusters"')
+    for k, failure in enumerate(scenario.thruster_failure):
         if failure.chaser >= chasers:
             raise ValueError(
-                f"jet_failure.{k}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
+                f"thruster_failure.{k}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
             )
-        if failure.jet >= jets:
+        if failure.thruster >= thrusters:
             raise ValueError(
-                f"jet_failure.{k}.jet: there is no jet {failure.jet}; the body has 0 to {jets - 1}"
+                f"thruster_failure.{k}.thruster: there is no thruster {failure.thruster}; the body has 0 to {thrusters - 1}"
             )
-        if any((f.chaser, f.jet) == (failure.chaser, failure.jet) for f in scenario.jet_failure[:k]):
-            raise ValueError(f"jet_failure.{k}: jet {failure.jet} of chaser {failure.chaser} fails twice")
+        if any(
+            (f.chaser, f.thruster) == (failure.chaser, failure.thruster)
+            for f in scenario.thruster_failure[:k]
+        ):
+            raise ValueError(
+                f"thruster_failure.{k}: thruster {failure.thruster} of chaser {failure.chaser} fails twice"
+            )
 
 
 def _check_ports(scenario: Scenario) -> None:
@@ -365,6 +372,8 @@ def _checked(validate: Callable[[Any], Scenario], values: Any, source: str) -> S
 
 def parse_scenario(values: dict[str, Any], source: str) -> Scenario:
     """Scenario from nested tables; raises ScenarioError with one line a fault, each with its path."""
+    if old := old_keys(values):
+        raise ScenarioError("\n".join(f"{source}: {line}" for line in old))
     return _checked(Scenario.model_validate, values, source)
 
 

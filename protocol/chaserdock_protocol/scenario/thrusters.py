@@ -1,4 +1,4 @@
-"""The scenario's sections of jets: where they sit, what they give, how they are pulsed, how they fail."""
+"""The scenario's sections of thrusters: where they sit, what they give, how they are pulsed, how they fail."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from pydantic import AfterValidator, Field, model_validator
 
 from .fields import NotNegative, Positive, Section, Vector
 
-MAX_JETS = 24
-"""Facets of the set of wrenches grow with the fifth power of the number of jets."""
+MAX_THRUSTERS = 24
+"""Facets of the set of wrenches grow with the fifth power of the number of thrusters."""
 
 
 def _unit(v: tuple[float, float, float]) -> tuple[float, float, float]:
@@ -26,7 +26,7 @@ def _unit(v: tuple[float, float, float]) -> tuple[float, float, float]:
 
 
 class Thruster(Section):
-    """A jet that is open or shut: where it sits (CRF), the direction of its force on the body (CRF, unit).
+    """A thruster that is open or shut: where it sits (CRF), the direction of its force on the body (CRF, unit).
 
     Its thrust rises linearly within ``rise_s`` of the valve's opening and falls linearly within ``fall_s`` of its
     closing. A pulse shorter than ``min_on_s`` does not open the valve.
@@ -48,11 +48,11 @@ class Thruster(Section):
 
 
 class Modulation(Section):
-    """How thrusts become pulses: once a carrier period and jet (docs/thrusters.md).
+    """How thrusts become pulses: once a carrier period and thruster (docs/thrusters.md).
 
     ``resolution_s``: pulse widths are whole multiples of it. ``carry_over``: impulse that was asked for and not
     given, as under the minimum on-time, is asked for again in the next period. ``schmitt``: open for whole periods,
-    from ``schmitt_on`` of the jet's thrust on until less than ``schmitt_off`` of it is asked for.
+    from ``schmitt_on`` of the thruster's thrust on until less than ``schmitt_off`` of it is asked for.
     """
 
     modulator: Literal["pwm", "schmitt"] = "pwm"
@@ -73,33 +73,33 @@ class Modulation(Section):
         return self
 
 
-class JetFailure(Section):
-    """From ``at_s`` on a jet of a chaser does not open, does not close, or gives ``factor`` of its thrust.
+class ThrusterFailure(Section):
+    """From ``at_s`` on a thruster of a chaser does not open, does not close, or gives ``factor`` of its thrust.
 
-    ``told``: the chaser is told at once; otherwise it has to find out.
+    ``reported``: the chaser is told at once; otherwise it has to find out.
     """
 
     chaser: Annotated[int, Field(ge=0)]
-    jet: Annotated[int, Field(ge=0)]
+    thruster: Annotated[int, Field(ge=0)]
     at_s: NotNegative
     kind: FailureKind
     factor: Annotated[float, Field(ge=0, le=1)] | None = None
-    told: bool = False
+    reported: bool = False
 
     @model_validator(mode="after")
-    def _factor(self) -> JetFailure:
+    def _factor(self) -> ThrusterFailure:
         if (self.kind == "weak") != (self.factor is not None):
             raise ValueError("factor goes with the kind weak, and weak needs it")
         return self
 
 
 def thrusts_max(thrusters: Sequence[Thruster]) -> Array:
-    """Full thrust (n,) of all jets, N."""
+    """Full thrust (n,) of all thrusters, N."""
     return np.array([t.thrust_N for t in thrusters])
 
 
 def check_layout(thrusters: Sequence[Thruster], force_max_N: float, torque_max_N_m: float) -> None:
-    """Raises ValueError unless the jets can give every wrench within the limits, all axes at once."""
+    """Raises ValueError unless the thrusters can give every wrench within the limits, all axes at once."""
     if not thrusters:
         raise ValueError("actuation thrusters needs thrusters, or a body that has some: slider, tetra12")
     box = np.array([force_max_N] * 3 + [torque_max_N_m] * 3)

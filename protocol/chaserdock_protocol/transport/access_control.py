@@ -27,7 +27,7 @@ class Query:
 QUERIES = (
     Query(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
     Query(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
-    Query(topics.JET_FAULT_KEY, frozenset({"operator"}), "world"),
+    Query(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
 )
 LOOK_ON: frozenset[Role] = frozenset({"analysis", "viewer"})
 """These publish nothing, and have no name of their own on the network."""

@@ -201,7 +201,7 @@ class Node:
     def subscribe(self, topic: Topic, place: int | str | None = None, *, latest: bool = False) -> None:
         """Subscribes a topic, of all chasers or processes when ``place`` is None.
 
-        ``latest`` keeps only the newest sample of a key that waits to be read (pictures in real time).
+        ``latest`` keeps only the newest sample of a key that waits to be read (images in real time).
         """
         expression = self._readable(topic, place)
 

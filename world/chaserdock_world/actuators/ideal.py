@@ -1,7 +1,7 @@
 """What drives a chaser in the world: commands held back until they take effect, bounded by the actuators.
 
-``ideal`` actuation gives the commanded wrench itself, cut off at the body's limits per axis; jets are in
-``jet_actuators``.
+``ideal`` actuation gives the commanded wrench itself, cut off at the body's limits per axis; thrusters are in
+``thruster_actuators``.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from chaserdock_world.physics.simulation import Physics
 
 class Given(NamedTuple):
     """What actuators gave since they were last asked: impulse (6,), body axes, and the time integral of the force
-    components' magnitudes; whether a command was more than they can do, how many came late; of jets, see BodyTruth."""
+    components' magnitudes; whether a command was more than they can do, how many came late; of thrusters, see BodyTruth."""
 
     impulse: Array
     absolute_impulse_N_s: float
     saturated: bool
     late: int
-    jet_impulse_N_s: tuple[float, ...] = ()
-    jet_open_s: tuple[float, ...] = ()
+    thruster_impulse_N_s: tuple[float, ...] = ()
+    thruster_open_s: tuple[float, ...] = ()
     propellant_kg: float = 0.0
 
 

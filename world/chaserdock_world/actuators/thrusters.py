@@ -1,7 +1,7 @@
-"""Jets that drive a chaser in the world: valves open and close as commanded, or as they have failed.
+"""Thrusters that drive a chaser in the world: valves open and close as commanded, or as they have failed.
 
-A jet's force acts at its place: that is a force and a torque about the centre of mass, constant in body axes over a
-physics step, in which it is the mean of what the jets give. Propellant is accounted for; the mass stays the same.
+A thruster's force acts at its place: that is a force and a torque about the centre of mass, constant in body axes over a
+physics step, in which it is the mean of what the thrusters give. Propellant is accounted for; the mass stays the same.
 """
 
 from __future__ import annotations
@@ -14,25 +14,25 @@ from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.bodies import Body
-from chaserdock_protocol.scenario.thrusters import FailureKind, JetFailure
+from chaserdock_protocol.scenario.thrusters import FailureKind, ThrusterFailure
 
 from .ideal import Actuators, Given, IdealActuators
 
 _AHEAD_STEPS = 32
 
 
-class JetActuators:
-    """The jets of one chaser: ``actuators.IdealActuators`` says what its members mean.
+class ThrusterActuators:
+    """The thrusters of one chaser: ``actuators.IdealActuators`` says what its members mean.
 
     Pulses have absolute times. What of them has passed when a late command comes is not made up for.
     """
 
-    def __init__(self, body: Body, timing: Timing, failures: tuple[JetFailure, ...]) -> None:
+    def __init__(self, body: Body, timing: Timing, failures: tuple[ThrusterFailure, ...]) -> None:
         self._timing = timing
         self._matrix = wrench_matrix(body.thrusters)
         self._valves = Valves(body.thrusters)
         for failure in failures:
-            self._valves.fail(failure.jet, failure.kind, round(failure.at_s * 1e9), failure.factor)
+            self._valves.fail(failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor)
         self._ahead: Array = np.zeros((0, 6))
         self._ahead_from = 0
         self._impulse = np.zeros(6)
@@ -41,9 +41,9 @@ class JetActuators:
         self._late = 0
         self._taken_step = 0
 
-    def fail(self, jet: int, kind: FailureKind | None, factor: float | None, step: int) -> None:
-        """From ``step`` on, until which ``take`` has been called, a jet fails in a way; None: it works again."""
-        self._valves.fail(jet, kind, self._timing.time_ns(step), factor)
+    def fail(self, thruster: int, kind: FailureKind | None, factor: float | None, step: int) -> None:
+        """From ``step`` on, until which ``take`` has been called, a thruster fails in a way; None: it works again."""
+        self._valves.fail(thruster, kind, self._timing.time_ns(step), factor)
         self._ahead = np.zeros((0, 6))
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
@@ -51,7 +51,7 @@ class JetActuators:
         now_ns = self._timing.time_ns(max(now_step, effective_step))
         for p in command.pulses:
             begin_ns = max(p.open_ns, now_ns)
-            if p.close_ns > begin_ns and not self._valves.pulse(p.jet, begin_ns, p.close_ns):
+            if p.close_ns > begin_ns and not self._valves.pulse(p.thruster, begin_ns, p.close_ns):
                 self._refused |= begin_ns == p.open_ns
         self._valves.set_shut(command.isolated, now_ns)
         self._late += effective_step < now_step
@@ -90,15 +90,15 @@ class JetActuators:
     def take(self, step: int) -> Given:
         """What was given since the last call, up to physics step ``step``."""
         since_ns, now_ns = self._timing.time_ns(self._taken_step), self._timing.time_ns(step)
-        jets = self._valves.impulses(np.array([since_ns, now_ns]))[0]
+        thrusters = self._valves.impulses(np.array([since_ns, now_ns]))[0]
         out = Given(
             self._impulse,
             self._absolute_N_s,
             self._refused,
             self._late,
-            tuple(jets.tolist()),
+            tuple(thrusters.tolist()),
             tuple(self._valves.open_s(since_ns, now_ns).tolist()),
-            self._valves.propellant_kg(jets),
+            self._valves.propellant_kg(thrusters),
         )
         self._impulse, self._absolute_N_s, self._refused, self._late = np.zeros(6), 0.0, False, 0
         self._taken_step = step
@@ -110,5 +110,5 @@ def actuators_of(scenario: Scenario, chaser: int) -> Actuators:
     """What drives a chaser, as the scenario has it."""
     if scenario.chaser.actuation == "ideal":
         return IdealActuators(scenario.chaser)
-    failures = tuple(f for f in scenario.jet_failure if f.chaser == chaser)
-    return JetActuators(scenario.chaser, scenario.timing, failures)
+    failures = tuple(f for f in scenario.thruster_failure if f.chaser == chaser)
+    return ThrusterActuators(scenario.chaser, scenario.timing, failures)

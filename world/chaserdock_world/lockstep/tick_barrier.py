@@ -71,7 +71,7 @@ class Answers:
         linked = self._membership.linked(self._teller.heard())
         return [name for name in wanted if name not in linked]
 
-    def open(self, tick: int, pictures: bool) -> None:
+    def open(self, tick: int, images: bool) -> None:
         """Opens a tick: tells everyone who is expected to answer it."""
         self._take_leave()
         linked = self._membership.linked(self._teller.heard())
@@ -81,7 +81,7 @@ class Answers:
         }
         # One that was lost and is back: the flight is again held to what it has recorded.
         self._recorder_expected |= self._recorder_wanted and "recorder" in linked
-        self._tick, self._pictures, self._revision = tick, pictures, 0
+        self._tick, self._images, self._revision = tick, images, 0
         self._answered.clear()
         self._review_terms()
         self._oldest_term = self.terms.term.number
@@ -125,7 +125,7 @@ class Answers:
             tick=self._tick,
             sim_time_ns=self._timing.tick_time_ns(self._tick),
             revision=self._revision,
-            pictures=self._pictures,
+            images=self._images,
             chasers=self.chasers,
             controller=bool(term.commander),
             term=term.number,

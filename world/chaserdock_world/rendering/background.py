@@ -76,7 +76,7 @@ class Earth:
 
 
 class Sky:
-    """Draws the background of pictures that start at ``origin_px`` and have ``size_px`` (width, height)."""
+    """Draws the background of images that start at ``origin_px`` and have ``size_px`` (width, height)."""
 
     def __init__(
         self, camera: Camera, origin_px: Array, size_px: tuple[int, int], earth: Earth | None = None
@@ -94,7 +94,7 @@ class Sky:
             self._rays = _rays(camera, origin_px, size_px, _EARTH_STEP_PX)
 
     def background(self, q_w_irf_wxyz: Array, light: Light | None = None) -> NDArray[np.uint8]:
-        """Ideal picture (h, w), uint8, of all that is far away; ``light`` (for the Earth's day side)."""
+        """Ideal image (h, w), uint8, of all that is far away; ``light`` (for the Earth's day side)."""
         width, height = self._size
         canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
         turn = rotations.to_matrix(q_w_irf_wxyz)

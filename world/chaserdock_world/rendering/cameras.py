@@ -1,4 +1,4 @@
-"""The chasers' cameras: exact picture, blur of motion, glare, effects, compression."""
+"""The chasers' cameras: exact image, blur of motion, glare, effects, compression."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ States = dict[str, BodyState]
 
 
 class Cameras:
-    """Takes the pictures of all chasers of a scenario; a picture depends on its arguments alone."""
+    """Takes the images of all chasers of a scenario; an image depends on its arguments alone."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, section = scenario, scenario.camera
@@ -67,21 +67,21 @@ class Cameras:
         # A chaser's own body lies behind its lens; its probe does not.
         self._own, self._others = (probe,), (body, probe)
         # PyBullet's renderer is one for all; what is drawn here has nothing to share.
-        self._beside = ThreadPoolExecutor(1, "pictures") if section.renderer == "exact" else None
+        self._beside = ThreadPoolExecutor(1, "images") if section.renderer == "exact" else None
 
-    def pictures(
+    def images(
         self, chasers: Sequence[int], number: int, tick: int, time_ns: int, states: States
     ) -> list[Image]:
-        """``picture`` of several chasers, of one moment, in their order: drawn on two threads."""
+        """``image`` of several chasers, of one moment, in their order: drawn on two threads."""
         if self._beside is None:
-            return [self.picture(i, number, tick, time_ns, states) for i in chasers]
+            return [self.image(i, number, tick, time_ns, states) for i in chasers]
         exposure = (number, tick, time_ns, states)
-        beside = {i: self._beside.submit(self.picture, i, *exposure) for i in chasers[1::2]}
-        here = {i: self.picture(i, *exposure) for i in chasers[::2]}
+        beside = {i: self._beside.submit(self.image, i, *exposure) for i in chasers[1::2]}
+        here = {i: self.image(i, *exposure) for i in chasers[::2]}
         return [here[i] if i in here else beside[i].result() for i in chasers]
 
-    def picture(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
-        """Picture ``number`` of chaser ``chaser`` of the bodies ``states``, exposed about ``time_ns``."""
+    def image(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
+        """Image ``number`` of chaser ``chaser`` of the bodies ``states``, exposed about ``time_ns``."""
         camera = self._cameras[chaser]
         taken = self.taken(chaser, number, time_ns, states)
         if self._jpeg_quality:
@@ -99,16 +99,16 @@ class Cameras:
         )
 
     def taken(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:
-        """The picture (h, w), uint8, before it is compressed."""
+        """The image (h, w), uint8, before it is compressed."""
         eclipses = self._scenario.camera.eclipses
         dark = any(e.from_s <= time_ns * 1e-9 < e.to_s for e in eclipses)
         light = self._night if dark else self._day
         moments = self._moments(chaser, states)
-        pictures = [self._exact(chaser, s, light) for s in moments]
-        exact = pictures[0]
-        if len(pictures) > 1:
-            total = np.sum(pictures, axis=0, dtype=np.uint16)
-            exact = np.asarray((total + len(pictures) // 2) // len(pictures), dtype=np.uint8)
+        images = [self._exact(chaser, s, light) for s in moments]
+        exact = images[0]
+        if len(images) > 1:
+            total = np.sum(images, axis=0, dtype=np.uint16)
+            exact = np.asarray((total + len(images) // 2) // len(images), dtype=np.uint8)
         glare = self._glares[chaser]
         if glare is not None and not dark:
             position, attitude = self._eye(chaser, states)
@@ -138,7 +138,7 @@ class Cameras:
         ]
 
     def _moments(self, chaser: int, states: States) -> list[States]:
-        """The bodies at moments spread over the exposure, as many as their motion in the picture asks for."""
+        """The bodies at moments spread over the exposure, as many as their motion in the image asks for."""
         if self._exposure_s == 0.0:
             return [states]
         ends = [self._corners(chaser, _moved(states, s * self._exposure_s)) for s in (-0.5, 0.5)]

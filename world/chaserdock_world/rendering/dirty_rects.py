@@ -1,4 +1,4 @@
-"""Which parts of a picture have to be painted: rectangles of pixels that do not overlap."""
+"""Which parts of an image have to be painted: rectangles of pixels that do not overlap."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Rectangle = tuple[int, int, int, int]
 def patches(covered: Sequence[Rectangle]) -> list[tuple[Rectangle, frozenset[int]]]:
     """Rectangles, none overlapping another, that hold the ``covered`` ones, and which of these each holds.
 
-    Bodies far apart in the picture are thus painted each on its own: one rectangle around all of them would be mostly
+    Bodies far apart in the image are thus painted each on its own: one rectangle around all of them would be mostly
     sky, and leave fewer samples to a pixel.
     """
     found: list[tuple[Rectangle, frozenset[int]]] = []

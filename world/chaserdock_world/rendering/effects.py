@@ -1,7 +1,7 @@
-"""What a camera adds to the picture of the world: exposure, point spread, noise.
+"""What a camera adds to the image of the world: exposure, point spread, noise.
 
-(Lens distortion is geometry, and the renderer's.) Deterministic: a picture's noise depends on the seed,
-the chaser and the number of the picture alone.
+(Lens distortion is geometry, and the renderer's.) Deterministic: an image's noise depends on the seed,
+the chaser and the number of the image alone.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from .native import function
 
-# The noise bank is larger than a picture by these (coprime) numbers of pixels: as many different offsets.
+# The noise bank is larger than an image by these (coprime) numbers of pixels: as many different offsets.
 _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
 # Fixed-point steps a unit of white noise: 16 bits hold eight standard deviations.
 _NOISE_STEPS = 4096.0
@@ -51,7 +51,7 @@ NO_EFFECTS = Effects(1.0, 0.0, 0.0, 0.0)
 
 
 class CameraEffects:
-    """Applies ``effects`` to pictures of one size; ``seed`` fixes all noise it will ever give."""
+    """Applies ``effects`` to images of one size; ``seed`` fixes all noise it will ever give."""
 
     def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
         self.effects = effects
@@ -61,8 +61,8 @@ class CameraEffects:
         sigma = np.sqrt(effects.read_noise**2 + effects.shot_noise * level)
         self._bank: NDArray[np.int16] | None = None
         if sigma.any():
-            # One bank of white noise, read at a random place for each picture: drawing fresh noise for
-            # every picture costs several times what the rest of the effects does.
+            # One bank of white noise, read at a random place for each image: drawing fresh noise for
+            # every image costs several times what the rest of the effects does.
             generator = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, 0])))
             size = (height_px + _SPARE_ROWS, width_px + _SPARE_COLUMNS)
             noise = generator.standard_normal(size, dtype=np.float32) * np.float32(_NOISE_STEPS)
@@ -72,13 +72,13 @@ class CameraEffects:
             self._sigma = np.rint(sigma * steps).astype(np.int16)
             self._to_levels = 1.0 / (_NOISE_STEPS * steps)
 
-    def apply(self, image: NDArray[np.uint8], chaser: int, picture: int) -> NDArray[np.uint8]:
-        """Picture ``picture`` of chaser ``chaser`` (both from 0), as the camera gives it (h, w), uint8.
+    def apply(self, image: NDArray[np.uint8], chaser: int, number: int) -> NDArray[np.uint8]:
+        """Image ``number`` of chaser ``chaser`` (both from 0), as the camera gives it (h, w), uint8.
 
         The given image is not changed. Raises ValueError for another size or type than stated before.
         """
         if image.shape != self._shape or image.dtype != np.uint8:
-            raise ValueError(f"expected a uint8 picture of {self._shape}, got {image.dtype} {image.shape}")
+            raise ValueError(f"expected a uint8 image of {self._shape}, got {image.dtype} {image.shape}")
         out = image
         if self.effects.gain != 1.0:
             out = np.asarray(cv2.convertScaleAbs(out, alpha=self.effects.gain), dtype=np.uint8)
@@ -86,7 +86,7 @@ class CameraEffects:
             out = blurred(out, self.effects.point_spread_px)
         if self._bank is not None:
             # The 1 keeps these streams apart from the bank's own.
-            seeds = np.random.SeedSequence([self.seed, 1, chaser, picture]).generate_state(3)
+            seeds = np.random.SeedSequence([self.seed, 1, chaser, number]).generate_state(3)
             row, column = int(seeds[0]) % (_SPARE_ROWS + 1), int(seeds[1]) % (_SPARE_COLUMNS + 1)
             noise = self._bank[row : row + self._shape[0], column : column + self._shape[1]]
             sign = 1.0 if seeds[2] & 1 else -1.0
@@ -104,7 +104,7 @@ class CameraEffects:
 def blur_taps(sigma_px: float) -> NDArray[np.uint16]:
     """Weights (2 r + 1,) of a Gaussian blur, in 256ths, of sum 256; r: three sigma, rounded up.
 
-    As OpenCV has them for 8-bit pictures: rounded from the outside inwards, each error passed on to the next weight.
+    As OpenCV has them for 8-bit images: rounded from the outside inwards, each error passed on to the next weight.
     """
     radius = int(np.ceil(3.0 * sigma_px))
     exact = 256.0 * cv2.getGaussianKernel(2 * radius + 1, sigma_px).ravel()
@@ -117,8 +117,8 @@ def blur_taps(sigma_px: float) -> NDArray[np.uint16]:
 
 
 def blurred(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
-    """The picture (h, w) with a Gaussian blur of ``sigma_px``, beyond its borders as at them: to the bit what
-    cv2.GaussianBlur gives, but quick where a picture is even, as most of space is."""
+    """The image (h, w) with a Gaussian blur of ``sigma_px``, beyond its borders as at them: to the bit what
+    cv2.GaussianBlur gives, but quick where an image is even, as most of space is."""
     taps = blur_taps(sigma_px)
     (rows, columns), width = image.shape, len(taps)
     if width // 2 > _BLOCK_PX:  # the kernel looks no farther; such a blur is rare

@@ -1,4 +1,4 @@
-"""The sun in, or near, the picture: its disc, and the light that a lens scatters from it."""
+"""The sun in, or near, the image: its disc, and the light that a lens scatters from it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Glare:
         self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def add(self, image: NDArray[np.uint8], to_sun_irf: Array) -> NDArray[np.uint8]:
-        """The picture (h, w) with the sun in direction ``to_sun_irf`` (3,), unit: the same one with no sun ahead."""
+        """The image (h, w) with the sun in direction ``to_sun_irf`` (3,), unit: the same one with no sun ahead."""
         if to_sun_irf[2] <= 0.0:
             return image
         # 1 - cos is small and exact enough: the angle squared is twice that, to 1 % up to 20 degrees.

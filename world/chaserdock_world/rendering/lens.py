@@ -1,4 +1,4 @@
-"""The ideal picture behind a lens: how large it must be, and how the lens distorts it."""
+"""The ideal image behind a lens: how large it must be, and how the lens distorts it."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 
 class Lens:
-    """What lies between the ideal picture, which renderers draw, and the picture that ``camera`` takes.
+    """What lies between the ideal image, which renderers draw, and the image that ``camera`` takes.
 
-    ``origin_px`` (2,): ideal pixel of the ideal picture's first one; ``size_px``: its width and height, which
+    ``origin_px`` (2,): ideal pixel of the ideal image's first one; ``size_px``: its width and height, which
     reach beyond the frame where the lens shows more. Raises ValueError when the camera's distortion cannot be
-    inverted everywhere in the picture.
+    inverted everywhere in the image.
     """
 
     def __init__(self, camera: Camera):
@@ -41,7 +41,7 @@ class Lens:
         )
         ideal = np.asarray(found, dtype=float).reshape(grid.shape)
         if not np.all(np.abs(self.camera.distort(ideal) - grid) < 1e-3):
-            raise ValueError("the lens distortion cannot be inverted everywhere in the picture")
+            raise ValueError("the lens distortion cannot be inverted everywhere in the image")
         low = np.floor(ideal.min(axis=(0, 1))) - 1.0
         high = np.ceil(ideal.max(axis=(0, 1))) + 2.0
         if np.any(high - low > 4.0 * np.array(self.size_px)):
@@ -52,7 +52,7 @@ class Lens:
         self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
 
     def distorted(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The picture (h, w) that the camera takes of an ideal picture of ``size_px``; itself without distortion."""
+        """The image (h, w) that the camera takes of an ideal image of ``size_px``; itself without distortion."""
         if self._maps is None:
             return ideal
         return np.asarray(cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)

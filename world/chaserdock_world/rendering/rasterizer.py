@@ -1,4 +1,4 @@
-"""Pictures of textured cuboids, exactly projected: each visible face is warped with OpenCV, supersampled.
+"""Images of textured cuboids, exactly projected: each visible face is warped with OpenCV, supersampled.
 
 Order of painting: boxes do not overlap, so between any two there is a separating plane; the one on the
 camera's side of it can hide the other and is painted later.
@@ -60,8 +60,8 @@ class _Scene:
 class Renderer:
     """Draws what ``camera`` sees of a target and of other bodies.
 
-    Keeps textures and lookup tables, no state: equal arguments give equal pictures. Raises ValueError when
-    the camera's distortion cannot be inverted everywhere in the picture.
+    Keeps textures and lookup tables, no state: equal arguments give equal images. Raises ValueError when
+    the camera's distortion cannot be inverted everywhere in the image.
     """
 
     def __init__(self, camera: Camera, model: TargetModel, earth: Earth | None = None):
@@ -73,7 +73,7 @@ class Renderer:
             for index in range(len(model.boxes))
             for face in range(6)
         }
-        # The canvas is the ideal picture; with lens distortion it reaches beyond the frame.
+        # The canvas is the ideal image; with lens distortion it reaches beyond the frame.
         self._lens = Lens(camera)
         self._origin, self._size = self._lens.origin_px, self._lens.size_px
         self._sky = Sky(camera, self._origin, self._size, earth)
@@ -88,7 +88,7 @@ class Renderer:
         obstacles: Sequence[Obstacle] = (),
         light: Light = DAYLIGHT,
     ) -> NDArray[np.uint8]:
-        """Picture (h, w), uint8, of the target and the ``obstacles``, lens distortion included.
+        """Image (h, w), uint8, of the target and the ``obstacles``, lens distortion included.
 
         ``camera_position_w_m`` (3,), ``camera_q_w_irf_wxyz`` (4,): see `Camera.irf_pose_in_world`.
         ``light``: a face turned from the sun lies in its own (attached) shadow; no shadows are cast.

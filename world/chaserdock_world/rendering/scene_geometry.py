@@ -1,6 +1,6 @@
-"""Which faces of which boxes a camera sees, where in its picture, and in which order they are painted.
+"""Which faces of which boxes a camera sees, where in its image, and in which order they are painted.
 
-The arithmetic is a kernel (native/scene.c): a picture shows a dozen faces, too few for as many calls into NumPy.
+The arithmetic is a kernel (native/scene.c): an image shows a dozen faces, too few for as many calls into NumPy.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class _Frustum(Structure):
 
 
 class Frustum:
-    """What of space a canvas shows: the picture of ``camera`` from pixel ``origin_px`` (2,), ``size_px`` wide and high."""
+    """What of space a canvas shows: the image of ``camera`` from pixel ``origin_px`` (2,), ``size_px`` wide and high."""
 
     def __init__(self, camera: Camera, origin_px: Array, size_px: Sequence[int]):
         # Planes n x + d >= 0 (n_x, n_y, n_z, d) within which a point is in front and on the canvas, with a

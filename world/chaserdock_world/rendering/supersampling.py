@@ -1,4 +1,4 @@
-"""Several samples to a pixel: a part of a picture as its samples, and their means as that part again.
+"""Several samples to a pixel: a part of an image as its samples, and their means as that part again.
 
 The arithmetic is a kernel (native/samples.c), to the bit cv2.resize's with INTER_NEAREST and INTER_AREA and several times as
 fast.
@@ -16,7 +16,7 @@ from .native import function
 
 
 def spread(view: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:
-    """Samples (samples * h, samples * w) of the ``view`` (h, w) of a picture, each of its pixel's level; 2 or 4."""
+    """Samples (samples * h, samples * w) of the ``view`` (h, w) of an image, each of its pixel's level; 2 or 4."""
     (rows, columns), place, stride = view.shape, *_place(view, samples)
     fine = np.empty((samples * rows, samples * columns), dtype=np.uint8)
     function("spread_samples")(
@@ -26,7 +26,7 @@ def spread(view: NDArray[np.uint8], samples: int) -> NDArray[np.uint8]:
 
 
 def take_means(fine: NDArray[np.uint8], samples: int, view: NDArray[np.uint8]) -> None:
-    """Gives every pixel of the ``view`` (h, w) of a picture the mean of its ``samples`` x ``samples`` samples; 2 or 4.
+    """Gives every pixel of the ``view`` (h, w) of an image the mean of its ``samples`` x ``samples`` samples; 2 or 4.
 
     Raises ValueError when there are other than (samples * h, samples * w) samples.
     """

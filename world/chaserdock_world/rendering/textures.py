@@ -37,7 +37,7 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
 
 def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marker, Array, int]]:
     """Markers on one face of a box: each with its centre (2,) in the face's axes (x right, y up; metres)
-    and the number of quarter turns, counter-clockwise, of its picture.
+    and the number of quarter turns, counter-clockwise, of its image.
 
     Raises ValueError for a marker in the face's plane that is turned by other than quarter turns.
     """

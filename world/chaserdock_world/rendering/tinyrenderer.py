@@ -1,8 +1,8 @@
-"""PyBullet's own software renderer, for targets of any shape: the adapter to its pictures.
+"""PyBullet's own software renderer, for targets of any shape: the adapter to its images.
 
 It draws a scene of its own, apart from the physics, with the camera at its origin (x right, y up, looking
 along -z). TinyRenderer samples half a pixel off, which is undone here, and not at all between pixels, so the
-picture is drawn ``supersampled`` times as wide and high and averaged.
+image is drawn ``supersampled`` times as wide and high and averaged.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class TinyRenderer:
             self._target = self._mesh_parts() if model.mesh else self._box_parts()
         width, height = self._lens.size_px
         left, top = (self._lens.origin_px - (camera.cx_px, camera.cy_px)).tolist()
-        # Borders of the picture at the near plane. TinyRenderer takes its samples at the upper left corners of
+        # Borders of the image at the near plane. TinyRenderer takes its samples at the upper left corners of
         # its pixels, counted from the bottom: half a sample to the left and half a sample up.
         left, top = left - 0.5 + 0.5 / supersampled, top - 0.5 - 0.5 / supersampled
         bounds = (
@@ -77,7 +77,7 @@ class TinyRenderer:
         obstacles: Sequence[Obstacle] = (),
         light: Light = DAYLIGHT,
     ) -> NDArray[np.uint8]:
-        """Picture (h, w), uint8; arguments as for `render.Renderer.render`.
+        """Image (h, w), uint8; arguments as for `render.Renderer.render`.
 
         The camera's lamp, if there is one, shines on all alike from the lens: TinyRenderer has one sun only.
         """

@@ -16,7 +16,7 @@ from chaserdock_protocol.scenario import Scenario
 
 from chaserdock_world.physics.simulation import BodyState
 
-# Keep the streams of random numbers apart from each other and from the pictures' noise.
+# Keep the streams of random numbers apart from each other and from the images' noise.
 _CALIBRATION, _BIAS, _NOISE = 101, 102, 103
 
 

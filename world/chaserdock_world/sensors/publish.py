@@ -73,8 +73,8 @@ def publish_truth(
                 "impulse_N_s": vector(took.impulse[:3]),
                 "angular_impulse_N_m_s": vector(took.impulse[3:]),
                 "absolute_impulse_N_s": took.absolute_impulse_N_s,
-                "jet_impulse_N_s": took.jet_impulse_N_s,
-                "jet_open_s": took.jet_open_s,
+                "thruster_impulse_N_s": took.thruster_impulse_N_s,
+                "thruster_open_s": took.thruster_open_s,
                 "propellant_kg": took.propellant_kg,
             }
             late += took.late

@@ -1,4 +1,4 @@
-"""Markers in a picture to the pose of the target (ArUco, fitted sides, PnP with covariance)."""
+"""Markers in an image to the pose of the target (ArUco, fitted sides, PnP with covariance)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The paper's perception, as a baseline: undistort the picture, ArUco, EPnP on all corners.
+"""The paper's perception, as a baseline: undistort the image, ArUco, EPnP on all corners.
 
 Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC 2023, sec. 4.
 Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of the views of a single

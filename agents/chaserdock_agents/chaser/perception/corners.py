@@ -1,7 +1,7 @@
 """Corners of markers from lines fitted to their sides, in undistorted coordinates.
 
 Contours and corner filters put the corners of a black square inwards of where they are; the centroid of the
-grey level's gradient across a side does not. In the distorted picture a side is a curve, so samples are laid
+grey level's gradient across a side does not. In the distorted image a side is a curve, so samples are laid
 out on ideal pixels and looked up where the lens puts them.
 
 Where the white border is only a few pixels wide, blur mixes the side with the border's outer edge and draws
@@ -43,7 +43,7 @@ class _Settings(Structure):
             # and how well that is known, a standard deviation; samples beyond the outer edge.
             "strip_px", "log_edge_sigma", "edge_sigma_spread", "strip_beyond_px",
             # Corners of markers with cells or borders of few pixels are less certain: relative sigma
-            # sqrt(1 + (this / width)^2), from the errors found in rendered pictures.
+            # sqrt(1 + (this / width)^2), from the errors found in rendered images.
             "uncertain_px",
         )),
         *((name, c_double * 2) for name in ("rows", "taps", "reach_px", "reweighted")),
@@ -102,16 +102,16 @@ def refine(
 ) -> Refined:
     """Corners from lines fitted along the sides of the black squares.
 
-    ``image``: the grey picture as taken, distorted. ``corners_ideal_px`` (n, 4, 2), ideal pixels: where they
+    ``image``: the grey image as taken, distorted. ``corners_ideal_px`` (n, 4, 2), ideal pixels: where they
     are to within two pixels or so, clockwise as seen. ``cells``: number of cells along a side, the black
     border included. ``margin_share`` (n,): width of the white border over the side of the marker.
-    Raises ValueError for a picture less than two pixels wide or high.
+    Raises ValueError for an image less than two pixels wide or high.
     """
     corners = np.array(corners_ideal_px, dtype=float, order="C")
     n = len(corners)
     image, margin = np.ascontiguousarray(image), np.array(margin_share, dtype=float, order="C")
     if min(image.shape) < 2:
-        raise ValueError(f"a picture of {image.shape} has no corners")
+        raise ValueError(f"an image of {image.shape} has no corners")
     good, sigma = np.zeros(n, dtype=np.uint8), np.ones(n)
     k = camera
     lens = (c_double * 9)(k.fx_px, k.fy_px, k.cx_px, k.cy_px, *k.distortion)

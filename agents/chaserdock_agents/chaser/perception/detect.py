@@ -19,9 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 _MIN_PERIMETER_PX = 40.0
 # A region of interest is grown by this share of its size and this much, for an uncertain prediction.
 _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
-# Pictures, or regions, with a smaller side than this are not halved.
+# Images, or regions, with a smaller side than this are not halved.
 _HALVED_PX = 300
-# A larger share of the picture than this is no saving.
+# A larger share of the image than this is no saving.
 _REGION_LIMIT = 0.7
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
@@ -30,7 +30,7 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Detections:
-    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the given picture: top left, top right, bottom right, bottom
+    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the given image: top left, top right, bottom right, bottom
     left of the upright marker. An id can occur more than once."""
 
     ids: NDArray[np.int64]
@@ -68,13 +68,13 @@ def detect(
     thorough: bool = False,
     enough: int | None = None,
 ) -> Detections:
-    """Markers of ``dictionary`` in a grey picture, or in its ``region`` (left, top, right, bottom; pixels,
+    """Markers of ``dictionary`` in a grey image, or in its ``region`` (left, top, right, bottom; pixels,
     right and bottom excluded). Corners are where OpenCV's contours have them: good to about a pixel.
 
     The threshold window of 7 px finds nearly all that 7 and 23 px together find, in half the time; the second
     is used where the first leaves fewer than two markers. ``thorough`` looks with 3, 13 and 23 px, and keeps
-    apart what lies close together: slower, for pictures that show a narrow white border. Where ``enough`` is
-    given, a large picture is looked at in half its size first, in a third of the time, and that has to do when it
+    apart what lies close together: slower, for images that show a narrow white border. Where ``enough`` is
+    given, a large image is looked at in half its size first, in a third of the time, and that has to do when it
     shows so many markers.
     """
     left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
@@ -96,15 +96,15 @@ def detect(
 
 @lru_cache(maxsize=4096)
 def _detector(dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: int) -> cv2.aruco.ArucoDetector:
-    """OpenCV's detector for pictures whose longer side has so many pixels; kept, as a flight meets few sizes."""
+    """OpenCV's detector for images whose longer side has so many pixels; kept, as a flight meets few sizes."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = windows.least_px
     parameters.adaptiveThreshWinSizeMax = windows.most_px
     parameters.adaptiveThreshWinSizeStep = windows.step_px
     parameters.minMarkerDistanceRate = windows.distance_rate
-    # A rate of the size of the picture passed in, so it differs between a region and the whole.
+    # A rate of the size of the image passed in, so it differs between a region and the whole.
     parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_px
-    # The rate counts from the longer side too; a marker that fills the picture must pass.
+    # The rate counts from the longer side too; a marker that fills the image must pass.
     parameters.maxMarkerPerimeterRate = 8.0
     parameters.maxErroneousBitsInBorderRate = 0.15
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
@@ -122,7 +122,7 @@ def _detect(part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: 
 def region_of(
     camera: Camera, model: TargetModel, position_irf_m: ArrayLike, q_irf_trf_wxyz: ArrayLike
 ) -> Region | None:
-    """Where in the picture a target with this predicted pose is; None for "look at all of it"."""
+    """Where in the image a target with this predicted pose is; None for "look at all of it"."""
     turn = rotations.to_matrix(q_irf_trf_wxyz)
     points = _box(model.size_m) @ turn.T + np.asarray(position_irf_m)
     # Infinity or NaN anywhere makes the sum of all one of them.
@@ -147,7 +147,7 @@ def _box(size_m: tuple[float, float, float]) -> Array:
 
 
 def _grown(px: list[float], end: int) -> tuple[int, int] | None:
-    """Where along one axis of the picture, ``end`` pixels long, these coordinates and a margin are; None for nowhere."""
+    """Where along one axis of the image, ``end`` pixels long, these coordinates and a margin are; None for nowhere."""
     low, high = min(px), max(px)
     grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX
     if not math.isfinite(grow):

@@ -1,4 +1,4 @@
-"""From a picture to the pose of the target: the entry to this package."""
+"""From an image to the pose of the target: the entry to this package."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ Method = Literal["default", "paper"]
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one picture tells of the target.
+    """What one image tells of the target.
 
     ``solutions``: best first, empty when nothing (or nothing trustworthy) is seen, two when a plane's tilt is
-    ambiguous. ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), in the picture as taken, distorted: of the
+    ambiguous. ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), in the image as taken, distorted: of the
     markers used. ``rejected_ids``: detected but not used, in ascending order: not on this target, twice in
-    the picture, contradicted by the others, or with a side that cannot be made out.
+    the image, contradicted by the others, or with a side that cannot be made out.
     """
 
     solutions: tuple[PoseSolution, ...]
@@ -38,7 +38,7 @@ class Sighting:
 
 
 class Perception:
-    """Finds a target of one model in the pictures of one camera.
+    """Finds a target of one model in the images of one camera.
 
     Holds constants only: `estimate` depends on its arguments alone. ``method``: "default", or "paper" for
     the paper's baseline. Raises ValueError for another method, or for an unknown marker dictionary.
@@ -52,23 +52,23 @@ class Perception:
         self.method: Method = method
         self._dictionary = detect.dictionary_of(model.dictionary)
         self._table = pnp.MarkerTable.of(model)
-        # Targets with many markers a face can spare the small ones that half a picture does not show.
+        # Targets with many markers a face can spare the small ones that half an image does not show.
         self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
         self._rows = {int(i): row for row, i in enumerate(self._table.ids)}
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> Sighting:
-        """The target's pose in a grey picture (h, w), uint8.
+        """The target's pose in a grey image (h, w), uint8.
 
         ``predicted``: position in IRF (3,), metres, and rotation TRF -> IRF (4,), where there is an idea
         of them. It says where to look first and has no part in the result. Raises ValueError for a
-        picture of another shape or type than the camera's.
+        image of another shape or type than the camera's.
         """
         shape = (self.camera.height_px, self.camera.width_px)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise ValueError(f"expected a uint8 picture of {shape}, got {got}")
+            raise ValueError(f"expected a uint8 image of {shape}, got {got}")
         image = np.ascontiguousarray(image)
         if self.method == "paper":
             return self._estimate_paper(image)

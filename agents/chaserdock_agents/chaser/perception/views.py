@@ -51,7 +51,7 @@ def plain_markers(
     the angle at which that one is seen: 1 from straight ahead, negative from behind.
 
     ``surface_trf`` (6 m, 3): of m markers the 4 m corners, m centres and m normals. As plain: with all corners at least
-    ``frame_margin_px`` inside the picture, about as large, and at about the same angle.
+    ``frame_margin_px`` inside the image, about as large, and at about the same angle.
     """
     markers = len(surface_trf) // 6
     surface, position = surface_trf @ pose.rotation.T, np.array(pose.position, dtype=float)

@@ -1,1 +1,1 @@
-"""A chaser's jets: which of them give a wrench, when they open, and which of them have failed."""
+"""A chaser's thrusters: which of them give a wrench, when they open, and which of them have failed."""

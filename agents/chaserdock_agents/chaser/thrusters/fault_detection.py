@@ -1,9 +1,9 @@
-"""Which jet has failed: its own part in the mismatch of commanded and observed impulse (docs/thrusters.md).
+"""Which thruster has failed: its own part in the mismatch of commanded and observed impulse (docs/thrusters.md).
 
-Every jet is held against two hypotheses, each with its signature: stuck on (full thrust at all times: the residual is
+Every thruster is held against two hypotheses, each with its signature: stuck on (full thrust at all times: the residual is
 what it was not asked for) and weak or stuck off (the residual is the negative of a part of what it was asked for). A
 hypothesis is accepted when the residuals are much likelier under it than under health (likelihood ratio), explain
-themselves with it (chi-square), and no other jet explains them nearly as well. No I/O; one failure is looked for at a time.
+themselves with it (chi-square), and no other thruster explains them nearly as well. No I/O; one failure is looked for at a time.
 """
 
 from __future__ import annotations
@@ -20,37 +20,37 @@ from numpy.typing import NDArray
 Flags = NDArray[np.bool_]
 
 _LIKELIER = 20.0
-"""Least log-likelihood gained over health: one in 5e8, for some thousand looks a minute and jet."""
+"""Least log-likelihood gained over health: one in 5e8, for some thousand looks a minute and thruster."""
 _CLEARER = 8.0
-"""Least log-likelihood gained over the second-best jet."""
+"""Least log-likelihood gained over the second-best thruster."""
 _ON_WINDOWS = (2, 3, 4, 6, 8)
-"""Ticks in a row that a jet may have been stuck on; one alone might be a bump."""
+"""Ticks in a row that a thruster may have been stuck on; one alone might be a bump."""
 _OFF_WINDOWS = (2, 3, 4, 6, 9, 15, 30)
-"""Ticks in which a jet was asked for something, the newest of them, that are looked at together."""
+"""Ticks in which a thruster was asked for something, the newest of them, that are looked at together."""
 _GONE = 0.85
 _NOTICEABLE = 0.3
-"""Parts of its thrust that a jet has lost when it counts as stuck off, and as weak."""
+"""Parts of its thrust that a thruster has lost when it counts as stuck off, and as weak."""
 _OWN_SCATTER = 0.1
-"""How well the failed jet's own thrust is known."""
+"""How well the failed thruster's own thrust is known."""
 _LOSS_SIGMA = 0.07
 """How well the lost part must be known."""
 ENOUGH = 1.0 / _LOSS_SIGMA**2
-"""Information about a jet (``JetWatch.information``) from which on its lost part is known that well."""
+"""Information about a thruster (``ThrusterFaultDetector.information``) from which on its lost part is known that well."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """A jet has failed; ``factor`` is what is left of its thrust (1 for stuck on)."""
+    """A thruster has failed; ``factor`` is what is left of its thrust (1 for stuck on)."""
 
-    jet: int
+    thruster: int
     kind: FailureKind
     factor: float
 
 
-class JetWatch:
-    """The evidence of the last ticks against the jets of one chaser; ``matrix`` (6, n) as of ``wrench_matrix``.
+class ThrusterFaultDetector:
+    """The evidence of the last ticks against the thrusters of one chaser; ``matrix`` (6, n) as of ``wrench_matrix``.
 
-    ``information`` (n,): how much the last look told of what every jet has lost of its thrust, one over variance.
+    ``information`` (n,): how much the last look told of what every thruster has lost of its thrust, one over variance.
     """
 
     def __init__(self, matrix: Array, full_N: Array, least_N_s: Array) -> None:
@@ -68,20 +68,20 @@ class JetWatch:
     def look(
         self, residual: Array, noise: Array, asked_N_s: Array, time_s: float, suspects: Flags
     ) -> Verdict | None:
-        """One tick's evidence: observed less expected impulse (6,) with its covariance (6, 6), what every jet was to
-        give (n,) in ``time_s``; ``suspects`` (n,) are the jets that may have failed. A verdict, if there is one."""
+        """One tick's evidence: observed less expected impulse (6,) with its covariance (6, 6), what every thruster was to
+        give (n,) in ``time_s``; ``suspects`` (n,) are the thrusters that may have failed. A verdict, if there is one."""
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
         seen = whiten @ residual
         columns = whiten @ self._matrix
         extra = self._full_N * time_s - asked_N_s
-        # Per jet: signature times residual, signature squared; and the residual squared.
+        # Per thruster: signature times residual, signature squared; and the residual squared.
         along, squared = columns.T @ seen, (columns**2).sum(axis=0)
         energy = float(seen @ seen)
         self._on.append((extra * along, extra**2 * squared, energy))
         fired = suspects & (asked_N_s > 0.5 * self._least_N_s)
         self.information = np.where(fired, asked_N_s**2 * squared, 0.0)
-        for jet in np.flatnonzero(fired):
-            self._off[jet].append((-asked_N_s * along, asked_N_s**2 * squared, energy))
+        for thruster in np.flatnonzero(fired):
+            self._off[thruster].append((-asked_N_s * along, asked_N_s**2 * squared, energy))
         return self._stuck_on(suspects) or self._lost(np.flatnonzero(fired).tolist(), suspects)
 
     def _stuck_on(self, suspects: Flags) -> Verdict | None:
@@ -98,8 +98,8 @@ class JetWatch:
         return None
 
     def _lost(self, fired: list[int], suspects: Flags) -> Verdict | None:
-        for jet in fired:
-            evidence = self._off[jet]
+        for thruster in fired:
+            evidence = self._off[thruster]
             for length in _OFF_WINDOWS:
                 if len(evidence) < length:
                     break
@@ -109,15 +109,17 @@ class JetWatch:
                     squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
                 )
                 gain = np.where(suspects, loss * along - loss**2 * squared / 2.0, -math.inf)
-                known = squared[jet] >= ENOUGH
-                if not known or loss[jet] < _NOTICEABLE or int(np.argmax(gain)) != jet:
+                known = squared[thruster] >= ENOUGH
+                if not known or loss[thruster] < _NOTICEABLE or int(np.argmax(gain)) != thruster:
                     continue
-                if _stands_out(gain, jet) and _explained(
-                    energy, float(2.0 * gain[jet]), float(squared[jet]), length
+                if _stands_out(gain, thruster) and _explained(
+                    energy, float(2.0 * gain[thruster]), float(squared[thruster]), length
                 ):
-                    gone = loss[jet] > _GONE
+                    gone = loss[thruster] > _GONE
                     return Verdict(
-                        jet, "stuck_off" if gone else "weak", 0.0 if gone else float(1.0 - loss[jet])
+                        thruster,
+                        "stuck_off" if gone else "weak",
+                        0.0 if gone else float(1.0 - loss[thruster]),
                     )
         return None
 

@@ -1,4 +1,4 @@
-"""What a chaser's motion says that its jets have given, beside what they should have. Pure functions."""
+"""What a chaser's motion says that its thrusters have given, beside what they should have. Pure functions."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from chaserdock_protocol.scenario.odometry import OdometrySection
 
 @dataclass(frozen=True)
 class Noise:
-    """One sigma of what makes a healthy chaser's motion differ from what is expected of its jets.
+    """One sigma of what makes a healthy chaser's motion differ from what is expected of its thrusters.
 
-    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of its odometry, each axis. ``scatter``: of a jet's impulse, in
+    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of its odometry, each axis. ``scatter``: of a thruster's impulse, in
     parts of it.
     ``floor_*``: of the prediction itself (attitude within a tick, rounding), each axis; N s and N m s.
     """
@@ -57,19 +57,19 @@ def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
 
 
 def covariance(
-    noise: Noise, body: Body, matrix: Array, jets_N_s: Array, before: Odometry, after: Odometry
+    noise: Noise, body: Body, matrix: Array, thrusters_N_s: Array, before: Odometry, after: Odometry
 ) -> Array:
-    """(6, 6): of observed less expected impulse, when jets (n,) were to give ``jets_N_s`` (``matrix``: (6, n)).
+    """(6, 6): of observed less expected impulse, when thrusters (n,) were to give ``thrusters_N_s`` (``matrix``: (6, n)).
 
     The faster it turns, the less the attitude half way says: a quarter of the turn is counted as one sigma.
     """
     turned = float(np.linalg.norm(after.omega_rad_s)) * (after.sim_time_ns - before.sim_time_ns) * 1e-9
     relative = noise.scatter**2 + (turned / 4.0) ** 2 + noise.attitude_rad**2
-    return np.diag(at_rest(noise, body)) + (matrix * (relative * jets_N_s**2)) @ matrix.T
+    return np.diag(at_rest(noise, body)) + (matrix * (relative * thrusters_N_s**2)) @ matrix.T
 
 
 def at_rest(noise: Noise, body: Body) -> Array:
-    """Variances (6,) of the observed impulse of a body whose jets are quiet."""
+    """Variances (6,) of the observed impulse of a body whose thrusters are quiet."""
     return np.concatenate(
         [
             np.full(3, noise.floor_N_s**2 + 2.0 * (body.mass_kg * noise.velocity_m_s) ** 2),

@@ -1,4 +1,4 @@
-/* Gaussian blur in fixed point, to the bit OpenCV's of 8-bit pictures, several times faster where a picture is even. */
+/* Gaussian blur in fixed point, to the bit OpenCV's of 8-bit images, several times faster where an image is even. */
 #include "pixels.h"
 
 /* Pixels -radius..columns + radius of a block from ``first`` on, beyond the row its last ones again. */
@@ -33,7 +33,7 @@ static void levels_of_row(const uint8_t *pixels, int64_t columns, int64_t blocks
         about[b] = (row[b] ^ row[b + 1]) | (row[b + 2] ^ row[b + 1]) ? -1 : row[b + 1];
 }
 
-/* out = image blurred across and down by ``taps`` (2 radius + 1), symmetric, of sum 256; beyond its border the picture goes on
+/* out = image blurred across and down by ``taps`` (2 radius + 1), symmetric, of sum 256; beyond its border the image goes on
  * as it ends. ``image`` and ``out`` (rows, columns). Radius at most BLOCK. Working
  * memory, by blocks: ``sums`` (2 radius + 1, blocks, BLOCK), ``levels`` (2 radius + 5, blocks + 2), ``made`` (2 radius + 1,
  * blocks).

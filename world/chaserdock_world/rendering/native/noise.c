@@ -1,4 +1,4 @@
-/* Noise on a picture. */
+/* Noise on an image. */
 #include "pixels.h"
 
 /* Added, 1.5 * 2^23 rounds a float of less than 2^22 to the nearest whole number, halves to even, which its bits then show. */

@@ -1,4 +1,4 @@
-/* Grey levels in blocks of 32, which may begin anywhere. Most blocks of a picture are empty space, all of one level. */
+/* Grey levels in blocks of 32, which may begin anywhere. Most blocks of an image are empty space, all of one level. */
 #ifndef CHASERDOCK_PIXELS_H
 #define CHASERDOCK_PIXELS_H
 

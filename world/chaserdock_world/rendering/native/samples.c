@@ -1,4 +1,4 @@
-/* Several samples to a pixel: from a picture to its samples and back, to the bit as OpenCV resizes. */
+/* Several samples to a pixel: from an image to its samples and back, to the bit as OpenCV resizes. */
 #include "pixels.h"
 
 typedef uint32_t four __attribute__((aligned(1), may_alias));

@@ -9,7 +9,7 @@ typedef struct {
     int64_t height, width, distorted;
     /* fx, fy, cx, cy, k1, k2, p1, p2, k3 */
     const double *lens;
-} Picture;
+} Image;
 
 /* Settings, in the order in which Python hands them over. The ends of a side are left out: there the neighbouring side's
  * gradient leaks in. */
@@ -43,8 +43,8 @@ static void sides_of(const double *corners, Side *sides) {
     }
 }
 
-/* Grey level between pixels; beyond the picture that of its border. */
-static double level_at(const Picture *p, double x, double y) {
+/* Grey level between pixels; beyond the image that of its border. */
+static double level_at(const Image *p, double x, double y) {
     x = x > 0.0 ? least(x, (double)(p->width - 1)) : 0.0;
     y = y > 0.0 ? least(y, (double)(p->height - 1)) : 0.0;
     int64_t column = (int64_t)x, row = (int64_t)y;
@@ -59,8 +59,8 @@ static double level_at(const Picture *p, double x, double y) {
     return upper + (lower - upper) * y;
 }
 
-/* Ideal pixel to pixel of the picture as taken (Brown-Conrady). */
-static void distort(const Picture *p, double *x, double *y) {
+/* Ideal pixel to pixel of the image as taken (Brown-Conrady). */
+static void distort(const Image *p, double *x, double *y) {
     const double *l = p->lens;
     double a = (*x - l[2]) / l[0], b = (*y - l[3]) / l[1], r2 = a * a + b * b;
     double radial = 1.0 + r2 * (l[4] + r2 * (l[5] + r2 * l[8]));
@@ -69,8 +69,8 @@ static void distort(const Picture *p, double *x, double *y) {
 }
 
 /* Grey levels of a row across a side, ``along`` it (-0.5 to 0.5), at ``across`` (taps) pixels out of it; whether its ends lie
- * inside the picture: it is straight enough for them to tell. */
-static int row_of(const Picture *p, const Side *s, double along, const double *across, int taps, double *levels) {
+ * inside the image: it is straight enough for them to tell. */
+static int row_of(const Image *p, const Side *s, double along, const double *across, int taps, double *levels) {
     double base[2];
     int inside = 1;
     for (int k = 0; k < 2; k++) base[k] = (s->start[k] + 0.5 * s->vector[k]) + along * s->vector[k];
@@ -116,7 +116,7 @@ static double median_of(const double *values, const double *weight, int rows) {
 
 /* One side's line, from the centroids of the grey level's gradient across it: how far out its ends are to be moved.
  * Returns whether enough rows count. */
-static int centroid_line(const Picture *p, const Settings *set, int pass, const Side *s, double cells, double *at_start,
+static int centroid_line(const Image *p, const Settings *set, int pass, const Side *s, double cells, double *at_start,
                          double *at_end) {
     int rows = (int)set->rows[pass], taps = (int)set->taps[pass], count = 0;
     double reach = reach_of(set, s, cells, set->reach_px[pass]);
@@ -193,7 +193,7 @@ static double limited(double value, double limit) { return least(most(value, -li
 
 /* How far out a side has to be moved, from the mean profile of a blurred strip ``border`` pixels wide:
  * b + a Phi((s - e) / sigma) - d Phi((s - e - m) / sigma), with b, a, d, e by least squares and sigma with a prior. */
-static double strip_shift(const Picture *p, const Settings *set, const Side *side, double cells, double border) {
+static double strip_shift(const Image *p, const Settings *set, const Side *side, double cells, double border) {
     int rows = (int)set->strip_rows, taps = (int)set->strip_taps, count = 0;
     double inner = reach_of(set, side, cells, set->reach_px[1]);
     double outer = least(border + set->strip_beyond_px, set->reach_px[1]);
@@ -260,7 +260,7 @@ static double strip_shift(const Picture *p, const Settings *set, const Side *sid
 EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width, const double *lens, int64_t distorted,
                                 const Settings *set, double cells, int64_t n, const double *margin, double *corners,
                                 uint8_t *good, double *sigma) {
-    Picture p = {image, height, width, distorted, lens};
+    Image p = {image, height, width, distorted, lens};
     for (int64_t m = 0; m < n; m++) {
         double *given = corners + 8 * m, refined[8], at_start[4], at_end[4];
         Side sides[4];

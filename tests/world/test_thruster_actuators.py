@@ -1,4 +1,4 @@
-"""Jets in the world: the body gets what they give at their places, however they fail and whatever comes late."""
+"""Thrusters in the world: the body gets what they give at their places, however they fail and whatever comes late."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import ActuatorCommand, JetPulse
+from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators.ideal import IdealActuators, fly_to
-from chaserdock_world.actuators.thrusters import JetActuators, actuators_of
+from chaserdock_world.actuators.thrusters import ThrusterActuators, actuators_of
 from chaserdock_world.physics.simulation import Physics
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -30,14 +30,14 @@ def command(
         source="command",
         force_N=(0.0, 0.0, 0.0),
         torque_N_m=(0.0, 0.0, 0.0),
-        pulses=tuple(JetPulse(jet=j, open_ns=a * MS, close_ns=b * MS) for j, a, b in pulses),
+        pulses=tuple(ThrusterPulse(thruster=j, open_ns=a * MS, close_ns=b * MS) for j, a, b in pulses),
         isolated=isolated,
     )
 
 
-def jets_of(s: Scenario) -> JetActuators:
+def thrusters_of(s: Scenario) -> ThrusterActuators:
     actuators = actuators_of(s, 0)
-    assert isinstance(actuators, JetActuators)
+    assert isinstance(actuators, ThrusterActuators)
     return actuators
 
 
@@ -57,80 +57,80 @@ def test_ideal_actuation_stays_what_it_was() -> None:
     st.lists(st.integers(1, 119), max_size=4, unique=True),
 )
 @quick
-def test_the_body_gets_the_jets_forces_at_their_places(
+def test_the_body_gets_the_thrusters_forces_at_their_places(
     pulses: list[tuple[int, int, int]], stops: list[int]
 ) -> None:
     s = mission()
-    physics, jets = Physics(s), jets_of(s)
-    jets.command(command(*[(j, a, a + w) for j, a, w in pulses]), 0, 0)
+    physics, thrusters = Physics(s), thrusters_of(s)
+    thrusters.command(command(*[(j, a, a + w) for j, a, w in pulses]), 0, 0)
     for end in (*sorted(stops), 140):
-        fly_to(end, physics, {"chaser/0": jets}, STEP_S)
-    took = jets.take(140)
-    wrench = wrench_matrix(s.chaser.thrusters) @ np.array(took.jet_impulse_N_s)
+        fly_to(end, physics, {"chaser/0": thrusters}, STEP_S)
+    took = thrusters.take(140)
+    wrench = wrench_matrix(s.chaser.thrusters) @ np.array(took.thruster_impulse_N_s)
     linear, angular = momentum(physics, s)
     physics.close()
     # Impulse and momentum agree while the body has hardly turned.
     np.testing.assert_allclose(took.impulse, wrench, atol=2e-6)
     np.testing.assert_allclose(linear, wrench[:3], atol=0.02 * float(np.linalg.norm(wrench[:3])) + 2e-3)
     np.testing.assert_allclose(angular, wrench[3:], atol=0.02 * float(np.linalg.norm(wrench[3:])) + 2e-4)
-    assert took.propellant_kg == pytest.approx(sum(took.jet_impulse_N_s) / (70.0 * 9.80665))
-    assert np.all(np.array(took.jet_open_s) * 1.5 >= np.array(took.jet_impulse_N_s) - 1e-9)
+    assert took.propellant_kg == pytest.approx(sum(took.thruster_impulse_N_s) / (70.0 * 9.80665))
+    assert np.all(np.array(took.thruster_open_s) * 1.5 >= np.array(took.thruster_impulse_N_s) - 1e-9)
 
 
 def test_flying_in_slices_changes_nothing() -> None:
     states = []
     for slices in ([200], [7, 50, 51, 100, 200]):
         s = mission()
-        physics, jets = Physics(s), jets_of(s)
-        jets.command(command((0, 3, 40), (5, 20, 77), (7, 100, 180)), 0, 0)
+        physics, thrusters = Physics(s), thrusters_of(s)
+        thrusters.command(command((0, 3, 40), (5, 20, 77), (7, 100, 180)), 0, 0)
         for end in slices:
-            fly_to(end, physics, {"chaser/0": jets}, STEP_S)
+            fly_to(end, physics, {"chaser/0": thrusters}, STEP_S)
         state = physics.state("chaser/0")
         states.append(np.concatenate([state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s]))
         physics.close()
     np.testing.assert_array_equal(states[0], states[1])
 
 
-def test_a_stuck_jet_thrusts_until_it_is_isolated() -> None:
-    s = mission(jet_failure=[{"chaser": 0, "jet": 2, "at_s": 0.05, "kind": "stuck_on"}])
-    physics, jets = Physics(s), jets_of(s)
-    fly_to(96, physics, {"chaser/0": jets}, STEP_S)
-    assert jets.take(96).jet_impulse_N_s[2] == pytest.approx(1.5 * 0.049, rel=1e-3)
-    jets.command(command(isolated=(2,), effective_ns=150 * MS), 144, 96)
-    fly_to(960, physics, {"chaser/0": jets}, STEP_S)
-    assert jets.take(960).jet_impulse_N_s[2] == pytest.approx(1.5 * 0.051, rel=1e-3)
-    fly_to(1920, physics, {"chaser/0": jets}, STEP_S)
-    assert jets.take(1920).jet_impulse_N_s[2] == 0.0
+def test_a_stuck_thruster_thrusts_until_it_is_isolated() -> None:
+    s = mission(thruster_failure=[{"chaser": 0, "thruster": 2, "at_s": 0.05, "kind": "stuck_on"}])
+    physics, thrusters = Physics(s), thrusters_of(s)
+    fly_to(96, physics, {"chaser/0": thrusters}, STEP_S)
+    assert thrusters.take(96).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.049, rel=1e-3)
+    thrusters.command(command(isolated=(2,), effective_ns=150 * MS), 144, 96)
+    fly_to(960, physics, {"chaser/0": thrusters}, STEP_S)
+    assert thrusters.take(960).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.051, rel=1e-3)
+    fly_to(1920, physics, {"chaser/0": thrusters}, STEP_S)
+    assert thrusters.take(1920).thruster_impulse_N_s[2] == 0.0
     physics.close()
 
 
 def test_what_has_passed_of_a_late_command_is_not_made_up_for() -> None:
     s = mission()
-    physics, jets = Physics(s), jets_of(s)
-    fly_to(48, physics, {"chaser/0": jets}, STEP_S)  # 50 ms
-    jets.command(command((0, 0, 40), (1, 10, 100), (2, 45, 55)), 10, 48)
-    fly_to(192, physics, {"chaser/0": jets}, STEP_S)
-    took = jets.take(192)
+    physics, thrusters = Physics(s), thrusters_of(s)
+    fly_to(48, physics, {"chaser/0": thrusters}, STEP_S)  # 50 ms
+    thrusters.command(command((0, 0, 40), (1, 10, 100), (2, 45, 55)), 10, 48)
+    fly_to(192, physics, {"chaser/0": thrusters}, STEP_S)
+    took = thrusters.take(192)
     assert took.late == 1
     assert not took.saturated
-    np.testing.assert_allclose(took.jet_open_s[:3], [0.0, 0.05, 0.0], atol=1e-6)
+    np.testing.assert_allclose(took.thruster_open_s[:3], [0.0, 0.05, 0.0], atol=1e-6)
     physics.close()
 
 
 def test_pulses_that_cannot_be_are_told() -> None:
     for pulse in ((12, 0, 50), (0, 0, 5), (0, 50, 20)):
-        jets = jets_of(mission())
-        jets.command(command(pulse), 0, 0)
-        assert jets.take(96).saturated is (pulse[2] > pulse[1])
-        assert sum(jets.take(192).jet_impulse_N_s) == 0.0
+        thrusters = thrusters_of(mission())
+        thrusters.command(command(pulse), 0, 0)
+        assert thrusters.take(96).saturated is (pulse[2] > pulse[1])
+        assert sum(thrusters.take(192).thruster_impulse_N_s) == 0.0
 
 
 def test_a_chaser_that_is_gone_closes_its_valves() -> None:
     s = mission()
-    physics, jets = Physics(s), jets_of(s)
-    jets.command(command((0, 0, 1000)), 0, 0)
-    fly_to(48, physics, {"chaser/0": jets}, STEP_S)
-    jets.stop(48)
-    fly_to(960, physics, {"chaser/0": jets}, STEP_S)
-    assert jets.take(960).jet_open_s[0] == pytest.approx(0.05)
+    physics, thrusters = Physics(s), thrusters_of(s)
+    thrusters.command(command((0, 0, 1000)), 0, 0)
+    fly_to(48, physics, {"chaser/0": thrusters}, STEP_S)
+    thrusters.stop(48)
+    fly_to(960, physics, {"chaser/0": thrusters}, STEP_S)
+    assert thrusters.take(960).thruster_open_s[0] == pytest.approx(0.05)
     physics.close()

@@ -1,4 +1,4 @@
-"""Test burns: they leave the motion of a healthy chaser as it is, reach every jet in turn, and find the idle one that
+"""Test burns: they leave the motion of a healthy chaser as it is, reach every thruster in turn, and find the idle one that
 has failed."""
 
 from __future__ import annotations
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.allocation import allocator_of
-from chaserdock_agents.chaser.thrusters.controller import JetPilot
-from chaserdock_agents.chaser.thrusters.self_test import JetProof
+from chaserdock_agents.chaser.thrusters.controller import ThrusterController
+from chaserdock_agents.chaser.thrusters.self_test import ThrusterSelfTest
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from closed_loop import fly
@@ -20,14 +20,14 @@ PERIOD_S, S = 0.1, 1_000_000_000
 
 
 class Bench:
-    """The proofs of a body's jets; what a burn fires counts as ``information`` each."""
+    """The proofs of a body's thrusters; what a burn fires counts as ``information`` each."""
 
     def __init__(self, body: str = "tetra12", every_s: float = 10.0) -> None:
         chaser = mission(body).chaser
         self.full = thrusts_max(chaser.thrusters)
         self.allocator = allocator_of(chaser)
         self.least = self.full * [t.min_on_s for t in chaser.thrusters]
-        self.proof = JetProof(self.allocator, self.least, every_s, enough=200.0)
+        self.proof = ThrusterSelfTest(self.allocator, self.least, every_s, enough=200.0)
         self.able = np.ones(len(self.full), dtype=np.bool_)
 
     def burn(self, now_ns: int, can: Array | None = None, asked: Array | None = None) -> Array | None:
@@ -37,7 +37,7 @@ class Bench:
 
 @pytest.mark.parametrize("body", ["tetra12", "slider"])
 @pytest.mark.parametrize("lost", [None, 3])
-def test_burns_cancel_and_reach_every_jet_and_then_there_is_peace(body: str, lost: int | None) -> None:
+def test_burns_cancel_and_reach_every_thruster_and_then_there_is_peace(body: str, lost: int | None) -> None:
     bench, tested = Bench(body), np.zeros(0)
     can = bench.full.copy()
     if lost is not None:
@@ -90,20 +90,20 @@ def test_burns_are_apart_and_only_where_there_is_room() -> None:
 
 
 def fired(odometry: dict[str, float] | None = None, chaser: Any = None, **command_as: Any) -> set[int]:
-    """Jets that open within three seconds in which a pilot is asked for nothing."""
+    """Thrusters that open within three seconds in which a pilot is asked for nothing."""
     s = mission(chaser=chaser or {}, odometry=odometry or {})
-    pilot, out = JetPilot(s, 0), set()
+    pilot, out = ThrusterController(s, 0), set()
     for tick in range(45):
         pilot.observe(at_rest(s, tick))
         command = wrench(s, tick, **command_as)
         pilot.heed(command)
-        out |= {p.jet for p in pilot.fly(passed_on(command)).pulses}
+        out |= {p.thruster for p in pilot.fly(passed_on(command)).pulses}
     return out
 
 
 def test_a_pilot_tests_when_it_may_and_can() -> None:
     assert len(fired()) >= 3
-    assert fired(chaser={"jet_test_s": 0}) == set()
+    assert fired(chaser={"thruster_test_s": 0}) == set()
     assert fired(chaser={"modulation": {"modulator": "schmitt"}}) == set()
     assert len(fired({"velocity_noise_m_s": 0.001, "omega_noise_deg_s": 0.05})) >= 3
     # Where a least pulse drowns in the noise of the odometry, tests would go on for ever.
@@ -118,10 +118,10 @@ def test_who_is_about_to_touch_or_is_held_tests_nothing() -> None:
 
 
 @pytest.mark.parametrize(("test_s", "finds"), [(10.0, True), (0.0, False)])
-def test_an_idle_jet_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
-    """Jet 11 of tetra12 is not used at the paper's rates: without tests nobody learns that it is gone."""
-    failure = {"chaser": 0, "jet": 11, "at_s": 8.0, "kind": "stuck_off"}
-    record = fly(mission(duration_s=26.0, chaser={"jet_test_s": test_s}, jet_failure=[failure]))[0]
+def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
+    """Thruster 11 of tetra12 is not used at the paper's rates: without tests nobody learns that it is gone."""
+    failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
+    record = fly(mission(duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]))[0]
     told = [what for _, what in record.events if "limits" not in what]
-    assert told == (["jet 11 stuck off: found, isolated"] if finds else [])
+    assert told == (["thruster 11 stuck off: found, isolated"] if finds else [])
     assert max(np.array(record.position_m)[np.array(record.time_s) > 8.0]) < 0.05

@@ -1,6 +1,6 @@
-"""The pictures of docs/cameras.md: ``python benchmarks/pictures.py [FOLDER]`` (docs/pictures by default).
+"""The images of docs/cameras.md: ``python benchmarks/images.py [FOLDER]`` (docs/images by default).
 
-One picture for each effect and target: what chaser 0 of ``harsh-light`` sees at its start, with one thing changed.
+One image for each effect and target: what chaser 0 of ``harsh-light`` sees at its start, with one thing changed.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ PLAIN = (
 )
 ECLIPSE = "camera.eclipses=[{from_s=0.0, to_s=9.0}]"
 SUN = "camera.sun_direction=[1.0, -0.12, 0.22]"
-PICTURES: dict[str, tuple[str, ...]] = {
+IMAGES: dict[str, tuple[str, ...]] = {
     "camera-plain": (),
     "camera-paper": ("target.model='paper'",),
     "camera-pybullet": ("camera.renderer='pybullet'",),
@@ -55,8 +55,8 @@ PICTURES: dict[str, tuple[str, ...]] = {
 
 
 def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "pictures"
-    for name, changes in PICTURES.items():
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
+    for name, changes in IMAGES.items():
         plain = () if name == "camera-harsh-light" else PLAIN
         scenario = load_scenario(ROOT / "scenarios" / "harsh-light.toml", (*plain, *changes))
         cameras = Cameras(scenario)
@@ -69,8 +69,8 @@ def main() -> None:
         for i in range(len(scenario.chasers)):
             position, attitude = scenario.start_pose(i)
             states[f"chaser/{i}"] = BodyState(position, np.zeros(3), attitude, np.zeros(3))
-        picture = cameras.picture(0, 0, 0, 0, states)
-        shown: Any = cv2.imdecode(np.frombuffer(picture.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cameras.image(0, 0, 0, 0, states)
+        shown: Any = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
         small = cv2.resize(shown, (640, 360), interpolation=cv2.INTER_AREA)
         path = folder / f"{name}.jpg"
         cv2.imwrite(str(path), small, [cv2.IMWRITE_JPEG_QUALITY, 80])

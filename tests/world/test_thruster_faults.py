@@ -1,4 +1,4 @@
-"""Jets that fail by an operator's command to the world: decided between ticks, refused with the reason, told to the log."""
+"""Thrusters that fail by an operator's command to the world: decided between ticks, refused with the reason, told to the log."""
 
 from __future__ import annotations
 
@@ -6,36 +6,36 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from chaserdock_protocol.messages import CommandReply, Event, JetFaultCommand, JetReport
+from chaserdock_protocol.messages import CommandReply, Event, ThrusterFaultCommand, ThrusterReport
 from chaserdock_protocol.recording.log import read_log
-from chaserdock_world.actuators.operator_faults import JetFaultDesk
-from chaserdock_world.actuators.thrusters import JetActuators, actuators_of
+from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
+from chaserdock_world.actuators.thrusters import ThrusterActuators, actuators_of
 from harness import SHORT, ByHand, finished, sets, wait_for_log
 from thruster_cases import mission
 
-ALLOWED: dict[str, Any] = {"chaser": {"jet_faults_by_command": True}}
+ALLOWED: dict[str, Any] = {"chaser": {"thruster_faults_by_command": True}}
 
 
-def asked(desk: JetFaultDesk, tick: int, timing: Any, **wish: Any) -> CommandReply:
+def asked(desk: ThrusterFaultHandler, tick: int, timing: Any, **wish: Any) -> CommandReply:
     """The answer to one wish, decided at ``tick``."""
     replies: list[CommandReply] = []
-    values: dict[str, Any] = {"chaser": 0, "jet": 2, "kind": "stuck_on", "operator": "me"}
-    desk.ask(JetFaultCommand(**(values | wish)), replies.append)
+    values: dict[str, Any] = {"chaser": 0, "thruster": 2, "kind": "stuck_on", "operator": "me"}
+    desk.ask(ThrusterFaultCommand(**(values | wish)), replies.append)
     assert replies == []  # not before the tick
     told = desk.decide(tick, timing)
     assert [what for what, _ in told] == [
-        "jet fault by command" if replies[0].accepted else "jet fault refused"
+        "thruster fault by command" if replies[0].accepted else "thruster fault refused"
     ]
     assert "by me" in told[0][1]
     assert replies[0].reason in told[0][1]
     return replies[0]
 
 
-def test_a_jet_fails_from_the_tick_on_and_is_mended_again() -> None:
+def test_a_thruster_fails_from_the_tick_on_and_is_mended_again() -> None:
     s = mission(**ALLOWED)
-    jets = actuators_of(s, 0)
-    assert isinstance(jets, JetActuators)
-    desk, per_tick = JetFaultDesk(s, {"chaser/0": jets}), s.timing.steps_per_tick
+    thrusters = actuators_of(s, 0)
+    assert isinstance(thrusters, ThrusterActuators)
+    desk, per_tick = ThrusterFaultHandler(s, {"chaser/0": thrusters}), s.timing.steps_per_tick
     given = []
     wishes = {2: "stuck_on", 3: "stuck_on", 5: "healthy"}
     for tick in range(8):
@@ -46,10 +46,10 @@ def test_a_jet_fails_from_the_tick_on_and_is_mended_again() -> None:
             assert answer.tick == tick
         step, end = s.timing.step_of_tick(tick), s.timing.step_of_tick(tick + 1)
         while step < end:
-            until = min(jets.next_change(step) or end, end)
-            jets.act(step, until - step, 1.0 / s.timing.physics_hz)
+            until = min(thrusters.next_change(step) or end, end)
+            thrusters.act(step, until - step, 1.0 / s.timing.physics_hz)
             step = until
-        given.append(jets.take(end).jet_impulse_N_s[2])
+        given.append(thrusters.take(end).thruster_impulse_N_s[2])
     full = 1.5 * per_tick / s.timing.physics_hz
     assert given[:2] == [0.0, 0.0]
     assert given[2] == pytest.approx(full - 1.5 * 0.001)  # less the rise
@@ -60,41 +60,41 @@ def test_a_jet_fails_from_the_tick_on_and_is_mended_again() -> None:
 @pytest.mark.parametrize(
     ("scenario", "wish", "reason"),
     [
-        ({}, {}, "chaser.jet_faults_by_command = true"),
+        ({}, {}, "chaser.thruster_faults_by_command = true"),
         (ALLOWED, {"chaser": 1}, "there is no chaser 1; this mission has 0 to 0"),
-        (ALLOWED, {"jet": 12}, "there is no jet 12; the body has 0 to 11"),
+        (ALLOWED, {"thruster": 12}, "there is no thruster 12; the body has 0 to 11"),
         (ALLOWED, {"kind": "weak"}, "weak needs it"),
         (ALLOWED, {"factor": 0.5}, "factor goes with weak"),
         (ALLOWED, {"kind": "weak", "factor": 1.5}, "factor must be from 0 to 1, not 1.5"),
-        ({"chaser": {"actuation": "ideal", "jet_faults_by_command": True}}, {}, "fly without jets"),
+        ({"chaser": {"actuation": "ideal", "thruster_faults_by_command": True}}, {}, "fly without thrusters"),
     ],
 )
 def test_what_cannot_be_is_refused_and_changes_nothing(
     scenario: dict[str, Any], wish: dict[str, Any], reason: str
 ) -> None:
     s = mission(**scenario)
-    jets = actuators_of(s, 0)
-    answer = asked(JetFaultDesk(s, {"chaser/0": jets}), 0, s.timing, **wish)
+    thrusters = actuators_of(s, 0)
+    answer = asked(ThrusterFaultHandler(s, {"chaser/0": thrusters}), 0, s.timing, **wish)
     assert not answer.accepted
     assert reason in answer.reason
-    assert jets.next_change(0) is None or not jets.act(0, 1, 0.001).any()
+    assert thrusters.next_change(0) is None or not thrusters.act(0, 1, 0.001).any()
 
 
 @pytest.mark.slow
 def test_in_a_mission_the_chaser_finds_out_what_was_done_to_it(tmp_path: Path) -> None:
-    by_hand, log = ByHand.at_free_port("jetfault"), tmp_path / "mission.mcap"
+    by_hand, log = ByHand.at_free_port("thrusterfault"), tmp_path / "mission.mcap"
     reach = ("--namespace", by_hand.namespace, "--connect", by_hand.endpoint)
-    flown = (*SHORT, "jet_failure=[]", "duration_s=25.0", "chaser.jet_faults_by_command=true")
+    flown = (*SHORT, "thruster_failure=[]", "duration_s=25.0", "chaser.thruster_faults_by_command=true")
     try:
-        by_hand.start("world", "world", "jet-failure", *sets(*flown))
+        by_hand.start("world", "world", "thruster-failure", *sets(*flown))
         by_hand.start("recorder", "record", "--out", str(tmp_path))
         by_hand.start("controller", "controller")
         by_hand.start("chaser/0", "chaser", "0")
         wait_for_log(log, 200_000)
-        status, said = finished("jet-fault", "0", "5", "stuck_on", "--operator", "test", *reach)
+        status, said = finished("thruster-fault", "0", "5", "stuck_on", "--operator", "test", *reach)
         assert (status, "accepted" in said) == (0, True), said
-        status, said = finished("jet-fault", "0", "44", "stuck_on", *reach)
-        assert (status, "there is no jet 44" in said) == (1, True), said
+        status, said = finished("thruster-fault", "0", "44", "stuck_on", *reach)
+        assert (status, "there is no thruster 44" in said) == (1, True), said
         for name in by_hand.processes:
             status, said = by_hand.said(name)
             assert status == 0, f"{name}: {said}"
@@ -105,11 +105,11 @@ def test_in_a_mission_the_chaser_finds_out_what_was_done_to_it(tmp_path: Path) -
         match record.message:
             case Event(process="world") as m:
                 events.append(m)
-            case JetReport() as m:
+            case ThrusterReport() as m:
                 reports.append(m)
-    done, refused = [e for e in events if e.what.startswith("jet fault")]
-    assert "chaser 0 jet 5 stuck_on, by test" in done.detail
-    assert refused.what == "jet fault refused"
+    done, refused = [e for e in events if e.what.startswith("thruster fault")]
+    assert "chaser 0 thruster 5 stuck_on, by test" in done.detail
+    assert refused.what == "thruster fault refused"
     shut = next(r for r in reports if r.isolated)
     assert shut.isolated == (5,)
     assert 0 < shut.sim_time_ns - done.sim_time_ns < 500_000_000

@@ -1,4 +1,4 @@
-"""A chaser's jets in flight: what it is told, finds and tells, and what the controller makes of that."""
+"""A chaser's thrusters in flight: what it is told, finds and tells, and what the controller makes of that."""
 
 from __future__ import annotations
 
@@ -8,58 +8,60 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
-from chaserdock_agents.chaser.thrusters.controller import JetPilot
+from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_controller.core import Flight, Inputs
 from chaserdock_controller.output.latency_compensation import (
     CommandHistory,
     predict_state,
     predict_state_with_impulse,
 )
-from chaserdock_controller.output.thruster_state import JetDesk
+from chaserdock_controller.output.thruster_state import ThrusterCommandHandler
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import JetReport, OperatorCommand
+from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
 from closed_loop import fly
 from flight_cases import odometry
 from thruster_cases import at_rest, box, mission, wrench
 
 
-def limits(report: JetReport) -> np.ndarray:
+def limits(report: ThrusterReport) -> np.ndarray:
     return np.array([*report.force_max_N, *report.torque_max_N_m])
 
 
 @pytest.mark.parametrize("kind", ["stuck_off", "stuck_on", "weak"])
 def test_what_it_is_told_it_acts_upon_at_once(kind: str) -> None:
     factor = {"factor": 0.5} if kind == "weak" else {}
-    s = mission(jet_failure=[{"chaser": 0, "jet": 4, "at_s": 0.1, "kind": kind, "told": True, **factor}])
-    pilot = JetPilot(s, 0)
+    s = mission(
+        thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.1, "kind": kind, "reported": True, **factor}]
+    )
+    pilot = ThrusterController(s, 0)
     np.testing.assert_allclose(limits(pilot.observe(at_rest(s, 0))), box(s))
-    assert pilot.observe(at_rest(s, 1)).jets == ("healthy",) * 12
+    assert pilot.observe(at_rest(s, 1)).thrusters == ("healthy",) * 12
     report = pilot.observe(at_rest(s, 2))
-    assert report.jets[4] == kind
+    assert report.thrusters[4] == kind
     assert report.isolated == (() if kind == "weak" else (4,))
     scale = limits(report) / box(s)
     assert np.ptp(scale) < 1e-12
     assert 0.5 < scale[0] < 1.0 or kind == "weak"
-    assert any(f"jet 4 {kind.replace('_', ' ')}" in what for _, what, _ in pilot.drain_events())
+    assert any(f"thruster 4 {kind.replace('_', ' ')}" in what for _, what, _ in pilot.drain_events())
     given = pilot.fly(passed_on(wrench(s, 2, 1.0)))
-    assert (4 in {p.jet for p in given.pulses}) is False or kind == "weak"
+    assert (4 in {p.thruster for p in given.pulses}) is False or kind == "weak"
     assert given.isolated == report.isolated
 
 
 def test_what_nobody_told_it_does_not_know() -> None:
-    s = mission(jet_failure=[{"chaser": 0, "jet": 4, "at_s": 0.0, "kind": "stuck_on"}])
-    pilot = JetPilot(s, 0)
+    s = mission(thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_on"}])
+    pilot = ThrusterController(s, 0)
     assert pilot.observe(at_rest(s, 0)).isolated == ()
 
 
 def test_an_operator_isolates_and_restores() -> None:
     s = mission()
-    pilot = JetPilot(s, 0)
+    pilot = ThrusterController(s, 0)
     pilot.observe(at_rest(s, 0))
-    pilot.heed(wrench(s, 0, isolated=(3, 200)))  # of a jet that is not there nothing comes
+    pilot.heed(wrench(s, 0, isolated=(3, 200)))  # of a thruster that is not there nothing comes
     given = pilot.fly(passed_on(wrench(s, 0, 1.5)))
     assert given.isolated == (3,)
-    assert 3 not in {p.jet for p in given.pulses}
+    assert 3 not in {p.thruster for p in given.pulses}
     report = pilot.observe(at_rest(s, 1))
     assert report.isolated == (3,)
     assert np.all(limits(report) < box(s))
@@ -68,22 +70,24 @@ def test_an_operator_isolates_and_restores() -> None:
     np.testing.assert_allclose(limits(pilot.observe(at_rest(s, 2))), box(s))
 
 
-def test_an_operator_may_trust_a_jet_that_the_chaser_does_not() -> None:
-    s = mission(jet_failure=[{"chaser": 0, "jet": 4, "at_s": 0.0, "kind": "stuck_off", "told": True}])
-    pilot = JetPilot(s, 0)
+def test_an_operator_may_trust_a_thruster_that_the_chaser_does_not() -> None:
+    s = mission(
+        thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}]
+    )
+    pilot = ThrusterController(s, 0)
     assert pilot.observe(at_rest(s, 0)).isolated == (4,)
     pilot.heed(wrench(s, 0, trusted=(4,)))
     pilot.fly(passed_on(wrench(s, 0)))
     report = pilot.observe(at_rest(s, 1))
     assert report.isolated == ()
-    assert report.jets[4] == "healthy"
+    assert report.thrusters[4] == "healthy"
 
 
 def test_who_is_held_looks_for_no_failures() -> None:
-    """Pulses that move nothing: a chaser in flight blames its jets, one that is held does not."""
+    """Pulses that move nothing: a chaser in flight blames its thrusters, one that is held does not."""
     for free in (True, False):
         s = mission()
-        pilot = JetPilot(s, 0)
+        pilot = ThrusterController(s, 0)
         for tick in range(40):
             pilot.observe(at_rest(s, tick))
             push = wrench(s, tick, free=free, force_N=(1.5 if tick % 10 < 4 else 0.0))
@@ -92,11 +96,11 @@ def test_who_is_held_looks_for_no_failures() -> None:
         assert free or not pilot.drain_events()
 
 
-def test_what_the_docking_sensor_feels_is_no_jets_fault() -> None:
-    """Pushed as by jet 3, which nobody asked: blamed in free flight, and not when the sensor has felt something."""
+def test_what_the_docking_sensor_feels_is_no_thrusters_fault() -> None:
+    """Pushed as by thruster 3, which nobody asked: blamed in free flight, and not when the sensor has felt something."""
     for touched in (False, True):
         s = mission()
-        pilot = JetPilot(s, 0)
+        pilot = ThrusterController(s, 0)
         push = wrench_matrix(s.chaser.thrusters)[:, 3] * s.chaser.thrusters[3].thrust_N
         for tick in range(10):
             time_ns = s.timing.tick_time_ns(tick)
@@ -114,18 +118,18 @@ def test_what_the_docking_sensor_feels_is_no_jets_fault() -> None:
 
 def test_impulse_given_is_told() -> None:
     s = mission()
-    pilot = JetPilot(s, 0)
+    pilot = ThrusterController(s, 0)
     total = np.zeros(3)
     for tick in range(31):
         total += pilot.observe(at_rest(s, tick), touched=True).given_impulse_N_s
         pilot.fly(passed_on(wrench(s, tick, 0.5 if tick < 15 else 0.0)))
-    # A second of 0.5 N; each of the jets that push within half of its least pulse, 15 mN s.
+    # A second of 0.5 N; each of the thrusters that push within half of its least pulse, 15 mN s.
     np.testing.assert_allclose(total, [0.5, 0.0, 0.0], atol=0.03)
 
 
 def test_impulse_under_way_is_told() -> None:
-    s = mission(time={"rate_hz": 10, "picture_hz": 10})
-    pilot = JetPilot(s, 0)
+    s = mission(time={"rate_hz": 10, "image_hz": 10})
+    pilot = ThrusterController(s, 0)
     assert limits(pilot.observe(at_rest(s, 0))).any()
     pilot.fly(passed_on(wrench(s, 0, 1.0)))
     # The period that began at 33 ms goes on until 133 ms, when the next command takes effect.
@@ -145,21 +149,21 @@ def test_a_state_with_the_impulse_of_a_command_is_that_with_the_command() -> Non
     assert predict_state_with_impulse(o, given, 0, s.chaser)[3] == 0.1
 
 
-def test_the_controller_asks_for_no_more_than_the_jets_left_can_give() -> None:
+def test_the_controller_asks_for_no_more_than_the_thrusters_left_can_give() -> None:
     s = mission()
     flight = Flight(s, lambda: 0.0)
     o = odometry(velocity_m_s=(5.0, -5.0, 5.0))
     free = flight.step(Inputs(0, 0, {0: o}, ())).wrenches[0]
-    report = JetReport(
+    report = ThrusterReport(
         chaser=0,
         tick=1,
         force_max_N=(0.5, 0.5, 0.5),
         torque_max_N_m=(0.05, 0.05, 0.05),
         coming_impulse_N_s=(0.0, 0.0, 0.0),
         coming_angular_impulse_N_m_s=(0.0, 0.0, 0.0),
-        jets=("healthy",) * 12,
+        thrusters=("healthy",) * 12,
     )
-    bound = flight.step(Inputs(1, 0, {0: o}, (), jets={0: report})).wrenches[0]
+    bound = flight.step(Inputs(1, 0, {0: o}, (), thrusters={0: report})).wrenches[0]
     assert max(map(abs, free.force_N)) == s.chaser.force_max_N
     assert max(map(abs, bound.force_N)) == pytest.approx(0.5, rel=1e-3)
 
@@ -167,44 +171,44 @@ def test_the_controller_asks_for_no_more_than_the_jets_left_can_give() -> None:
 @pytest.mark.parametrize(
     ("command", "accepted", "reason"),
     [
-        ({"chaser": 0, "jet": 3}, True, "jet 3 isolated"),
-        ({"chaser": 0, "jet": 12}, False, "needs a jet; this body has 0 to 11"),
-        ({"chaser": 0}, False, "needs a jet"),
-        ({"chaser": 4, "jet": 0}, False, "there is no chaser 4"),
+        ({"chaser": 0, "thruster": 3}, True, "thruster 3 isolated"),
+        ({"chaser": 0, "thruster": 12}, False, "needs a thruster; this body has 0 to 11"),
+        ({"chaser": 0}, False, "needs a thruster"),
+        ({"chaser": 4, "thruster": 0}, False, "there is no chaser 4"),
         (
-            {"chaser": 0, "jet": 3, "expires_ns": 10**9},
+            {"chaser": 0, "thruster": 3, "expires_ns": 10**9},
             False,
             "stale: it was to be done by 1.00 s, it is 2.00 s",
         ),
     ],
 )
 def test_operators_are_answered(command: dict[str, Any], accepted: bool, reason: str) -> None:
-    answer = JetDesk(mission()).command(OperatorCommand(command="isolate", **command), 2.0)
+    answer = ThrusterCommandHandler(mission()).command(OperatorCommand(command="isolate", **command), 2.0)
     assert (answer.accepted, reason in answer.reason) == (accepted, True)
 
 
 def test_operators_commands_reach_the_chaser_and_stay() -> None:
-    s = mission(timeline=[{"at_s": 0.0, "command": "isolate", "chasers": [0], "jet": 2}])
+    s = mission(timeline=[{"at_s": 0.0, "command": "isolate", "chasers": [0], "thruster": 2}])
     flight = Flight(s, lambda: 0.0)
     out = flight.step(Inputs(0, 0, {0: odometry()}, ()))
     assert out.replies[0].accepted
     assert out.wrenches[0].isolated == (2,)
-    back = OperatorCommand(command="restore", chaser=0, jet=2)
+    back = OperatorCommand(command="restore", chaser=0, thruster=2)
     out = flight.step(Inputs(1, 66_666_666, {0: odometry(tick=1)}, (), (back, back)))
-    assert [r.reason for r in out.replies] == ["jet 2 restored", "jet 2 is already restored"]
+    assert [r.reason for r in out.replies] == ["thruster 2 restored", "thruster 2 is already restored"]
     assert (out.wrenches[0].isolated, out.wrenches[0].trusted) == ((), (2,))
-    ideal = JetDesk(mission(chaser={"actuation": "ideal"}))
-    assert not ideal.command(OperatorCommand(command="isolate", chaser=0, jet=2), 0.0).accepted
+    ideal = ThrusterCommandHandler(mission(chaser={"actuation": "ideal"}))
+    assert not ideal.command(OperatorCommand(command="isolate", chaser=0, thruster=2), 0.0).accepted
 
 
-@pytest.mark.parametrize("jet", [1, 6])
-def test_a_stuck_jet_is_isolated_in_flight_within_half_a_second(jet: int) -> None:
-    """The closed loop, without pictures: found, shut off, and back on the reference."""
-    failure = {"chaser": 0, "jet": jet, "at_s": 8.0, "kind": "stuck_on"}
-    record = fly(mission(duration_s=18.0, jet_failure=[failure]))[0]
-    shut_s = [c.effective_time_ns / 1e9 - 8.0 for c in record.commands if c.isolated == (jet,)]
+@pytest.mark.parametrize("thruster", [1, 6])
+def test_a_stuck_thruster_is_isolated_in_flight_within_half_a_second(thruster: int) -> None:
+    """The closed loop, without images: found, shut off, and back on the reference."""
+    failure = {"chaser": 0, "thruster": thruster, "at_s": 8.0, "kind": "stuck_on"}
+    record = fly(mission(duration_s=18.0, thruster_failure=[failure]))[0]
+    shut_s = [c.effective_time_ns / 1e9 - 8.0 for c in record.commands if c.isolated == (thruster,)]
     assert 0.0 < shut_s[0] <= 0.5
-    assert not [c for c in record.commands if c.isolated not in ((), (jet,))]
+    assert not [c for c in record.commands if c.isolated not in ((), (thruster,))]
     late = np.array(record.time_s) >= 8.0
     assert np.array(record.position_m)[late].max() < 0.05
     assert record.rms(16.0)[0] < 0.01

@@ -1,10 +1,10 @@
-"""Which jet has failed: found from residuals alone, and never where nothing has."""
+"""Which thruster has failed: found from residuals alone, and never where nothing has."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.thrusters.fault_detection import Flags, JetWatch, Verdict
+from chaserdock_agents.chaser.thrusters.fault_detection import Flags, ThrusterFaultDetector, Verdict
 from chaserdock_agents.chaser.thrusters.impulse_residual import Noise, covariance, noise_of, observed_impulse
 from chaserdock_controller.output.latency_compensation import integrate
 from chaserdock_models.rotations import Array
@@ -19,7 +19,7 @@ TICK_S = 1.0 / 15
 
 
 class Case:
-    """A body whose odometry comes from integrating what its jets really give."""
+    """A body whose odometry comes from integrating what its thrusters really give."""
 
     def __init__(
         self, body: str, seed: int, noise: Noise | None = None, odometry_noise: bool = False
@@ -28,7 +28,7 @@ class Case:
         self.noise = noise or Noise()
         self.matrix, self.full = wrench_matrix(self.body.thrusters), thrusts_max(self.body.thrusters)
         least = self.full * [t.min_on_s for t in self.body.thrusters]
-        self.watch = JetWatch(self.matrix, self.full, least)
+        self.watch = ThrusterFaultDetector(self.matrix, self.full, least)
         self.rng = np.random.default_rng(seed)
         self.state = start(seed)
         self.state[3:6] *= 0.05
@@ -66,7 +66,7 @@ class Case:
         )
 
     def random(self, share: float = 0.25) -> Array:
-        """Impulses of jets, some of which fire."""
+        """Impulses of thrusters, some of which fire."""
         fires = self.rng.uniform(size=len(self.full)) < share
         return np.where(fires, self.full * self.rng.uniform(0.01, 0.05, len(self.full)), 0.0)
 
@@ -75,45 +75,45 @@ class Case:
 def test_observed_impulse_is_what_was_given(seed: int) -> None:
     case = Case("tetra12", seed)
     for _ in range(10):
-        jets, before = case.random(), case.last
-        case.step(jets, jets)
+        thrusters, before = case.random(), case.last
+        case.step(thrusters, thrusters)
         seen = observed_impulse(before, case.last, case.body)
-        np.testing.assert_allclose(seen, case.matrix @ jets, atol=2e-4)
+        np.testing.assert_allclose(seen, case.matrix @ thrusters, atol=2e-4)
 
 
 @pytest.mark.parametrize(
-    ("body", "jet"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
+    ("body", "thruster"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
 )
-def test_stuck_on_is_found_within_three_ticks(body: str, jet: int) -> None:
-    case = Case(body, jet)
+def test_stuck_on_is_found_within_three_ticks(body: str, thruster: int) -> None:
+    case = Case(body, thruster)
     for _ in range(5):
-        jets = case.random()
-        assert case.step(jets, jets) is None
+        thrusters = case.random()
+        assert case.step(thrusters, thrusters) is None
     verdict = None
     for part in (0.4, 1.0, 1.0):  # the first tick in part only
         asked = case.random(0.1)
         given = asked.copy()
-        given[jet] = max(asked[jet], case.full[jet] * TICK_S * part)
+        given[thruster] = max(asked[thruster], case.full[thruster] * TICK_S * part)
         if (verdict := case.step(asked, given)) is not None:
             break
-    assert verdict == Verdict(jet, "stuck_on", 1.0)
+    assert verdict == Verdict(thruster, "stuck_on", 1.0)
 
 
 @pytest.mark.parametrize(
-    ("body", "jet"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
+    ("body", "thruster"), [("tetra12", j) for j in range(12)] + [("slider", j) for j in range(16)]
 )
 @pytest.mark.parametrize(("left", "kind"), [(0.0, "stuck_off"), (0.5, "weak")])
-def test_a_lost_jet_is_found_after_some_pulses(body: str, jet: int, left: float, kind: str) -> None:
-    case = Case(body, jet)
+def test_a_lost_thruster_is_found_after_some_pulses(body: str, thruster: int, left: float, kind: str) -> None:
+    case = Case(body, thruster)
     verdict = None
     for _ in range(120):
         asked = case.random()
         given = asked.copy()
-        given[jet] *= left
+        given[thruster] *= left
         if (verdict := case.step(asked, given)) is not None:
             break
     assert verdict is not None
-    assert (verdict.jet, verdict.kind) == (jet, kind)
+    assert (verdict.thruster, verdict.kind) == (thruster, kind)
     assert verdict.factor == pytest.approx(left, abs=0.15)
 
 
@@ -133,22 +133,22 @@ def test_the_scenarios_odometry_is_the_pilots_noise() -> None:
     assert noise_of(mission().odometry) == Noise()
 
 
-@pytest.mark.parametrize("jet", [0, 4, 8])
-def test_noisy_odometry_takes_longer_and_finds_the_same(jet: int) -> None:
+@pytest.mark.parametrize("thruster", [0, 4, 8])
+def test_noisy_odometry_takes_longer_and_finds_the_same(thruster: int) -> None:
     noise = Noise(velocity_m_s=5e-4, omega_rad_s=5e-4)
-    case = Case("tetra12", jet, noise, odometry_noise=True)
+    case = Case("tetra12", thruster, noise, odometry_noise=True)
     verdict = None
     for _ in range(7):  # half a second, less the latency
         given = np.zeros(12)
-        given[jet] = case.full[jet] * TICK_S
+        given[thruster] = case.full[thruster] * TICK_S
         if (verdict := case.step(np.zeros(12), given)) is not None:
             break
-    assert verdict == Verdict(jet, "stuck_on", 1.0)
+    assert verdict == Verdict(thruster, "stuck_on", 1.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_bump_or_a_pull_is_no_jet(seed: int) -> None:
-    """What touches the chaser pushes as no jet does: nobody is blamed."""
+def test_a_bump_or_a_pull_is_no_thruster(seed: int) -> None:
+    """What touches the chaser pushes as no thruster does: nobody is blamed."""
     case = Case("tetra12", seed)
     rng = np.random.default_rng(seed)
     pull = rng.normal(size=6) * ([0.05] * 3 + [0.002] * 3)

@@ -20,7 +20,7 @@ import numpy as np
 from chaserdock_controller.nmpc.problem import dynamics, multiply
 from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
 from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
-from chaserdock_controller.nmpc.warm_start import Frame, Task, worded
+from chaserdock_controller.nmpc.warm_start import Frame, Task, status_of
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -184,7 +184,7 @@ class AcadosPeer:
                 limits = task.problem.input_max[group, None, :]
                 u[group] = np.clip(answer.reshape(-1, len(group), 6).swapaxes(0, 1), -limits, limits)
             for i in group:
-                words[i], iterations[i] = worded(usable, late), int(np.sum(solver.get_stats("qp_iter")))
+                words[i], iterations[i] = status_of(usable, late), int(np.sum(solver.get_stats("qp_iter")))
         self.spent = Spent(wall_s, cpu_s)
         return frame.finish(task, u, words, iterations)
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
@@ -64,7 +64,7 @@ def fly(
     actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in numbers}
     thrusters = scenario.chaser.actuation == "thrusters"
     pilots = {i: ThrusterController(scenario, i) for i in numbers} if thrusters else {}
-    flight = Flight(scenario, time.perf_counter)
+    flight = ControllerCore(scenario, time.perf_counter)
     records = {i: Record() for i in numbers}
     offsets = {i: scenario.chasers[i].position_m for i in numbers}
     try:
@@ -90,13 +90,13 @@ def fly(
                     sightings.append(
                         _sighting(scenario, i, tick, now_ns, state, target, noise, noise_m, noise_rad)
                     )
-            out = flight.step(Inputs(tick, now_ns, odometry, tuple(sightings), thrusters=reports))
+            out = flight.step(TickInputs(tick, now_ns, odometry, tuple(sightings), thrusters=reports))
             for i, command in out.wrenches.items():
                 if i in out.references:
                     offsets[i] = out.references[i].offset_m
                 given = passed_on(command)
                 if i in pilots:
-                    pilots[i].heed(command)
+                    pilots[i].apply_command(command)
                     given = pilots[i].fly(given)
                 effective = timing.step_of_time(given.effective_time_ns)
                 actuators[f"chaser/{i}"].command(given, effective, physics.step_count)

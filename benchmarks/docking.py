@@ -27,7 +27,7 @@ import msgspec
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
 from docking_flights import APPROACH_AT_S, Failure, Outcome, abort, dock, mission
-from offline import Eye, seeing_eye, statistical_eye
+from offline import CameraPose, seeing_eye, statistical_eye
 from results import options_of, write_json
 
 KINDS = ("stuck_on", "stuck_off")
@@ -129,7 +129,7 @@ def abort_figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
     }
 
 
-def noisy(scenario: Scenario) -> Eye:
+def noisy(scenario: Scenario) -> CameraPose:
     """Sees the target's true pose with 2 mm and 0.1 degrees of noise, and in every tenth image nothing."""
     return statistical_eye(scenario, scenario.seed, 0.002, math.radians(0.1), blind=0.1)
 

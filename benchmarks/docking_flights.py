@@ -15,7 +15,7 @@ from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import OperatorCommand, ProbeTouch
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.physics.simulation import TARGET
-from offline import Eye, Offline, momentum
+from offline import CameraPose, Offline, momentum
 
 ROOT = Path(__file__).resolve().parents[1]
 APPROACH_AT_S = 4.0
@@ -213,7 +213,7 @@ def order(what: str) -> OperatorCommand:
 def dock(
     seed: int,
     scenario: Scenario,
-    eye_of: Callable[[Scenario], Eye],
+    eye_of: Callable[[Scenario], CameraPose],
     failure: Failure | None = None,
     approach_at_s: float = APPROACH_AT_S,
 ) -> Outcome:
@@ -269,7 +269,7 @@ def offset_error_m(flight: Offline) -> float:
     return float(np.linalg.norm(offset - np.array(flight.scenario.chasers[0].position_m)))
 
 
-def abort(seed: int, scenario: Scenario, eye_of: Callable[[Scenario], Eye], again: bool) -> Outcome:
+def abort(seed: int, scenario: Scenario, eye_of: Callable[[Scenario], CameraPose], again: bool) -> Outcome:
     """An approach, aborted at a random time; then, if ``again``, a second one to its end."""
     flight = Offline(scenario, eye_of(scenario))
     abort_at_s = APPROACH_AT_S + float(np.random.default_rng([seed, 0xAB0]).uniform(0.0, ABORT_WITHIN_S))

@@ -33,7 +33,7 @@ from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.physics.simulation import TARGET
-from offline import Eye, Offline, seeing_eye, statistical_eye
+from offline import CameraPose, Offline, seeing_eye, statistical_eye
 from results import options_of, write_json
 
 from chaserdock.reproduce.paper import ROWS
@@ -129,7 +129,7 @@ class Flown:
         )
 
 
-def fly(seed: int, scenario: Scenario, eye: Eye) -> Flown:
+def fly(seed: int, scenario: Scenario, eye: CameraPose) -> Flown:
     """Flies to the end and keeps account of distances and goals, on ground truth."""
     flight, n = Offline(scenario, eye), len(scenario.chasers)
     out, goals = Flown(seed), {i: g for i in range(n) if (g := scenario.goal_of(i)) is not None}
@@ -162,12 +162,15 @@ def fly(seed: int, scenario: Scenario, eye: Eye) -> Flown:
     return out
 
 
-def noisy(scenario: Scenario) -> Eye:
+def noisy(scenario: Scenario) -> CameraPose:
     return statistical_eye(scenario, scenario.seed, NOISE_M, NOISE_RAD)
 
 
 def variations(
-    name: str, seeds: Iterable[int], scenario_of: Callable[[int], Scenario], eye_of: Callable[[Scenario], Eye]
+    name: str,
+    seeds: Iterable[int],
+    scenario_of: Callable[[int], Scenario],
+    eye_of: Callable[[Scenario], CameraPose],
 ) -> dict[str, float]:
     """Flies every seed; the worst of each figure."""
     flown = []

@@ -16,7 +16,7 @@ from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
@@ -29,11 +29,11 @@ from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.sensors.publish import docking_status, odometry_of
 
 States = dict[str, BodyState]
-Eye = Callable[[int, int, int, States], Sighting]
+CameraPose = Callable[[int, int, int, States], Sighting]
 """From chaser, tick, time (ns) and all bodies' states to what that chaser sees."""
 
 
-def seeing_eye(scenario: Scenario) -> Eye:
+def seeing_eye(scenario: Scenario) -> CameraPose:
     """Real images, rendered and searched for markers as in the chaser's process."""
     cameras = Cameras(scenario)
     perception = make_perception(scenario)
@@ -50,7 +50,7 @@ def seeing_eye(scenario: Scenario) -> Eye:
 
 def statistical_eye(
     scenario: Scenario, seed: int, position_m: float, attitude_rad: float, blind: float = 0.0
-) -> Eye:
+) -> CameraPose:
     """The target's true pose with white noise of these sigmas an axis; in the share ``blind`` of images, nothing."""
     rng = np.random.default_rng([seed, 0xE1E])
     camera = scenario.camera_model()
@@ -90,7 +90,7 @@ class Offline:
     """
 
     scenario: Scenario
-    eye: Eye
+    eye: CameraPose
     actuator_gain: float = 1.0
     tick: int = 0
     touched: set[tuple[str, str]] = field(default_factory=set)
@@ -98,12 +98,12 @@ class Offline:
     events: list[tuple[float, str]] = field(default_factory=list)
     verdicts: list[tuple[float, str]] = field(default_factory=list)
     propellant_kg: float = 0.0
-    last: Outputs | None = None
+    last: TickOutputs | None = None
 
     def __post_init__(self) -> None:
         s = self.scenario
         self.physics = Physics(s)
-        self.flight = Flight(s, lambda: 0.0)
+        self.flight = ControllerCore(s, lambda: 0.0)
         self.actuators = {f"chaser/{i}": actuators_of(s, i) for i in range(len(s.chasers))}
         thrusters = s.chaser.actuation == "thrusters"
         self.pilots = {i: ThrusterController(s, i) for i in range(len(s.chasers))} if thrusters else {}
@@ -118,7 +118,7 @@ class Offline:
     def phase(self, chaser: int) -> str:
         return self.flight.guidance.chasers[chaser].phase
 
-    def step(self, commands: tuple[OperatorCommand, ...] = ()) -> Outputs:
+    def step(self, commands: tuple[OperatorCommand, ...] = ()) -> TickOutputs:
         """Flies one tick: senses, decides, acts, and moves on to the next."""
         s, timing, physics = self.scenario, self.scenario.timing, self.physics
         tick, time_ns, states = self.tick, timing.tick_time_ns(self.tick), self.states()
@@ -135,11 +135,11 @@ class Offline:
                 (time_ns / 1e9, f"{what}, {detail}") for _, what, detail in pilot.drain_events()
             ]
         seen = tuple(self.eye(i, tick, time_ns, states) for i in chasers) if timing.has_images(tick) else ()
-        out = self.flight.step(Inputs(tick, time_ns, odometry, seen, commands, reports, docking))
+        out = self.flight.step(TickInputs(tick, time_ns, odometry, seen, commands, reports, docking))
         for i, wrench in out.wrenches.items():
             command = passed_on(wrench)
             if i in self.pilots:
-                self.pilots[i].heed(wrench)
+                self.pilots[i].apply_command(wrench)
                 command = self.pilots[i].fly(command)
             if self.actuator_gain != 1.0:
                 command = stronger(command, self.actuator_gain)

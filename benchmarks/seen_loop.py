@@ -15,7 +15,7 @@ import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Image, OperatorCommand, Sighting
@@ -91,7 +91,7 @@ class Flown:
     phases: list[tuple[float, int, str]]
     events: list[tuple[float, str, str]]
     seen: dict[int, list[bool]]
-    last: Outputs
+    last: TickOutputs
     reinitialisations: int
 
     def tracking_rms(self, from_s: float) -> tuple[float, float]:
@@ -107,7 +107,7 @@ class _Shadow:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.perceptions = [make_perception(scenario) for _ in scenario.chasers]
-        self.flight = Flight(scenario, time.perf_counter)
+        self.flight = ControllerCore(scenario, time.perf_counter)
         self.estimates = Estimates()
 
 
@@ -124,7 +124,7 @@ def fly(
     navigation, numbers = Navigation(scenario), range(len(scenario.chasers))
     actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in numbers}
     perceptions = [make_perception(scenario) for _ in numbers]
-    flight = Flight(scenario, time.perf_counter)
+    flight = ControllerCore(scenario, time.perf_counter)
     beside = {name: _Shadow(s) for name, s in (shadows or {}).items()}
     before: dict[int, Sighting] = {}
     estimates = Estimates()
@@ -132,7 +132,7 @@ def fly(
     seen: dict[int, list[bool]] = {i: [] for i in numbers}
     phases: list[tuple[float, int, str]] = []
     events: list[tuple[float, str, str]] = []
-    out: Outputs | None = None
+    out: TickOutputs | None = None
     try:
         for tick in range(scenario.ticks):
             now_ns = timing.tick_time_ns(tick)
@@ -159,11 +159,11 @@ def fly(
                     same = shadow.scenario.perception.name == scenario.perception.name
                     sighting = before[i] if same else look(shadow.perceptions[i], given, None)
                     aside[name].append(sighting if on_sighting is None else on_sighting(sighting))
-            out = flight.step(Inputs(tick, now_ns, odometry, tuple(sightings), commands(now_s)))
+            out = flight.step(TickInputs(tick, now_ns, odometry, tuple(sightings), commands(now_s)))
             truth = states["target"]
             estimates.note(now_s, out.target, truth)
             for name, shadow in beside.items():
-                fused = shadow.flight.fuse(Inputs(tick, now_ns, odometry, tuple(aside[name])))[1]
+                fused = shadow.flight.fuse(TickInputs(tick, now_ns, odometry, tuple(aside[name])))[1]
                 shadow.estimates.note(now_s, fused, truth)
             events += [(now_s, e.level, e.what) for e in out.events]
             for i, r in out.references.items():

@@ -6,13 +6,13 @@ import math
 
 import numpy as np
 from chaserdock_controller.estimation import (
-    Eye,
+    CameraPose,
     Measurement,
     Mekf,
     MekfParameters,
     PaperEstimator,
     PoseHypothesis,
-    TargetEstimate,
+    TargetState,
 )
 from chaserdock_controller.estimation.camera_calibration import seen_by
 from chaserdock_models import rotations as rot
@@ -53,11 +53,11 @@ LOOKS = [rot.exp([0.0, 0.0, 0.5 * math.pi * c]) for c in range(4)]
 """Attitudes, chaser to TRF, of chasers all round the target's z axis, each facing it."""
 
 
-def eye_of(chaser: int, time_ns: int) -> Eye:
+def eye_of(chaser: int, time_ns: int) -> CameraPose:
     """The camera of a chaser in synchronized flight 1 m from the target."""
     p, q = truth(time_ns)
     place = p + rot.rotate(q, rot.rotate(LOOKS[chaser % 4], [-1.0, 0.0, 0.0]))
-    return Eye(place, rot.multiply(rot.multiply(q, LOOKS[chaser % 4]), Q_CRF_IRF_FORWARD_WXYZ))
+    return CameraPose(place, rot.multiply(rot.multiply(q, LOOKS[chaser % 4]), Q_CRF_IRF_FORWARD_WXYZ))
 
 
 def see(
@@ -92,21 +92,19 @@ def see(
     return Measurement(chaser, time_ns, tuple(hypotheses), markers, eye)
 
 
-def errors(e: TargetEstimate) -> np.ndarray:
+def errors(e: TargetState) -> np.ndarray:
     """True minus estimated state (12,), in the order of the covariance."""
     p, q = truth(e.time_ns)
     dtheta = rot.log(rot.multiply(rot.conjugate(e.q_wxyz), q))
     return np.concatenate([p - e.position_m, V - e.velocity_m_s, dtheta, W - e.omega_rad_s])
 
 
-def nees(e: TargetEstimate) -> float:
+def nees(e: TargetState) -> float:
     d = errors(e)
     return float(d @ np.linalg.solve(e.covariance, d))
 
 
-def fly(
-    estimator: Mekf | PaperEstimator, chasers: int, seconds: float, seed: int = 0
-) -> list[TargetEstimate]:
+def fly(estimator: Mekf | PaperEstimator, chasers: int, seconds: float, seed: int = 0) -> list[TargetState]:
     rng = np.random.default_rng(seed)
     return [
         estimator.update([see(rng, c, ns(k)) for c in range(chasers)], ns(k))
@@ -114,7 +112,7 @@ def fly(
     ]
 
 
-def same(a: TargetEstimate, b: TargetEstimate) -> bool:
+def same(a: TargetState, b: TargetState) -> bool:
     """Equal bit for bit."""
     arrays = ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s", "covariance")
     plain = ("time_ns", "status", "sightings", "rejected")

@@ -81,7 +81,7 @@ def advance(states: Array, inputs: Array, duration_s: float, parts: int = 4) -> 
 
 
 @dataclass
-class Flight:
+class ControllerCore:
     states: Array  # (ticks + 1, N, 13)
     plans: list[NmpcPlan]
     cost: float  # eq. 6's stage cost along the true motion, times the control period
@@ -101,7 +101,7 @@ def fly(
     states: Array,
     control_s: float,
     time_s: float,
-) -> Flight:
+) -> ControllerCore:
     history, plans, cost = [states], [], 0.0
     for k in range(round(time_s / control_s)):
         problem = problem_at(states, k * control_s)
@@ -116,7 +116,7 @@ def fly(
             cost += control_s * np.sum(np.array([3.5] * 3 + [40.0] * 3) * (u - free) ** 2)
         states = advance(states, plan.inputs[:, 0], control_s)
         history.append(states)
-    return Flight(np.array(history), plans, float(cost))
+    return ControllerCore(np.array(history), plans, float(cost))
 
 
 def tumbling(n: int, feed: bool = True) -> tuple[Callable[[Array, float], NmpcInput], Array]:

@@ -20,7 +20,7 @@ from chaserdock.exit_codes import STOPPED
 
 from .json_events import Start
 from .launcher import Fleet, judge
-from .progress import Show, Teller
+from .progress import ProgressReporter, Show
 
 LOG_CLOSED_S = 60.0
 """After the end the recorder has that long (wall time) to have everything and close its log."""
@@ -46,8 +46,8 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
             return STOPPED
         folder = out / run_name(mission)
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
-        teller = Teller(scenario, show)
-        teller.tell(
+        reporter = ProgressReporter(scenario, show)
+        reporter.tell(
             Start(
                 scenario=scenario.name,
                 seed=scenario.seed,
@@ -58,9 +58,9 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
             )
         )
         try:
-            failure = _watch(node, teller, stop, world_away_s)
+            failure = _watch(node, reporter, stop, world_away_s)
         finally:
-            teller.close()
+            reporter.close()
         if stop():
             return STOPPED
         log = folder / LOG_NAME
@@ -68,14 +68,14 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
             raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
         if not _wait_for_end(log):
             failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
-        status = judge(Fleet(), folder, failure, teller)
+        status = judge(Fleet(), folder, failure, reporter)
         _write_page(log)
         return status
     finally:
         node.close()  # only now, as the router may end with this
 
 
-def _watch(node: Node, teller: Teller, stop: Stop, world_away_s: float) -> str | None:
+def _watch(node: Node, reporter: ProgressReporter, stop: Stop, world_away_s: float) -> str | None:
     """Shows the flight until it has ended; why it failed, or None."""
     seen = {"world": time.monotonic()}
 
@@ -84,16 +84,16 @@ def _watch(node: Node, teller: Teller, stop: Stop, world_away_s: float) -> str |
             seen["world"] = float("inf") if alive else time.monotonic()
 
     node.subscribe(topics.END)
-    teller.subscribe(node)
+    reporter.subscribe(node)
     node.watch_liveliness(changed)
     node.announce()
     while not stop():
         received = node.receive(0.1)
         if received is not None:
-            teller.take(received.message)
+            reporter.take(received.message)
             if isinstance(received.message, MissionEnd):
                 return None if received.message.complete else received.message.reason
-        teller.show()
+        reporter.show()
         if time.monotonic() - seen["world"] > world_away_s:
             return f"the world has been gone for {world_away_s:g} s"
     return None

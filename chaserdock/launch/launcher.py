@@ -32,7 +32,7 @@ from chaserdock.viewer.address import free_port as free_page_port
 
 from . import container as member
 from .json_events import Failed, Result, Start
-from .progress import Show, Teller
+from .progress import ProgressReporter, Show
 
 _PATIENCE_S = 120
 _END_S = 30.0
@@ -214,8 +214,8 @@ def run_mission(
         if view:
             start_viewer(onlookers, words, network)
         start_all(fleet, scenario, path, folder, mode, overrides, network)
-        teller = Teller(scenario, show)
-        teller.tell(
+        reporter = ProgressReporter(scenario, show)
+        reporter.tell(
             Start(
                 scenario=scenario.name,
                 seed=scenario.seed,
@@ -226,16 +226,16 @@ def run_mission(
             )
         )
         try:
-            failure = watch(fleet, hub, teller, stop)
+            failure = watch(fleet, hub, reporter, stop)
         finally:
-            teller.close()
+            reporter.close()
     finally:
         fleet.end()
         if hub is not None:
             hub.close()
         onlookers.end()
         stop.restore()
-    return judge(fleet, folder, failure, teller, stopped=stop.asked)
+    return judge(fleet, folder, failure, reporter, stopped=stop.asked)
 
 
 def start_all(
@@ -268,32 +268,32 @@ def start_viewer(onlookers: Fleet, words: Path, network: list[str]) -> None:
     print(f"{url_of(DEFAULT_HOST, port)} shows the mission", file=sys.stderr, flush=True)
 
 
-def watch(fleet: Fleet, hub: Node, teller: Teller, stop: _Stop) -> str | None:
+def watch(fleet: Fleet, hub: Node, reporter: ProgressReporter, stop: _Stop) -> str | None:
     """Shows the flight until it has ended; why it failed, or None."""
     hub.subscribe(topics.END)
-    teller.subscribe(hub)
+    reporter.subscribe(hub)
     ended: MissionEnd | None = None
     measured_s = 0.0
     while ended is None:
         received = hub.receive(0.1)
         if received is not None:
-            teller.take(received.message)
+            reporter.take(received.message)
             if isinstance(received.message, MissionEnd):
                 ended = received.message
-        teller.show()
+        reporter.show()
         if time.monotonic() - measured_s > 2.0:
             measured_s = time.monotonic()
             fleet.measure()
         if stop.asked and not stop.passed_on:
             stop.passed_on = True
-            teller.say("stopping: the log is being closed")
+            reporter.say("stopping: the log is being closed")
             fleet.children[0].process.send_signal(signal.SIGTERM)
         dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
         if dead and ended is None:
-            if dead[0].name == "world" or stop.asked or not teller.flying:
+            if dead[0].name == "world" or stop.asked or not reporter.flying:
                 return "stopped by the operator" if stop.asked else dead[0].last_words()
             for child in dead:
-                teller.warn(child.name, child.last_words())
+                reporter.warn(child.name, child.last_words())
     fleet.wait(_END_S)
     if stop.asked:
         return "stopped by the operator"
@@ -304,7 +304,9 @@ def watch(fleet: Fleet, hub: Node, teller: Teller, stop: _Stop) -> str | None:
     return bad[0].last_words() if bad else None
 
 
-def judge(fleet: Fleet, folder: Path, failure: str | None, teller: Teller, stopped: bool = False) -> int:
+def judge(
+    fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter, stopped: bool = False
+) -> int:
     """Writes summary.json from the log, and tells it; the run's status."""
     from chaserdock_protocol.recording.log import LogError
 
@@ -315,7 +317,7 @@ def judge(fleet: Fleet, folder: Path, failure: str | None, teller: Teller, stopp
         summary = summarize(log)
     except LogError as error:
         status = STOPPED if stopped else FAILED
-        teller.tell(Failed(status=status, text=failure or str(error)))
+        reporter.tell(Failed(status=status, text=failure or str(error)))
         print(f"chaserdock: {failure or error}", file=sys.stderr)
         return status
     if failure is not None:
@@ -325,8 +327,8 @@ def judge(fleet: Fleet, folder: Path, failure: str | None, teller: Teller, stopp
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
-    if teller.for_scripts:
-        teller.tell(Result(status=status, folder=str(folder), summary=summary))
+    if reporter.for_scripts:
+        reporter.tell(Result(status=status, folder=str(folder), summary=summary))
     else:
         print(text_of(summary))
         print(f"log, summary and the processes' words: {folder}")

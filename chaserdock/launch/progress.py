@@ -46,7 +46,7 @@ class Show(StrEnum):
     scripts = "scripts"
 
 
-class Teller:
+class ProgressReporter:
     """Shows a flight while it is flown."""
 
     def __init__(self, scenario: Scenario, show: Show, out: TextIO | None = None) -> None:

@@ -25,13 +25,12 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import Scenario
 
-from chaserdock_controller.estimation.types import Estimator, Eye, Measurement
-from chaserdock_controller.estimation.types import TargetEstimate as Fused
+from chaserdock_controller.estimation.types import CameraPose, Estimator, Measurement, TargetState
 from chaserdock_controller.guidance.approach_cone import corridor_rows
 from chaserdock_controller.guidance.composite_body import Captures, pose_in_target
 from chaserdock_controller.guidance.phases import CALIBRATED, Guidance
 from chaserdock_controller.guidance.target_search import Searches, settled
-from chaserdock_controller.ingest.lost_chasers import Absent, with_absent
+from chaserdock_controller.ingest.lost_chasers import LostChasers, with_lost_chasers
 from chaserdock_controller.nmpc.budget import Bounded, SolveBudget
 from chaserdock_controller.output.latency_compensation import (
     CommandHistory,
@@ -45,7 +44,7 @@ from chaserdock_controller.output.thruster_state import THRUSTER_COMMANDS, Thrus
 
 from .estimation import geometry
 from .guidance import reference
-from .interfaces import Inputs, Outputs
+from .interfaces import TickInputs, TickOutputs
 from .nmpc import NmpcInput, NmpcPlan, make_solver
 from .parameters import estimator_of, nmpc_parameters
 
@@ -54,7 +53,7 @@ _ODOMETRY_KEPT_NS = 2_000_000_000
 _GREATEST_MARGIN_M = 0.1
 
 
-class Flight:
+class ControllerCore:
     """The controller's memory from tick to tick. ``now_s`` is a wall clock that only measures the solver; in
     ``realtime`` the scenario's budget of seconds follows from what it measures.
 
@@ -91,9 +90,9 @@ class Flight:
         self._last_solve_ns: int | None = None
         self._troubled: set[int] = set()
         self._searches = Searches(scenario.chaser, self._camera)
-        self.absent = Absent()
+        self.absent = LostChasers()
 
-    def step(self, inputs: Inputs) -> Outputs:
+    def step(self, inputs: TickInputs) -> TickOutputs:
         """Everything that one tick asks of the controller. Who tells of a state that is none is left out, and coasts."""
         now_s = inputs.time_ns / 1e9
         bad = {i: why for i, o in inputs.odometry.items() if (why := fault_of(o))}
@@ -101,7 +100,7 @@ class Flight:
             good = {i: o for i, o in inputs.odometry.items() if i not in bad}
             inputs = replace(inputs, odometry=good)
         fused, target = self.fuse(inputs)
-        out = Outputs(target=target)
+        out = TickOutputs(target=target)
         told = [
             ("warning" if "gated out" in text else "info", text) for _, text in self.estimator.drain_events()
         ]
@@ -145,7 +144,7 @@ class Flight:
         self._history.forget_before(inputs.time_ns)
         return out
 
-    def fuse(self, inputs: Inputs) -> tuple[Fused, TargetEstimate]:
+    def fuse(self, inputs: TickInputs) -> tuple[TargetState, TargetEstimate]:
         """The estimation of ``step`` alone: the fused state and its message. Once a tick, by ``step`` or instead of it."""
         for odometry in inputs.odometry.values():
             self._odometry[odometry.chaser, odometry.sim_time_ns] = odometry
@@ -178,11 +177,11 @@ class Flight:
                 )
                 for solution in s.solutions
             )
-            eye = Eye(*self._camera.irf_pose_in_world(odometry.position_m, odometry.q_wxyz))
+            eye = CameraPose(*self._camera.irf_pose_in_world(odometry.position_m, odometry.q_wxyz))
             measurements.append(Measurement(s.chaser, s.sim_time_ns, hypotheses, len(s.marker_ids), eye))
         return measurements
 
-    def _command(self, inputs: Inputs, fused: Fused, out: Outputs) -> None:
+    def _command(self, inputs: TickInputs, fused: TargetState, out: TickOutputs) -> None:
         """References, plan and commands of all chasers whose odometry is there."""
         ids = tuple(sorted(inputs.odometry))
         effective_ns = self.scenario.timing.effective_ns(inputs.tick)
@@ -197,7 +196,7 @@ class Flight:
         if known and planned:
             problem = self._problem(planned, inputs, self.estimator.estimate_at(effective_ns), effective_ns)
             away = self.absent.away(inputs.time_ns)
-            problem = with_absent(problem, away, effective_ns, self._parameters.dt_s)
+            problem = with_lost_chasers(problem, away, effective_ns, self._parameters.dt_s)
         self._describe(ids if known else (), inputs, fused, out)
         if problem is not None:
             begun_s = self._now_s()
@@ -253,7 +252,7 @@ class Flight:
         return i in self._captures.latched and self.guidance.chasers[i].phase not in ("retreat", "abort")
 
     def _send(
-        self, i: int, inputs: Inputs, effective_ns: int, mode: Mode, wrench: Array, out: Outputs
+        self, i: int, inputs: TickInputs, effective_ns: int, mode: Mode, wrench: Array, out: TickOutputs
     ) -> None:
         wrench = in_steps(wrench, self._thrusters.limits(i))
         self._history.add(i, effective_ns, wrench)
@@ -272,7 +271,9 @@ class Flight:
             free=self.guidance.is_free(i),
         )
 
-    def _problem(self, ids: tuple[int, ...], inputs: Inputs, ahead: Fused, effective_ns: int) -> NmpcInput:
+    def _problem(
+        self, ids: tuple[int, ...], inputs: TickInputs, ahead: TargetState, effective_ns: int
+    ) -> NmpcInput:
         """The NMPC's problem at the time when the commands take effect."""
         p, s = self._parameters, self.scenario
         times_s = np.arange(p.stages + 1, dtype=float) * p.dt_s
@@ -335,12 +336,14 @@ class Flight:
         turns = self.guidance.turns(i, times_s)
         return q if turns is None else rotations.multiply(q, turns)
 
-    def _margin_m(self, ahead: Fused) -> float:
+    def _margin_m(self, ahead: TargetState) -> float:
         """What the uncertainty of the target's position adds to the distance from it."""
         sigma_m = float(np.sqrt(np.linalg.eigvalsh(ahead.covariance[:3, :3])[-1]))
         return min(self.scenario.limits.estimate_margin_sigmas * sigma_m, _GREATEST_MARGIN_M)
 
-    def _describe(self, ids: tuple[int, ...], inputs: Inputs, fused: Fused, out: Outputs) -> None:
+    def _describe(
+        self, ids: tuple[int, ...], inputs: TickInputs, fused: TargetState, out: TickOutputs
+    ) -> None:
         """Where every chaser is to be now, and its phase by how near it is to that."""
         now_s = inputs.time_ns / 1e9
         for i in ids:
@@ -375,7 +378,7 @@ class Flight:
             if detail.endswith(CALIBRATED) and found is not None:
                 self._events(out, inputs, [("info", f"chaser {i}: {in_words(found)}")])
 
-    def _events(self, out: Outputs, inputs: Inputs, told: list[tuple[str, str]]) -> None:
+    def _events(self, out: TickOutputs, inputs: TickInputs, told: list[tuple[str, str]]) -> None:
         for level, text in told:
             out.events.append(
                 Event(

@@ -22,7 +22,7 @@ from chaserdock_protocol.messages import (
 
 
 @dataclass(frozen=True)
-class Inputs:
+class TickInputs:
     """What a tick brings. Sightings may belong to earlier ticks."""
 
     tick: int
@@ -35,7 +35,7 @@ class Inputs:
 
 
 @dataclass
-class Outputs:
+class TickOutputs:
     """What a tick yields; dictionaries by chaser."""
 
     target: TargetEstimate

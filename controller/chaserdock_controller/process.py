@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.fault_injection import Lost, layer_of
 from chaserdock_protocol.messages import (
     CommandReply,
@@ -31,15 +31,15 @@ from chaserdock_protocol.process import ProcessOptions, Stop, built
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node, Received
-from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
+from chaserdock_protocol.transport.session import Heartbeat, health_of, take_part
 
-from chaserdock_controller.ingest.odometry_validation import OdometryWatch
-from chaserdock_controller.ingest.sensor_consistency import Agreement
+from chaserdock_controller.ingest.odometry_validation import OdometryValidation
+from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.output.message_builders import no_command
-from chaserdock_controller.redundancy.checkpoint import Memory, NoMemory
-from chaserdock_controller.redundancy.standby import Shadow
+from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
+from chaserdock_controller.redundancy.standby import HotStandby
 
-from .core import Flight, Inputs, Outputs
+from .core import ControllerCore, TickInputs, TickOutputs
 
 _REMEMBERED_TICKS = 256
 _IDLE = 5
@@ -53,7 +53,7 @@ def main(options: ProcessOptions) -> int:
 
     def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
-        flight = Flight(scenario, time.perf_counter, realtime=mission.mode == "realtime")
+        flight = ControllerCore(scenario, time.perf_counter, realtime=mission.mode == "realtime")
         controller = Controller(node, scenario, flight, mission.mode == "realtime")
         node.faults = layer_of(scenario, node.name, lockstep=mission.mode == "lockstep")
         controller.open(instance)
@@ -77,7 +77,7 @@ class Controller:
 
     node: Node
     scenario: Scenario
-    flight: Flight
+    flight: ControllerCore
     realtime: bool = False
     replaying: bool = False
     ended: bool = False
@@ -89,7 +89,7 @@ class Controller:
     _docking: dict[int, DockingStatus] = field(default_factory=dict)
     _seen: set[tuple[int, int]] = field(default_factory=set)
     _used: dict[tuple[int, int], bool] = field(default_factory=dict)
-    _agreement: Agreement = field(default_factory=Agreement)
+    _agreement: SensorConsistency = field(default_factory=SensorConsistency)
     _missed: set[tuple[str, int, int]] = field(default_factory=set)
     _sightings: list[Sighting] = field(default_factory=list)
     _asked: list[tuple[OperatorCommand, Callable[[CommandReply], None]]] = field(default_factory=list)
@@ -97,12 +97,12 @@ class Controller:
 
     def __post_init__(self) -> None:
         s = self.scenario
-        self._watch = OdometryWatch(s)
+        self._watch = OdometryValidation(s)
         self._ports = [s.docking.port_of(i) for i in range(len(s.chasers))]
         self.name = self.node.name
-        self.shadow = Shadow(self.name, self.realtime, self.replaying)
-        self._memory = Memory(self.flight, self._watch, self._agreement)
-        self._answered: tuple[Tick, Outputs, float] | None = None
+        self.shadow = HotStandby(self.name, self.realtime, self.replaying)
+        self._memory = Checkpoint(self.flight, self._watch, self._agreement)
+        self._answered: tuple[Tick, TickOutputs, float] | None = None
         self._given_state_to: dict[str, str] = {}
         self._idle = 0
         self._on_network = False
@@ -121,7 +121,7 @@ class Controller:
         told = (topics.TICK, topics.END, topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.THRUSTERS)
         for topic in (*told, topics.STATE):
             node.subscribe(topic)
-        self.teller = PresenceTeller(node, instance)
+        self.heartbeat = Heartbeat(node, instance)
 
     def listen(self) -> None:
         """Waits for one message; works the tick out when it was the last missing."""
@@ -159,7 +159,7 @@ class Controller:
             before = self.shadow.commands
             for text in self.shadow.note(message):
                 self._tell("warning", text, message.tick, message.sim_time_ns)
-            self.teller.settled.set()
+            self.heartbeat.settled.set()
             if self.shadow.commands != before:
                 self._take_or_leave_command(message)
         return False
@@ -198,7 +198,7 @@ class Controller:
         elif self.shadow.wants_state(word.tick, self.done_tick):
             try:
                 self._memory.recall(word.state)
-            except NoMemory as error:
+            except CheckpointError as error:
                 self.node.counts.rejected["controller/state:format"] += 1
                 self._tell(
                     "error", f"the commander's state cannot be used: {error}", word.tick, word.sim_time_ns
@@ -236,7 +236,7 @@ class Controller:
             case ThrusterReport() as report:
                 self._thrusters[report.chaser] = report
             case Presence() as presence:
-                self.teller.take(presence)
+                self.heartbeat.take(presence)
             case MissionEnd():
                 self.ended = True
             case Lost(tick=tick):
@@ -298,7 +298,7 @@ class Controller:
             # What was seen from a place that is only reckoned is no measurement.
             self._sightings = [s for s in self._sightings if (s.chaser, s.tick) != (i, tick.tick)]
             if tick.sim_time_ns - last.sim_time_ns <= self.scenario.controller.command_lifetime_s * 1e9:
-                known[i] = went_on(last, tick.tick, tick.sim_time_ns)
+                known[i] = extrapolate(last, tick.tick, tick.sim_time_ns)
         return dict(sorted(known.items()))
 
     def _work_out(self, tick: Tick) -> None:
@@ -312,7 +312,7 @@ class Controller:
         docking = {i: d for i, d in self._docking.items() if d.tick == tick.tick and i in tick.chasers}
         commands = tuple(c for c, _ in asked)
         out = self.flight.step(
-            Inputs(
+            TickInputs(
                 tick.tick,
                 tick.sim_time_ns,
                 here,
@@ -351,7 +351,7 @@ class Controller:
             self.node.publish(topics.HEALTH, health, self.name)
 
     def _publish(
-        self, tick: Tick, out: Outputs, took_s: float, operated: tuple[OperatorCommand, ...]
+        self, tick: Tick, out: TickOutputs, took_s: float, operated: tuple[OperatorCommand, ...]
     ) -> None:
         node, newest = self.node, self.shadow.newest or tick
         if newest.standing_by and not self.replaying:
@@ -381,7 +381,7 @@ class Controller:
         self._given_state_to = dict(newest.standing_by)
         try:
             state = self._memory.told()
-        except NoMemory as error:
+        except CheckpointError as error:
             self._tell("warning", f"its state cannot be given on: {error}", tick.tick, tick.sim_time_ns)
             return
         self._say_word(tick, ControllerState(process=self.name, term=newest.term, state=state))
@@ -397,4 +397,4 @@ class Controller:
 
     def farewell(self) -> None:
         """The last messages of this process."""
-        self.teller.farewell(self.done_tick, self.tick.sim_time_ns if self.tick else 0)
+        self.heartbeat.farewell(self.done_tick, self.tick.sim_time_ns if self.tick else 0)

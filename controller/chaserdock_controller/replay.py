@@ -8,26 +8,26 @@ from typing import Any, cast
 
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.replay_node import Said, SilentTeller, Stage, Tape
+from chaserdock_protocol.replay_node import ReplayNode, Said, SilentHeartbeat, Stage
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import Node, Received
 
-from .core import Flight, Inputs, Outputs
+from .core import ControllerCore, TickInputs, TickOutputs
 from .process import Controller
 
 
 class _FusionAlone:
     """A flight that estimates and commands nothing."""
 
-    def __init__(self, flight: Flight) -> None:
+    def __init__(self, flight: ControllerCore) -> None:
         self._flight = flight
 
-    def step(self, inputs: Inputs) -> Outputs:
-        return Outputs(target=self._flight.fuse(inputs)[1])
+    def step(self, inputs: TickInputs) -> TickOutputs:
+        return TickOutputs(target=self._flight.fuse(inputs)[1])
 
 
-def _flight_of(scenario: Scenario) -> Flight:
-    return Flight(scenario, now_s=lambda: 0.0)
+def _flight_of(scenario: Scenario) -> ControllerCore:
+    return ControllerCore(scenario, now_s=lambda: 0.0)
 
 
 def _named_once(recorded: Iterable[Received]) -> Iterator[tuple[str, list[Received]]]:
@@ -53,16 +53,16 @@ def _named_once(recorded: Iterable[Received]) -> Iterator[tuple[str, list[Receiv
 
 def _play(scenario: Scenario, recorded: Iterable[Received], flight_of: Callable[[], Any]) -> Iterator[Said]:
     """The answers of whoever commanded. One that takes over knows what the other knew; one started again does not."""
-    tape, controller, last_seq, last_commander = Tape("controller"), None, -1, ""
+    tape, controller, last_seq, last_commander = ReplayNode("controller"), None, -1, ""
     for named, came in _named_once(recorded):
         commander = named or last_commander
         for received in came:
             is_target = received.topic is topics.TARGET
             anew = is_target and received.message.seq < last_seq and commander == last_commander
             if controller is None or anew:
-                tape = Tape("controller")
+                tape = ReplayNode("controller")
                 controller = Controller(cast(Node, tape), scenario, flight_of(), replaying=True)
-                controller.teller = cast(Any, SilentTeller())
+                controller.heartbeat = cast(Any, SilentHeartbeat())
             if is_target:
                 last_seq = received.message.seq
             if received.topic is topics.OPERATED:

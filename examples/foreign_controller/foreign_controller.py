@@ -192,8 +192,8 @@ class Controller:
             for key in keys
         ]
         self.over = threading.Event()
-        self.teller = threading.Thread(target=self.tell_presence, daemon=True)
-        self.teller.start()
+        self.heartbeat = threading.Thread(target=self.tell_presence, daemon=True)
+        self.heartbeat.start()
 
     def tell_presence(self):
         while not self.over.wait(0.05):
@@ -227,7 +227,7 @@ class Controller:
                 self.answer(scenario, tick, target, odometry, sightings if tick["images"] else {})
                 done = now
         self.over.set()
-        self.teller.join()  # what it still says is to be in the counts
+        self.heartbeat.join()  # what it still says is to be in the counts
         counts = {key: n + 1 for key, n in self.seq.items()}
         time_ns = tick["sim_time_ns"] if tick else 0
         self.publish(

@@ -10,7 +10,7 @@ from .codec import vector
 from .messages import Odometry
 
 
-def went_on(odometry: Odometry, tick: int, time_ns: int) -> Odometry:
+def extrapolate(odometry: Odometry, tick: int, time_ns: int) -> Odometry:
     """A body's odometry at a later tick and time (ns), by constant velocity (WRF) and rate (CRF)."""
     after_s = (time_ns - odometry.sim_time_ns) / 1e9
     turn = rotations.exp(np.asarray(odometry.omega_rad_s) * after_s)

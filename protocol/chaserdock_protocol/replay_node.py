@@ -17,7 +17,7 @@ Said = tuple[Topic, int | str | None, Message]
 """What a process publishes: topic, place, message (not numbered)."""
 
 
-class Tape:
+class ReplayNode:
     """Stands in for a process' ``Node``: it hears what is put in, and what it says is kept."""
 
     def __init__(self, name: str) -> None:
@@ -44,8 +44,8 @@ class Tape:
         return said
 
 
-class SilentTeller:
-    """Stands in for a process' ``PresenceTeller``: nobody needs to be told."""
+class SilentHeartbeat:
+    """Stands in for a process' ``Heartbeat``: nobody needs to be told."""
 
     def __init__(self) -> None:
         self.settled = threading.Event()

@@ -25,7 +25,7 @@ from chaserdock_models.rotations import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate, Tick, WrenchCommand
-from chaserdock_protocol.replay_node import SilentTeller, Tape
+from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.transport import Received
 
@@ -232,8 +232,8 @@ def command(scenario: Scenario, tick: int, commander: str, term: int) -> WrenchC
 
 @pytest.fixture
 def chaser(scenario: Scenario) -> Chaser:
-    made = Chaser(Tape("chaser/0"), scenario, 0)  # type: ignore[arg-type]
-    made.teller = SilentTeller()  # type: ignore[assignment]
+    made = Chaser(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
+    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     return made
 
 

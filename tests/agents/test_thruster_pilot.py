@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_controller.output.latency_compensation import (
     CommandHistory,
     predict_state,
@@ -58,14 +58,14 @@ def test_an_operator_isolates_and_restores() -> None:
     s = mission()
     pilot = ThrusterController(s, 0)
     pilot.observe(at_rest(s, 0))
-    pilot.heed(wrench(s, 0, isolated=(3, 200)))  # of a thruster that is not there nothing comes
+    pilot.apply_command(wrench(s, 0, isolated=(3, 200)))  # of a thruster that is not there nothing comes
     given = pilot.fly(passed_on(wrench(s, 0, 1.5)))
     assert given.isolated == (3,)
     assert 3 not in {p.thruster for p in given.pulses}
     report = pilot.observe(at_rest(s, 1))
     assert report.isolated == (3,)
     assert np.all(limits(report) < box(s))
-    pilot.heed(wrench(s, 1, trusted=(3,)))
+    pilot.apply_command(wrench(s, 1, trusted=(3,)))
     assert pilot.fly(passed_on(wrench(s, 1))).isolated == ()
     np.testing.assert_allclose(limits(pilot.observe(at_rest(s, 2))), box(s))
 
@@ -76,7 +76,7 @@ def test_an_operator_may_trust_a_thruster_that_the_chaser_does_not() -> None:
     )
     pilot = ThrusterController(s, 0)
     assert pilot.observe(at_rest(s, 0)).isolated == (4,)
-    pilot.heed(wrench(s, 0, trusted=(4,)))
+    pilot.apply_command(wrench(s, 0, trusted=(4,)))
     pilot.fly(passed_on(wrench(s, 0)))
     report = pilot.observe(at_rest(s, 1))
     assert report.isolated == ()
@@ -91,7 +91,7 @@ def test_who_is_held_looks_for_no_failures() -> None:
         for tick in range(40):
             pilot.observe(at_rest(s, tick))
             push = wrench(s, tick, free=free, force_N=(1.5 if tick % 10 < 4 else 0.0))
-            pilot.heed(push)
+            pilot.apply_command(push)
             pilot.fly(passed_on(push))
         assert free or not pilot.drain_events()
 
@@ -111,7 +111,7 @@ def test_what_the_docking_sensor_feels_is_no_thrusters_fault() -> None:
                 tick=tick, time_ns=time_ns, velocity_m_s=linear, q_wxyz=still, omega_rad_s=angular
             )
             pilot.observe(moved, touched)
-            pilot.heed(wrench(s, tick))
+            pilot.apply_command(wrench(s, tick))
             pilot.fly(passed_on(wrench(s, tick)))
         assert pilot.isolated == (() if touched else (3,))
 
@@ -151,9 +151,9 @@ def test_a_state_with_the_impulse_of_a_command_is_that_with_the_command() -> Non
 
 def test_the_controller_asks_for_no_more_than_the_thrusters_left_can_give() -> None:
     s = mission()
-    flight = Flight(s, lambda: 0.0)
+    flight = ControllerCore(s, lambda: 0.0)
     o = odometry(velocity_m_s=(5.0, -5.0, 5.0))
-    free = flight.step(Inputs(0, 0, {0: o}, ())).wrenches[0]
+    free = flight.step(TickInputs(0, 0, {0: o}, ())).wrenches[0]
     report = ThrusterReport(
         chaser=0,
         tick=1,
@@ -163,7 +163,7 @@ def test_the_controller_asks_for_no_more_than_the_thrusters_left_can_give() -> N
         coming_angular_impulse_N_m_s=(0.0, 0.0, 0.0),
         thrusters=("healthy",) * 12,
     )
-    bound = flight.step(Inputs(1, 0, {0: o}, (), thrusters={0: report})).wrenches[0]
+    bound = flight.step(TickInputs(1, 0, {0: o}, (), thrusters={0: report})).wrenches[0]
     assert max(map(abs, free.force_N)) == s.chaser.force_max_N
     assert max(map(abs, bound.force_N)) == pytest.approx(0.5, rel=1e-3)
 
@@ -189,12 +189,12 @@ def test_operators_are_answered(command: dict[str, Any], accepted: bool, reason:
 
 def test_operators_commands_reach_the_chaser_and_stay() -> None:
     s = mission(timeline=[{"at_s": 0.0, "command": "isolate", "chasers": [0], "thruster": 2}])
-    flight = Flight(s, lambda: 0.0)
-    out = flight.step(Inputs(0, 0, {0: odometry()}, ()))
+    flight = ControllerCore(s, lambda: 0.0)
+    out = flight.step(TickInputs(0, 0, {0: odometry()}, ()))
     assert out.replies[0].accepted
     assert out.wrenches[0].isolated == (2,)
     back = OperatorCommand(command="restore", chaser=0, thruster=2)
-    out = flight.step(Inputs(1, 66_666_666, {0: odometry(tick=1)}, (), (back, back)))
+    out = flight.step(TickInputs(1, 66_666_666, {0: odometry(tick=1)}, (), (back, back)))
     assert [r.reason for r in out.replies] == ["thruster 2 restored", "thruster 2 is already restored"]
     assert (out.wrenches[0].isolated, out.wrenches[0].trusted) == ((), (2,))
     ideal = ThrusterCommandHandler(mission(chaser={"actuation": "ideal"}))

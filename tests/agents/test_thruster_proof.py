@@ -96,7 +96,7 @@ def fired(odometry: dict[str, float] | None = None, chaser: Any = None, **comman
     for tick in range(45):
         pilot.observe(at_rest(s, tick))
         command = wrench(s, tick, **command_as)
-        pilot.heed(command)
+        pilot.apply_command(command)
         out |= {p.thruster for p in pilot.fly(passed_on(command)).pulses}
     return out
 

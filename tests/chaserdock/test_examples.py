@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.types import Eye, Measurement, PoseHypothesis
+from chaserdock_controller.estimation.types import CameraPose, Measurement, PoseHypothesis
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import load_scenario
@@ -83,7 +83,7 @@ def test_the_pages_estimator_is_deaf_to_few_markers(tmp_path: Path, monkeypatch:
     scenario = load_scenario(ROOT / "scenarios/single.toml", ("estimator.name=three",))
     estimator = estimator_of(scenario)
     pose = PoseHypothesis(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6))
-    eye = Eye(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+    eye = CameraPose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     assert estimator.update([Measurement(0, 0, (pose,), 2, eye)], 0).status == "none"
     assert estimator.accepted == 0
     found = estimator.update([Measurement(0, 100_000_000, (pose,), 3, eye)], 100_000_000)

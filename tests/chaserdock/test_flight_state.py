@@ -16,7 +16,7 @@ from rich.console import Console
 from chaserdock.launch import progress
 from chaserdock.launch.flight_state import FlightState
 from chaserdock.launch.json_events import Commanded, Line, Progress, Start, Told
-from chaserdock.launch.progress import Show, Teller, head_of, words_of
+from chaserdock.launch.progress import ProgressReporter, Show, head_of, words_of
 from chaserdock.launch.scenario_files import SHIPPED
 
 SCENARIO = load_scenario(SHIPPED[0] / "two-chaser-tracking.toml")
@@ -158,15 +158,15 @@ def test_words() -> None:
 
 def test_scripts_get_one_object_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     out = io.StringIO()
-    teller = Teller(SCENARIO, Show.scripts, out)
-    teller.tell(Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b"))
-    teller.take(tick(0))
-    teller.take(m.Event(process="world", level="error", what="gone", sim_time_ns=5_000_000_000))
-    teller.take(m.CommandReply(command="hold", chaser=0, accepted=True, reason="phase hold"))
-    teller.warn("chaser/1", "killed")
-    teller.warn("chaser/1", "killed")
-    teller.say("only for people")
-    teller.close()
+    heartbeat = ProgressReporter(SCENARIO, Show.scripts, out)
+    heartbeat.tell(Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b"))
+    heartbeat.take(tick(0))
+    heartbeat.take(m.Event(process="world", level="error", what="gone", sim_time_ns=5_000_000_000))
+    heartbeat.take(m.CommandReply(command="hold", chaser=0, accepted=True, reason="phase hold"))
+    heartbeat.warn("chaser/1", "killed")
+    heartbeat.warn("chaser/1", "killed")
+    heartbeat.say("only for people")
+    heartbeat.close()
     lines = [msgspec.json.decode(line, type=Line) for line in out.getvalue().splitlines()]
     assert [type(line) for line in lines] == [Start, Told, Commanded, Told, Progress]
     assert json.loads(out.getvalue().splitlines()[1])["type"] == "event"
@@ -177,9 +177,9 @@ def test_scripts_get_one_object_a_line(capsys: pytest.CaptureFixture[str]) -> No
 def test_people_are_told_on_standard_error_or_not_at_all(
     show: Show, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    teller = Teller(SCENARIO, show)
-    teller.take(m.Event(process="world", level="warning", what="gone", sim_time_ns=5_000_000_000))
-    teller.close()
+    heartbeat = ProgressReporter(SCENARIO, show)
+    heartbeat.take(m.Event(process="world", level="warning", what="gone", sim_time_ns=5_000_000_000))
+    heartbeat.close()
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err == ("   5.00 s  WARNING: world: gone\n" if show is Show.people else "")
@@ -188,12 +188,12 @@ def test_people_are_told_on_standard_error_or_not_at_all(
 def test_a_terminal_gets_a_live_table(monkeypatch: pytest.MonkeyPatch) -> None:
     out = io.StringIO()
     monkeypatch.setattr(progress, "Console", lambda stderr: Console(file=out, force_terminal=True, width=100))
-    teller = Teller(SCENARIO, Show.people)
-    teller.state = flown()
-    teller.take(placed(1, 150, 0.02))
-    teller.take(wanted(1, 150))
-    teller.take(m.Event(process="world", level="warning", what="gone"))
-    teller.close()
+    heartbeat = ProgressReporter(SCENARIO, Show.people)
+    heartbeat.state = flown()
+    heartbeat.take(placed(1, 150, 0.02))
+    heartbeat.take(wanted(1, 150))
+    heartbeat.take(m.Event(process="world", level="warning", what="gone"))
+    heartbeat.close()
     said = out.getvalue()
     assert "WARNING: world: gone" in said
     for part in ("two-chaser-tracking", "of 120 s", "hold", "20.00 mm", "90.000 deg"):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.ingest.lost_chasers import (
     ABSENT_S,
@@ -15,10 +15,10 @@ from chaserdock_controller.ingest.lost_chasers import (
     FORGOTTEN_S,
     GROWTH_M_S,
     MOST_M,
-    Absent,
+    LostChasers,
     coasting,
     margin_m,
-    with_absent,
+    with_lost_chasers,
 )
 from chaserdock_controller.nmpc import NmpcInput
 from chaserdock_controller.output.latency_compensation import integrate
@@ -65,7 +65,7 @@ def test_it_goes_on_as_it_moved_last() -> None:
 
 
 def test_who_is_away_is_told_once_and_so_is_the_end_of_it() -> None:
-    absent = Absent()
+    absent = LostChasers()
     assert absent.take({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
     told = []
     for k in range(1, 200):
@@ -83,7 +83,7 @@ def test_who_is_away_is_told_once_and_so_is_the_end_of_it() -> None:
 
 
 def test_a_moment_unheard_of_is_no_absence() -> None:
-    absent = Absent()
+    absent = LostChasers()
     absent.take({0: odometry(0, 1.0, Q[1:])}, 10**9)
     assert absent.take({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
     assert absent.away(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
@@ -91,7 +91,7 @@ def test_a_moment_unheard_of_is_no_absence() -> None:
 
 def test_nobody_away_leaves_the_problem_as_it_is() -> None:
     problem: Any = object()
-    assert with_absent(problem, {}, 0, 0.1) is problem
+    assert with_lost_chasers(problem, {}, 0, 0.1) is problem
 
 
 @pytest.mark.parametrize("between", [0.35, np.array([[0.0, 0.4], [0.4, 0.0]])])
@@ -108,7 +108,7 @@ def test_an_absent_chaser_is_a_row_that_keeps_nothing_itself(between: Any) -> No
         corridors=np.ones((n, stages + 1, 5)),
     )
     last = odometry(7, 1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0))
-    with_it = with_absent(problem, {7: last}, 2_000_000_000, 0.1)
+    with_it = with_lost_chasers(problem, {7: last}, 2_000_000_000, 0.1)
     assert with_it.states.shape == (3, 13)
     np.testing.assert_allclose(with_it.states[2, :6], [1.1, 0.0, 0.0, 0.1, 0.0, 0.0])
     np.testing.assert_allclose(with_it.references[2, -1, :3], [1.15, 0.0, 0.0])
@@ -124,7 +124,7 @@ def test_an_absent_chaser_is_a_row_that_keeps_nothing_itself(between: Any) -> No
 
 def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     """How near chaser 0, sent past it, comes to chaser 1, of which nothing is heard after a second; what is told."""
-    flight = Flight(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
+    flight = ControllerCore(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
     if blind:
         flight.absent.away = lambda now_ns: {}  # type: ignore[method-assign]
     timing, rate_hz = scenario.timing, scenario.time.rate_hz
@@ -149,7 +149,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
         commands: tuple[OperatorCommand, ...] = ()
         if tick == 2 * rate_hz:
             commands = (OperatorCommand(command="goto", chaser=0, offset_m=(1.0, -1.6, 0.0)),)
-        out = flight.step(Inputs(tick, now_ns, here, (), commands))
+        out = flight.step(TickInputs(tick, now_ns, here, (), commands))
         assert set(out.wrenches) == set(here)
         assert out.solver is not None
         assert len(out.solver.status) == len(out.solver.chasers) == len(here)

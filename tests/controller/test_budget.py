@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller import core as flight_module
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, make_solver
 from chaserdock_controller.nmpc.budget import SolveBudget
@@ -89,19 +89,19 @@ class Slow:
         return plan
 
 
-def far(mission: Scenario, flight: Flight, tick: int) -> Outputs:
+def far(mission: Scenario, flight: ControllerCore, tick: int) -> TickOutputs:
     """Both chasers metres from where they are to be, at rest: their thrust is at its limit."""
     now_ns = mission.timing.tick_time_ns(tick)
     still = {"velocity_m_s": (0.0,) * 3, "omega_rad_s": (0.0,) * 3, "q_wxyz": (1.0, 0.0, 0.0, 0.0)}
     here = {i: odometry(i, tick, now_ns, position_m=(-3.0, 2.0 * i, 0.5), **still) for i in (0, 1)}
-    return flight.step(Inputs(tick, now_ns, here, ()))
+    return flight.step(TickInputs(tick, now_ns, here, ()))
 
 
 @pytest.mark.parametrize("realtime", [True, False])
 def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_never(realtime: bool) -> None:
     mission = scenario(controller={"solve_budget_s": 3 * SLOW_S})
     slow = Slow(None)
-    flight = Flight(mission, lambda: slow.time_s, PerfectEstimator(mission.target), realtime)
+    flight = ControllerCore(mission, lambda: slow.time_s, PerfectEstimator(mission.target), realtime)
     slow.inner = flight._solver
     flight._solver = slow  # type: ignore[assignment]
     told = [far(mission, flight, tick).solver for tick in range(4)]
@@ -122,5 +122,5 @@ def test_seconds_go_with_a_solver_that_can_be_held_to_them(monkeypatch: pytest.M
     monkeypatch.setattr(flight_module, "make_solver", lambda *_: object())
     mission = scenario(controller={"solve_budget_s": 0.01})
     with pytest.raises(PluginError, match="has no max_iterations to set"):
-        Flight(mission, lambda: 0.0, realtime=True)
-    Flight(mission, lambda: 0.0)
+        ControllerCore(mission, lambda: 0.0, realtime=True)
+    ControllerCore(mission, lambda: 0.0)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.evaluation.closed_loop import fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.guidance.approach_cone import (
@@ -138,14 +138,14 @@ def test_by_capture_the_corridor_is_there_in_the_corridor_and_gone_when_latched(
     assert [phase for phase, there in seen.items() if there] == ["approach", "final", "contact", "retreat"]
 
 
-def step(flight: Flight, tick: int, **changes: Any) -> Outputs:
+def step(flight: ControllerCore, tick: int, **changes: Any) -> TickOutputs:
     """One tick with chaser 0 as told and chaser 1 at its place."""
     timing = flight.scenario.timing
     here = {
         0: odometry(0, tick, timing.tick_time_ns(tick), **changes),
         1: odometry(1, tick, timing.tick_time_ns(tick), position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3),
     }
-    return flight.step(Inputs(tick, timing.tick_time_ns(tick), here, ()))
+    return flight.step(TickInputs(tick, timing.tick_time_ns(tick), here, ()))
 
 
 @pytest.mark.parametrize("order", ["approach", "hold"])
@@ -155,7 +155,7 @@ def test_in_flight_the_plan_stays_in_the_corridor(order: Any) -> None:
     lazy = {"weight_position": 1.0, "weight_final_position": 1.0}
     timeline = [{"at_s": 0.0, "command": order, "chasers": [0]}]
     mission = scenario(target=still, timeline=timeline, controller=lazy, **NEAR)
-    flight = Flight(mission, lambda: 0.0, PerfectEstimator(mission.target))
+    flight = ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target))
     now = {
         "position_m": (-0.6, 0.19, 0.0),
         "velocity_m_s": (0.0, 0.06, 0.0),

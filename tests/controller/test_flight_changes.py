@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_controller import core as flight_module
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.evaluation.closed_loop import fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_models.rotations import Array
@@ -23,7 +23,7 @@ def three() -> Scenario:
     return parse_scenario({"name": "test", "duration_s": 60.0, "target": still, "chasers": chasers}, "test")
 
 
-def step(flight: Flight, tick: int, there: tuple[int, ...], **more: object) -> Outputs:
+def step(flight: ControllerCore, tick: int, there: tuple[int, ...], **more: object) -> TickOutputs:
     """A tick of those who are there, each 5 cm beside its place and at rest."""
     scenario, now_ns = flight.scenario, flight.scenario.timing.tick_time_ns(tick)
     here = {}
@@ -39,13 +39,13 @@ def step(flight: Flight, tick: int, there: tuple[int, ...], **more: object) -> O
             velocity_m_s=(0.0,) * 3,
             omega_rad_s=(0.0,) * 3,
         )
-    return flight.step(Inputs(tick, now_ns, here, (), **more))  # type: ignore[arg-type]
+    return flight.step(TickInputs(tick, now_ns, here, (), **more))  # type: ignore[arg-type]
 
 
 def test_who_comes_and_goes_costs_nobody_a_tick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Everyone who is there has a plan in every tick, the first after a change included, and no solver is built anew."""
     mission = three()
-    flight, alone = (Flight(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2))
+    flight, alone = (ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2))
     monkeypatch.setattr(flight_module, "make_solver", lambda *_: pytest.fail("a solver was built in flight"))
     steady: dict[int, list[Array]] = {}
     for tick, there in enumerate([(0, 1, 2)] * 4 + [(0, 2)] * 4 + [(2,)] * 4 + [(0, 1, 2)] * 4):
@@ -64,7 +64,7 @@ def test_who_comes_and_goes_costs_nobody_a_tick(monkeypatch: pytest.MonkeyPatch)
 def test_who_latches_is_quiet_at_once_and_the_others_have_their_plans() -> None:
     mission = capture_scenario(2)
     prescribed = mission.target.model_copy(update={"motion": "constant_rates"})
-    flight = Flight(mission, lambda: 0.0, PerfectEstimator(prescribed))
+    flight = ControllerCore(mission, lambda: 0.0, PerfectEstimator(prescribed))
     felt = {"contact": True, "armed": True}
     for tick, latched in enumerate([False, False, True, True, False]):
         now_ns = mission.timing.tick_time_ns(tick)

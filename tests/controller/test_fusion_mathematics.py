@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation import Eye, MekfParameters, PoseHypothesis, to_world
+from chaserdock_controller.estimation import CameraPose, MekfParameters, PoseHypothesis, to_world
 from chaserdock_controller.estimation import motion_models as motion
 from chaserdock_controller.estimation import so3 as scalar
 from chaserdock_controller.estimation.camera_calibration import seen_by
@@ -115,7 +115,7 @@ def _branch(bias: np.ndarray, covariance: np.ndarray) -> Branch:
     return Branch(0, np.array([1.0, 2.0, 3.0]), V, Q0, W, (7,), bias.reshape(1, 7), covariance, 0.0, {})
 
 
-EYE = Eye(np.array([0.3, -0.9, 0.2]), rot.normalize([0.6, -0.3, 0.5, -0.4]))
+EYE = CameraPose(np.array([0.3, -0.9, 0.2]), rot.normalize([0.6, -0.3, 0.5, -0.4]))
 
 
 def test_measurement_jacobian_by_differences() -> None:

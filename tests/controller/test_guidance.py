@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_controller.guidance import loss_of_sight as vision
 from chaserdock_controller.guidance.phases import Guidance
 from chaserdock_models import rotations
@@ -285,11 +285,11 @@ def test_whatever_is_asked_the_reference_is_smooth_and_slow(
 def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
     timeline = [{"at_s": 0.0, "command": "approach", "chasers": [0]}]
     mission = scenario(timeline=timeline)
-    flight = Flight(mission, lambda: 0.0)
+    flight = ControllerCore(mission, lambda: 0.0)
     timing = mission.timing
     for tick in range(4):
         here = {i: odometry(i, tick, timing.tick_time_ns(tick)) for i in (0, 1)}
-        out = flight.step(Inputs(tick, timing.tick_time_ns(tick), here, ()))
+        out = flight.step(TickInputs(tick, timing.tick_time_ns(tick), here, ()))
         assert out.target.status == "none"
         assert out.target.accepted == ()
         assert sorted(out.wrenches) == [0, 1]
@@ -305,7 +305,7 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
         assert out.solver.chasers == ()
         told = [(r.accepted, r.reason) for r in out.replies]
         assert told == ([(False, "the target has not been found yet")] if tick == 0 else [])
-    assert flight.step(Inputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())).wrenches.keys() == {1}
+    assert flight.step(TickInputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())).wrenches.keys() == {1}
 
 
 # -- when nobody sees the target ----------------------------------------------------------------------------

@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import Flight, Inputs
-from chaserdock_controller.estimation import Eye, Measurement, Mekf, MekfParameters, PoseHypothesis
+from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.estimation import CameraPose, Measurement, Mekf, MekfParameters, PoseHypothesis
 from chaserdock_controller.estimation.camera_calibration import seen_by
 from chaserdock_controller.guidance.phases import Guidance
 from chaserdock_controller.guidance.pointing import (
@@ -123,7 +123,7 @@ def test_nobody_seen_means_searching_and_then_going_to_its_place_facing_the_targ
 
 def test_a_flight_without_sightings_searches_and_says_so() -> None:
     s = scenario()
-    flight = Flight(s, lambda: 0.0)
+    flight = ControllerCore(s, lambda: 0.0)
     said, modes, torque = [], [], ()
     for k in range(40):
         places = [s.start_pose(i) for i in range(2)]
@@ -131,7 +131,7 @@ def test_a_flight_without_sightings_searches_and_says_so() -> None:
             i: _odometry(i, k, np.concatenate([p, np.zeros(3), q, np.zeros(3)]))
             for i, (p, q) in enumerate(places)
         }
-        out = flight.step(Inputs(k, now[0].sim_time_ns, now, ()))
+        out = flight.step(TickInputs(k, now[0].sim_time_ns, now, ()))
         said += [e.what for e in out.events]
         modes.append(out.wrenches[0].mode)
         torque = out.wrenches[0].torque_N_m
@@ -186,7 +186,7 @@ def test_turning_about_shows_the_mounting_and_flying_in_step_does_not(seed: int)
             q = rotations.integrate(rotations.IDENTITY, W, t)
             place = V * t + rotations.rotate(q, [-1.0, 0.0, 0.0])
             turned = rotations.multiply(q, calibration_turns([t])[0]) if manoeuvre else q
-            eye = Eye(place, rotations.multiply(turned, Q_CRF_IRF_FORWARD_WXYZ))
+            eye = CameraPose(place, rotations.multiply(turned, Q_CRF_IRF_FORWARD_WXYZ))
             seen = seen_by(eye, V * t, q, true)
             noise = rng.normal(size=6) * np.sqrt(np.diag(R))
             h = PoseHypothesis(

@@ -8,12 +8,12 @@ from typing import Any, cast
 import msgspec
 import pytest
 from chaserdock_agents.chaser.process import Chaser
-from chaserdock_controller.core import Flight
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.process import Controller
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import Lost
 from chaserdock_protocol.messages import Image, Message, Odometry, Sighting, Tick, WrenchCommand
-from chaserdock_protocol.replay_node import SilentTeller, Tape
+from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Received
@@ -66,8 +66,8 @@ def lost(scenario: Scenario, tick: int) -> Lost:
 
 @pytest.fixture
 def chaser(scenario: Scenario) -> Chaser:
-    made = Chaser(Tape("chaser/0"), scenario, 0)  # type: ignore[arg-type]
-    made.teller = SilentTeller()  # type: ignore[assignment]
+    made = Chaser(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
+    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     return made
 
 
@@ -155,8 +155,8 @@ def test_older_odometry_does_not_take_the_newers_place(chaser: Chaser, scenario:
 
 @pytest.fixture
 def controller(scenario: Scenario) -> Controller:
-    made = Controller(Tape("controller"), scenario, Flight(scenario, lambda: 0.0))  # type: ignore[arg-type]
-    made.teller = SilentTeller()  # type: ignore[assignment]
+    made = Controller(ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0))  # type: ignore[arg-type]
+    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     return made
 
 
@@ -228,9 +228,9 @@ class Clock:
 def in_real_time(scenario: Scenario) -> tuple[Controller, Clock]:
     """A controller that waits for the sightings of tick 1."""
     clock = Clock()
-    flight = Flight(scenario, lambda: 0.0)
-    made = Controller(Tape("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
-    made.teller = SilentTeller()  # type: ignore[assignment]
+    flight = ControllerCore(scenario, lambda: 0.0)
+    made = Controller(ReplayNode("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
+    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     tell(made, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
     for i in (0, 1):
         tell(made, topics.ODOMETRY, i, odometry(scenario, i, 1))
@@ -243,7 +243,7 @@ def test_in_real_time_a_tick_waits_for_its_sightings_and_not_for_ever(scenario: 
     assert not [m for t, m in said if t is topics.WRENCH]
     clock.now_s = 0.9 / scenario.time.rate_hz
     controller.listen()  # nothing comes
-    commands: list[Any] = [m for t, _, m in cast(Tape, controller.node).said() if t is topics.WRENCH]
+    commands: list[Any] = [m for t, _, m in cast(ReplayNode, controller.node).said() if t is topics.WRENCH]
     assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]
     # The sighting that is late belongs to the next tick's estimate, and makes no second command.
     said = tell(controller, topics.SIGHTING, 1, sighting(scenario, 1, 1))

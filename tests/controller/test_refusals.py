@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_protocol import codec
@@ -62,11 +62,11 @@ def test_a_chaser_may_start_where_it_may_not_stay() -> None:
     assert nmpc_parameters(scenario(chasers=[near])).stages == 30
 
 
-def flying(mission: Scenario) -> Flight:
-    return Flight(mission, lambda: 0.0, PerfectEstimator(mission.target))
+def flying(mission: Scenario) -> ControllerCore:
+    return ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target))
 
 
-def step(flight: Flight, tick: int, *commands: OperatorCommand, **changes: Any) -> Outputs:
+def step(flight: ControllerCore, tick: int, *commands: OperatorCommand, **changes: Any) -> TickOutputs:
     """Chaser 0 as told, chaser 1 at its place."""
     now_ns = flight.scenario.timing.tick_time_ns(tick)
     here = {
@@ -75,7 +75,7 @@ def step(flight: Flight, tick: int, *commands: OperatorCommand, **changes: Any) 
         ),
         1: odometry(1, tick, now_ns, position_m=(0.0, -1.2, 0.0), velocity_m_s=(0.0,) * 3),
     }
-    return flight.step(Inputs(tick, now_ns, here, (), commands))
+    return flight.step(TickInputs(tick, now_ns, here, (), commands))
 
 
 BAD = [
@@ -112,7 +112,7 @@ def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
 def test_when_every_state_is_bad_everybody_coasts() -> None:
     flight = flying(scenario())
     bad = {i: odometry(i, 0, 0, q_wxyz=(0.0,) * 4) for i in (0, 1)}
-    out = flight.step(Inputs(0, 0, bad, ()))
+    out = flight.step(TickInputs(0, 0, bad, ()))
     assert [out.wrenches[i].mode for i in (0, 1)] == ["coast", "coast"]
 
 

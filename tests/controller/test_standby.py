@@ -8,16 +8,16 @@ from typing import Any, cast
 import msgspec
 import numpy as np
 import pytest
-from chaserdock_controller.core import Flight
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.process import Controller
 from chaserdock_controller.redundancy import serialization as plain
-from chaserdock_controller.redundancy.checkpoint import CLASSES, Memory, NoMemory
-from chaserdock_controller.redundancy.standby import Shadow
+from chaserdock_controller.redundancy.checkpoint import CLASSES, Checkpoint, CheckpointError
+from chaserdock_controller.redundancy.standby import HotStandby
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
 from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
 from chaserdock_protocol.recording.log import read_log, read_scenario
-from chaserdock_protocol.replay_node import SilentTeller, Tape
+from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.transport import Node, Received
 
@@ -48,15 +48,15 @@ def ticks() -> dict[int, list[Received]]:
 
 
 def member(scenario: Scenario, name: str, instance: str) -> Controller:
-    made = Controller(cast(Node, Tape(name)), scenario, Flight(scenario, lambda: 0.0))
-    made.teller = cast(Any, SilentTeller())
+    made = Controller(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
+    made.heartbeat = cast(Any, SilentHeartbeat())
     made.shadow.instance = instance
     return made
 
 
 def hear(process: Controller, *messages: Received) -> list[tuple[Any, Any]]:
     """Hands a controller messages; what it says to them, without what is measured by the wall clock."""
-    tape = cast(Tape, process.node)
+    tape = cast(ReplayNode, process.node)
     for message in messages:
         tape.put(message)
     before = None
@@ -176,7 +176,7 @@ def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Sc
 # -- the state ----------------------------------------------------------------------------------------------
 
 
-def memory(scenario: Scenario) -> tuple[Controller, Memory]:
+def memory(scenario: Scenario) -> tuple[Controller, Checkpoint]:
     one = member(scenario, "controller", "c")
     return one, one._memory
 
@@ -220,7 +220,7 @@ def test_what_is_no_state_is_refused_whole(scenario: Scenario, ticks: Any, spoil
             case "key":
                 values[1].append([["list", []], 1])
         bad = msgspec.msgpack.encode(values)
-    with pytest.raises(NoMemory):
+    with pytest.raises(CheckpointError):
         told.recall(bad)
     assert told.told() == state
 
@@ -276,7 +276,7 @@ def tick(number: int, commander: str, instance: str, term: int, revision: int = 
 
 
 def test_the_command_is_of_the_very_start_that_is_named() -> None:
-    shadow = Shadow("standby", instance="s2")
+    shadow = HotStandby("standby", instance="s2")
     shadow.note(tick(0, "standby", "s1", 1))
     assert not shadow.commands
     shadow.note(tick(0, "standby", "s2", 2, 1))
@@ -290,7 +290,7 @@ def test_the_command_is_of_the_very_start_that_is_named() -> None:
 
 def test_missed_ticks_make_a_follower_ask_for_the_state() -> None:
     for realtime, missed in ((False, 1), (True, 11)):
-        shadow = Shadow("standby", realtime=realtime, instance="s")
+        shadow = HotStandby("standby", realtime=realtime, instance="s")
         for number in range(3):
             shadow.note(tick(number, "controller", "c", 1))
         assert not shadow.wants_state(2, 2)
@@ -303,7 +303,7 @@ def test_missed_ticks_make_a_follower_ask_for_the_state() -> None:
 def test_words_are_of_one_tick_in_lockstep_and_of_all_in_real_time() -> None:
     hold = OperatorCommand(command="hold", chaser=0)
     for realtime, expected in ((False, ()), (True, (hold,))):
-        shadow = Shadow("standby", realtime=realtime)
+        shadow = HotStandby("standby", realtime=realtime)
         shadow.words = {3: (hold,), 4: ()}
         assert shadow.operated(4) == expected
         assert not shadow.operated(5)

@@ -13,7 +13,7 @@ import pytest
 from chaserdock_agents.chaser.command_gate import passed_on, refusal
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
-from chaserdock_controller.core import Flight, Inputs
+from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Image,
@@ -90,12 +90,12 @@ def test_controller_answers_the_same(scenario: Scenario, records: dict[type, lis
         sightings[record.message.tick].append(record.message)
     targets = {r.message.tick: r.message for r in records[TargetEstimate]}
     wrenches = {(r.message.chaser, r.message.tick): r.message for r in records[WrenchCommand]}
-    flight = Flight(scenario, now_s=lambda: 0.0)
+    flight = ControllerCore(scenario, now_s=lambda: 0.0)
     for tick in range(scenario.ticks):
         time_ns = scenario.timing.tick_time_ns(tick)
         # Another order of arrival must not matter.
         seen = tuple(reversed(sightings[tick]))
-        out = flight.step(Inputs(tick, time_ns, odometry[tick], seen))
+        out = flight.step(TickInputs(tick, time_ns, odometry[tick], seen))
         assert out.target.status == targets[tick].status
         np.testing.assert_allclose(out.target.position_m, targets[tick].position_m, atol=1e-7)
         np.testing.assert_allclose(out.target.q_wxyz, targets[tick].q_wxyz, atol=1e-7)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import Flight, Inputs
-from chaserdock_controller.estimation.types import TargetEstimate
+from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.reference import predict_target
 from chaserdock_controller.nmpc import kernels
 from chaserdock_controller.parameters import nmpc_parameters
@@ -32,7 +32,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     velocity, omega = np.array(target.velocity_m_s), np.array(target.omega_rad_s)
     if seed:
         omega = rotations.rotate(rotations.normalize(rng.normal(size=4)), omega)
-    flight = Flight(scenario, lambda: 0.0)
+    flight = ControllerCore(scenario, lambda: 0.0)
     flight.guidance.found(0.0)
     states = np.zeros((n, 13))
     for i in range(n):
@@ -48,9 +48,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         flight.guidance.expect(due)
         assert all(flight.guidance.command(c, now_s).accepted for c in due)
         p, q = (a[0] for a in predict_target(at, velocity, [1.0, 0, 0, 0], omega, [now_s]))
-        exact = TargetEstimate(
-            round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ()
-        )
+        exact = TargetState(round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ())
         seen = {
             i: Odometry(
                 tick=tick,
@@ -64,7 +62,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
             for i, x in enumerate(states)
         }
         ids = tuple(range(n))
-        problem = flight._problem(ids, Inputs(tick, exact.time_ns, seen, ()), exact, exact.time_ns)
+        problem = flight._problem(ids, TickInputs(tick, exact.time_ns, seen, ()), exact, exact.time_ns)
         plan = flight._solver.solve(problem, TICK_S if tick else 0.0, ids)
         assert "failed" not in plan.status
         x = np.empty((n, 5, 13))

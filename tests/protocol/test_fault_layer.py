@@ -11,7 +11,7 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.fault_injection import FaultLayer, Lost, sender_of
 from chaserdock_protocol.messages import Image, Odometry, Sighting, WrenchCommand
 from chaserdock_protocol.scenario.faults import Fault
@@ -268,7 +268,7 @@ def test_went_on() -> None:
         q_wxyz=(1.0, 0.0, 0.0, 0.0),
         omega_rad_s=(0.0, 0.0, math.pi / 2),
     )
-    later = went_on(still, 5, 2_000_000_000)
+    later = extrapolate(still, 5, 2_000_000_000)
     assert (later.tick, later.sim_time_ns, later.chaser) == (5, 2_000_000_000, 1)
     assert later.position_m == (1.5, 2.0, 2.0)
     assert np.allclose(later.q_wxyz, [math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)])

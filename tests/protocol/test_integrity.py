@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
-from chaserdock_controller.ingest.odometry_validation import OdometryWatch
-from chaserdock_controller.ingest.sensor_consistency import Agreement
+from chaserdock_controller.ingest.odometry_validation import OdometryValidation
+from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
@@ -45,7 +45,7 @@ def lying(odometry: Odometry, off_m: tuple[float, float, float], turn_rad: float
 
 
 def test_honest_odometry_is_handed_on_as_it_is() -> None:
-    watch = OdometryWatch(SCENARIO)
+    watch = OdometryValidation(SCENARIO)
     for tick in [*range(50), *range(53, 60), 90]:  # some are missing
         assert watch.believed(flown(tick)) == (flown(tick), [])
 
@@ -54,7 +54,7 @@ def test_noise_that_the_scenario_admits_is_no_jump() -> None:
     noisy = SCENARIO.model_copy(
         update={"odometry": SCENARIO.odometry.model_copy(update={"position_noise_m": 0.02})}
     )
-    watch = OdometryWatch(noisy)
+    watch = OdometryValidation(noisy)
     assert [watch.believed(flown(tick, 0.02))[1] for tick in range(200)] == [[]] * 200
 
 
@@ -66,7 +66,7 @@ def test_noise_that_the_scenario_admits_is_no_jump() -> None:
 def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
     off: tuple[float, float, float], turn: float
 ) -> None:
-    watch, told = OdometryWatch(SCENARIO), []
+    watch, told = OdometryValidation(SCENARIO), []
     for tick in range(60):
         lie = 20 <= tick < 40
         given_, events = watch.believed(lying(flown(tick), off, turn) if lie else flown(tick))
@@ -79,14 +79,14 @@ def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
 
 
 def test_after_long_silence_anything_is_believed() -> None:
-    watch = OdometryWatch(SCENARIO)
+    watch = OdometryValidation(SCENARIO)
     watch.believed(flown(0))
     far = lying(flown(30), (3.0, 0.0, 0.0), 0.0)
     assert watch.believed(far) == (far, [])
 
 
 def test_agreement() -> None:
-    agreement, told = Agreement(), []
+    agreement, told = SensorConsistency(), []
     for tick in range(100):
         now_s = tick / 16  # exact
         rejected = {2} if 30 <= tick < 60 or tick in (10, 12, 80) else set()
@@ -96,7 +96,7 @@ def test_agreement() -> None:
 
 
 def test_who_sees_nothing_does_not_disagree() -> None:
-    agreement = Agreement()
+    agreement = SensorConsistency()
     assert [agreement.observe(t / 10, (), ()) for t in range(50)] == [[]] * 50
 
 
@@ -105,7 +105,7 @@ def test_the_limit_grows_with_the_time_between(gap: int) -> None:
     """What full thrust can do in the time is no jump."""
     body = SCENARIO.chaser
     dt = gap / SCENARIO.time.rate_hz
-    watch = OdometryWatch(SCENARIO)
+    watch = OdometryValidation(SCENARIO)
     first = flown(0)
     watch.believed(first)
     moved = 0.5 * body.force_max_N / body.mass_kg * dt**2

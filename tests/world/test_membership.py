@@ -8,7 +8,7 @@ import time
 import pytest
 from chaserdock_protocol.messages import JoinRequest, Presence
 from chaserdock_protocol.transport import Link, Node
-from chaserdock_protocol.transport.session import PresenceTeller
+from chaserdock_protocol.transport.session import Heartbeat
 from chaserdock_world.lockstep.membership import Membership
 
 
@@ -219,8 +219,8 @@ def test_of_two_that_join_at_once_the_second_is_refused() -> None:
 def test_nobody_tells_its_presence_on_a_closed_session() -> None:
     # A thread that is in Zenoh while the interpreter ends aborts the process: it has to end with the node, farewell or not.
     node = Node("chaser/0", "chaser", Link("told", listen=("tcp/127.0.0.1:0",)))
-    teller = PresenceTeller(node, "first")
+    heartbeat = Heartbeat(node, "first")
     time.sleep(0.1)
     node.close()
     assert not [t for t in threading.enumerate() if t.name == "presence"]
-    teller.stop()  # twice does no harm
+    heartbeat.stop()  # twice does no harm

@@ -19,7 +19,7 @@ from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd, Thr
 from chaserdock_protocol.process import ProcessOptions, Stop, built, say
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
-from chaserdock_protocol.transport.session import PresenceTeller, new_instance
+from chaserdock_protocol.transport.session import Heartbeat, new_instance
 
 from chaserdock_world.actuators.ideal import Actuators, fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
@@ -94,12 +94,12 @@ def gather(
         if f"chaser/{i}" in physics.latches:
             node.advertise(topics.DOCKING, i)
         node.advertise(topics.IMAGE, i)
-    teller = PresenceTeller(node, membership.instance)
+    heartbeat = Heartbeat(node, membership.instance)
     node.announce()
     return Answers(
         node,
         membership,
-        teller,
+        heartbeat,
         scenario.timing,
         actuators,
         lambda: physics.step_count,

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import cv2
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.fault_injection import Lost, layer_of
 from chaserdock_protocol.messages import (
     ActuatorCommand,
@@ -31,7 +31,7 @@ from chaserdock_protocol.process import ProcessOptions, Stop, built
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
-from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
+from chaserdock_protocol.transport.session import Heartbeat, health_of, take_part
 
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 
@@ -112,7 +112,7 @@ class Chaser:
         node.subscribe(topics.TARGET)
         node.subscribe(topics.TICK)
         node.subscribe(topics.END)
-        self.teller = PresenceTeller(node, instance)
+        self.heartbeat = Heartbeat(node, instance)
 
     def listen(self) -> None:
         """Waits for one message and does what it asks for."""
@@ -136,14 +136,14 @@ class Chaser:
                 self._fly(command)
             case Tick() as tick:
                 self.tick = tick
-                self.teller.settled.set()
+                self.heartbeat.settled.set()
                 self._watch_thrusters()
                 self._brake_if_alone()
                 if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
                     health = health_of(self.node, tick.tick, tick.sim_time_ns)
                     self.node.publish(topics.HEALTH, health, self.name)
             case Presence() as presence:
-                self.teller.take(presence)
+                self.heartbeat.take(presence)
             case MissionEnd():
                 self.ended = True
             case Lost() as lost if received is not None:
@@ -175,7 +175,7 @@ class Chaser:
             )
             self.node.publish(topics.SIGHTING, nothing, self.number)
         elif topic is topics.ODOMETRY and self.odometry is not None:
-            self._know(went_on(self.odometry, lost.tick, lost.sim_time_ns))
+            self._know(extrapolate(self.odometry, lost.tick, lost.sim_time_ns))
         elif topic is topics.DOCKING:
             before = self.docking
             still = (
@@ -248,7 +248,7 @@ class Chaser:
             self._stale = False
             self._heed(command)
             if self._thrusters is not None:
-                self._thrusters.heed(command)
+                self._thrusters.apply_command(command)
             self._send(passed_on(command))
             return
         self.node.counts.stale += 1
@@ -342,4 +342,4 @@ class Chaser:
     def farewell(self) -> None:
         """The last messages of this process."""
         tick = self.tick
-        self.teller.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)
+        self.heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)

@@ -7,7 +7,7 @@ from typing import Any, cast
 
 import cv2
 from chaserdock_protocol import topics
-from chaserdock_protocol.replay_node import Said, SilentTeller, Stage, Tape
+from chaserdock_protocol.replay_node import ReplayNode, Said, SilentHeartbeat, Stage
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import Node, Received
 
@@ -17,15 +17,15 @@ from .process import Chaser
 def play_perception(scenario: Scenario, recorded: Iterable[Received]) -> Iterator[Said]:
     """The sightings of all chasers."""
     cv2.setNumThreads(1)
-    chasers: dict[int, tuple[Tape, Chaser]] = {}
+    chasers: dict[int, tuple[ReplayNode, Chaser]] = {}
     last_seq: dict[int, int] = {}
     for received in recorded:
         number, seq = received.message.chaser, received.message.seq
         answers = received.topic is topics.SIGHTING
         if number not in chasers or (answers and seq < last_seq.get(number, -1)):
-            tape = Tape(f"chaser/{number}")
+            tape = ReplayNode(f"chaser/{number}")
             chaser = Chaser(cast(Node, tape), scenario, number)
-            chaser.teller = cast(Any, SilentTeller())
+            chaser.heartbeat = cast(Any, SilentHeartbeat())
             chasers[number] = tape, chaser
         if answers:
             last_seq[number] = seq

@@ -32,7 +32,7 @@ from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Node, Raw
 from chaserdock_protocol.transport.bounded_queue import Inbox
-from chaserdock_protocol.transport.session import PresenceTeller, health_of, take_part
+from chaserdock_protocol.transport.session import Heartbeat, health_of, take_part
 
 from .foxglove_layer import SHOWN
 from .rotation import Recording
@@ -111,7 +111,7 @@ class Recorder:
         """Subscribes everything, then tells its presence."""
         self.node.advertise(topics.ACK)
         self.node.subscribe_raw("**", self._arrived)
-        self.teller = PresenceTeller(self.node, instance)
+        self.heartbeat = Heartbeat(self.node, instance)
 
     def _arrived(self, raw: Raw) -> None:
         if not self._waiting.put(raw, len(raw.payload)):
@@ -136,11 +136,11 @@ class Recorder:
     def _note(self, key: str, message: object) -> None:
         match message:
             case Presence():
-                self.teller.take(message)
+                self.heartbeat.take(message)
             case Tick() as tick:
                 if self.node.faults is not None:
                     self.node.faults.strike(tick.tick)
-                self.teller.settled.set()
+                self.heartbeat.settled.set()
                 self._expected = {topics.ACTUATORS.key_of(i) for i in tick.chasers}
                 self._controllers = {tick.commander or "controller", *tick.standing_by}
                 if tick.controller:

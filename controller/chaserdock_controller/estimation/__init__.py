@@ -6,7 +6,7 @@ from .baseline import PaperEstimator, PaperParameters
 from .geometry import to_world
 from .mekf import Mekf
 from .parameters import MekfParameters
-from .types import CameraError, Estimator, Eye, Measurement, PoseHypothesis, TargetEstimate
+from .types import CameraError, CameraPose, Estimator, Measurement, PoseHypothesis, TargetState
 
 ESTIMATORS = ("mekf", "paper")
 
@@ -28,15 +28,15 @@ def make_estimator(name: str, parameters: MekfParameters | PaperParameters | Non
 __all__ = [
     "ESTIMATORS",
     "CameraError",
+    "CameraPose",
     "Estimator",
-    "Eye",
     "Measurement",
     "Mekf",
     "MekfParameters",
     "PaperEstimator",
     "PaperParameters",
     "PoseHypothesis",
-    "TargetEstimate",
+    "TargetState",
     "make_estimator",
     "to_world",
 ]

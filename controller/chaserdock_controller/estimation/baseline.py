@@ -19,7 +19,7 @@ from itertools import groupby
 import numpy as np
 
 from .so3 import qinv_mul, qlog
-from .types import Array, Matrix3, Measurement, Shock, TargetEstimate, content_key, is_usable, no_estimate
+from .types import Array, Matrix3, Measurement, Shock, TargetState, content_key, is_usable, no_estimate
 
 
 @dataclass(frozen=True)
@@ -100,7 +100,7 @@ class PaperEstimator:
         self._events: list[tuple[int, str]] = []
         self._was_lost = False
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate:
+    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
         """Takes in measurements, in any order, and returns the estimate for ``now_ns``."""
         usable: list[Measurement] = []
         for m in sorted(measurements, key=content_key):
@@ -129,7 +129,7 @@ class PaperEstimator:
         self._was_lost = estimate.status == "lost"
         return estimate
 
-    def estimate_at(self, time_ns: int) -> TargetEstimate:
+    def estimate_at(self, time_ns: int) -> TargetState:
         """The newest combination, unchanged, whatever the time: the method predicts nothing."""
         if self._mean is None:
             return no_estimate(time_ns)
@@ -143,7 +143,7 @@ class PaperEstimator:
             omega = np.mean([w for _, w in self._rates], axis=0)
         sigma = (p.sigma_position_m, p.sigma_velocity_m_s, p.sigma_attitude_rad, p.sigma_omega_rad_s)
         covariance = np.diag(np.repeat(np.square(sigma), 3))
-        return TargetEstimate(
+        return TargetState(
             time_ns,
             position.copy(),
             velocity,

@@ -16,7 +16,7 @@ import numpy as np
 
 from .parameters import MekfParameters
 from .so3 import qexp, qinv_mul, qmatrix, qmul, right_jacobian, skew
-from .types import Array, Eye
+from .types import Array, CameraPose
 
 ERRORS = 7
 """Numbers of a camera's calibration error: turn (3), shift (3), focal length (1)."""
@@ -34,7 +34,7 @@ class Seen(NamedTuple):
     by_errors: Array
 
 
-def seen_by(eye: Eye, position_m: Array, q_wxyz: Array, errors: Array) -> Seen:
+def seen_by(eye: CameraPose, position_m: Array, q_wxyz: Array, errors: Array) -> Seen:
     """What a camera with ``errors`` (7,) measures of a target at ``position_m`` (3,), ``q_wxyz`` (4,), WRF."""
     axes = qmatrix(eye.q_wxyz)
     turn, longer = errors[:3], 1.0 + float(errors[6])
@@ -64,7 +64,7 @@ def _diagonal(turn_rad: float, shift_m: float, share: float) -> Array:
     return matrix
 
 
-def pose_prior(eye: Eye, position_m: Array, q_wxyz: Array, p: MekfParameters) -> Array:
+def pose_prior(eye: CameraPose, position_m: Array, q_wxyz: Array, p: MekfParameters) -> Array:
     """Covariance (6, 6) of a measured pose that comes of the camera's unknown errors alone."""
     g = seen_by(eye, position_m, q_wxyz, NO_ERROR).by_errors
     return g @ prior(p) @ g.T

@@ -17,7 +17,7 @@ from . import motion_models as motion
 from .camera_calibration import ERRORS, NO_ERROR, pose_prior, prior, seen_by
 from .parameters import MekfParameters, chi_square_6
 from .so3 import qexp, qinv_mul, qlog, qmul, qnormalize, right_jacobian
-from .types import Array, Eye, Measurement, PoseHypothesis
+from .types import Array, CameraPose, Measurement, PoseHypothesis
 
 POSE = np.array([0, 1, 2, 6, 7, 8])
 _POSE_GRID = np.ix_(POSE, POSE)
@@ -121,7 +121,9 @@ def with_cameras(branch: Branch, chasers: list[int], p: MekfParameters) -> Branc
     return replace(branch, cameras=branch.cameras + new, bias=bias, covariance=covariance)
 
 
-def innovate(branch: Branch, chaser: int, eye: Eye, h: PoseHypothesis, p: MekfParameters) -> Innovation:
+def innovate(
+    branch: Branch, chaser: int, eye: CameraPose, h: PoseHypothesis, p: MekfParameters
+) -> Innovation:
     """How the measured pose ``h`` differs from the branch's prediction, and how much that may be.
 
     The residual's Jacobian is exact at zero error; the camera's own errors are part of the prediction.
@@ -219,7 +221,7 @@ def absorb(
     return branch, tuple(sorted(accepted)), tuple(sorted(rejected))
 
 
-def agreement(poses: list[tuple[PoseHypothesis, Eye]], p: MekfParameters) -> list[int]:
+def agreement(poses: list[tuple[PoseHypothesis, CameraPose]], p: MekfParameters) -> list[int]:
     """For each pose, how many of the others agree with it within noise, floor and the cameras' prior errors."""
     counts = [0] * len(poses)
     for i in range(len(poses)):
@@ -230,14 +232,16 @@ def agreement(poses: list[tuple[PoseHypothesis, Eye]], p: MekfParameters) -> lis
     return counts
 
 
-def agree(a: PoseHypothesis, eye_a: Eye, b: PoseHypothesis, eye_b: Eye, p: MekfParameters) -> bool:
+def agree(
+    a: PoseHypothesis, eye_a: CameraPose, b: PoseHypothesis, eye_b: CameraPose, p: MekfParameters
+) -> bool:
     """Whether two measured poses of the same time differ by no more than their errors explain."""
     d = np.concatenate([a.position_m - b.position_m, qlog(qinv_mul(b.q_wxyz, a.q_wxyz))])
     s = _spread(a, eye_a, p) + _spread(b, eye_b, p)
     return float(d @ np.linalg.solve(s, d)) <= chi_square_6(p.gate_probability)
 
 
-def _spread(h: PoseHypothesis, eye: Eye, p: MekfParameters) -> Array:
+def _spread(h: PoseHypothesis, eye: CameraPose, p: MekfParameters) -> Array:
     """Covariance (6, 6) of a measured pose, its camera's unknown errors among it."""
     noise = measurement_noise(h, p)
     return noise + pose_prior(eye, h.position_m, h.q_wxyz, p) if p.has_bias else noise

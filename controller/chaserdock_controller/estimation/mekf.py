@@ -21,7 +21,7 @@ from .types import (
     Matrix3,
     Measurement,
     Shock,
-    TargetEstimate,
+    TargetState,
     content_key,
     is_usable,
     no_estimate,
@@ -81,7 +81,7 @@ class Mekf:
         state = self._newest()
         return state.reinitialisations if state else 0
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate:
+    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
         """Takes in measurements, of any exposure times up to ``now_ns`` and in any order, and returns
         the estimate for ``now_ns``. Raises ValueError as ``estimate_at``."""
         newest = self._buffer[-1].time_ns if self._buffer else None
@@ -110,7 +110,7 @@ class Mekf:
         self._was_lost = lost
         return estimate
 
-    def estimate_at(self, time_ns: int) -> TargetEstimate:
+    def estimate_at(self, time_ns: int) -> TargetState:
         """The estimate for ``time_ns``, from the measurements exposed up to then; changes nothing.
 
         Raises ValueError for a time before the oldest state still held in the buffer.
@@ -131,7 +131,7 @@ class Mekf:
             status = "predicting"
         covariance = mixture_covariance(branches)
         covariance[np.ix_(POSE, POSE)] += state.frozen
-        return TargetEstimate(
+        return TargetState(
             time_ns,
             best.position_m.copy(),
             best.velocity_m_s.copy(),

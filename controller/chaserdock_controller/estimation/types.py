@@ -29,7 +29,7 @@ class PoseHypothesis:
 
 
 @dataclass(frozen=True, eq=False)
-class Eye:
+class CameraPose:
     """A camera at an exposure, as odometry and calibration have it: its lens (3,) in WRF, and (4,) IRF to WRF."""
 
     position_m: Array
@@ -49,7 +49,7 @@ class Measurement:
     time_ns: int
     hypotheses: tuple[PoseHypothesis, ...]
     markers: int
-    eye: Eye
+    eye: CameraPose
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +68,7 @@ class CameraError:
 
 
 @dataclass(frozen=True, eq=False)
-class TargetEstimate:
+class TargetState:
     """The fused state of the target at ``time_ns``.
 
     position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
@@ -117,9 +117,9 @@ class Estimator(Protocol):
     @property
     def reinitialisations(self) -> int: ...
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate: ...
+    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState: ...
 
-    def estimate_at(self, time_ns: int) -> TargetEstimate: ...
+    def estimate_at(self, time_ns: int) -> TargetState: ...
 
     def disturb(self, shock: Shock) -> None: ...
 
@@ -131,9 +131,9 @@ class Estimator(Protocol):
 NO_ESTIMATE_VARIANCE = 1e6
 
 
-def no_estimate(time_ns: int) -> TargetEstimate:
+def no_estimate(time_ns: int) -> TargetState:
     """The estimate with status "none" at ``time_ns``."""
-    return TargetEstimate(
+    return TargetState(
         time_ns,
         np.zeros(3),
         np.zeros(3),

@@ -17,7 +17,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import Scenario
 
-from chaserdock_controller.core import Flight, Inputs, Outputs
+from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.output.latency_compensation import integrate
 
 from .perfect_knowledge import PerfectEstimator
@@ -71,7 +71,7 @@ def fly_offline(
     the actuators give of what they are asked for. Raises ValueError for a target that is not prescribed.
     """
     truth = PerfectEstimator(scenario.target)
-    flight = Flight(scenario, time.perf_counter, PerfectEstimator(scenario.target))
+    flight = ControllerCore(scenario, time.perf_counter, PerfectEstimator(scenario.target))
     timing, n = scenario.timing, len(scenario.chasers)
     states, acting = _initial(scenario), np.zeros((n, 6))
     waiting: list[tuple[int, Array]] = []
@@ -85,7 +85,7 @@ def fly_offline(
             break
         if now_ns >= busy_until_ns:
             odometry = {i: _odometry(i, tick, now_ns, x) for i, x in enumerate(states)}
-            out = flight.step(Inputs(tick, now_ns, odometry, ()))
+            out = flight.step(TickInputs(tick, now_ns, odometry, ()))
             failed += _failures(out)
             took_s = out.solver.wall_solve_s if out.solver is not None else 0.0
             solve_s.append(took_s)
@@ -116,13 +116,13 @@ def fly_offline(
     )
 
 
-def _failures(out: Outputs) -> int:
+def _failures(out: TickOutputs) -> int:
     if out.solver is None or not out.solver.status:
         return 1
     return sum(status == "failed" for status in out.solver.status)
 
 
-def _errors(scenario: Scenario, flight: Flight, there, states: Array, now_ns: int) -> Array:
+def _errors(scenario: Scenario, flight: ControllerCore, there, states: Array, now_ns: int) -> Array:
     """Distance (m) and angle (rad) of every chaser to its reference pose, (N, 2)."""
     out = np.empty((len(states), 2))
     for i, x in enumerate(states):

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from chaserdock_protocol.scenario.bodies import Target
 
-from chaserdock_controller.estimation.types import Matrix3, Measurement, Shock, TargetEstimate
+from chaserdock_controller.estimation.types import Matrix3, Measurement, Shock, TargetState
 from chaserdock_controller.guidance.reference import predict_target
 
 
@@ -28,11 +28,11 @@ class PerfectEstimator:
         self._velocity = np.array(target.velocity_m_s) if moves else still
         self._omega = np.array(target.omega_rad_s) if moves else still
 
-    def estimate_at(self, time_ns: int) -> TargetEstimate:
+    def estimate_at(self, time_ns: int) -> TargetState:
         """The state at any time, with a covariance of 1e-12 (SI units) on the diagonal."""
         position, q = self._start
         positions, attitudes = predict_target(position, self._velocity, q, self._omega, [time_ns / 1e9])
-        return TargetEstimate(
+        return TargetState(
             time_ns,
             positions[0],
             self._velocity,
@@ -44,7 +44,7 @@ class PerfectEstimator:
             (),
         )
 
-    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetEstimate:
+    def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
         """The state now; measurements are not needed."""
         return self.estimate_at(now_ns)
 

@@ -14,8 +14,7 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 
 from chaserdock_controller.estimation.rigid_target import TargetBody, TargetPath, joined, tumble
-from chaserdock_controller.estimation.types import Estimator, Shock
-from chaserdock_controller.estimation.types import TargetEstimate as Fused
+from chaserdock_controller.estimation.types import Estimator, Shock, TargetState
 from chaserdock_controller.output.latency_compensation import CommandHistory
 
 from . import reference
@@ -104,7 +103,7 @@ class Captures:
             sigmas[1] = math.hypot(sigmas[1], turned)
         self._estimator.disturb(Shock(sigmas[0], sigmas[1], velocity, omega))
 
-    def join(self, fused: Fused, odometry: dict[int, Odometry]) -> None:
+    def join(self, fused: TargetState, odometry: dict[int, Odometry]) -> None:
         """After this tick's sightings: if somebody has latched or let go, the target is another body from now on.
 
         The held chasers' masses and the target's are the scenario's, where they hold it is estimated.
@@ -122,7 +121,7 @@ class Captures:
         self._estimator.change_body((tuple(rows[0]), tuple(rows[1]), tuple(rows[2])), tuple(centre))
         self._changed = False
 
-    def path(self, ahead: Fused, step_s: float, steps: int) -> tuple[TargetPath, TargetPath]:
+    def path(self, ahead: TargetState, step_s: float, steps: int) -> tuple[TargetPath, TargetPath]:
         """The target from the estimate ``ahead`` on: at 0, step_s, ... steps * step_s, and in the middles between."""
         state = (ahead.position_m, ahead.velocity_m_s, ahead.q_wxyz, ahead.omega_rad_s)
         if self._free:
@@ -136,7 +135,9 @@ class Captures:
         nodes = TargetPath(positions[:k], attitudes[:k], rates, still, still)
         return nodes, TargetPath(positions[k:], attitudes[k:], rates[1:], still[1:], still[1:])
 
-    def senses(self, i: int, fused: Fused, odometry: Odometry, told: DockingStatus | None) -> Senses | None:
+    def senses(
+        self, i: int, fused: TargetState, odometry: Odometry, told: DockingStatus | None
+    ) -> Senses | None:
         """What guidance wants to know of a chaser at its port; None where it has none."""
         s = self._scenario
         port = s.docking.port_of(i)
@@ -154,7 +155,7 @@ class Captures:
         return Senses(view, contact, i in self.latched, *pose_in_target(fused, odometry))
 
 
-def pose_in_target(fused: Fused, odometry: Odometry) -> tuple[Array, Array]:
+def pose_in_target(fused: TargetState, odometry: Odometry) -> tuple[Array, Array]:
     """A chaser's estimated centre (3,) and attitude (4,) in TRF."""
     centre = rotations.rotate_inverse(fused.q_wxyz, np.array(odometry.position_m) - fused.position_m)
     return centre, rotations.multiply(rotations.conjugate(fused.q_wxyz), odometry.q_wxyz)

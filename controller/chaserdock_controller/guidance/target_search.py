@@ -8,7 +8,7 @@ from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
 
-from chaserdock_controller.estimation.types import TargetEstimate as Fused
+from chaserdock_controller.estimation.types import TargetState
 
 from .pointing import facing, search_wrench, turning_wrench
 
@@ -16,7 +16,7 @@ from .pointing import facing, search_wrench, turning_wrench
 _SETTLED_M_S, _SETTLED_RAD_S = 0.01, 0.02
 
 
-def settled(fused: Fused) -> bool:
+def settled(fused: TargetState) -> bool:
     """Whether the target's rates are known well enough to fly by."""
     sums = [float(fused.covariance.diagonal()[i : i + 3].sum()) for i in (3, 9)]
     if sums[0] < _SETTLED_M_S**2 and sums[1] < _SETTLED_RAD_S**2:
@@ -32,7 +32,7 @@ class Searches:
         self._body, self._camera = body, camera
         self._from: dict[int, tuple[float, Array]] = {}
 
-    def wrench(self, odometry: Odometry, since_s: float, fused: Fused) -> Array:
+    def wrench(self, odometry: Odometry, since_s: float, fused: TargetState) -> Array:
         """Force and torque (6,), body axes, of a chaser that has searched since ``since_s``: it looks about or, once
         somebody sees the target, at it."""
         if fused.status in ("tracking", "predicting"):

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from chaserdock_models.rotations import Array
-from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.messages.fields import Level
 
@@ -31,7 +31,7 @@ def margin_m(away_s: float) -> float:
 
 
 @dataclass
-class Absent:
+class LostChasers:
     """The last odometry of every chaser, and who is away; ``told``: who has been said to be."""
 
     known: dict[int, Odometry] = field(default_factory=dict)
@@ -52,7 +52,7 @@ class Absent:
         return events
 
     def away(self, now_ns: int) -> dict[int, Odometry]:
-        """Absent chasers that are obstacles, by their last odometry."""
+        """LostChasers chasers that are obstacles, by their last odometry."""
         return {
             i: o
             for i, o in sorted(self.known.items())
@@ -62,11 +62,13 @@ class Absent:
 
 def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
     """Positions (K, 3), WRF, of a chaser by its last odometry, ``times_s`` (K,) after ``from_ns``."""
-    ahead = went_on(last, last.tick, from_ns)
+    ahead = extrapolate(last, last.tick, from_ns)
     return np.asarray(ahead.position_m) + times_s[:, None] * np.asarray(ahead.velocity_m_s)
 
 
-def with_absent(problem: NmpcInput, away: Mapping[int, Odometry], from_ns: int, step_s: float) -> NmpcInput:
+def with_lost_chasers(
+    problem: NmpcInput, away: Mapping[int, Odometry], from_ns: int, step_s: float
+) -> NmpcInput:
     """The problem with a row for each absent chaser after the others': it coasts and avoids nobody, and they avoid it.
 
     ``from_ns``: the time of stage 0. The margin is that of the horizon's end.

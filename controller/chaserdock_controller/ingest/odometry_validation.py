@@ -14,7 +14,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.extrapolation import went_on
+from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.messages.fields import Level
 from chaserdock_protocol.scenario import Scenario
@@ -37,7 +37,7 @@ class Known:
         return bool(np.any(self.off_m)) or bool(self.turn[0] != 1.0)
 
 
-class OdometryWatch:
+class OdometryValidation:
     """The odometry of all chasers, each as far as it can be believed."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -57,7 +57,7 @@ class OdometryWatch:
         if known is None or not 0.0 < after_s <= LONGEST_S:
             self._known[odometry.chaser] = Known(odometry)
             return odometry, []
-        ahead = went_on(known.last, odometry.tick, odometry.sim_time_ns)
+        ahead = extrapolate(known.last, odometry.tick, odometry.sim_time_ns)
         limit_m = (
             PLAUSIBLE_M + self._noise_m + self._slip_m_s * after_s + self._acceleration_m_s2 * after_s**2
         )

@@ -14,7 +14,7 @@ AGREES_S = 0.6
 
 
 @dataclass
-class Agreement:
+class SensorConsistency:
     """Which chasers' sightings the estimator has refused for how long. A lying camera or odometry shows in this."""
 
     disagreeing: set[int] = field(default_factory=set)

@@ -17,7 +17,7 @@ import numpy as np
 from .casadi_nlp import pack, row_floor
 from .problem import Nlp, build_nlp
 from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, worded
+from .warm_start import Frame, status_of
 
 MAX_OUTER, MAX_INNER = 10, 100
 # Of the scaled problem, inputs as shares of their limits: gradient in units of cost (it begins at some 1e3), and m.
@@ -89,7 +89,7 @@ class AlpaqaSolver:
         if usable:
             u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
         iterations = np.full(n, int(stats["inner"]["iterations"]), dtype=np.int64)
-        return frame.finish(task, u, [worded(usable, late)] * n, iterations)
+        return frame.finish(task, u, [status_of(usable, late)] * n, iterations)
 
 
 def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
@@ -100,7 +100,7 @@ def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
     """
     n = nlp.n
     x, p = nlp.problem["x"], nlp.problem["p"]
-    # Inputs as shares of their limits, which are the last parameters: a well-scaled box.
+    # TickInputs as shares of their limits, which are the last parameters: a well-scaled box.
     w, limits = ca.SX.sym("w", x.numel()), ca.SX.sym("limits", 6 * n)
     f, g = ca.Function("nlp", [x, p], [nlp.problem["f"], nlp.problem["g"]])(
         w * ca.repmat(limits, nlp.stages, 1), p

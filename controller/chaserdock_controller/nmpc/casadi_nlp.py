@@ -16,7 +16,7 @@ import numpy as np
 from .problem import Nlp, build_nlp
 from .slack import slack_l1_weight
 from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, Task, worded
+from .warm_start import Frame, Task, status_of
 
 MAX_ITERATIONS = 200
 # The solvers' own words for an answer that can be flown, and for the best one had when iterations ran out.
@@ -132,4 +132,4 @@ class NlpSolver:
         usable = (solved or late) and bool(np.isfinite(solution).all())
         if usable:
             u = np.clip(solution, -limits[:, None, :], limits[:, None, :])
-        return frame.finish(task, u, [worded(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+        return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))

@@ -28,7 +28,7 @@ import numpy as np
 from .casadi_nlp import pack, row_floor
 from .problem import Nlp, build_nlp
 from .types import NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, worded
+from .warm_start import Frame, status_of
 
 MAX_INNER = 500
 TOLERANCE = 1e-3
@@ -91,7 +91,7 @@ class OpenSolver:
             iterations = int(status.num_inner_iterations)
             if usable:
                 u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
-        return frame.finish(task, u, [worded(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+        return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
 
 
 def _called(nlp: Nlp, x: Any, p: Any) -> tuple[Any, Any]:
@@ -110,7 +110,7 @@ def _built(nlp: Nlp, inner: int) -> Any:
     """The compiled solver of a problem, from the cache or fresh."""
     import opengen as og  # pyright: ignore[reportMissingImports] (an extra)
 
-    # Inputs as shares of their limits, a well-scaled box. Lower bounds of the distances are parameters.
+    # TickInputs as shares of their limits, a well-scaled box. Lower bounds of the distances are parameters.
     inputs, rooms = 6 * nlp.n * nlp.stages, nlp.stages * nlp.rows
     w, p = ca.MX.sym("w", inputs), ca.MX.sym("p", nlp.problem["p"].numel())
     limits, floor = ca.MX.sym("limits", 6 * nlp.n), ca.MX.sym("floor", rooms)

@@ -16,7 +16,7 @@ import numpy as np
 from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick
 from .slack import SLACK_L2, slack_l1_weight
 from .types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, worded
+from .warm_start import Frame, status_of
 
 # Rows that no admissible input can reach are left out; the bound is taken this much wider.
 REACH_SAFETY = 1.5
@@ -61,7 +61,7 @@ class RtiSolver:
         code, iterations = solve_tick(
             frame.model, frame.weights, p, u, outer_m, self._reach, w1, SLACK_L2, budget
         )
-        plan = frame.finish(task, u, [worded(c != BROKEN, c == LIMIT) for c in code], iterations)
+        plan = frame.finish(task, u, [status_of(c != BROKEN, c == LIMIT) for c in code], iterations)
         cut_short = (code == LIMIT) & (iterations < MAX_ITERATIONS)
         words = [BUDGET if cut else word for cut, word in zip(cut_short, plan.status, strict=True)]
         return replace(plan, status=tuple(words))

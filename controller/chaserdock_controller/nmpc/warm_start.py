@@ -111,6 +111,6 @@ class Frame:
         )
 
 
-def worded(usable: bool, at_limit: bool) -> str:
+def status_of(usable: bool, at_limit: bool) -> str:
     """The status before violations are counted."""
     return FAILED if not usable else (ITERATION_LIMIT if at_limit else SOLVED)

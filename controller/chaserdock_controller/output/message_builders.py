@@ -10,8 +10,7 @@ from chaserdock_protocol.messages import Plan, TargetEstimate, Tick, WrenchComma
 from chaserdock_protocol.messages.fields import CameraCalibration
 
 from chaserdock_controller.estimation import Mekf
-from chaserdock_controller.estimation.types import Estimator
-from chaserdock_controller.estimation.types import TargetEstimate as Fused
+from chaserdock_controller.estimation.types import Estimator, TargetState
 from chaserdock_controller.nmpc import NmpcPlan
 
 
@@ -29,7 +28,7 @@ def plan_message(chaser: int, tick: int, effective_ns: int, step_s: float, plan:
 
 
 def target_message(
-    tick: int, time_ns: int, fused: Fused, seen: set[int], estimator: Estimator, camera: Camera
+    tick: int, time_ns: int, fused: TargetState, seen: set[int], estimator: Estimator, camera: Camera
 ) -> TargetEstimate:
     """The fused state; ``seen``: chasers whose sightings of the target came for this tick."""
     return TargetEstimate(

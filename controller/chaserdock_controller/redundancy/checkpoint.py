@@ -14,7 +14,7 @@ import msgspec
 from chaserdock_models.docking_geometry import PortView
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 
-from chaserdock_controller.core import Flight
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import Mekf
 from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
 from chaserdock_controller.estimation.filter_update import FilterState
@@ -22,12 +22,12 @@ from chaserdock_controller.estimation.hypothesis import Branch
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.rigid_target import TargetBody
-from chaserdock_controller.estimation.types import Eye, Measurement, PoseHypothesis, Shock
+from chaserdock_controller.estimation.types import CameraPose, Measurement, PoseHypothesis, Shock
 from chaserdock_controller.guidance.docking import Senses
 from chaserdock_controller.guidance.phases import ChaserGuidance
 from chaserdock_controller.guidance.trajectories import Glide, Move, Part
-from chaserdock_controller.ingest.odometry_validation import Known, OdometryWatch
-from chaserdock_controller.ingest.sensor_consistency import Agreement
+from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
+from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 
 from . import serialization as plain
 
@@ -35,7 +35,7 @@ CLASSES: tuple[type, ...] = (
     Branch,
     ChaserGuidance,
     Exposure,
-    Eye,
+    CameraPose,
     FilterState,
     Glide,
     ThrusterReport,
@@ -61,7 +61,7 @@ _CAPTURES = ("body", "latched", "_changed")
 _FLIGHT = ("_odometry", "_last_solve_ns", "_troubled")
 
 
-class NoMemory(ValueError):
+class CheckpointError(ValueError):
     """Bytes that are no controller's state, or not of this mission; the text says why."""
 
 
@@ -73,10 +73,12 @@ class _Drawer:
     names: tuple[str, ...]
 
 
-class Memory:
+class Checkpoint:
     """What is told and taken over of one controller."""
 
-    def __init__(self, flight: Flight, watch: OdometryWatch, agreement: Agreement) -> None:
+    def __init__(
+        self, flight: ControllerCore, watch: OdometryValidation, agreement: SensorConsistency
+    ) -> None:
         self._flight = flight
         # The flight's parts are looked up when they are needed: a replay of fusion alone has none.
         parts: dict[str, Any] = {
@@ -93,7 +95,7 @@ class Memory:
         self._drawers = {name: _Drawer(*part) for name, part in parts.items()}
 
     def told(self) -> bytes:
-        """The state now. Raises NoMemory when something in it cannot be told."""
+        """The state now. Raises CheckpointError when something in it cannot be told."""
         values: dict[str, Any] = {
             name: {attribute: vars(drawer.owner())[attribute] for attribute in drawer.names}
             for name, drawer in self._drawers.items()
@@ -105,22 +107,22 @@ class Memory:
         try:
             return msgspec.msgpack.encode(plain.told(values, CLASSES))
         except plain.NotPlain as error:
-            raise NoMemory(f"not to be told: {error}") from None
+            raise CheckpointError(f"not to be told: {error}") from None
 
     def recall(self, state: bytes) -> None:
-        """Takes a state over, whole or not at all. Raises NoMemory."""
+        """Takes a state over, whole or not at all. Raises CheckpointError."""
         try:
             values = plain.understood(msgspec.msgpack.decode(state), CLASSES)
             for name, drawer in self._drawers.items():
                 if set(values[name]) != set(drawer.names):
-                    raise NoMemory(f"{name}: {', '.join(map(str, values[name]))}")
+                    raise CheckpointError(f"{name}: {', '.join(map(str, values[name]))}")
             chasers = values["guidance"]["chasers"]
             due, there = int(values["guidance"]["_due"]), self._flight.scenario.timeline
             plans, estimator = dict(values["plans"]), dict(values["estimator"])
         except (msgspec.DecodeError, plain.NotPlain, LookupError, TypeError, ValueError) as error:
-            raise NoMemory(str(error)) from None
+            raise CheckpointError(str(error)) from None
         if len(chasers) != len(self._flight.scenario.chasers) or not 0 <= due <= len(there):
-            raise NoMemory("it is of another mission")
+            raise CheckpointError("it is of another mission")
         values["guidance"]["_due"] = sorted(there, key=lambda entry: entry.at_s)[len(there) - due :]
         for name, drawer in self._drawers.items():
             _put(drawer.owner(), values[name])
@@ -153,6 +155,6 @@ def _of_estimator(estimator: Any) -> dict[str, Any]:
     return {"kind": type(estimator).__name__, **values}
 
 
-def _frame_of(flight: Flight) -> Any:
+def _frame_of(flight: ControllerCore) -> Any:
     """Where the solver keeps its warm starts, if it is one of ours."""
     return vars(vars(flight)["_solver"]).get("_frame")

@@ -21,7 +21,7 @@ _MOST_HELD = 100_000
 
 
 @dataclass
-class Shadow:
+class HotStandby:
     """``commands``: the newest tick gives the command to this process; ``since``: from which tick on."""
 
     name: str

@@ -91,7 +91,7 @@ def partners_of(process: str, present: set[str]) -> set[str]:
     return present - {process}
 
 
-class PresenceTeller:
+class Heartbeat:
     """Publishes this process' presence at intervals and collects the others'; a daemon thread of its own.
 
     Construct it after all other subscriptions of the node.

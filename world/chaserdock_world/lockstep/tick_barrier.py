@@ -11,7 +11,7 @@ from chaserdock_protocol.fault_injection import Lost
 from chaserdock_protocol.messages import ActuatorCommand, Event, Latch, Presence, RecorderAck, Tick
 from chaserdock_protocol.process import say
 from chaserdock_protocol.transport import Node
-from chaserdock_protocol.transport.session import PresenceTeller, health_of
+from chaserdock_protocol.transport.session import Heartbeat, health_of
 
 from chaserdock_world.actuators.ideal import Actuators
 
@@ -32,7 +32,7 @@ class Answers:
         self,
         node: Node,
         membership: Membership,
-        teller: PresenceTeller,
+        heartbeat: Heartbeat,
         timing: Timing,
         actuators: Mapping[str, Actuators],
         step_now: Callable[[], int],
@@ -48,7 +48,7 @@ class Answers:
         self._standby_expected = standby_expected
         self._node = node
         self._membership = membership
-        self._teller = teller
+        self._teller = heartbeat
         self._timing = timing
         self._actuators = actuators
         self._step_now = step_now

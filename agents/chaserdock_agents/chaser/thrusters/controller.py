@@ -169,7 +169,7 @@ class ThrusterController:
             given_angular_impulse_N_m_s=vector(given[3:]),
         )
 
-    def heed(self, command: WrenchCommand) -> None:
+    def apply_command(self, command: WrenchCommand) -> None:
         """Takes what a command says beside its wrench: what the operator wants of thrusters, whether it flies freely."""
         shut, trusted = frozenset(command.isolated), frozenset(command.trusted)
         count = len(self._full_N)

@@ -28,11 +28,11 @@ def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int |
 
         return NlpSolver(name, params, n, max_iterations)
     if name == "alpaqa":
-        from .alpaqa import AlpaqaSolver
+        from .alpaqa_backend import AlpaqaSolver
 
         return AlpaqaSolver(params, n, max_iterations)
     if name == "open":
-        from .open import OpenSolver
+        from .open_backend import OpenSolver
 
         return OpenSolver(params, n, max_iterations)
     return plugins.load("solver", name, BACK_ENDS)(params, n, max_iterations)

@@ -101,10 +101,7 @@ class ControllerCore:
             inputs = replace(inputs, odometry=good)
         fused, target = self.fuse(inputs)
         out = TickOutputs(target=target)
-        told = [
-            ("warning" if "gated out" in text else "info", text) for _, text in self.estimator.drain_events()
-        ]
-        self._events(out, inputs, told)
+        self._events(out, inputs, [(e.level, e.text) for e in self.estimator.drain_events()])
         if fused.status in ("tracking", "predicting"):
             self.guidance.watch(now_s, seen=fused.status == "tracking")
             self.guidance.found(now_s)

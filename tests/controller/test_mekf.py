@@ -197,7 +197,7 @@ def test_too_late_too_early_twice_and_unusable_are_counted_and_change_nothing() 
     after = f.update([see(rng, 1, ns(2)), see(rng, 0, ns(70)), see(rng, 0, ns(59)), *unusable], ns(59))
     assert same(before, after)
     assert (f.late_dropped, f.early_dropped, f.duplicates, f.invalid) == (1, 1, 1, 6)
-    assert sum("unusable" in text for _, text in f.drain_events()) == 6
+    assert sum("unusable" in text for _, _, text in f.drain_events()) == 6
 
 
 def test_estimate_at_is_pure_and_predicts() -> None:
@@ -240,10 +240,10 @@ def test_events_are_told_once_even_when_exposures_are_replayed() -> None:
     f = Mekf()
     rng = np.random.default_rng(15)
     f.update([see(rng, 0, ns(5))], ns(5))
-    assert [t for _, t in f.drain_events()] == ["initialised by chaser 0"]
+    assert [t for _, _, t in f.drain_events()] == ["initialised by chaser 0"]
     f.update([see(rng, 0, ns(6))], ns(6))
     assert f.drain_events() == []
     f.update([see(rng, 1, ns(5))], ns(6))  # replays the start
     assert f.drain_events() == []
     f.update([see(rng, 1, ns(4))], ns(6))  # it turns out that another one saw it first
-    assert f.drain_events() == [(ns(4), "initialised by chaser 1")]
+    assert f.drain_events() == [(ns(4), "info", "initialised by chaser 1")]

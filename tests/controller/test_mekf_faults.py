@@ -46,12 +46,12 @@ def test_lost_and_found_again_with_the_rates_kept() -> None:
     omega = f.estimate_at(ns(5 * HZ)).omega_rad_s
     k = 400 * HZ
     assert f.update([], ns(k)).status == "lost"
-    assert [t for _, t in f.drain_events()].count("lost") == 1
+    assert [t for _, _, t in f.drain_events()].count("lost") == 1
     e = f.update([see(rng, 0, ns(k + 1))], ns(k + 1))
     assert e.status == "tracking"
     assert np.linalg.norm(e.omega_rad_s - omega) < 1e-12
     assert f.reinitialisations == 1
-    assert "found again by chaser 0" in [t for _, t in f.drain_events()]
+    assert "found again by chaser 0" in [t for _, _, t in f.drain_events()]
 
 
 def test_a_start_too_vague_for_one_exposure_adds_up() -> None:
@@ -109,7 +109,7 @@ def test_a_lying_camera_among_three_is_gated_out(liar: int, alone_s: int) -> Non
     assert e.sightings == 2
     assert np.linalg.norm(errors(e)[:3]) < 2e-3
     assert np.linalg.norm(errors(e)[6:9]) < math.radians(0.3)
-    texts = [t for _, t in f.drain_events()]
+    texts = [t for _, _, t in f.drain_events()]
     assert f"chaser {liar} gated out: 10 in a row" in texts
     assert f.reinitialisations == (1 if alone_s else 0)
 
@@ -153,7 +153,7 @@ def test_a_jump_of_the_target_re_initialises_and_keeps_the_rates() -> None:
     assert [s.sightings for s in states] == [0] * 9 + [2] * 11
     assert states[8].status == "predicting"
     assert f.reinitialisations == 1
-    assert any(t.startswith("re-initialised") for _, t in f.drain_events())
+    assert any(t.startswith("re-initialised") for _, _, t in f.drain_events())
     e = states[9]
     assert np.linalg.norm(e.omega_rad_s - W) < math.radians(1.0)
     assert np.linalg.norm(e.velocity_m_s - V) < 0.02
@@ -188,7 +188,7 @@ def test_an_ambiguous_start_is_resolved(wrong_first: bool, helper: str) -> None:
             assert math.sqrt(e.covariance[7, 7]) > math.radians(10.0)
     assert np.linalg.norm(errors(e)[6:9]) < math.radians(0.5)
     assert math.sqrt(e.covariance[7, 7]) < math.radians(1.0)
-    resolved = "ambiguity resolved" in [t for _, t in f.drain_events()]
+    resolved = "ambiguity resolved" in [t for _, _, t in f.drain_events()]
     assert resolved == (helper != "same exposure")
     assert f.reinitialisations == 0
 
@@ -199,7 +199,7 @@ def test_an_ambiguity_that_stays_times_out() -> None:
     e = no_estimate(0)
     for k in range(6 * HZ):
         e = f.update([see(rng, 0, ns(k), flip=FLIP)], ns(k))
-    assert any("timed out" in t for _, t in f.drain_events())
+    assert any("timed out" in t for _, _, t in f.drain_events())
     assert math.sqrt(e.covariance[7, 7]) < math.radians(2.0)
 
 

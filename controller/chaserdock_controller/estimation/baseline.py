@@ -19,7 +19,17 @@ from itertools import groupby
 import numpy as np
 
 from .so3 import qinv_mul, qlog
-from .types import Array, Matrix3, Measurement, Shock, TargetState, content_key, is_usable, no_estimate
+from .types import (
+    Array,
+    EstimatorEvent,
+    Matrix3,
+    Measurement,
+    Shock,
+    TargetState,
+    content_key,
+    is_usable,
+    no_estimate,
+)
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,7 @@ class PaperEstimator:
         self._removed_in_a_row = 0
         self._seen = 0
         self._rejected: tuple[int, ...] = ()
-        self._events: list[tuple[int, str]] = []
+        self._events: list[EstimatorEvent] = []
         self._was_lost = False
 
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
@@ -110,7 +120,9 @@ class PaperEstimator:
                 self.late_dropped += 1
             elif not is_usable(m):
                 self.invalid += 1
-                self._events.append((now_ns, f"chaser {m.chaser}: unusable measurement, dropped"))
+                self._events.append(
+                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: unusable measurement, dropped")
+                )
             else:
                 usable.append(m)
         for time_ns, group in groupby(usable, key=lambda m: m.time_ns):
@@ -125,7 +137,7 @@ class PaperEstimator:
             self._combine(time_ns, fresh)
         estimate = self.estimate_at(now_ns)
         if estimate.status == "lost" and not self._was_lost:
-            self._events.append((now_ns, "lost"))
+            self._events.append(EstimatorEvent(now_ns, "info", "lost"))
         self._was_lost = estimate.status == "lost"
         return estimate
 
@@ -161,7 +173,7 @@ class PaperEstimator:
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
         """Nothing to do: there is no model of the body."""
 
-    def drain_events(self) -> list[tuple[int, str]]:
+    def drain_events(self) -> list[EstimatorEvent]:
         """What happened since the last call, as (simulated time in ns, text)."""
         events, self._events = self._events, []
         return events
@@ -209,9 +221,9 @@ class PaperEstimator:
                 self._rates.clear()
                 self._mean = None
                 self.reinitialisations += 1
-                self._events.append((time_ns, "re-initialised"))
+                self._events.append(EstimatorEvent(time_ns, "info", "re-initialised"))
         else:
-            self._events.append((time_ns, "initialised"))
+            self._events.append(EstimatorEvent(time_ns, "info", "initialised"))
         self._removed_in_a_row = 0
         self._poses.append((position, q))
         mean = (

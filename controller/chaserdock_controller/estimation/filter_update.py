@@ -14,9 +14,7 @@ import numpy as np
 from .hypothesis import Branch, absorb, agree, pose_sigmas, predict, start
 from .parameters import MekfParameters
 from .so3 import qexp, qinv_mul, qlog, qmul
-from .types import Array, Measurement, PoseHypothesis, Shock
-
-Event = tuple[int, str]
+from .types import Array, EstimatorEvent, Measurement, PoseHypothesis, Shock
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,11 +42,11 @@ class FilterState:
 
 def process(
     state: FilterState | None, time_ns: int, group: list[Measurement], p: MekfParameters
-) -> tuple[FilterState, tuple[Event, ...]]:
+) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
     """The state after the exposure at ``time_ns`` with the measurements ``group``, sorted by chaser, and
     what happened. ``state`` is the state after the exposure before, None at the first."""
     before = state if state is not None else FilterState(time_ns)
-    events: list[Event] = []
+    events: list[EstimatorEvent] = []
     seen = [m for m in group if m.hypotheses]
     named = {m.chaser for m in group}
     recent = [m for m in before.recent if m.chaser not in named] + group
@@ -142,17 +140,21 @@ def mixture_covariance(branches: tuple[Branch, ...]) -> Array:
 
 
 def _absorb_all(
-    now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[Event]
+    now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState:
     before = now.branches
     results = [absorb(b, seen, p) for b in before]
     best = max(range(len(results)), key=lambda k: (results[k][0].log_likelihood, -k))
     for chaser in results[best][2]:
         if results[best][0].misses[chaser] == p.sustained_rejections:
-            events.append((now.time_ns, f"chaser {chaser} gated out: {p.sustained_rejections} in a row"))
+            events.append(
+                EstimatorEvent(
+                    now.time_ns, "warning", f"chaser {chaser} gated out: {p.sustained_rejections} in a row"
+                )
+            )
     for chaser in results[best][1]:
         if before[best].misses.get(chaser, 0) >= p.sustained_rejections:
-            events.append((now.time_ns, f"chaser {chaser} accepted again"))
+            events.append(EstimatorEvent(now.time_ns, "info", f"chaser {chaser} accepted again"))
     accepted, rejected = results[best][1:]
     return replace(
         now,
@@ -165,7 +167,7 @@ def _absorb_all(
     )
 
 
-def _choose(now: FilterState, p: MekfParameters, events: list[Event]) -> FilterState:
+def _choose(now: FilterState, p: MekfParameters, events: list[EstimatorEvent]) -> FilterState:
     """Puts the likeliest branch first and drops what evidence or time has ruled out."""
     if len(now.branches) < 2:
         return now
@@ -173,10 +175,10 @@ def _choose(now: FilterState, p: MekfParameters, events: list[Event]) -> FilterS
     top = ranked[0]
     kept = [b for b in ranked if top.log_likelihood - b.log_likelihood < p.ambiguity_log_odds]
     if len(kept) == 1:
-        events.append((now.time_ns, "ambiguity resolved"))
+        events.append(EstimatorEvent(now.time_ns, "info", "ambiguity resolved"))
     elif now.time_ns - now.ambiguous_since_ns > p.ambiguity_timeout_s * 1e9:
         kept = [top]
-        events.append((now.time_ns, "ambiguity timed out: kept the likelier attitude"))
+        events.append(EstimatorEvent(now.time_ns, "info", "ambiguity timed out: kept the likelier attitude"))
     return replace(now, branches=tuple(kept))
 
 
@@ -215,7 +217,7 @@ def _begin(
     rates: tuple[Array, Array, Array],
     p: MekfParameters,
     verb: str,
-    events: list[Event],
+    events: list[EstimatorEvent],
 ) -> FilterState:
     """Branches from the camera that most others agree with; the other cameras follow as updates."""
     seed = max(seen, key=lambda m: (*_ranking(m, opinions, p), -m.chaser))
@@ -223,7 +225,9 @@ def _begin(
     kept = [h for h, s in zip(seed.hypotheses, supports, strict=True) if s == max(supports)]
     branches = tuple(start(now.time_ns, seed, h, rates, p) for h in kept)
     text = f"{verb} by chaser {seed.chaser}"
-    events.append((now.time_ns, text + (", ambiguous: two hypotheses" if len(kept) > 1 else "")))
+    events.append(
+        EstimatorEvent(now.time_ns, "info", text + (", ambiguous: two hypotheses" if len(kept) > 1 else ""))
+    )
     now = replace(
         now,
         branches=branches,
@@ -249,11 +253,11 @@ def _rates(branch: Branch) -> tuple[Array, Array, Array]:
 
 
 def _find_again(
-    now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[Event]
+    now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState | None:
     """Begins anew from the state "lost", with the rates and their covariance as they are; None if the
     measurements by themselves are no better than lost (then they had better add up)."""
-    told: list[Event] = []
+    told: list[EstimatorEvent] = []
     again = replace(now, reinitialisations=now.reinitialisations + 1)
     again = _begin(again, seen, _opinions(now), _rates(now.branches[0]), p, "found again", told)
     if all(is_lost(b, p) for b in again.branches):
@@ -263,7 +267,7 @@ def _find_again(
 
 
 def _restart(
-    now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[Event]
+    now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState:
     """Begins anew where most cameras say the target is, keeping its rates with a wider covariance.
 

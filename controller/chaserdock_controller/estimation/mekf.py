@@ -13,11 +13,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .camera_calibration import ERRORS
-from .filter_update import Event, FilterState, is_lost, mixture_covariance, process, shaken
+from .filter_update import FilterState, is_lost, mixture_covariance, process, shaken
 from .hypothesis import POSE, predict
 from .parameters import MekfParameters
 from .types import (
     CameraError,
+    EstimatorEvent,
     Matrix3,
     Measurement,
     Shock,
@@ -40,7 +41,7 @@ class Exposure:
     parameters: MekfParameters
     shocks: list[Shock] = field(default_factory=list)
     state: FilterState | None = None
-    events: tuple[Event, ...] = ()
+    events: tuple[EstimatorEvent, ...] = ()
 
 
 class Mekf:
@@ -59,8 +60,8 @@ class Mekf:
         self.duplicates = 0
         self._buffer: list[Exposure] = []
         self._base: FilterState | None = None  # the state just before the buffer
-        self._pending: list[Event] = []  # events outside of the buffer, not yet drained
-        self._drained: set[Event] = set()  # events of the buffer already drained
+        self._pending: list[EstimatorEvent] = []  # events outside of the buffer, not yet drained
+        self._drained: set[EstimatorEvent] = set()  # events of the buffer already drained
         self._was_lost = False
 
     @property
@@ -90,14 +91,18 @@ class Mekf:
         for m in sorted(measurements, key=content_key):
             if m.time_ns > now_ns:
                 self.early_dropped += 1
-                self._pending.append((now_ns, f"chaser {m.chaser}: exposure later than now, dropped"))
+                self._pending.append(
+                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: exposure later than now, dropped")
+                )
             elif (horizon is not None and m.time_ns < horizon) or (
                 self._base is not None and m.time_ns <= self._base.time_ns
             ):
                 self.late_dropped += 1
             elif not is_usable(m):
                 self.invalid += 1
-                self._pending.append((now_ns, f"chaser {m.chaser}: unusable measurement, dropped"))
+                self._pending.append(
+                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: unusable measurement, dropped")
+                )
             elif self._insert(m):
                 first_changed = m.time_ns if first_changed is None else min(first_changed, m.time_ns)
         if first_changed is not None:
@@ -106,7 +111,7 @@ class Mekf:
         estimate = self.estimate_at(now_ns)
         lost = estimate.status == "lost"
         if lost and not self._was_lost:
-            self._pending.append((now_ns, "lost"))
+            self._pending.append(EstimatorEvent(now_ns, "info", "lost"))
         self._was_lost = lost
         return estimate
 
@@ -173,7 +178,7 @@ class Mekf:
             centre_of_mass_trf_m=centre_trf_m,
         )
 
-    def drain_events(self) -> list[Event]:
+    def drain_events(self) -> list[EstimatorEvent]:
         """What happened since the last call, as (simulated time in ns, text), in order of time."""
         fresh = [e for x in self._buffer for e in x.events if e not in self._drained]
         self._drained.update(fresh)

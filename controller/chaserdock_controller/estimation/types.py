@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from chaserdock_protocol.messages.fields import Level
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -102,6 +103,14 @@ class Shock:
     omega_rad_s: Array = field(default_factory=lambda: np.zeros(3))
 
 
+class EstimatorEvent(NamedTuple):
+    """A change in the estimator that an operator should know, at simulated time ``time_ns``."""
+
+    time_ns: int
+    level: Level
+    text: str
+
+
 class Estimator(Protocol):
     """What ``make_estimator`` returns: see ``mekf.Mekf`` for the meaning of each member."""
 
@@ -125,7 +134,7 @@ class Estimator(Protocol):
 
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None: ...
 
-    def drain_events(self) -> list[tuple[int, str]]: ...
+    def drain_events(self) -> list[EstimatorEvent]: ...
 
 
 NO_ESTIMATE_VARIANCE = 1e6

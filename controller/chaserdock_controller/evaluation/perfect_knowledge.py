@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from chaserdock_protocol.scenario.bodies import Target
 
-from chaserdock_controller.estimation.types import Matrix3, Measurement, Shock, TargetState
+from chaserdock_controller.estimation.types import EstimatorEvent, Matrix3, Measurement, Shock, TargetState
 from chaserdock_controller.guidance.reference import predict_target
 
 
@@ -54,6 +54,6 @@ class PerfectEstimator:
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
         """Nothing to do: a prescribed target moves the same whoever holds on to it."""
 
-    def drain_events(self) -> list[tuple[int, str]]:
+    def drain_events(self) -> list[EstimatorEvent]:
         """None, ever."""
         return []

@@ -22,7 +22,13 @@ from chaserdock_controller.estimation.hypothesis import Branch
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.rigid_target import TargetBody
-from chaserdock_controller.estimation.types import CameraPose, Measurement, PoseHypothesis, Shock
+from chaserdock_controller.estimation.types import (
+    CameraPose,
+    EstimatorEvent,
+    Measurement,
+    PoseHypothesis,
+    Shock,
+)
 from chaserdock_controller.guidance.docking import Senses
 from chaserdock_controller.guidance.phases import ChaserGuidance
 from chaserdock_controller.guidance.trajectories import Glide, Move, Part
@@ -34,6 +40,7 @@ from . import serialization as plain
 CLASSES: tuple[type, ...] = (
     Branch,
     ChaserGuidance,
+    EstimatorEvent,
     Exposure,
     CameraPose,
     FilterState,

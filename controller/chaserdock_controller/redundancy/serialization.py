@@ -26,6 +26,8 @@ def names_of(kind: type) -> list[str]:
     """Fields of a dataclass or message type."""
     if issubclass(kind, Struct):
         return list(kind.__struct_fields__)
+    if issubclass(kind, tuple):
+        return list(kind._fields)  # type: ignore[attr-defined]
     return [f.name for f in dataclasses.fields(kind)]
 
 

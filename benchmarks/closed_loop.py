@@ -17,7 +17,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, PoseSolution, Sighting, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators.ideal import fly_to
-from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import BodyState, Physics
 
 _SIGMA_M, _SIGMA_RAD = 1e-4, 1e-4
@@ -61,7 +61,7 @@ def fly(
     rng = np.random.default_rng(seed)
     physics, timing = Physics(scenario), scenario.timing
     numbers = range(len(scenario.chasers))
-    actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in numbers}
+    actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in numbers}
     thrusters = scenario.chaser.actuation == "thrusters"
     pilots = {i: ThrusterController(scenario, i) for i in numbers} if thrusters else {}
     flight = ControllerCore(scenario, time.perf_counter)
@@ -77,7 +77,7 @@ def fly(
             for i in numbers:
                 state = physics.state(f"chaser/{i}")
                 odometry[i] = _odometry(state, i, tick, now_ns)
-                took = actuators[f"chaser/{i}"].take(step)
+                took = actuators[f"chaser/{i}"].take_output(step)
                 records[i].absolute_impulse_N_s += took.absolute_impulse_N_s
                 records[i].propellant_kg += took.propellant_kg
                 records[i].thrusters_N_s.append(took.thruster_impulse_N_s)

@@ -23,7 +23,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, OperatorCommand, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators.ideal import fly_to
-from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
 from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.sensors.publish import docking_status, odometry_of
@@ -104,7 +104,7 @@ class Offline:
         s = self.scenario
         self.physics = Physics(s)
         self.flight = ControllerCore(s, lambda: 0.0)
-        self.actuators = {f"chaser/{i}": actuators_of(s, i) for i in range(len(s.chasers))}
+        self.actuators = {f"chaser/{i}": make_actuators(s, i) for i in range(len(s.chasers))}
         thrusters = s.chaser.actuation == "thrusters"
         self.pilots = {i: ThrusterController(s, i) for i in range(len(s.chasers))} if thrusters else {}
 
@@ -125,7 +125,7 @@ class Offline:
         chasers = range(len(s.chasers))
         docking = {x.chaser: docking_status(x, tick, time_ns) for x in physics.latches.values()}
         for latch in physics.latches.values():
-            self.touches += latch.take()
+            self.touches += latch.take_touches()
         odometry = {i: odometry_of(i, states[f"chaser/{i}"], tick, time_ns) for i in chasers}
         reports = {}
         for i, pilot in self.pilots.items():
@@ -161,7 +161,7 @@ class Offline:
 
     def given(self, name: str) -> Array:
         """Impulse (6,), N s and N m s, body axes, that a chaser's actuators gave since this was last asked."""
-        took = self.actuators[name].take(self.physics.step_count)
+        took = self.actuators[name].take_output(self.physics.step_count)
         self.propellant_kg += took.propellant_kg
         return took.impulse
 

@@ -22,10 +22,10 @@ from chaserdock_protocol.messages import Image, OperatorCommand, Sighting
 from chaserdock_protocol.messages import TargetEstimate as Estimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators.ideal import fly_to
-from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import BodyState, Physics
 from chaserdock_world.rendering.cameras import Cameras
-from chaserdock_world.sensors.errors import Navigation
+from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import odometry_of
 
 OnImage = Callable[[Image], Image | None]
@@ -121,8 +121,8 @@ def fly(
 ) -> Flown:
     """Flies a scenario to its end, or until ``until`` says so."""
     physics, timing, cameras = Physics(scenario), scenario.timing, Cameras(scenario)
-    navigation, numbers = Navigation(scenario), range(len(scenario.chasers))
-    actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in numbers}
+    navigation, numbers = OdometrySensor(scenario), range(len(scenario.chasers))
+    actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in numbers}
     perceptions = [make_perception(scenario) for _ in numbers]
     flight = ControllerCore(scenario, time.perf_counter)
     beside = {name: _Shadow(s) for name, s in (shadows or {}).items()}
@@ -139,7 +139,7 @@ def fly(
             now_s = now_ns / 1e9
             states = {name: physics.state(name) for name in physics.bodies}
             odometry = {
-                i: odometry_of(i, navigation.sensed(i, tick, states[f"chaser/{i}"]), tick, now_ns)
+                i: odometry_of(i, navigation.measure(i, tick, states[f"chaser/{i}"]), tick, now_ns)
                 for i in numbers
             }
             sightings: list[Sighting] = []

@@ -34,8 +34,8 @@ class PoseLimits(Protocol):
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A body: position (3,) and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) in body axes."""
+class BodyState:
+    """State of a rigid body: position (3,) and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) in body axes."""
 
     position_m: Array
     velocity_m_s: Array
@@ -81,7 +81,7 @@ def axis_error_deg(port: Port, q_off_wxyz: Array) -> float:
     return math.degrees(math.acos(min(1.0, max(-1.0, -float(ahead @ np.asarray(port.axis))))))
 
 
-def view_of(port: Port, reach_m: float, q_off_wxyz: Array, chaser: Motion, target: Motion) -> PortView:
+def view_of(port: Port, reach_m: float, q_off_wxyz: Array, chaser: BodyState, target: BodyState) -> PortView:
     """Tip relative to port. ``reach_m``: tip from the chaser's centre along +X; ``q_off_wxyz`` (4,) CRF to TRF docked.
 
     Velocities are relative to the target as it turns: what an observer on the port sees.

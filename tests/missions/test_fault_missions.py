@@ -66,7 +66,7 @@ def test_killed_recorder_ends_the_log_and_not_the_flight(tmp_path: Path) -> None
     status, _, told = flown(tmp_path / "run", 'kind = "kill", at_s = 4.0, process = "recorder"')
     assert status == 1
     assert 3.0 < told["sim_time_s"] <= 4.1
-    assert "flown to its end" in (tmp_path / "run" / "processes" / "world.txt").read_text()
+    assert "completed" in (tmp_path / "run" / "processes" / "world.txt").read_text()
 
 
 def test_in_real_time(tmp_path: Path) -> None:

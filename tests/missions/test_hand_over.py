@@ -56,7 +56,7 @@ def test_killed_in_lockstep_the_flight_goes_on_as_if_nothing_had_been(tmp_path: 
     status, killed, told = flown(tmp_path / "killed", 'kind="kill", at_s=2.0, process="controller"')
     assert status == 0, told["failures"]
     what = [(e.what, e.detail) for e in killed.events]
-    assert ("hand-over", "term 2: standby commands: controller is gone") in what
+    assert ("hand-over", "term 2: standby leads: controller lost") in what
     before, after = truth_of(plain), truth_of(killed)
     for name in before:
         np.testing.assert_array_equal(before[name], after[name])
@@ -73,7 +73,9 @@ def test_cut_off_in_lockstep_the_standby_commands_and_keeps_the_command(tmp_path
     assert status == 0, told["failures"]
     log = tmp_path / "cut" / "mission.mcap"
     handed = [e for e in cut.events if e.what == "hand-over"]
-    assert [e.detail for e in handed] == ["term 2: standby commands: controller has been silent for 0.20 s"]
+    assert [e.detail for e in handed] == [
+        "term 2: standby leads: no command of controller executed for 0.20 s"
+    ]
     assert handed[0].sim_time_ns / 1e9 == pytest.approx(1.6, abs=0.01)
     assert any(e.what == "alone: plan" for e in cut.events)
     assert any(e.what == "commanded again" for e in cut.events)

@@ -1,4 +1,4 @@
-"""Terms: who commands, from when on, and that nobody else is obeyed."""
+"""Leader election between controllers, and rejection of commands of stale terms by chasers."""
 
 from __future__ import annotations
 
@@ -8,7 +8,14 @@ import msgspec
 import pytest
 from chaserdock_agents.chaser.command_gate import stale_term
 from chaserdock_protocol.messages import Tick, WrenchCommand
-from chaserdock_world.lockstep.leader_election import BEGIN_S, LEASE_S, Term, Terms, following, lease_s
+from chaserdock_world.lockstep.leader_election import (
+    FIRST_COMMAND_S,
+    LEASE_S,
+    LeaderElection,
+    Term,
+    lease_s,
+    next_term,
+)
 
 BOTH = {"controller": "c1", "standby": "s1"}
 FIRST = Term(1, "controller", "c1")
@@ -16,9 +23,9 @@ NOBODY: frozenset[str] = frozenset()
 
 
 def test_the_first_term_is_the_controllers_and_lasts() -> None:
-    assert following(Term(), BOTH, NOBODY) == FIRST
-    assert following(FIRST, BOTH, NOBODY) is FIRST
-    assert following(FIRST, {"controller": "c1"}, NOBODY) is FIRST
+    assert next_term(Term(), BOTH, NOBODY) == FIRST
+    assert next_term(FIRST, BOTH, NOBODY) is FIRST
+    assert next_term(FIRST, {"controller": "c1"}, NOBODY) is FIRST
 
 
 @pytest.mark.parametrize(
@@ -34,14 +41,14 @@ def test_the_first_term_is_the_controllers_and_lasts() -> None:
     ],
 )
 def test_who_follows(here: dict[str, str], silent: list[str], after: Term) -> None:
-    assert following(FIRST, here, frozenset(silent)) == after
+    assert next_term(FIRST, here, frozenset(silent)) == after
 
 
 def test_a_number_is_never_given_twice() -> None:
     draw, term, seen = random.Random(1), Term(), {}
     for _ in range(2000):
         here = {name: draw.choice("abc") + name[0] for name in BOTH if draw.random() < 0.7}
-        after = following(
+        after = next_term(
             term, here, frozenset(draw.sample(sorted(here.values()), draw.randint(0, len(here))))
         )
         assert after.number >= term.number
@@ -57,28 +64,30 @@ def test_a_number_is_never_given_twice() -> None:
 
 
 def test_silence_ends_a_term_only_where_another_can_have_it() -> None:
-    terms = Terms(LEASE_S)
-    assert terms.review(BOTH, 10.0)
-    terms.flown(1, 10.0)
-    assert not terms.review(BOTH, 10.0 + LEASE_S)
-    assert not terms.review({"controller": "c1"}, 15.0)
-    assert terms.review(BOTH, 15.0) == "term 2: standby commands: controller has been silent for 5.00 s"
-    terms.flown(1, 15.0)  # of the term before: says nothing about this one
-    assert not terms.review(BOTH, 15.0 + 0.9 * BEGIN_S)
-    assert terms.silence_s(15.0 + 1.1 * BEGIN_S) > 0.0
+    election = LeaderElection(LEASE_S)
+    assert election.update(BOTH, 10.0)
+    election.renew_lease(1, 10.0)
+    assert not election.update(BOTH, 10.0 + LEASE_S)
+    assert not election.update({"controller": "c1"}, 15.0)
+    assert (
+        election.update(BOTH, 15.0) == "term 2: standby leads: no command of controller executed for 5.00 s"
+    )
+    election.renew_lease(1, 15.0)  # of the term before: says nothing about this one
+    assert not election.update(BOTH, 15.0 + 0.9 * FIRST_COMMAND_S)
+    assert election.expired_for_s(15.0 + 1.1 * FIRST_COMMAND_S) > 0.0
     # Nobody gets the command back who has not been heard since.
-    assert not terms.review(BOTH, 15.0 + 1.1 * BEGIN_S)
-    terms.lives("c1")
-    assert terms.review(BOTH, 15.0 + 1.1 * BEGIN_S).startswith("term 3: controller commands")
+    assert not election.update(BOTH, 15.0 + 1.1 * FIRST_COMMAND_S)
+    election.mark_responsive("c1")
+    assert election.update(BOTH, 15.0 + 1.1 * FIRST_COMMAND_S).startswith("term 3: controller leads")
 
 
 def test_a_commander_that_is_gone_loses_the_command_at_once() -> None:
-    terms = Terms(LEASE_S)
-    terms.review(BOTH, 0.0)
-    assert terms.review({"standby": "s1"}, 0.0) == "term 2: standby commands: controller is gone"
-    assert terms.review({}, 0.0) == "nobody commands: standby is gone"
-    assert terms.review({"controller": "c2"}, 1.0) == "term 3: controller commands: nobody did"
-    assert not terms.review({"controller": "c2", "standby": "s2"}, 1.0)  # keeps it until it is lost itself
+    election = LeaderElection(LEASE_S)
+    election.update(BOTH, 0.0)
+    assert election.update({"standby": "s1"}, 0.0) == "term 2: standby leads: controller lost"
+    assert election.update({}, 0.0) == "no leader: standby lost"
+    assert election.update({"controller": "c2"}, 1.0) == "term 3: controller leads: no leader before"
+    assert not election.update({"controller": "c2", "standby": "s2"}, 1.0)  # keeps it until it is lost itself
 
 
 def test_a_lease_is_some_ticks_at_least() -> None:
@@ -136,8 +145,8 @@ def test_where_nobody_commands_who_did_last_is_refused() -> None:
 
 
 def test_a_machine_that_stalls_again_and_again_does_not_change_commanders_each_time() -> None:
-    terms, now_s = Terms(LEASE_S), 0.0
-    terms.review(BOTH, now_s)
+    election, now_s = LeaderElection(LEASE_S), 0.0
+    election.update(BOTH, now_s)
 
     def hand_overs(*stalls: float) -> int:
         """How often the command changes hands where commands come every 0.1 s, but each second stop for so long."""
@@ -146,11 +155,11 @@ def test_a_machine_that_stalls_again_and_again_does_not_change_commanders_each_t
         for stall_s in stalls:
             for _ in range(10):
                 now_s += 0.1
-                terms.flown(terms.term.number, now_s)
+                election.renew_lease(election.term.number, now_s)
             for instance in BOTH.values():
-                terms.lives(instance)
+                election.mark_responsive(instance)
             now_s += stall_s
-            changes += bool(terms.review(BOTH, now_s))
+            changes += bool(election.update(BOTH, now_s))
         return changes
 
     assert hand_overs(*[0.25] * 15) == 2  # the second has doubled the lease

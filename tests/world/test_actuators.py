@@ -1,4 +1,4 @@
-"""The actuators: when commands take effect, their limits, and what they are said to have done."""
+"""Ideal actuators: effective times, limits, and the output they report."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def command(seq: int, fx_N: float, torque_N_m: float = 0.0) -> ActuatorCommand:
     )
 
 
-def test_commands_wait_until_they_take_effect_and_then_hold() -> None:
+def test_command_acts_from_its_effective_step_until_the_next() -> None:
     a = IdealActuators(BODY)
     a.command(command(0, 1.0), 10, 0)
     a.command(command(1, 2.0), 20, 0)
@@ -41,14 +41,14 @@ def test_commands_wait_until_they_take_effect_and_then_hold() -> None:
     assert a.late == 0
 
 
-def test_commands_act_in_the_order_of_their_effect_not_of_their_arrival() -> None:
+def test_commands_act_in_order_of_effective_step_not_of_arrival() -> None:
     a = IdealActuators(BODY)
     for seq, effective in ((2, 30), (0, 10), (1, 20)):
         a.command(command(seq, float(seq) / 2), effective, 0)
     assert [a.act(step, 10, STEP_S)[0] for step in (0, 10, 20, 30)] == [0.0, 0.0, 0.5, 1.0]
 
 
-def test_of_two_with_the_same_effect_the_later_number_acts() -> None:
+def test_higher_sequence_number_wins_at_equal_effective_step() -> None:
     for order in ((0, 1), (1, 0)):
         a = IdealActuators(BODY)
         for seq in order:
@@ -56,37 +56,37 @@ def test_of_two_with_the_same_effect_the_later_number_acts() -> None:
         assert a.act(10, 1, STEP_S)[0] == 1.5
 
 
-def test_a_number_used_twice_is_no_trouble() -> None:
-    """A chaser that was started anew counts from zero again."""
+def test_repeated_sequence_number_is_accepted() -> None:
+    """A chaser that restarts counts from zero again."""
     a = IdealActuators(BODY)
     a.command(command(3, 1.0), 10, 0)
     a.command(command(3, 0.5), 10, 0)
     assert a.act(10, 1, STEP_S)[0] in (0.5, 1.0)
 
 
-def test_a_late_command_acts_at_once_and_is_counted() -> None:
+def test_late_command_acts_at_once_and_is_counted() -> None:
     a = IdealActuators(BODY)
     a.act(0, 50, STEP_S)
     a.command(command(0, 1.0), 49, 50)
     a.command(command(1, 1.25), 50, 50)  # just in time
     assert a.next_change(50) is None
     assert a.act(50, 1, STEP_S)[0] == 1.25
-    assert a.take(0)[3] == 1
-    assert a.take(0)[3] == 0
+    assert a.take_output(0)[3] == 1
+    assert a.take_output(0)[3] == 0
 
 
-def test_commands_are_cut_off_at_the_bodys_limits_and_that_is_told() -> None:
+def test_wrench_is_limited_and_saturation_reported() -> None:
     a = IdealActuators(BODY)
     a.command(command(0, BODY.force_max_N, -BODY.torque_max_N_m), 0, 0)
     a.act(0, 1, STEP_S)
-    assert a.take(0)[2] is False
+    assert a.take_output(0)[2] is False
     a.command(command(1, -5.0, 1.0), 1, 0)
     np.testing.assert_array_equal(a.act(1, 1, STEP_S), [-2.0, 0.0, 0.0, 0.05, 0.0, 0.0])
-    assert a.take(0)[2] is True
-    assert a.take(0)[2] is False
+    assert a.take_output(0)[2] is True
+    assert a.take_output(0)[2] is False
 
 
-def test_impulse_is_accounted_for() -> None:
+def test_output_integrates_impulse() -> None:
     a = IdealActuators(BODY)
     both = ActuatorCommand(
         chaser=0,
@@ -98,13 +98,13 @@ def test_impulse_is_accounted_for() -> None:
     a.command(both, HZ, 0)
     a.act(0, HZ, STEP_S)
     a.act(HZ, HZ // 2, STEP_S)
-    impulse, absolute, *_ = a.take(0)
+    impulse, absolute, *_ = a.take_output(0)
     np.testing.assert_allclose(impulse, [0.5, -1.0, 0.25, 0.005, 0.0, -0.01], rtol=1e-12)
     assert absolute == pytest.approx(3.5 / 2)
-    assert a.take(0)[1] == 0.0
+    assert a.take_output(0)[1] == 0.0
 
 
-def test_stop_ends_everything() -> None:
+def test_stop_clears_wrench_and_queue() -> None:
     a = IdealActuators(BODY)
     a.command(command(0, 1.0), 0, 0)
     a.command(command(1, 2.0), 20, 0)
@@ -119,7 +119,9 @@ def test_stop_ends_everything() -> None:
     st.lists(st.integers(1, 59), max_size=3, unique=True),
 )
 @settings(derandomize=True, deadline=None, max_examples=60)
-def test_what_the_body_gets_is_what_was_commanded(commands: list[tuple[int, int]], stops: list[int]) -> None:
+def test_body_receives_the_integral_of_the_commands(
+    commands: list[tuple[int, int]], stops: list[int]
+) -> None:
     """``fly_to`` splits the flight at every change: the momentum gained is the commands' integral."""
     physics = Physics(scenario())
     a = IdealActuators(BODY)
@@ -133,7 +135,7 @@ def test_what_the_body_gets_is_what_was_commanded(commands: list[tuple[int, int]
         for seq in [s for s, (effective, _) in enumerate(commands) if effective == step]:
             force = float(commands[seq][1])
         expected += force * STEP_S
-    impulse, absolute, saturated, *_ = a.take(0)
+    impulse, absolute, saturated, *_ = a.take_output(0)
     velocity = physics.state("chaser/0").velocity_m_s
     physics.close()
     assert impulse[0] == pytest.approx(expected, abs=1e-12)

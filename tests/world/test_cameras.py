@@ -1,4 +1,4 @@
-"""The cameras of a scenario: each effect does what it says, and errors drawn are drawn as stated."""
+"""Cameras of a scenario: every effect, and the distribution of drawn errors."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.scenario.overrides import ScenarioError
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics, prescribed_state
 from chaserdock_world.rendering.cameras import Cameras
-from chaserdock_world.sensors.errors import Navigation, true_camera
+from chaserdock_world.sensors.errors import OdometrySensor, true_camera
 
 SINGLE = Path(__file__).resolve().parents[2] / "scenarios" / "single.toml"
 BARE = (
@@ -38,7 +38,7 @@ def taken(*changes, omega=(0.0, 0.0, 0.0), time_ns=0):
 
 
 @pytest.mark.parametrize("renderer", ["exact", "pybullet"])
-def test_images_taken_at_once_are_those_taken_one_by_one(renderer):
+def test_concurrent_rendering_equals_sequential_rendering(renderer):
     scenario = load_scenario(SINGLE.with_name("four-chaser-docking.toml"), (f"camera.renderer='{renderer}'",))
     physics, cameras = Physics(scenario), Cameras(scenario)
     states = {name: physics.state(name) for name in physics.bodies}
@@ -47,7 +47,7 @@ def test_images_taken_at_once_are_those_taken_one_by_one(renderer):
         assert cameras.images(chasers, 7, 7, 70_000_000, states) == one_by_one
 
 
-def test_blur_is_the_mean_of_the_images_of_the_exposure():
+def test_motion_blur_is_the_mean_over_the_exposure():
     omega, exposure_s = (0.0, 0.0, 0.4), 0.1
     scenario = scenario_with()
     cameras, at_rest = Cameras(scenario), states_of(scenario)
@@ -65,7 +65,7 @@ def test_blur_is_the_mean_of_the_images_of_the_exposure():
     assert np.array_equal(taken(f"camera.effects.exposure_s={exposure_s}"), images[10])
 
 
-def test_glare_falls_with_the_square_of_the_angle_and_ends_in_eclipse_and_behind_bodies():
+def test_glare_falls_with_squared_angle_and_vanishes_in_eclipse_and_occultation():
     sun, glare = "camera.sun_direction=[1.0, 0.3, 0.2]", "camera.effects.glare=500.0"
     far = "target.position_m=[0.0, 30.0, 0.0]"
     plain, lit = taken(sun, far), taken(sun, far, glare)
@@ -85,7 +85,7 @@ def test_glare_falls_with_the_square_of_the_angle_and_ends_in_eclipse_and_behind
     assert np.array_equal(taken(behind, glare), taken(behind))
 
 
-def test_in_an_eclipse_the_lamp_is_the_light():
+def test_lamp_lights_the_target_in_eclipse():
     eclipse = "camera.eclipses=[{from_s=0.0, to_s=2.0}]"
     day, dark, lamp = taken(), taken(eclipse), taken(eclipse, "camera.lamp=60.0")
     face = day > 60  # white paint
@@ -94,7 +94,7 @@ def test_in_an_eclipse_the_lamp_is_the_light():
     assert 40 < np.median(lamp[face]) < 60 / 0.6**2
 
 
-def test_the_earth_is_where_it_is_said_to_be():
+def test_earth_is_drawn_at_its_direction():
     image = taken(
         "target.position_m=[0.0, 30.0, 0.0]", "camera.earth={direction=[0.0, 0.0, -1.0], radius_deg=84.0}"
     )
@@ -105,40 +105,40 @@ def test_the_earth_is_where_it_is_said_to_be():
     assert np.median(image[int(limb) + 6 : int(limb) + 30, :200]) > 15
 
 
-def test_calibration_errors_are_drawn_per_chaser_and_seed_with_the_stated_sigma():
+def test_calibration_errors_have_the_stated_sigma_per_chaser_and_seed():
     error = "camera.calibration_error={focal_length_share=0.001, centre_px=0.5, mounting_deg=0.3, mounting_m=0.002}"
     drawn = []
     for seed in range(80):
         scenario = scenario_with(error, f"seed={seed}")
-        told, true = scenario.camera_model(), true_camera(scenario, 0)
+        calibrated, true = scenario.camera_model(), true_camera(scenario, 0)
         assert true == true_camera(scenario, 0)
         turn = rotations.log(
-            rotations.multiply(true.q_crf_irf_wxyz, rotations.conjugate(told.q_crf_irf_wxyz))
+            rotations.multiply(true.q_crf_irf_wxyz, rotations.conjugate(calibrated.q_crf_irf_wxyz))
         )
         drawn.append(
             [
-                true.fx_px / told.fx_px - 1.0,
-                true.cx_px - told.cx_px,
-                true.cy_px - told.cy_px,
+                true.fx_px / calibrated.fx_px - 1.0,
+                true.cx_px - calibrated.cx_px,
+                true.cy_px - calibrated.cy_px,
                 *np.degrees(turn),
-                *np.subtract(true.position_crf_m, told.position_crf_m),
+                *np.subtract(true.position_crf_m, calibrated.position_crf_m),
             ]
         )
-        assert true.fx_px / true.fy_px == pytest.approx(told.fx_px / told.fy_px)
+        assert true.fx_px / true.fy_px == pytest.approx(calibrated.fx_px / calibrated.fy_px)
     sigma = np.std(drawn, axis=0) / ([0.001, 0.5, 0.5] + [0.3] * 3 + [0.002] * 3)
     assert np.all((sigma > 0.7) & (sigma < 1.3))
     assert true_camera(scenario_with(error), 0) != true_camera(scenario_with(error), 1)
     assert true_camera(scenario_with(), 0) == scenario_with().camera_model()
 
 
-def test_odometry_has_the_stated_noise_about_the_stated_bias():
+def test_odometry_has_the_stated_noise_and_bias():
     scenario = scenario_with(
         "odometry={position_noise_m=0.002, attitude_noise_deg=0.1, position_bias_m=0.01}"
     )
     state = states_of(scenario)["chaser/0"]
-    navigation = Navigation(scenario)
-    known = [navigation.sensed(0, tick, state) for tick in range(300)]
-    again = Navigation(scenario).sensed(0, 7, state)
+    navigation = OdometrySensor(scenario)
+    known = [navigation.measure(0, tick, state) for tick in range(300)]
+    again = OdometrySensor(scenario).measure(0, 7, state)
     assert np.array_equal(again.position_m, known[7].position_m)
     off = np.array([k.position_m - state.position_m for k in known])
     assert np.abs(off.std(axis=0) / 0.002 - 1.0).max() < 0.2
@@ -146,10 +146,10 @@ def test_odometry_has_the_stated_noise_about_the_stated_bias():
     turns = [rotations.log(rotations.multiply(rotations.conjugate(state.q_wxyz), k.q_wxyz)) for k in known]
     assert np.abs(np.degrees(np.std(turns, axis=0)) / 0.1 - 1.0).max() < 0.2
     assert np.array_equal(known[0].velocity_m_s, state.velocity_m_s)
-    assert Navigation(scenario_with()).sensed(0, 3, state) is state
+    assert OdometrySensor(scenario_with()).measure(0, 3, state) is state
 
 
-def test_a_mounting_turned_to_the_left_sees_the_target_on_the_right():
+def test_camera_mounted_to_the_left_sees_the_target_on_the_right():
     image, turned = taken(), taken("camera.mounting_rotation_deg=[0.0, 0.0, 5.0]")
 
     def column(pixels):
@@ -160,7 +160,7 @@ def test_a_mounting_turned_to_the_left_sees_the_target_on_the_right():
 
 
 @pytest.mark.parametrize(
-    ("change", "told"),
+    ("change", "message"),
     [
         ("camera.renderer=opengl", "camera.renderer"),
         ("camera.calibration=none.yaml", "no such calibration file"),
@@ -176,12 +176,12 @@ def test_a_mounting_turned_to_the_left_sees_the_target_on_the_right():
         ),
     ],
 )
-def test_cameras_that_cannot_be_are_told_so(change, told):
-    with pytest.raises(ScenarioError, match=told):
+def test_invalid_camera_is_refused(change, message):
+    with pytest.raises(ScenarioError, match=message):
         scenario_with(change)
 
 
-def test_a_lens_that_folds_the_image_is_told_so():
+def test_non_invertible_lens_is_refused():
     lens = "{width_px=640,height_px=480,fx_px=400.0,fy_px=400.0,cx_px=320.0,cy_px=240.0,distortion=[-0.9,0.0,0.0,0.0]}"
     with pytest.raises(ScenarioError, match="distortion"):
         Cameras(scenario_with(f"camera.intrinsics={lens}"))

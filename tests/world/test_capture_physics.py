@@ -1,4 +1,4 @@
-"""Contact, latch and capture in the world: what touches, what closes, and that momentum stays."""
+"""Contact, latch and capture in the simulation, and conservation of momentum."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def latch_of(physics: Physics) -> ProbeLatch:
 
 
 @pytest.mark.parametrize("omega", [(0.0, 0.0, 0.0), (0.015, 0.045, 0.03), (0.045, 0.135, 0.09)])
-def test_an_armed_latch_closes_holds_and_conserves_momentum(
+def test_armed_latch_closes_holds_and_conserves_momentum(
     worlds: Any, omega: tuple[float, float, float]
 ) -> None:
     """Through the touch, the capture and 20 s after: momentum to 1e-4, nothing slips by more than 5 um."""
@@ -77,14 +77,14 @@ def test_an_armed_latch_closes_holds_and_conserves_momentum(
     assert np.linalg.norm(now[0] - held[0]) < 5e-6
     assert rotations.angle_between(now[1], held[1]) < 1e-5
     assert touched == set()
-    (touch,) = latch_of(physics).take()
+    (touch,) = latch_of(physics).take_touches()
     assert touch.latched
     assert touch.refused == ""
     assert touch.lateral_m < 1e-3
     assert 0.004 < touch.closing_m_s < 0.012
 
 
-def test_a_pull_moves_both_bodies_as_one_and_a_release_parts_them(worlds: Any) -> None:
+def test_latched_bodies_move_as_one_until_release(worlds: Any) -> None:
     physics = worlds(omega_rad_s=(0.0, 0.0, 0.0))
     physics.command_latch(0, "arm", 0)
     physics.advance(HZ, {})
@@ -110,7 +110,7 @@ def test_a_pull_moves_both_bodies_as_one_and_a_release_parts_them(worlds: Any) -
         ({"turn_rad": math.radians(4.0)}, "angle"),
     ],
 )
-def test_outside_of_the_tolerances_it_bounces(worlds: Any, changes: dict[str, float], reason: str) -> None:
+def test_probe_outside_tolerances_bounces(worlds: Any, changes: dict[str, float], reason: str) -> None:
     physics = worlds(omega_rad_s=(0.0, 0.0, 0.0), **changes)
     physics.command_latch(0, "arm", 0)
     physics.advance(HZ, {})
@@ -124,13 +124,13 @@ def test_outside_of_the_tolerances_it_bounces(worlds: Any, changes: dict[str, fl
     assert float(relative(physics)[0][0]) < before  # it moves away
 
 
-def test_a_latch_that_is_not_armed_does_not_close(worlds: Any) -> None:
+def test_unarmed_latch_does_not_close(worlds: Any) -> None:
     physics = worlds()
     physics.advance(HZ, {})
     assert [t.refused for t in latch_of(physics).touches] == ["not armed"]
 
 
-def test_a_command_to_the_latch_acts_when_it_is_due(worlds: Any) -> None:
+def test_latch_command_acts_at_its_effective_step(worlds: Any) -> None:
     physics = worlds(gap_m=0.5)
     physics.command_latch(0, "arm", 10)
     physics.command_latch(0, "keep", 11)
@@ -144,7 +144,7 @@ def test_a_command_to_the_latch_acts_when_it_is_due(worlds: Any) -> None:
     assert not latch_of(physics).armed
 
 
-def test_a_touch_of_the_body_is_no_touch_of_the_probe(worlds: Any) -> None:
+def test_body_contact_is_not_a_probe_touch(worlds: Any) -> None:
     """Sideways on: the chaser's flank meets the target."""
     physics = worlds()
     target = physics.state(TARGET)
@@ -166,7 +166,7 @@ def test_a_touch_of_the_body_is_no_touch_of_the_probe(worlds: Any) -> None:
     assert latch_of(physics).touches == []
 
 
-def test_without_capture_there_is_no_latch_and_no_probe() -> None:
+def test_scenario_without_capture_has_no_latch_and_no_probe() -> None:
     physics = Physics(scenario(docking={"kind": "held"}))
     try:
         assert physics.latches == {}

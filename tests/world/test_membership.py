@@ -1,4 +1,4 @@
-"""Who takes part in a mission: joining, leaving, and who has heard whom."""
+"""Membership of a mission: joining, departure and mutual discovery."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ def first(*names: str) -> dict[str, str]:
 def joined(members: Membership, *names: str) -> Membership:
     for name in names:
         assert members.admit(JoinRequest(process=name, instance=f"{name}-1")).accepted
-        members.alive_changed(name, True)
+        members.set_alive(name, True)
     return members
 
 
 def tell(members: Membership, name: str, *heard: str, instance: str | None = None) -> bool:
     message = Presence(process=name, instance=instance or f"{name}-1", heard=first(*heard))
-    return members.presence_told(message)
+    return members.update_presence(message)
 
 
 @pytest.mark.parametrize("mode", ["lockstep", "realtime"])
-def test_who_may_join_is_told_the_mission(mode: str) -> None:
+def test_admitted_process_receives_the_mission(mode: str) -> None:
     for name in ("chaser/0", "chaser/1", "controller", "recorder"):
         reply = membership(mode=mode).admit(JoinRequest(process=name, instance="i"))
         assert (reply.accepted, reply.reason) == (True, "")
@@ -54,10 +54,10 @@ def test_who_may_join_is_told_the_mission(mode: str) -> None:
         ("target", "'target' is no process of a mission"),
         ("", "'' is no process of a mission"),
         ("hacker", "is no process of a mission"),
-        ("world", "this mission has its world already"),
+        ("world", "this mission has a world already"),
     ],
 )
-def test_who_may_not_join_is_told_why(name: str, reason: str) -> None:
+def test_refused_process_receives_the_reason(name: str, reason: str) -> None:
     members = membership()
     reply = members.admit(JoinRequest(process=name, instance="i"))
     assert not reply.accepted
@@ -66,75 +66,75 @@ def test_who_may_not_join_is_told_why(name: str, reason: str) -> None:
     assert not tell(members, name, instance="i")
 
 
-def test_nobody_joins_twice_at_a_time_and_anybody_comes_back() -> None:
+def test_running_process_blocks_a_second_instance_until_it_departs() -> None:
     members = joined(membership(), "chaser/0")
     twin = JoinRequest(process="chaser/0", instance="another")
     assert members.admit(twin).reason == "chaser/0 is already running in this mission"
     assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-1")).accepted  # asked again
-    members.alive_changed("chaser/0", False)
-    assert members.who_left() == ["chaser/0"]
-    assert members.who_left() == []
+    members.set_alive("chaser/0", False)
+    assert members.take_departed() == ["chaser/0"]
+    assert members.take_departed() == []
     assert members.admit(twin).accepted
     assert not tell(members, "chaser/0", "world")  # the old one has nothing to say any more
     assert tell(members, "chaser/0", "world", instance="another")
 
 
-def test_leaving_without_having_come_is_nothing() -> None:
+def test_departure_of_unknown_process_is_ignored() -> None:
     members = membership()
-    members.alive_changed("chaser/0", False)
-    assert members.who_left() == []
-    assert members.alive() == set()
+    members.set_alive("chaser/0", False)
+    assert members.take_departed() == []
+    assert members._alive == set()
 
 
-def test_linked_are_those_who_have_heard_each_other_both_ways() -> None:
+def test_connection_requires_mutual_discovery() -> None:
     members = joined(membership(1), "chaser/0", "controller")
-    assert members.linked({}) == set()
+    assert members.connected({}) == set()
     everyone = first("chaser/0", "controller")
     tell(members, "chaser/0", "world", "controller")
     tell(members, "controller", "world", "chaser/0")
-    assert members.linked(everyone) == {"chaser/0", "controller"}
-    assert members.linked(first("controller")) == {"controller"}  # the world has not heard the chaser
+    assert members.connected(everyone) == {"chaser/0", "controller"}
+    assert members.connected(first("controller")) == {"controller"}  # the world has not heard the chaser
     tell(members, "controller", "world")  # not any more
-    assert members.linked(everyone) == set()
+    assert members.connected(everyone) == set()
     tell(members, "controller", "chaser/0")  # has not heard the world
-    assert members.linked(everyone) == {"chaser/0"}
+    assert members.connected(everyone) == {"chaser/0"}
 
 
-def test_chasers_need_not_hear_each_other_and_the_recorder_must_hear_all() -> None:
+def test_chasers_need_not_discover_each_other_but_recorder_needs_all() -> None:
     members = joined(membership(2), "chaser/0", "chaser/1", "controller", "recorder")
     tell(members, "chaser/0", "world", "controller")
     tell(members, "chaser/1", "world", "controller")
     tell(members, "controller", "world", "chaser/0", "chaser/1")
     tell(members, "recorder", "world", "chaser/0", "controller")
     everyone = first("chaser/0", "chaser/1", "controller", "recorder")
-    assert members.linked(everyone) == {"chaser/0", "chaser/1", "controller"}
+    assert members.connected(everyone) == {"chaser/0", "chaser/1", "controller"}
 
 
-def test_who_is_gone_links_nobody_up_and_is_linked_no_more() -> None:
+def test_departed_process_is_disconnected() -> None:
     members = joined(membership(1), "chaser/0", "controller")
     tell(members, "chaser/0", "world", "controller")
     tell(members, "controller", "world", "chaser/0")
     everyone = first("chaser/0", "controller")
-    members.alive_changed("controller", False)
-    assert members.linked(everyone) == {"chaser/0"}
-    assert members.alive() == {"chaser/0"}
-    members.alive_changed("controller", True)
-    assert members.linked(everyone) == {"chaser/0"}  # back, and not heard anew
+    members.set_alive("controller", False)
+    assert members.connected(everyone) == {"chaser/0"}
+    assert members._alive == {"chaser/0"}
+    members.set_alive("controller", True)
+    assert members.connected(everyone) == {"chaser/0"}  # returned, but not discovered again
 
 
-def test_who_has_heard_an_earlier_start_has_not_heard_this_one() -> None:
+def test_discovery_of_an_earlier_instance_does_not_count() -> None:
     members = joined(membership(1), "chaser/0", "controller")
     tell(members, "chaser/0", "world", "controller")
     tell(members, "controller", "world", "chaser/0")
-    members.alive_changed("chaser/0", False)
+    members.set_alive("chaser/0", False)
     assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-2")).accepted
-    members.alive_changed("chaser/0", True)
+    members.set_alive("chaser/0", True)
     tell(members, "chaser/0", "world", "controller", instance="chaser/0-2")
     again = {**first("controller"), "chaser/0": "chaser/0-2"}
-    assert members.linked(again) == set()  # the controller still talks of the first one
+    assert members.connected(again) == set()  # the controller still talks of the first one
     heard = {"world": "world-1", "chaser/0": "chaser/0-2"}
-    assert members.presence_told(Presence(process="controller", instance="controller-1", heard=heard))
-    assert members.linked(again) == {"chaser/0", "controller"}
+    assert members.update_presence(Presence(process="controller", instance="controller-1", heard=heard))
+    assert members.connected(again) == {"chaser/0", "controller"}
 
 
 def flying(chasers: int = 2) -> tuple[Membership, dict[str, str]]:
@@ -146,79 +146,78 @@ def flying(chasers: int = 2) -> tuple[Membership, dict[str, str]]:
     tell(members, "controller", "world", *ids)
     heard = first(*ids, "controller")
     members.flying = True
-    assert members.linked(heard) == set(heard)
+    assert members.connected(heard) == set(heard)
     return members, heard
 
 
 def again(members: Membership, name: str, *heard: str) -> None:
     """A process that crashed has started again, and tells whom it has heard."""
-    members.alive_changed(name, False)
+    members.set_alive(name, False)
     assert members.admit(JoinRequest(process=name, instance=f"{name}-2")).accepted
-    members.alive_changed(name, True)
+    members.set_alive(name, True)
     assert tell(members, name, *heard, instance=f"{name}-2")
 
 
-def test_in_flight_a_chaser_that_joins_puts_nobody_out() -> None:
+def test_joining_chaser_disconnects_nobody_in_flight() -> None:
     members, heard = flying(2)
     again(members, "chaser/1", "world", "controller")
     heard["chaser/1"] = "chaser/1-2"
     for _ in range(3):  # the controller has not heard the second start yet
-        assert members.linked(heard) == {"chaser/0", "controller"}
+        assert members.connected(heard) == {"chaser/0", "controller"}
     with_it = {**first("chaser/0"), "world": "world-1", "chaser/1": "chaser/1-2"}
-    assert members.presence_told(Presence(process="controller", instance="controller-1", heard=with_it))
-    assert members.linked(heard) == {"chaser/0", "chaser/1", "controller"}
+    assert members.update_presence(Presence(process="controller", instance="controller-1", heard=with_it))
+    assert members.connected(heard) == {"chaser/0", "chaser/1", "controller"}
 
 
-def test_in_flight_a_controller_that_joins_puts_nobody_out_and_waits_for_all() -> None:
+def test_joining_controller_disconnects_nobody_and_waits_for_all() -> None:
     members, heard = flying(2)
     again(members, "controller", "world", "chaser/0")
     heard["controller"] = "controller-2"
     with_it = {"world": "world-1", "controller": "controller-2"}
-    assert members.linked(heard) == {"chaser/0", "chaser/1"}
+    assert members.connected(heard) == {"chaser/0", "chaser/1"}
     for i in (0, 1):
-        told = Presence(process=f"chaser/{i}", instance=f"chaser/{i}-1", heard=with_it)
-        assert members.presence_told(told)
-        assert members.linked(heard) == {"chaser/0", "chaser/1"}
+        presence = Presence(process=f"chaser/{i}", instance=f"chaser/{i}-1", heard=with_it)
+        assert members.update_presence(presence)
+        assert members.connected(heard) == {"chaser/0", "chaser/1"}
     tell(members, "controller", "world", "chaser/0", "chaser/1", instance="controller-2")
-    assert members.linked(heard) == {"chaser/0", "chaser/1", "controller"}
+    assert members.connected(heard) == {"chaser/0", "chaser/1", "controller"}
 
 
-def test_in_flight_two_who_fly_must_still_hear_each_other_and_the_world_them() -> None:
+def test_flying_processes_must_stay_mutually_discovered() -> None:
     members, heard = flying(1)
-    assert members.linked(first("controller")) == {"controller"}  # the world lost sight of the chaser
+    assert members.connected(first("controller")) == {"controller"}  # the world lost sight of the chaser
     members, heard = flying(1)
     tell(members, "controller", "world")
-    assert members.linked(heard) == set()
+    assert members.connected(heard) == set()
 
 
-def test_when_all_were_lost_the_barrier_is_for_all_again() -> None:
+def test_full_discovery_is_required_again_after_loss_of_all() -> None:
     members, heard = flying(1)
     for name in ("chaser/0", "controller"):
         again(members, name, "world")
         heard[name] = f"{name}-2"
-    assert members.linked(heard) == set()
+    assert members.connected(heard) == set()
     for name, other in (("chaser/0", "controller"), ("controller", "chaser/0")):
         known = {"world": "world-1", other: f"{other}-2"}
-        assert members.presence_told(Presence(process=name, instance=f"{name}-2", heard=known))
-    assert members.linked(heard) == {"chaser/0", "controller"}
+        assert members.update_presence(Presence(process=name, instance=f"{name}-2", heard=known))
+    assert members.connected(heard) == {"chaser/0", "controller"}
 
 
-def test_of_two_that_join_at_once_the_second_is_refused() -> None:
+def test_second_of_two_simultaneous_joins_is_refused() -> None:
     now_s = [100.0]
     members = membership(1)
     members.now_s = lambda: now_s[0]
     assert members.admit(JoinRequest(process="chaser/0", instance="a")).accepted
     assert (
-        "another chaser/0 is just joining"
-        in members.admit(JoinRequest(process="chaser/0", instance="b")).reason
+        "another chaser/0 is joining" in members.admit(JoinRequest(process="chaser/0", instance="b")).reason
     )
     now_s[0] += 6.0  # the first never came
     assert members.admit(JoinRequest(process="chaser/0", instance="b")).accepted
 
 
-def test_nobody_tells_its_presence_on_a_closed_session() -> None:
+def test_heartbeat_ends_with_its_node() -> None:
     # A thread that is in Zenoh while the interpreter ends aborts the process: it has to end with the node, farewell or not.
-    node = Node("chaser/0", "chaser", Link("told", listen=("tcp/127.0.0.1:0",)))
+    node = Node("chaser/0", "chaser", Link("heartbeat", listen=("tcp/127.0.0.1:0",)))
     heartbeat = Heartbeat(node, "first")
     time.sleep(0.1)
     node.close()

@@ -1,4 +1,4 @@
-"""PyBullet against physics and against the controller's model: motion, forces, contacts."""
+"""The PyBullet simulation against analytical physics and the controller model: motion, forces, contacts."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def state13(s: BodyState) -> Array:
         ((0.1, 0.5, 0.55), (0.2, 0.3, 0.32)),  # 28 degrees a second
     ],
 )
-def test_torque_free_body_keeps_its_angular_momentum(
+def test_torque_free_body_conserves_angular_momentum(
     worlds: Any, inertia: tuple[float, ...], omega: tuple[float, ...]
 ) -> None:
     """120 s at the default physics rate: within 1e-3, in size and direction; energy likewise."""
@@ -79,7 +79,7 @@ def test_torque_free_body_keeps_its_angular_momentum(
 
 
 @pytest.mark.parametrize("steps", [0, 1, 7, 8, 9, HZ, 12_345])
-def test_prescribed_target_is_exact_at_any_step(worlds: Any, steps: int) -> None:
+def test_prescribed_target_is_exact_at_every_step(worlds: Any, steps: int) -> None:
     q, v, omega = np.array([HALF, 0.0, HALF, 0.0]), np.array([0.01, -0.02, 0.03]), np.array([0.1, -0.3, 0.2])
     target = {
         "position_m": [1.0, 2.0, 3.0],
@@ -99,14 +99,14 @@ def test_prescribed_target_is_exact_at_any_step(worlds: Any, steps: int) -> None
     np.testing.assert_array_equal(state13(prescribed_state(physics._scenario, t)), state13(s))
 
 
-def test_static_target_stays(worlds: Any) -> None:
+def test_static_target_does_not_move(worlds: Any) -> None:
     physics = worlds(target={"motion": "static", "position_m": [0.5, 0.0, 0.0]})
     physics.advance(HZ, {})
     s = physics.state(TARGET)
     np.testing.assert_array_equal(state13(s), [0.5, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0])
 
 
-def test_bodies_start_where_the_scenario_says(worlds: Any) -> None:
+def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
     chasers = [
         {
             "position_m": [-1.0, 0.0, 0.0],
@@ -131,7 +131,7 @@ def test_bodies_start_where_the_scenario_says(worlds: Any) -> None:
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2), (0.4, -1.1, 2.0)])
-def test_a_force_in_body_axes_accelerates_along_them(worlds: Any, axis: int, turn: tuple[float, ...]) -> None:
+def test_force_accelerates_along_body_axes(worlds: Any, axis: int, turn: tuple[float, ...]) -> None:
     q = rotations.exp(turn)
     physics = worlds(chasers=[{"position_m": [-5.0, 0.0, 0.0], "q_wxyz": q.tolist()}])
     wrench = np.zeros(6)
@@ -147,7 +147,7 @@ def test_a_force_in_body_axes_accelerates_along_them(worlds: Any, axis: int, tur
     np.testing.assert_allclose(s.omega_rad_s, np.zeros(3), rtol=0, atol=1e-12)
 
 
-def test_a_force_turns_with_the_body(worlds: Any) -> None:
+def test_force_rotates_with_the_body(worlds: Any) -> None:
     """A quarter turn later a push along body x is one along world y."""
     physics = worlds()
     inertia_z = physics._scenario.chaser.inertia[2]
@@ -162,7 +162,7 @@ def test_a_force_turns_with_the_body(worlds: Any) -> None:
     np.testing.assert_allclose(gained / np.linalg.norm(gained), [0.0, 1.0, 0.0], rtol=0, atol=1e-3)
 
 
-def test_no_wrench_is_left_over(worlds: Any) -> None:
+def test_wrench_does_not_persist(worlds: Any) -> None:
     physics = worlds()
     physics.advance(10, {"chaser/0": np.ones(6)})
     s = physics.state("chaser/0")
@@ -173,7 +173,7 @@ def test_no_wrench_is_left_over(worlds: Any) -> None:
 
 
 @pytest.mark.parametrize("split", [1, 7, 128])
-def test_how_the_steps_are_grouped_changes_nothing(worlds: Any, split: int) -> None:
+def test_grouping_of_steps_does_not_change_the_result(worlds: Any, split: int) -> None:
     wrench = {"chaser/0": np.array([0.5, -0.2, 0.1, 0.01, -0.02, 0.005])}
     a, b = worlds(), worlds()
     a.advance(896, wrench)
@@ -190,7 +190,7 @@ def test_how_the_steps_are_grouped_changes_nothing(worlds: Any, split: int) -> N
     ("seed", "inertia"),
     [(0, (0.1, 0.5, 0.55)), (1, (0.6, 0.12, 0.6)), (2, (0.5, 0.9, 0.45)), (3, None)],
 )
-def test_the_controllers_model_is_the_worlds(
+def test_controller_model_matches_the_simulation(
     worlds: Any, seed: int, inertia: tuple[float, float, float] | None
 ) -> None:
     """10 s of random inputs within the limits, inertias far from a sphere: 1 mm and 0.05 degrees (bar of the issue)."""
@@ -228,7 +228,7 @@ def test_the_controllers_model_is_the_worlds(
 # -- contacts ---------------------------------------------------------------------------------------------
 
 
-def test_contact_is_reported_when_bodies_meet_and_not_before(worlds: Any) -> None:
+def test_contact_is_reported_when_bodies_touch_and_not_before(worlds: Any) -> None:
     start = {"start_velocity_m_s": [0.5, 0.0, 0.0]}
     chaser = {"position_m": [-0.6, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
     physics = worlds(chasers=[chaser | start], target={"motion": "static"})
@@ -248,7 +248,9 @@ def test_contact_is_reported_when_bodies_meet_and_not_before(worlds: Any) -> Non
 
 @pytest.mark.parametrize("speed_m_s", [0.01, 0.1, 1.0])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.6, 0.6, 0.2)])
-def test_no_touch_is_too_gentle_or_too_short(worlds: Any, speed_m_s: float, turn: tuple[float, ...]) -> None:
+def test_gentle_and_short_contacts_are_reported(
+    worlds: Any, speed_m_s: float, turn: tuple[float, ...]
+) -> None:
     start = {"start_velocity_m_s": [speed_m_s, 0.0, 0.0], "q_wxyz": rotations.exp(turn).tolist()}
     physics = worlds(
         chasers=[{"position_m": [-0.26, 0.01, 0.0]} | start], target={"motion": "static"}, limits=NONE
@@ -259,7 +261,7 @@ def test_no_touch_is_too_gentle_or_too_short(worlds: Any, speed_m_s: float, turn
     assert physics.state("chaser/0").velocity_m_s[0] < 0.5 * speed_m_s
 
 
-def test_contact_between_chasers(worlds: Any) -> None:
+def test_contact_between_chasers_is_reported(worlds: Any) -> None:
     chasers = [
         {
             "position_m": [-1.0, 0.3, 0.0],
@@ -277,7 +279,7 @@ def test_contact_between_chasers(worlds: Any) -> None:
     assert touched == {("chaser/0", "chaser/1")}
 
 
-def test_a_moving_prescribed_target_hits_who_stands_in_its_way(worlds: Any) -> None:
+def test_moving_prescribed_target_contacts_a_chaser_in_its_way(worlds: Any) -> None:
     physics = worlds(
         target={"velocity_m_s": [-0.3, 0.0, 0.0], "omega_rad_s": [0.0, 0.0, 0.0]},
         chasers=[{"position_m": [-0.5, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],

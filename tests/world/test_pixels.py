@@ -1,4 +1,4 @@
-"""The kernels that work on an image's pixels: to the bit what OpenCV and NumPy give, from every instruction set."""
+"""Pixel operations of rendering are bit-identical to OpenCV and NumPy on every instruction set."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_blur_is_opencvs(sigma_px: float) -> None:
 
 @pytest.mark.parametrize("size", [(480, 640), (33, 97)])
 @pytest.mark.parametrize(("read", "shot"), [(1.5, 0.025), (0.0, 0.5), (60.0, 2.0), (3000.0, 0.0)])
-def test_noise_is_that_of_its_formula(size: tuple[int, int], read: float, shot: float) -> None:
+def test_noise_kernel_equals_numpy(size: tuple[int, int], read: float, shot: float) -> None:
     camera = CameraEffects(size[1], size[0], Effects(1.0, 0.0, read, shot), seed=3)
     assert camera._bank is not None
     for number, image in enumerate(images(size)):
@@ -92,7 +92,7 @@ def test_samples_that_do_not_fit_are_refused() -> None:
         take_means(np.zeros((8, 10), dtype=np.uint8), 2, view)
 
 
-def test_stars_are_where_the_camera_projects_them() -> None:
+def test_stars_are_drawn_at_their_projection() -> None:
     rng = np.random.default_rng(4)
     for camera in (Camera.from_hfov(640, 480, 1.0), Camera.from_hfov(64, 64, 2.6)):
         origin, size = np.array([-9.0, -7.0]), (camera.width_px + 11, camera.height_px + 8)

@@ -1,4 +1,4 @@
-"""The rendered image against projected truth, what hides what, and the camera's effects."""
+"""Rendered images against projected ground truth, occlusion, and camera effects."""
 
 import cv2
 import numpy as np
@@ -39,7 +39,7 @@ def blank(*boxes):
 @pytest.mark.parametrize("draw", [Renderer, TinyRenderer])
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("name", ["paper", "servicer"])
-def test_corners_are_where_they_project_to(draw, camera, name):
+def test_marker_corners_are_at_their_projection(draw, camera, name):
     model = target_model(name)
     position = np.array([0.05, -0.03, 0.45 if name == "paper" else 0.8])
     q = turned(0.2, -0.3, 0.4)
@@ -69,7 +69,7 @@ def test_corners_are_where_they_project_to(draw, camera, name):
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_both_renderers_draw_the_same_image(camera):
+def test_renderers_agree(camera):
     model = target_model("servicer")
     crowd = [
         (chaser_boxes(), [0.2, 0.1, 0.6], rotations.exp([0.2, 0.1, 0.3])),
@@ -92,7 +92,7 @@ def test_both_renderers_draw_the_same_image(camera):
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
 @pytest.mark.parametrize("name", ["paper", "servicer"])
-def test_every_cell_has_its_colour(camera, name):
+def test_marker_cells_have_their_grey_level(camera, name):
     model = target_model(name)
     position, q = np.array([0.02, 0.03, 0.8]), turned(0.3, 0.4, -0.4)
     image = Renderer(camera, model).render(EYE, AHEAD, position, q, (), FULL_SUN)
@@ -115,7 +115,7 @@ def test_every_cell_has_its_colour(camera, name):
     assert checked >= 49
 
 
-def test_hidden_by_a_chaser_in_front_and_not_by_one_behind():
+def test_chaser_in_front_occludes_the_target_and_one_behind_does_not():
     model = target_model("servicer")
     renderer = Renderer(CAMERA, model)
     position = np.array([0.0, 0.0, 1.5])
@@ -130,7 +130,7 @@ def test_hidden_by_a_chaser_in_front_and_not_by_one_behind():
     assert np.mean(covered != plain) > 0.02
 
 
-def test_probe_in_contact_is_painted_before_the_body_it_touches():
+def test_probe_in_contact_is_painted_before_the_body():
     """Camera of the docked chaser: its probe's tip touches the target's face."""
     model = blank(Box((0.2, 0.2, 0.2), shade=1.0))
     camera = Camera.from_hfov(640, 480, np.deg2rad(60.0), (0.07, 0.0, 0.075))
@@ -153,7 +153,7 @@ def test_probe_in_contact_is_painted_before_the_body_it_touches():
 
 @given(st.integers(0, 10_000))
 @settings(derandomize=True, deadline=None, max_examples=40)
-def test_painted_order_agrees_with_ray_casting(seed):
+def test_paint_order_agrees_with_ray_casting(seed):
     """Random boxes apart from each other, each of its own shade: the first one a ray hits is seen."""
     generator = np.random.default_rng(seed)
     boxes, shades = [], iter(np.linspace(0.3, 1.0, 5))
@@ -207,7 +207,7 @@ def placed(*boxes):
     return out
 
 
-def test_a_wide_near_box_is_in_front_though_its_centre_is_farther():
+def test_wide_near_box_occludes_though_its_centre_is_farther():
     wide, small = ([3.0, 0.0, 1.0], [4.0, 0.5, 0.1]), ([-0.5, 0.0, 1.3], [0.1, 0.1, 0.1])
     assert np.linalg.norm(wide[0]) > np.linalg.norm(small[0])
     boxes = placed(wide, small)
@@ -218,19 +218,19 @@ def test_a_wide_near_box_is_in_front_though_its_centre_is_farther():
     assert paint_order(boxes) == [0, 1]
 
 
-def test_boxes_on_either_side_of_the_eye_hide_nothing():
+def test_boxes_on_opposite_sides_of_the_camera_do_not_occlude():
     assert hides(placed(*(([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in (2.0, -2.0))), 0, 1) == 0
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
-def test_behind_or_beside_the_camera_nothing_is_drawn(camera):
+def test_target_outside_the_field_of_view_is_not_drawn(camera):
     renderer = Renderer(camera, target_model("servicer"))
     empty = renderer.render(EYE, AHEAD, [0.0, 0.0, -2.0], FACING)
     for position in ([0.0, 0.0, -1.0], [0.0, 0.0, -0.3], [5.0, 0.0, 1.0], [0.0, -5.0, 1.0]):
         assert np.array_equal(renderer.render(EYE, AHEAD, position, FACING), empty)
 
 
-def test_a_box_that_reaches_behind_the_camera_is_cut_not_mirrored():
+def test_box_reaching_behind_the_camera_is_clipped():
     """A long wall on the right, from far ahead to behind the camera: the left half stays empty."""
     model = blank(Box((0.02, 1.0, 6.0), shade=1.0))
     image = Renderer(CAMERA, model).render(
@@ -244,7 +244,7 @@ def test_a_box_that_reaches_behind_the_camera_is_cut_not_mirrored():
     assert np.all(image[240, int(edge) + 2 :] > 200)
 
 
-def test_a_marked_face_that_reaches_behind_the_camera_is_right_where_it_is_seen():
+def test_marked_face_reaching_behind_the_camera_is_correct_where_visible():
     model = target_model("servicer")
     q = rotations.IDENTITY
     position = np.array(
@@ -275,7 +275,7 @@ def test_a_marked_face_that_reaches_behind_the_camera_is_right_where_it_is_seen(
     assert checked > 20
 
 
-def test_images_repeat_bit_for_bit_and_do_not_depend_on_what_came_before():
+def test_rendering_is_stateless_and_repeatable():
     model = target_model("paper")
     views = [([0.0, 0.0, z], turned(0.1 * z, 0.2, z)) for z in (0.4, 0.8, 1.6)]
     first, second = Renderer(CAMERA, model), Renderer(CAMERA, model)
@@ -286,7 +286,7 @@ def test_images_repeat_bit_for_bit_and_do_not_depend_on_what_came_before():
     assert forward[0].dtype == np.uint8
 
 
-def test_sunlit_faces_are_brighter():
+def test_sunlit_faces_are_brighter_than_shaded_ones():
     model = blank(Box((0.2, 0.2, 0.2), shade=0.5))
     renderer = Renderer(CAMERA, model)
     lit = renderer.render(EYE, AHEAD, [0.0, 0.0, 1.0], rotations.IDENTITY, (), FULL_SUN)
@@ -297,7 +297,7 @@ def test_sunlit_faces_are_brighter():
         Light((0.0, 0.0, 0.0))
 
 
-def test_sixteen_chasers_make_a_image():
+def test_scene_with_sixteen_chasers_renders():
     generator = np.random.default_rng(5)
     crowd = [
         (
@@ -313,7 +313,7 @@ def test_sixteen_chasers_make_a_image():
     assert np.mean(image != alone) > 0.05
 
 
-def test_textures_average_exactly():
+def test_texture_levels_preserve_the_mean():
     texture = finest_texture(target_model("paper"), 0, 4)
     assert texture is not None
     cells = marker_cells("DICT_5X5_50", 4)
@@ -322,12 +322,12 @@ def test_textures_average_exactly():
     assert texture.mean() / 255.0 == pytest.approx(marked * share + (1.0 - marked) * 0.95, abs=2e-3)
 
 
-def test_a_lens_that_cannot_be_inverted_is_refused():
+def test_renderer_refuses_a_non_invertible_lens():
     with pytest.raises(ValueError, match="distortion"):
         Renderer(Camera.from_hfov(640, 480, 1.6, distortion=(-0.9, 0.0, 0.0, 0.0)), target_model("paper"))
 
 
-def test_chaser_boxes_reach_as_far_as_they_say():
+def test_chaser_boxes_reach_to_the_probe_tip():
     body, probe = chaser_boxes((0.25, 0.25, 0.05), 0.35)
     assert body.size_m == (0.25, 0.25, 0.05)
     assert probe.position_m[0] + probe.size_m[0] / 2.0 == pytest.approx(0.35)
@@ -336,7 +336,7 @@ def test_chaser_boxes_reach_as_far_as_they_say():
         chaser_boxes(probe_reach_m=0.1)
 
 
-def test_effects_repeat_by_chaser_and_image_and_differ_between_them():
+def test_noise_repeats_for_equal_chaser_and_image_and_differs_otherwise():
     image = np.full((480, 640), 100, dtype=np.uint8)
     one, other = (CameraEffects(640, 480, Effects(), 42) for _ in range(2))
     a = one.apply(image, 0, 7)
@@ -352,7 +352,7 @@ def test_effects_repeat_by_chaser_and_image_and_differ_between_them():
 
 
 @pytest.mark.parametrize("level", [40, 100, 220])
-def test_noise_has_the_stated_strength(level):
+def test_noise_has_the_stated_variance(level):
     image = np.full((480, 640), level, dtype=np.uint8)
     noisy = CameraEffects(640, 480, Effects(1.0, 0.0, 2.0, 0.05), 1).apply(image, 0, 0).astype(float)
     assert noisy.mean() == pytest.approx(level, abs=0.05)
@@ -360,7 +360,7 @@ def test_noise_has_the_stated_strength(level):
     assert noisy.var() == pytest.approx(4.0 + 0.05 * level + 1.0 / 12.0, rel=0.03)
 
 
-def test_effects_can_be_off_and_leave_the_image_alone():
+def test_disabled_effects_do_not_change_the_image():
     image = np.random.default_rng(0).integers(0, 256, (480, 640)).astype(np.uint8)
     before = image.copy()
     out = CameraEffects(640, 480, NO_EFFECTS, 1).apply(image, 0, 0)

@@ -10,7 +10,7 @@ from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.actuators.ideal import IdealActuators, fly_to
-from chaserdock_world.actuators.thrusters import ThrusterActuators, actuators_of
+from chaserdock_world.actuators.thrusters import ThrusterActuators, make_actuators
 from chaserdock_world.physics.simulation import Physics
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -36,7 +36,7 @@ def command(
 
 
 def thrusters_of(s: Scenario) -> ThrusterActuators:
-    actuators = actuators_of(s, 0)
+    actuators = make_actuators(s, 0)
     assert isinstance(actuators, ThrusterActuators)
     return actuators
 
@@ -48,8 +48,8 @@ def momentum(physics: Physics, s: Scenario) -> tuple[Array, Array]:
     return s.chaser.mass_kg * state.velocity_m_s, rotations.rotate(state.q_wxyz, spin)
 
 
-def test_ideal_actuation_stays_what_it_was() -> None:
-    assert isinstance(actuators_of(mission(chaser={"actuation": "ideal"}), 0), IdealActuators)
+def test_ideal_actuation_gives_ideal_actuators() -> None:
+    assert isinstance(make_actuators(mission(chaser={"actuation": "ideal"}), 0), IdealActuators)
 
 
 @given(
@@ -57,7 +57,7 @@ def test_ideal_actuation_stays_what_it_was() -> None:
     st.lists(st.integers(1, 119), max_size=4, unique=True),
 )
 @quick
-def test_the_body_gets_the_thrusters_forces_at_their_places(
+def test_body_receives_thruster_forces_at_their_positions(
     pulses: list[tuple[int, int, int]], stops: list[int]
 ) -> None:
     s = mission()
@@ -65,7 +65,7 @@ def test_the_body_gets_the_thrusters_forces_at_their_places(
     thrusters.command(command(*[(j, a, a + w) for j, a, w in pulses]), 0, 0)
     for end in (*sorted(stops), 140):
         fly_to(end, physics, {"chaser/0": thrusters}, STEP_S)
-    took = thrusters.take(140)
+    took = thrusters.take_output(140)
     wrench = wrench_matrix(s.chaser.thrusters) @ np.array(took.thruster_impulse_N_s)
     linear, angular = momentum(physics, s)
     physics.close()
@@ -77,7 +77,7 @@ def test_the_body_gets_the_thrusters_forces_at_their_places(
     assert np.all(np.array(took.thruster_open_s) * 1.5 >= np.array(took.thruster_impulse_N_s) - 1e-9)
 
 
-def test_flying_in_slices_changes_nothing() -> None:
+def test_grouping_of_steps_does_not_change_thruster_output() -> None:
     states = []
     for slices in ([200], [7, 50, 51, 100, 200]):
         s = mission()
@@ -91,46 +91,46 @@ def test_flying_in_slices_changes_nothing() -> None:
     np.testing.assert_array_equal(states[0], states[1])
 
 
-def test_a_stuck_thruster_thrusts_until_it_is_isolated() -> None:
+def test_stuck_thruster_fires_until_isolated() -> None:
     s = mission(thruster_failure=[{"chaser": 0, "thruster": 2, "at_s": 0.05, "kind": "stuck_on"}])
     physics, thrusters = Physics(s), thrusters_of(s)
     fly_to(96, physics, {"chaser/0": thrusters}, STEP_S)
-    assert thrusters.take(96).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.049, rel=1e-3)
+    assert thrusters.take_output(96).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.049, rel=1e-3)
     thrusters.command(command(isolated=(2,), effective_ns=150 * MS), 144, 96)
     fly_to(960, physics, {"chaser/0": thrusters}, STEP_S)
-    assert thrusters.take(960).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.051, rel=1e-3)
+    assert thrusters.take_output(960).thruster_impulse_N_s[2] == pytest.approx(1.5 * 0.051, rel=1e-3)
     fly_to(1920, physics, {"chaser/0": thrusters}, STEP_S)
-    assert thrusters.take(1920).thruster_impulse_N_s[2] == 0.0
+    assert thrusters.take_output(1920).thruster_impulse_N_s[2] == 0.0
     physics.close()
 
 
-def test_what_has_passed_of_a_late_command_is_not_made_up_for() -> None:
+def test_passed_part_of_a_late_pulse_is_lost() -> None:
     s = mission()
     physics, thrusters = Physics(s), thrusters_of(s)
     fly_to(48, physics, {"chaser/0": thrusters}, STEP_S)  # 50 ms
     thrusters.command(command((0, 0, 40), (1, 10, 100), (2, 45, 55)), 10, 48)
     fly_to(192, physics, {"chaser/0": thrusters}, STEP_S)
-    took = thrusters.take(192)
+    took = thrusters.take_output(192)
     assert took.late == 1
     assert not took.saturated
     np.testing.assert_allclose(took.thruster_open_s[:3], [0.0, 0.05, 0.0], atol=1e-6)
     physics.close()
 
 
-def test_pulses_that_cannot_be_are_told() -> None:
+def test_infeasible_pulses_are_reported_as_saturated() -> None:
     for pulse in ((12, 0, 50), (0, 0, 5), (0, 50, 20)):
         thrusters = thrusters_of(mission())
         thrusters.command(command(pulse), 0, 0)
-        assert thrusters.take(96).saturated is (pulse[2] > pulse[1])
-        assert sum(thrusters.take(192).thruster_impulse_N_s) == 0.0
+        assert thrusters.take_output(96).saturated is (pulse[2] > pulse[1])
+        assert sum(thrusters.take_output(192).thruster_impulse_N_s) == 0.0
 
 
-def test_a_chaser_that_is_gone_closes_its_valves() -> None:
+def test_lost_chaser_closes_its_valves() -> None:
     s = mission()
     physics, thrusters = Physics(s), thrusters_of(s)
     thrusters.command(command((0, 0, 1000)), 0, 0)
     fly_to(48, physics, {"chaser/0": thrusters}, STEP_S)
     thrusters.stop(48)
     fly_to(960, physics, {"chaser/0": thrusters}, STEP_S)
-    assert thrusters.take(960).thruster_open_s[0] == pytest.approx(0.05)
+    assert thrusters.take_output(960).thruster_open_s[0] == pytest.approx(0.05)
     physics.close()

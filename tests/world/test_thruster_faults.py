@@ -1,4 +1,4 @@
-"""Thrusters that fail by an operator's command to the world: decided between ticks, refused with the reason, told to the log."""
+"""Thruster faults by operator command: applied between ticks, refused with a reason, recorded as events."""
 
 from __future__ import annotations
 
@@ -9,47 +9,47 @@ import pytest
 from chaserdock_protocol.messages import CommandReply, Event, ThrusterFaultCommand, ThrusterReport
 from chaserdock_protocol.recording.log import read_log
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
-from chaserdock_world.actuators.thrusters import ThrusterActuators, actuators_of
+from chaserdock_world.actuators.thrusters import ThrusterActuators, make_actuators
 from harness import SHORT, ByHand, finished, sets, wait_for_log
 from thruster_cases import mission
 
 ALLOWED: dict[str, Any] = {"chaser": {"thruster_faults_by_command": True}}
 
 
-def asked(desk: ThrusterFaultHandler, tick: int, timing: Any, **wish: Any) -> CommandReply:
-    """The answer to one wish, decided at ``tick``."""
+def submit(handler: ThrusterFaultHandler, tick: int, timing: Any, **changes: Any) -> CommandReply:
+    """The reply to one changes, decided at ``tick``."""
     replies: list[CommandReply] = []
     values: dict[str, Any] = {"chaser": 0, "thruster": 2, "kind": "stuck_on", "operator": "me"}
-    desk.ask(ThrusterFaultCommand(**(values | wish)), replies.append)
+    handler.submit(ThrusterFaultCommand(**(values | changes)), replies.append)
     assert replies == []  # not before the tick
-    told = desk.decide(tick, timing)
-    assert [what for what, _ in told] == [
+    events = handler.apply_pending(tick, timing)
+    assert [what for what, _ in events] == [
         "thruster fault by command" if replies[0].accepted else "thruster fault refused"
     ]
-    assert "by me" in told[0][1]
-    assert replies[0].reason in told[0][1]
+    assert "by me" in events[0][1]
+    assert replies[0].reason in events[0][1]
     return replies[0]
 
 
-def test_a_thruster_fails_from_the_tick_on_and_is_mended_again() -> None:
+def test_thruster_fails_from_the_tick_on_until_repaired() -> None:
     s = mission(**ALLOWED)
-    thrusters = actuators_of(s, 0)
+    thrusters = make_actuators(s, 0)
     assert isinstance(thrusters, ThrusterActuators)
-    desk, per_tick = ThrusterFaultHandler(s, {"chaser/0": thrusters}), s.timing.steps_per_tick
+    handler, per_tick = ThrusterFaultHandler(s, {"chaser/0": thrusters}), s.timing.steps_per_tick
     given = []
-    wishes = {2: "stuck_on", 3: "stuck_on", 5: "healthy"}
+    kinds = {2: "stuck_on", 3: "stuck_on", 5: "healthy"}
     for tick in range(8):
-        if tick in wishes:
-            answer = asked(desk, tick, s.timing, kind=wishes[tick])
-            assert answer.accepted
-            assert ("already" in answer.reason) is (tick == 3)
-            assert answer.tick == tick
+        if tick in kinds:
+            reply = submit(handler, tick, s.timing, kind=kinds[tick])
+            assert reply.accepted
+            assert ("already" in reply.reason) is (tick == 3)
+            assert reply.tick == tick
         step, end = s.timing.step_of_tick(tick), s.timing.step_of_tick(tick + 1)
         while step < end:
             until = min(thrusters.next_change(step) or end, end)
             thrusters.act(step, until - step, 1.0 / s.timing.physics_hz)
             step = until
-        given.append(thrusters.take(end).thruster_impulse_N_s[2])
+        given.append(thrusters.take_output(end).thruster_impulse_N_s[2])
     full = 1.5 * per_tick / s.timing.physics_hz
     assert given[:2] == [0.0, 0.0]
     assert given[2] == pytest.approx(full - 1.5 * 0.001)  # less the rise
@@ -58,30 +58,30 @@ def test_a_thruster_fails_from_the_tick_on_and_is_mended_again() -> None:
 
 
 @pytest.mark.parametrize(
-    ("scenario", "wish", "reason"),
+    ("scenario", "changes", "reason"),
     [
         ({}, {}, "chaser.thruster_faults_by_command = true"),
         (ALLOWED, {"chaser": 1}, "there is no chaser 1; this mission has 0 to 0"),
         (ALLOWED, {"thruster": 12}, "there is no thruster 12; the body has 0 to 11"),
-        (ALLOWED, {"kind": "weak"}, "weak needs it"),
-        (ALLOWED, {"factor": 0.5}, "factor goes with weak"),
+        (ALLOWED, {"kind": "weak"}, "factor is required for weak"),
+        (ALLOWED, {"factor": 0.5}, "factor is required for weak"),
         (ALLOWED, {"kind": "weak", "factor": 1.5}, "factor must be from 0 to 1, not 1.5"),
-        ({"chaser": {"actuation": "ideal", "thruster_faults_by_command": True}}, {}, "fly without thrusters"),
+        ({"chaser": {"actuation": "ideal", "thruster_faults_by_command": True}}, {}, "have no thrusters"),
     ],
 )
-def test_what_cannot_be_is_refused_and_changes_nothing(
-    scenario: dict[str, Any], wish: dict[str, Any], reason: str
+def test_invalid_fault_command_is_refused_without_effect(
+    scenario: dict[str, Any], changes: dict[str, Any], reason: str
 ) -> None:
     s = mission(**scenario)
-    thrusters = actuators_of(s, 0)
-    answer = asked(ThrusterFaultHandler(s, {"chaser/0": thrusters}), 0, s.timing, **wish)
-    assert not answer.accepted
-    assert reason in answer.reason
+    thrusters = make_actuators(s, 0)
+    reply = submit(ThrusterFaultHandler(s, {"chaser/0": thrusters}), 0, s.timing, **changes)
+    assert not reply.accepted
+    assert reason in reply.reason
     assert thrusters.next_change(0) is None or not thrusters.act(0, 1, 0.001).any()
 
 
 @pytest.mark.slow
-def test_in_a_mission_the_chaser_finds_out_what_was_done_to_it(tmp_path: Path) -> None:
+def test_chaser_detects_a_commanded_thruster_fault_in_a_mission(tmp_path: Path) -> None:
     by_hand, log = ByHand.at_free_port("thrusterfault"), tmp_path / "mission.mcap"
     reach = ("--namespace", by_hand.namespace, "--connect", by_hand.endpoint)
     flown = (*SHORT, "thruster_failure=[]", "duration_s=25.0", "chaser.thruster_faults_by_command=true")

@@ -1,17 +1,15 @@
-"""The world process: owns simulated time, flies the bodies, takes the images, knows the truth.
+"""The world process: owns simulated time, simulates the bodies, renders the images and publishes the ground truth.
 
-Lock-step: a tick ends when every expected answer to it has come; nothing depends on the order of arrival or
-on the wall clock. Real time: a tick ends when the wall clock says so.
+Lock-step: a tick ends when all expected replies have arrived; nothing depends on the order of arrival or on the wall clock.
+Real time: the wall clock ends a tick.
 """
 
 from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
 
 import cv2
-from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.fault_injection import layer_of
@@ -21,27 +19,29 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
 from chaserdock_protocol.transport.session import Heartbeat, new_instance
 
-from chaserdock_world.actuators.ideal import Actuators, fly_to
+from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
-from chaserdock_world.actuators.thrusters import actuators_of
+from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.lockstep.membership import Membership
-from chaserdock_world.lockstep.tick_barrier import Answers
+from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.rendering.cameras import Cameras, States
-from chaserdock_world.sensors.errors import Navigation
+from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import publish_docking, publish_odometry, publish_truth
+
+_REALTIME_SLICES_HZ = 240
 
 
 def main(options: ProcessOptions) -> int:
-    """Runs the world of ``options.scenario``; 0 when it was flown to its end, 1 when not, 2 for bad input."""
-    # Other processes need the cores, and OpenCV's idle threads spin between an image's many short calls.
+    """Run the world of ``options.scenario``; return 0 if the mission was completed, 1 if not, 2 for invalid input."""
+    # The other processes need the cores, and OpenCV's idle threads spin between the many short calls of an image.
     cv2.setNumThreads(1)
     node: Node | None = None
     try:
         scenario = load_world_scenario(options)
         node = Node("world", "world", options.link)
         refuse_second_world(node)
-        return fly(scenario, options, node, Stop(options.watch_parent))
+        return World(scenario, options, node).run(Stop(options.watch_parent))
     except ChaserdockError as error:
         say("world", str(error))
         return 2
@@ -51,7 +51,7 @@ def main(options: ProcessOptions) -> int:
 
 
 def load_world_scenario(options: ProcessOptions) -> Scenario:
-    """The scenario of the options, with overrides and seed; raises ScenarioError."""
+    """Return the scenario of the options, with overrides and seed; raises ScenarioError."""
     if options.scenario is None:
         raise ScenarioError("the world needs a scenario file")
     overrides = options.overrides if options.seed is None else (*options.overrides, f"seed={options.seed}")
@@ -59,7 +59,7 @@ def load_world_scenario(options: ProcessOptions) -> Scenario:
 
 
 def refuse_second_world(node: Node) -> None:
-    """Raises TransportError if a world already answers in this namespace."""
+    """Raise TransportError if a world is already running in this namespace."""
     reply = node.ask(
         topics.JOIN_KEY, JoinRequest(process="world", instance=new_instance()), JoinReply, timeout_s=0.5
     )
@@ -67,140 +67,147 @@ def refuse_second_world(node: Node) -> None:
         raise TransportError(reply.reason)
 
 
-def gather(
-    scenario: Scenario,
-    options: ProcessOptions,
-    node: Node,
-    actuators: Mapping[str, Actuators],
-    physics: Physics,
-) -> Answers:
-    """Opens the world's ears and doors: from here on processes can join."""
-    membership = Membership(
-        chasers=len(scenario.chasers),
-        run_id=uuid.uuid4().hex[:12],
-        mode=options.mode,
-        scenario_json=scenario.model_dump_json(),
-        instance=new_instance(),
-    )
-    node.waits = options.mode == "lockstep"
-    node.subscribe(topics.ACTUATORS)
-    node.subscribe(topics.ACK)
-    node.watch_liveliness(membership.alive_changed)
-    node.answer(topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request)))
-    for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD):
-        node.advertise(topic)
-    for i in range(len(scenario.chasers)):
-        node.advertise(topics.ODOMETRY, i)
-        if f"chaser/{i}" in physics.latches:
-            node.advertise(topics.DOCKING, i)
-        node.advertise(topics.IMAGE, i)
-    heartbeat = Heartbeat(node, membership.instance)
-    node.announce()
-    return Answers(
-        node,
-        membership,
-        heartbeat,
-        scenario.timing,
-        actuators,
-        lambda: physics.step_count,
-        physics.command_latch,
-        options.recorder_expected,
-        scenario.controller.command_lifetime_s,
-        scenario.controller.standby,
-    )
+class World:
+    """One mission: simulation, sensors, actuators and the barrier of its ticks. Processes can join once it is made."""
 
+    def __init__(self, scenario: Scenario, options: ProcessOptions, node: Node) -> None:
+        self._scenario, self._options, self._node = scenario, options, node
+        self._timing, self._realtime = scenario.timing, options.mode == "realtime"
+        self._cameras, self._physics = Cameras(scenario), Physics(scenario)
+        self._odometry = OdometrySensor(scenario)
+        self._actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in range(len(scenario.chasers))}
+        self._faults = ThrusterFaultHandler(scenario, self._actuators)
+        self._contacts: set[tuple[str, str]] = set()
+        self._started_s = 0.0
+        node.faults = layer_of(scenario, "world", lockstep=not self._realtime)
+        self._barrier = self._open_mission()
 
-Contacts = set[tuple[str, str]]
+    def _open_mission(self) -> TickBarrier:
+        """Subscribe, advertise and announce the world; return the barrier of its ticks."""
+        node, scenario, options = self._node, self._scenario, self._options
+        membership = Membership(
+            chasers=len(scenario.chasers),
+            run_id=uuid.uuid4().hex[:12],
+            mode=options.mode,
+            scenario_json=scenario.model_dump_json(),
+            instance=new_instance(),
+        )
+        node.waits = not self._realtime
+        node.subscribe(topics.ACTUATORS)
+        node.subscribe(topics.ACK)
+        node.watch_liveliness(membership.set_alive)
+        node.answer(topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request)))
+        for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD):
+            node.advertise(topic)
+        for i in range(len(scenario.chasers)):
+            node.advertise(topics.ODOMETRY, i)
+            if f"chaser/{i}" in self._physics.latches:
+                node.advertise(topics.DOCKING, i)
+            node.advertise(topics.IMAGE, i)
+        heartbeat = Heartbeat(node, membership.instance)
+        node.announce()
+        node.answer(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
+        return TickBarrier(
+            node,
+            membership,
+            heartbeat,
+            self._timing,
+            self._actuators,
+            lambda: self._physics.step_count,
+            self._physics.command_latch,
+            options.recorder_expected,
+            scenario.controller.command_lifetime_s,
+            scenario.controller.standby,
+        )
 
+    def run(self, stop: Stop) -> int:
+        """Wait for the processes, simulate all ticks and end the mission; return the exit status."""
+        if not self._wait_for_processes(stop):
+            return self._end_mission(0, "stopped before the first tick", complete=False)
+        built()
+        self._started_s, tick = time.monotonic(), 0
+        while True:
+            states = self._publish_state(tick)
+            if tick == self._scenario.ticks:
+                return self._end_mission(tick, "completed", complete=True)
+            self._open_tick(tick)
+            self._expose_images(tick, states)
+            if self._realtime:
+                self._step_realtime(tick)
+            else:
+                self._await_replies_and_step(tick, stop)
+            if stop() or self._barrier.lost_all_chasers(self._options.rejoin_s, stop):
+                return self._end_mission(tick, "stopped" if stop() else "no chaser is left", complete=False)
+            tick += 1
 
-def expose(
-    node: Node,
-    cameras: Cameras,
-    chasers: Sequence[int],
-    tick: int,
-    timing: Timing,
-    states: States,
-    *,
-    at_once: bool,
-) -> None:
-    """Takes and sends the images of a tick: each when it is drawn, or all at once, as cameras do that expose at once."""
-    exposure = (tick // timing.ticks_per_image, tick, timing.tick_time_ns(tick), states)
-    one_by_one = (cameras.image(i, *exposure) for i in chasers)
-    for image in cameras.images(chasers, *exposure) if at_once else one_by_one:
-        node.publish(topics.IMAGE, image, image.chaser)
+    def _wait_for_processes(self, stop: Stop) -> bool:
+        """Wait until all expected processes are connected; return False if stopped before."""
+        barrier = self._barrier
 
+        def missing() -> str:
+            return ", ".join(barrier.missing_processes())
 
-def pass_lockstep(
-    tick: int, answers: Answers, stop: Stop, timing: Timing, fly_to_step: Callable[[int], Contacts]
-) -> Contacts:
-    """Flies a tick whose end waits for all answers; the pairs of bodies that touched."""
-    end = timing.step_of_tick(tick + 1)
-    # No answer to this tick can act before its latency has passed: fly that far while they think.
-    contacts = fly_to_step(min(end, timing.step_of_tick(tick) + timing.latency_steps))
-    if answers.wait(answers.complete, stop, answers.who_is_slow):
-        contacts |= fly_to_step(end)
-    return contacts
+        say("world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing()}")
+        started = barrier.wait_until(lambda: not barrier.missing_processes(), stop, missing)
+        barrier.start_flight()
+        return started
 
-
-def pass_realtime(
-    tick: int, begun_s: float, answers: Answers, timing: Timing, fly_to_step: Callable[[int], Contacts]
-) -> Contacts:
-    """Flies a tick at the pace of the wall clock, in slices, so that a command acts when it comes, not before."""
-    contacts: Contacts = set()
-    slices = max(1, timing.steps_per_tick // max(1, timing.physics_hz // 240))
-    for k in range(1, slices + 1):
-        step = timing.step_of_tick(tick) + timing.steps_per_tick * k // slices
-        answers.listen_until(begun_s + step / timing.physics_hz)
-        contacts |= fly_to_step(step)
-    return contacts
-
-
-def fly(scenario: Scenario, options: ProcessOptions, node: Node, stop: Stop) -> int:
-    """Gathers the processes, flies all ticks, ends the mission; the process' status."""
-    cameras, physics, timing = Cameras(scenario), Physics(scenario), scenario.timing
-    navigation = Navigation(scenario)
-    actuators = {f"chaser/{i}": actuators_of(scenario, i) for i in range(len(scenario.chasers))}
-    node.faults = layer_of(scenario, "world", lockstep=options.mode == "lockstep")
-    answers = gather(scenario, options, node, actuators, physics)
-    faults = ThrusterFaultHandler(scenario, actuators)
-    node.answer(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, faults.ask)
-    say("world", f"{scenario.name}, {options.mode}: waiting for {', '.join(answers.missing_at_start())}")
-    started = answers.wait(
-        lambda: not answers.missing_at_start(), stop, lambda: ", ".join(answers.missing_at_start())
-    )
-    answers.settle()
-    built()
-    reason = "flown to its end" if started else "stopped before the first tick"
-    begun_s, tick = time.monotonic(), 0
-
-    def fly_to_step(step: int) -> Contacts:
-        return fly_to(step, physics, actuators, 1.0 / timing.physics_hz)
-
-    contacts: Contacts = set()
-    while started:
+    def _publish_state(self, tick: int) -> States:
+        """Publish odometry, docking sensors and ground truth at the beginning of a tick; return the bodies' states."""
+        node, physics, timing = self._node, self._physics, self._timing
         states = {name: physics.state(name) for name in physics.bodies}
-        publish_docking(node, physics.latches, tick, timing)  # before the truth, which takes the touches
-        publish_truth(node, states, tick, timing, actuators, contacts, physics.latches)
-        publish_odometry(node, states, tick, timing, navigation)
-        if tick == scenario.ticks:
-            break
-        images = timing.has_images(tick)
-        answers.open(tick, images)
-        for what, detail in faults.decide(tick, timing):
-            answers.warn(what, detail)
-        if images:
-            expose(node, cameras, answers.chasers, tick, timing, states, at_once=options.mode == "realtime")
-        if options.mode == "lockstep":
-            contacts = pass_lockstep(tick, answers, stop, timing, fly_to_step)
-        else:
-            contacts = pass_realtime(tick, begun_s, answers, timing, fly_to_step)
-        if stop() or answers.abandoned(options.rejoin_s, stop):
-            reason = "stopped" if stop() else "no chaser is left"
-            break
-        tick += 1
-    complete = started and tick == scenario.ticks
-    time_ns = timing.tick_time_ns(tick)
-    node.publish(topics.END, MissionEnd(tick=tick, sim_time_ns=time_ns, reason=reason, complete=complete))
-    answers.farewell(tick, time_ns)
-    say("world", f"{reason} at {time_ns / 1e9:.2f} s")
-    return 0 if complete else 1
+        publish_docking(node, physics.latches, tick, timing)  # first, as the ground truth takes the touches
+        publish_truth(node, states, tick, timing, self._actuators, self._contacts, physics.latches)
+        publish_odometry(node, states, tick, timing, self._odometry)
+        return states
+
+    def _open_tick(self, tick: int) -> None:
+        self._barrier.open_tick(tick, self._timing.has_images(tick))
+        for what, detail in self._faults.apply_pending(tick, self._timing):
+            self._barrier.publish_warning(what, detail)
+
+    def _expose_images(self, tick: int, states: States) -> None:
+        """Render and publish the images of a tick.
+
+        In lock-step each is published as soon as it is rendered, in real time all together, as synchronized cameras do.
+        """
+        timing, chasers = self._timing, self._barrier.chasers
+        if not timing.has_images(tick):
+            return
+        exposure = (tick // timing.ticks_per_image, tick, timing.tick_time_ns(tick), states)
+        one_by_one = (self._cameras.image(i, *exposure) for i in chasers)
+        for image in self._cameras.images(chasers, *exposure) if self._realtime else one_by_one:
+            self._node.publish(topics.IMAGE, image, image.chaser)
+
+    def _await_replies_and_step(self, tick: int, stop: Stop) -> None:
+        """Lock-step: step the physics to the end of the tick, waiting for all replies before they take effect."""
+        timing, barrier = self._timing, self._barrier
+        end = timing.step_of_tick(tick + 1)
+        self._contacts = set()
+        # No reply takes effect before the latency has passed: simulate that far while the others compute.
+        self._step_to(min(end, timing.step_of_tick(tick) + timing.latency_steps))
+        if barrier.wait_until(barrier.is_complete, stop, barrier.pending):
+            self._step_to(end)
+
+    def _step_realtime(self, tick: int) -> None:
+        """Real time: step the physics with the wall clock, in slices, so that a command acts as soon as it arrives."""
+        timing = self._timing
+        self._contacts = set()
+        slices = max(1, timing.steps_per_tick // max(1, timing.physics_hz // _REALTIME_SLICES_HZ))
+        for k in range(1, slices + 1):
+            step = timing.step_of_tick(tick) + timing.steps_per_tick * k // slices
+            self._barrier.process_until(self._started_s + step / timing.physics_hz)
+            self._step_to(step)
+
+    def _step_to(self, step: int) -> None:
+        self._contacts |= fly_to(step, self._physics, self._actuators, 1.0 / self._timing.physics_hz)
+
+    def _end_mission(self, tick: int, reason: str, complete: bool) -> int:
+        """Publish the end of the mission; return the exit status."""
+        time_ns = self._timing.tick_time_ns(tick)
+        self._node.publish(
+            topics.END, MissionEnd(tick=tick, sim_time_ns=time_ns, reason=reason, complete=complete)
+        )
+        self._barrier.publish_farewell(tick, time_ns)
+        say("world", f"{reason} at {time_ns / 1e9:.2f} s")
+        return 0 if complete else 1

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.docking_geometry import Motion, view_of
+from chaserdock_models.docking_geometry import BodyState, view_of
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import DockingStatus, Odometry
 from chaserdock_protocol.scenario import Scenario
@@ -143,13 +143,13 @@ class Captures:
         port = s.docking.port_of(i)
         if port is None:
             return None
-        chaser = Motion(
+        chaser = BodyState(
             np.array(odometry.position_m),
             np.array(odometry.velocity_m_s),
             np.array(odometry.q_wxyz),
             np.array(odometry.omega_rad_s),
         )
-        target = Motion(fused.position_m, fused.velocity_m_s, fused.q_wxyz, fused.omega_rad_s)
+        target = BodyState(fused.position_m, fused.velocity_m_s, fused.q_wxyz, fused.omega_rad_s)
         view = view_of(port, s.chaser.probe_reach_m, np.asarray(s.chasers[i].q_wxyz), chaser, target)
         contact = told is not None and told.contact
         return Senses(view, contact, i in self.latched, *pose_in_target(fused, odometry))

@@ -1,7 +1,6 @@
-"""What drives a chaser in the world: commands held back until they take effect, bounded by the actuators.
+"""Actuators of a chaser in the simulation: the interface, and ideal actuators that give the commanded wrench.
 
-``ideal`` actuation gives the commanded wrench itself, cut off at the body's limits per axis; thrusters are in
-``thruster_actuators``.
+Commands wait until they take effect; ideal actuators limit each axis of a command to the body's limits.
 """
 
 from __future__ import annotations
@@ -19,9 +18,13 @@ from chaserdock_protocol.scenario.bodies import Body
 from chaserdock_world.physics.simulation import Physics
 
 
-class Given(NamedTuple):
-    """What actuators gave since they were last asked: impulse (6,), body axes, and the time integral of the force
-    components' magnitudes; whether a command was more than they can do, how many came late; of thrusters, see BodyTruth."""
+class ActuatorOutput(NamedTuple):
+    """Output of a chaser's actuators over an interval.
+
+    ``impulse`` (6,): N s and N m s, body axes; ``absolute_impulse_N_s``: time integral of the force components' absolute
+    values; ``saturated``: a command exceeded the limits; ``late``: number of commands after their effective time;
+    thrusters: see BodyTruth.
+    """
 
     impulse: Array
     absolute_impulse_N_s: float
@@ -33,22 +36,35 @@ class Given(NamedTuple):
 
 
 class Actuators(Protocol):
-    """What drives one chaser: see ``IdealActuators`` for the meaning of each member."""
+    """Actuators of one chaser. Steps are physics steps."""
 
-    def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None: ...
+    def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
+        """Queue a command that acts from ``effective_step`` on; a late one acts at once and is counted."""
+        ...
 
-    def next_change(self, step: int) -> int | None: ...
+    def next_change(self, step: int) -> int | None:
+        """Return the first step after ``step`` at which the wrench may change, None if none is known."""
+        ...
 
-    def act(self, step: int, steps: int, step_s: float) -> Array: ...
+    def act(self, step: int, steps: int, step_s: float) -> Array:
+        """Return the wrench (6,), body axes, N and N m, from ``step`` on and account for ``steps`` steps of it.
 
-    def stop(self, step: int) -> None: ...
+        The wrench must not change in between (see ``next_change``).
+        """
+        ...
 
-    def take(self, step: int) -> Given: ...
+    def stop(self, step: int) -> None:
+        """Stop the actuators at ``step``: the chaser is lost."""
+        ...
+
+    def take_output(self, step: int) -> ActuatorOutput:
+        """Return the output since the last call, up to ``step``."""
+        ...
 
 
 @dataclass
 class IdealActuators:
-    """Commands of one chaser in the order of their effect, and what has been given so far."""
+    """Actuators that give the commanded wrench within the body's limits."""
 
     body: Body
     wrench: Array = field(default_factory=lambda: np.zeros(6))
@@ -56,51 +72,48 @@ class IdealActuators:
     absolute_impulse_N_s: float = 0.0
     saturated: bool = False
     late: int = 0
-    _waiting: list[tuple[int, int, int, Array]] = field(default_factory=list)
-    _taken: int = 0
+    _queue: list[tuple[int, int, int, Array]] = field(default_factory=list)
+    _received: int = 0
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
-        """Takes a command that is to act from ``effective_step`` on; a late one acts at once, and is counted."""
+        """See ``Actuators.command``."""
         limit = np.repeat([self.body.force_max_N, self.body.torque_max_N_m], 3)
-        asked = np.array([*command.force_N, *command.torque_N_m])
-        given = np.clip(asked, -limit, limit)
-        self.saturated |= bool(np.any(np.abs(asked) > limit * (1 + 1e-6)))
+        wrench = np.array([*command.force_N, *command.torque_N_m])
+        self.saturated |= bool(np.any(np.abs(wrench) > limit * (1 + 1e-6)))
         self.late += effective_step < now_step
-        # A chaser started anew counts from zero again: then the last to come decides, and arrays are never compared.
-        self._taken += 1
-        heapq.heappush(self._waiting, (effective_step, command.seq, self._taken, given))
+        # A restarted chaser counts ``seq`` from zero again; the order of arrival decides, and arrays are never compared.
+        self._received += 1
+        entry = (effective_step, command.seq, self._received, np.clip(wrench, -limit, limit))
+        heapq.heappush(self._queue, entry)
 
     def next_change(self, step: int) -> int | None:
-        """The first step after ``step`` at which another command takes effect, if one waits."""
-        return min((w[0] for w in self._waiting if w[0] > step), default=None)
+        """See ``Actuators.next_change``."""
+        return min((entry[0] for entry in self._queue if entry[0] > step), default=None)
 
     def act(self, step: int, steps: int, step_s: float) -> Array:
-        """The wrench (6,), body axes, that acts from physics step ``step`` on, for ``steps`` steps of ``step_s``.
-
-        There must be no change in between (see ``next_change``).
-        """
-        while self._waiting and self._waiting[0][0] <= step:
-            self.wrench = heapq.heappop(self._waiting)[3]
+        """See ``Actuators.act``."""
+        while self._queue and self._queue[0][0] <= step:
+            self.wrench = heapq.heappop(self._queue)[3]
         self.impulse = self.impulse + self.wrench * (steps * step_s)
         self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * steps * step_s
         return self.wrench
 
     def stop(self, step: int) -> None:
-        """The chaser is gone at physics step ``step``: nothing acts any more."""
-        self._waiting.clear()
+        """See ``Actuators.stop``."""
+        self._queue.clear()
         self.wrench = np.zeros(6)
 
-    def take(self, step: int) -> Given:
-        """What was given since the last call, up to physics step ``step``."""
-        out = Given(self.impulse, self.absolute_impulse_N_s, self.saturated, self.late)
+    def take_output(self, step: int) -> ActuatorOutput:
+        """See ``Actuators.take_output``."""
+        output = ActuatorOutput(self.impulse, self.absolute_impulse_N_s, self.saturated, self.late)
         self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = np.zeros(6), 0.0, False, 0
-        return out
+        return output
 
 
 def fly_to(
     end_step: int, physics: Physics, actuators: Mapping[str, Actuators], step_s: float
 ) -> set[tuple[str, str]]:
-    """Advances the physics to ``end_step`` under what the actuators give; the pairs of bodies that touched."""
+    """Advance the physics to ``end_step`` under the actuators' wrenches; return the pairs of bodies that touched."""
     touched: set[tuple[str, str]] = set()
     while (step := physics.step_count) < end_step:
         changes = (a.next_change(step) for a in actuators.values())

@@ -1,4 +1,4 @@
-"""Who takes part: the world admits processes, sees them come and go, and knows who is joined up with whom."""
+"""Membership of a mission: admits processes, tracks their liveliness and which of them have discovered each other."""
 
 from __future__ import annotations
 
@@ -10,31 +10,33 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
-from chaserdock_protocol.transport import session as presence
+from chaserdock_protocol.transport.session import partners_of
 
-JOINING_S = 5.0
-"""Between being admitted and being seen alive a process has that long before another may take its place."""
+JOIN_TIMEOUT_S = 5.0
+"""An admitted process keeps its name reserved for so long before its liveliness token appears."""
 
 
 @dataclass
 class Membership:
-    """The world's view of the processes of its mission; called from Zenoh's threads and from the loop."""
+    """The processes of a mission as the world knows them. Thread-safe: called from Zenoh's threads and the main loop.
+
+    ``instance``: the world's own; ``flying``: set at the first tick, from when on connected processes no longer wait for
+    processes that are only joining (see ``connected``).
+    """
 
     chasers: int
     run_id: str
     mode: str
     scenario_json: str
-    _alive: set[str] = field(default_factory=set)
-    _admitted: dict[str, str] = field(default_factory=dict)
     instance: str = ""
     now_s: Callable[[], float] = time.monotonic
+    flying: bool = False
+    _alive: set[str] = field(default_factory=set)
+    _admitted: dict[str, str] = field(default_factory=dict)
     _admitted_s: dict[str, float] = field(default_factory=dict)
     _heard: dict[str, dict[str, str]] = field(default_factory=dict)
-    _instances: dict[str, str] = field(default_factory=dict)
-    _left: list[str] = field(default_factory=list)
-    flying: bool = False
-    """From the first tick on; those who are joined up then no longer wait for somebody who is only just joining."""
-    _joined_up: set[str] = field(default_factory=set)
+    _departed: list[str] = field(default_factory=list)
+    _connected: set[str] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
 
     @property
@@ -43,8 +45,8 @@ class Membership:
         return self.mode == "realtime"
 
     def admit(self, request: JoinRequest) -> JoinReply:
-        """Answers a process that wants to join: refused with the reason, or told the mission."""
-        reason = self._objection(request)
+        """Admit a process and return the mission, or refuse it with a reason."""
+        reason = self._refusal(request)
         if reason:
             return JoinReply(accepted=False, reason=reason)
         with self._lock:
@@ -58,84 +60,81 @@ class Membership:
             scenario_json=self.scenario_json,
         )
 
-    def _objection(self, request: JoinRequest) -> str:
+    def _refusal(self, request: JoinRequest) -> str:
         name = request.process
         if not topics.is_member_name(name):
             return f"{name!r} is no process of a mission"
         if name == "world":
-            return "this mission has its world already; choose another --namespace for a second one"
+            return "this mission has a world already; choose another --namespace for a second one"
         if name.startswith("chaser/") and int(name.partition("/")[2]) >= self.chasers:
             return f"there is no {name} in this mission; its chasers are 0 to {self.chasers - 1}"
         with self._lock:
             if self._admitted.get(name, request.instance) != request.instance:
                 if name in self._alive:
                     return f"{name} is already running in this mission"
-                if self.now_s() - self._admitted_s.get(name, -math.inf) < JOINING_S:
-                    return f"another {name} is just joining this mission"
+                if self.now_s() - self._admitted_s.get(name, -math.inf) < JOIN_TIMEOUT_S:
+                    return f"another {name} is joining this mission"
         return ""
 
-    def alive_changed(self, name: str, alive: bool) -> None:
-        """A liveliness token came or went."""
+    def set_alive(self, name: str, alive: bool) -> None:
+        """Record that a liveliness token appeared or disappeared."""
         with self._lock:
             if alive:
                 self._alive.add(name)
             elif name in self._alive:
                 self._alive.discard(name)
                 self._heard.pop(name, None)
-                self._joined_up.discard(name)
+                self._connected.discard(name)
                 self._admitted_s.pop(name, None)
-                self._left.append(name)
+                self._departed.append(name)
 
-    def presence_told(self, message: Presence) -> bool:
-        """Notes whom a process has heard; False when it was never admitted under that instance."""
+    def update_presence(self, message: Presence) -> bool:
+        """Record which processes a process has heard; return False if that instance is not admitted."""
         with self._lock:
             if self._admitted.get(message.process) != message.instance:
                 return False
             self._heard[message.process] = dict(message.heard)
             return True
 
-    def who_left(self) -> list[str]:
-        """Processes lost since the last call."""
+    def take_departed(self) -> list[str]:
+        """Return the processes lost since the last call."""
         with self._lock:
-            left, self._left = self._left, []
-            return left
+            departed, self._departed = self._departed, []
+            return departed
 
-    def linked(self, world_heard: dict[str, str]) -> set[str]:
-        """Processes that are alive and joined up with all they deal with; ``world_heard``: whom the world has heard.
+    def connected(self, heard_by_world: dict[str, str]) -> set[str]:
+        """Return the processes that are alive and have discovered, and been discovered by, all their partners.
 
-        Only the instances that are here now count: whoever has heard an earlier start of a process has not heard it.
-        Before the flight all pairs count for both. In flight a pair with a newcomer counts for the newcomer alone, so
-        that nobody who flies is put out by one who joins.
+        ``heard_by_world``: processes that the world has heard, with their instances. Only current instances count: a
+        process that restarts has to be heard again. Before the flight a pair that is not connected holds back both
+        processes. In flight a pair of a flying and a joining process holds back the joining one only, so that no process
+        drops out of the flight because another one joins.
         """
         with self._lock:
-            here = {**self._admitted, "world": self.instance}
-            known = {**self._heard, "world": world_heard}
+            current = {**self._admitted, "world": self.instance}
             heard = {
-                name: {o for o, instance in others.items() if here.get(o) == instance}
-                for name, others in known.items()
+                name: {other for other, instance in others.items() if current.get(other) == instance}
+                for name, others in {**self._heard, "world": heard_by_world}.items()
                 if name in self._alive or name == "world"
             }
             present = {"world", *(n for n in heard if n.startswith("chaser/") or n in topics.CONTROLLERS)}
-            linked = {
+            settled = {*self._connected, "world"}
+
+            def pair_is_connected(name: str, partner: str) -> bool:
+                if partner not in heard or (name in self._connected and partner not in settled):
+                    return True
+                return name in heard[partner] and partner in heard[name]
+
+            connected = {
                 name
                 for name in heard
-                if name != "world"
-                and all(
-                    name in heard[o] and o in heard[name]
-                    for o in presence.partners_of(name, present)
-                    if o in heard and (name not in self._joined_up or o in {*self._joined_up, "world"})
-                )
+                if name != "world" and all(pair_is_connected(name, p) for p in partners_of(name, present))
             }
             if self.flying:
-                self._joined_up = set(linked)
-            return linked
+                self._connected = set(connected)
+            return connected
 
     def instance_of(self, name: str) -> str:
-        """The start of a process that was admitted last; empty when none was."""
+        """Return the instance of a process that was admitted last, empty if none was."""
         with self._lock:
             return self._admitted.get(name, "")
-
-    def alive(self) -> set[str]:
-        """Processes whose liveliness token is there."""
-        with self._lock:
-            return set(self._alive)

@@ -1,4 +1,4 @@
-"""The world's ear: whom it expects an answer from in a tick, and what has come."""
+"""Lock-step barrier: collects the replies that a tick expects, and applies the actuator commands among them."""
 
 from __future__ import annotations
 
@@ -15,18 +15,22 @@ from chaserdock_protocol.transport.session import Heartbeat, health_of
 
 from chaserdock_world.actuators.ideal import Actuators
 
-from .leader_election import Terms, lease_s
+from .leader_election import LeaderElection, lease_s
 from .membership import Membership
 
 RECORDER_WINDOW_TICKS = 8
-"""How far the flight may be ahead of what the recorder has confirmed: bounds what lies in the network."""
-_IMPATIENT_S = 5.0
-_GREATEST_SHIFT_NS = 1_000_000_000
-"""A command that is to act so much earlier or later than its tick's has a wrong clock behind it."""
+"""The flight is at most this far ahead of the recorder's acknowledgements, which bounds the data in the network."""
+_STATUS_INTERVAL_S = 5.0
+_POLL_S = 0.02
+_MAX_CLOCK_ERROR_NS = 1_000_000_000
+"""A command whose effective time differs from its tick's by more comes from a wrong clock."""
 
 
-class Answers:
-    """Collects the answers to the open tick. ``chasers``: ids expected; ``terms``: which controller commands."""
+class TickBarrier:
+    """Opens ticks, collects the replies to them and decides when a tick is complete.
+
+    ``chasers``: ids of the chasers whose reply the open tick expects. ``election``: which controller leads.
+    """
 
     def __init__(
         self,
@@ -35,92 +39,244 @@ class Answers:
         heartbeat: Heartbeat,
         timing: Timing,
         actuators: Mapping[str, Actuators],
-        step_now: Callable[[], int],
+        current_step: Callable[[], int],
         command_latch: Callable[[int, Latch, int], None],
         recorder_expected: bool,
         watchdog_s: float = 0.5,
         standby_expected: bool = False,
     ) -> None:
         self.chasers: tuple[int, ...] = ()
-        self.terms = Terms(lease_s(timing.rate_hz))
+        self.election = LeaderElection(lease_s(timing.rate_hz))
         self._oldest_term = 0
         self._controllers: dict[str, str] = {}
         self._standby_expected = standby_expected
         self._node = node
         self._membership = membership
-        self._teller = heartbeat
+        self._heartbeat = heartbeat
         self._timing = timing
         self._actuators = actuators
-        self._step_now = step_now
+        self._current_step = current_step
         self._command_latch = command_latch
-        self._recorder_expected = self._recorder_wanted = recorder_expected
+        self._recorder_expected = self._recorder_configured = recorder_expected
         self._recorded_tick = -1
         self._tick = -1
+        self._images = False
         self._revision = 0
-        # At least two ticks: a command lives until the next tick's has come.
+        # At least two ticks, as a command acts until that of the next tick arrives.
         self._watchdog_ns = round(max(watchdog_s, 2.0 / timing.rate_hz) * 1e9)
         self._commanded_ns: dict[str, int] = {}
-        self._answered: set[int] = set()
-        self._warned_s = time.monotonic()
-        self._alone_s: float | None = None
+        self._replied: set[int] = set()
+        self._no_chaser_since_s: float | None = None
 
-    def missing_at_start(self) -> list[str]:
-        """Processes that are not joined up yet."""
-        wanted = [*self._actuators, "controller", *(["standby"] if self._standby_expected else [])]
-        wanted += ["recorder"] if self._recorder_expected else []
-        linked = self._membership.linked(self._teller.heard())
-        return [name for name in wanted if name not in linked]
+    # -- before, between and after ticks ---------------------------------------------------------------------
 
-    def open(self, tick: int, images: bool) -> None:
-        """Opens a tick: tells everyone who is expected to answer it."""
-        self._take_leave()
-        linked = self._membership.linked(self._teller.heard())
-        self.chasers = self._chasers_among(linked)
+    def missing_processes(self) -> list[str]:
+        """Return the expected processes that are not connected yet."""
+        expected = [*self._actuators, "controller", *(["standby"] if self._standby_expected else [])]
+        expected += ["recorder"] if self._recorder_expected else []
+        connected = self._connected()
+        return [name for name in expected if name not in connected]
+
+    def start_flight(self) -> None:
+        """Start the flight: heartbeats slow down, and joining processes no longer hold back connected ones."""
+        self._membership.flying = True
+        self._heartbeat.settled.set()
+
+    def open_tick(self, tick: int, images: bool) -> None:
+        """Open a tick: determine whose reply it expects, elect the leader and publish the tick."""
+        self._remove_departed()
+        connected = self._connected()
+        self.chasers = self._chasers_among(connected)
         self._controllers = {
-            name: self._membership.instance_of(name) for name in topics.CONTROLLERS if name in linked
+            name: self._membership.instance_of(name) for name in topics.CONTROLLERS if name in connected
         }
-        # One that was lost and is back: the flight is again held to what it has recorded.
-        self._recorder_expected |= self._recorder_wanted and "recorder" in linked
+        # A recorder that returns paces the flight again.
+        self._recorder_expected |= self._recorder_configured and "recorder" in connected
         self._tick, self._images, self._revision = tick, images, 0
-        self._answered.clear()
-        self._review_terms()
-        self._oldest_term = self.terms.term.number
+        self._replied.clear()
+        self._update_leader()
+        self._oldest_term = self.election.term.number
         if self._node.faults is not None:
-            for what, which in self._node.faults.told_at(tick):
-                self.warn(what, which)
-        self._watch_actuators()
-        self._tell()
+            for what, detail in self._node.faults.told_at(tick):
+                self.publish_warning(what, detail)
+        self._check_watchdogs()
+        self._publish_tick()
         if tick > 0 and tick % self._timing.rate_hz == 0:
             health = health_of(self._node, tick, self._timing.tick_time_ns(tick))
             self._node.publish(topics.HEALTH, health, "world")
 
+    def is_complete(self) -> bool:
+        """Return whether all expected replies to the open tick have arrived and the recorder keeps up."""
+        keeps_up = not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
+        return keeps_up and self._replied.issuperset(self.chasers)
+
+    def pending(self) -> str:
+        """Return the names of the processes that the open tick waits for."""
+        late = [f"chaser/{i}" for i in self.chasers if i not in self._replied]
+        return ", ".join(late) or "recorder"
+
+    def lost_all_chasers(self, rejoin_s: float, stopped: Callable[[], bool]) -> bool:
+        """Return whether no chaser is left and none returns within ``rejoin_s`` of wall time.
+
+        All processes are lost at once when the router restarts or the world is cut off. In lock-step this waits, with
+        simulated time at rest, until all are back or the time is over; in real time it does not wait.
+        """
+        now_s = time.monotonic()
+        if self.chasers or rejoin_s <= 0.0:
+            self._no_chaser_since_s = None
+            return not self.chasers
+        if self._no_chaser_since_s is None:
+            self._no_chaser_since_s = now_s
+            self.publish_warning("all chasers lost", f"waiting up to {rejoin_s:g} s for their return")
+        if self._membership.realtime:
+            return now_s - self._no_chaser_since_s > rejoin_s
+        self._recorder_expected = self._recorder_configured
+        self.wait_until(
+            lambda: not self.missing_processes() or time.monotonic() - now_s > rejoin_s,
+            stopped,
+            lambda: ", ".join(self.missing_processes()),
+        )
+        missing = self.missing_processes()
+        self._recorder_expected &= "recorder" not in missing
+        self.publish_warning("end of wait for lost processes", f"missing: {', '.join(missing) or 'none'}")
+        self._no_chaser_since_s = None
+        return not self._chasers_among(self._connected())
+
+    def publish_warning(self, what: str, detail: str) -> None:
+        """Publish an event of level warning, and print it."""
+        time_ns = self._timing.tick_time_ns(max(self._tick, 0))
+        event = Event(
+            tick=self._tick, sim_time_ns=time_ns, process="world", level="warning", what=what, detail=detail
+        )
+        self._node.publish(topics.EVENT, event, "world")
+        say("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
+
+    def publish_farewell(self, tick: int, time_ns: int) -> None:
+        """Publish the world's last messages."""
+        self._heartbeat.farewell(tick, time_ns)
+
+    # -- receiving -------------------------------------------------------------------------------------------
+
+    def wait_until(
+        self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]
+    ) -> bool:
+        """Process messages until ``done``; return False if ``stopped`` first. Prints at intervals what it waits for."""
+        printed_s = time.monotonic()
+        while not done():
+            if stopped():
+                return False
+            self.process_message(_POLL_S)
+            if time.monotonic() - printed_s > _STATUS_INTERVAL_S:
+                printed_s = time.monotonic()
+                say("world", f"waiting for {waiting_for()}")
+        return True
+
+    def process_until(self, wall_s: float) -> None:
+        """Process messages until a time of the monotonic wall clock."""
+        while (left := wall_s - time.monotonic()) > 0:
+            self.process_message(min(left, _POLL_S))
+
+    def process_message(self, timeout_s: float) -> None:
+        """Process one message, if one arrives in time, and the departure of processes."""
+        received = self._node.receive(timeout_s)
+        match received.message if received is not None else None:
+            case ActuatorCommand() as command:
+                self._apply_command(command)
+            case RecorderAck() as ack:
+                self._recorded_tick = max(self._recorded_tick, ack.tick)
+            case Presence() as presence:
+                if self._membership.update_presence(presence):
+                    self._heartbeat.take(presence)
+                    self.election.mark_responsive(presence.instance)
+            case Lost(tick=tick) if received is not None and tick == self._tick:
+                self._replied.add(int(received.place or 0))  # its actuators keep their last command
+        changed = self._remove_departed()
+        if self._tick >= 0 and self._membership.realtime and self._update_leader():
+            self._oldest_term, changed = self.election.term.number, True
+        if changed:
+            self._revision += 1
+            self._publish_tick()
+
+    def _apply_command(self, command: ActuatorCommand) -> None:
+        """Hand a command to the actuators and the latch, or count why it is rejected."""
+        if rejection := self._check_command(command):
+            self._node.counts.rejected[f"actuators:{rejection}"] += 1
+            return
+        name = f"chaser/{command.chaser}"
+        self._commanded_ns[name] = max(
+            self._timing.tick_time_ns(command.tick), self._commanded_ns.get(name, 0)
+        )
+        effective_step = self._timing.step_of_time(command.effective_time_ns)
+        self._actuators[name].command(command, effective_step, self._current_step())
+        self._command_latch(command.chaser, command.latch, effective_step)
+
+    def _check_command(self, command: ActuatorCommand) -> str:
+        """Renew the leader's lease and record the reply; return why the command is rejected, empty if it is not."""
+        if f"chaser/{command.chaser}" not in self._actuators or command.tick > self._tick:
+            return "unexpected"
+        if command.source == "command":
+            # In lock-step a command of a leader that was lost within this tick is still valid.
+            if command.term < self._oldest_term:
+                return "stale term"
+            self.election.renew_lease(command.term, self._now_s())
+        if command.tick == self._tick:
+            # In real time a chaser may brake before its command arrives: the later reply replaces the first.
+            if command.chaser in self._replied and not self._membership.realtime:
+                return "twice"
+            self._replied.add(command.chaser)
+        due_ns = self._timing.effective_ns(command.tick)
+        return "time" if abs(command.effective_time_ns - due_ns) > _MAX_CLOCK_ERROR_NS else ""
+
+    # -- processes -------------------------------------------------------------------------------------------
+
+    def _connected(self) -> set[str]:
+        return self._membership.connected(self._heartbeat.heard())
+
+    def _chasers_among(self, connected: set[str]) -> tuple[int, ...]:
+        return tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in connected)
+
     def _now_s(self) -> float:
-        """What a silent commander's lease is counted in: simulated time where the wall clock decides nothing."""
+        """Return the time that leases are measured in."""
         if self._membership.realtime:
             return time.monotonic()
         return self._timing.tick_time_ns(max(self._tick, 0)) / 1e9
 
-    def _review_terms(self) -> bool:
-        """Gives the command to another controller where that is due; whether it has."""
-        before = self.terms.term
-        why = self.terms.review(self._controllers, self._now_s())
-        if why and before.number:
-            self.warn("hand-over", why)
-        return bool(why)
+    def _update_leader(self) -> bool:
+        """Grant a new term if one is due; return whether the leader changed."""
+        before = self.election.term
+        reason = self.election.update(self._controllers, self._now_s())
+        if reason and before.number:
+            self.publish_warning("hand-over", reason)
+        return bool(reason)
 
-    def _watch_actuators(self) -> None:
-        """Actuators that get no commands any more stop by themselves, as a valve driver's watchdog has it."""
+    def _check_watchdogs(self) -> None:
+        """Stop actuators that no longer receive commands, as the watchdog of a valve driver does."""
         now_ns = self._timing.tick_time_ns(self._tick)
         for name in [n for n, since in self._commanded_ns.items() if now_ns - since > self._watchdog_ns]:
-            self._actuators[name].stop(self._step_now())
+            self._actuators[name].stop(self._current_step())
             del self._commanded_ns[name]
-            self.warn("actuators stopped", f"{name}: no command for {self._watchdog_ns / 1e9:g} s")
+            self.publish_warning("actuators stopped", f"{name}: no command for {self._watchdog_ns / 1e9:g} s")
 
-    def _chasers_among(self, linked: set[str]) -> tuple[int, ...]:
-        return tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in linked)
+    def _remove_departed(self) -> bool:
+        """Remove processes that were lost; return whether this changes whose reply the open tick expects."""
+        changed = False
+        for name in self._membership.take_departed():
+            self._heartbeat.forget(name)
+            self.publish_warning("process lost", name)
+            if name == "recorder":
+                self._recorder_expected = False
+            elif name in self._controllers:
+                del self._controllers[name]
+                changed |= self._update_leader() or self._tick >= 0
+            elif name in self._actuators:
+                self._actuators[name].stop(self._current_step())
+                self._commanded_ns.pop(name, None)
+                changed |= any(f"chaser/{i}" == name for i in self.chasers)
+                self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
+        return changed and self._tick >= 0
 
-    def _tell(self) -> None:
-        term = self.terms.term
+    def _publish_tick(self) -> None:
+        term = self.election.term
         message = Tick(
             tick=self._tick,
             sim_time_ns=self._timing.tick_time_ns(self._tick),
@@ -134,145 +290,3 @@ class Answers:
             standing_by={n: i for n, i in self._controllers.items() if n != term.commander},
         )
         self._node.publish(topics.TICK, message)
-
-    def listen(self, timeout_s: float) -> None:
-        """Takes in one message, if one comes in time, and notes who left."""
-        received = self._node.receive(timeout_s)
-        match received.message if received is not None else None:
-            case ActuatorCommand() as command:
-                self._take_command(command)
-            case RecorderAck() as ack:
-                self._recorded_tick = max(self._recorded_tick, ack.tick)
-            case Presence() as presence:
-                if self._membership.presence_told(presence):
-                    self._teller.take(presence)
-                    self.terms.lives(presence.instance)
-            case Lost(tick=tick) if received is not None and tick == self._tick:
-                self._answered.add(int(received.place or 0))  # what its actuators do now, they go on doing
-        changed = self._take_leave()
-        if self._tick >= 0 and self._membership.realtime and self._review_terms():
-            self._oldest_term, changed = self.terms.term.number, True
-        if changed:
-            self._revision += 1
-            self._tell()
-
-    def _take_command(self, command: ActuatorCommand) -> None:
-        actuators = self._actuators.get(f"chaser/{command.chaser}")
-        if actuators is None or command.tick > self._tick:
-            self._node.counts.rejected["actuators:unexpected"] += 1
-            return
-        if command.source == "command":
-            # In lock-step, what a commander that was lost in this tick had said of it still counts.
-            if command.term < self._oldest_term:
-                self._node.counts.rejected["actuators:stale term"] += 1
-                return
-            self.terms.flown(command.term, self._now_s())
-        if command.tick == self._tick:
-            # In real time a chaser may brake first and then still get its command: the later one counts.
-            if command.chaser in self._answered and not self._membership.realtime:
-                self._node.counts.rejected["actuators:twice"] += 1
-                return
-            self._answered.add(command.chaser)
-        due_ns = self._timing.effective_ns(command.tick)
-        if abs(command.effective_time_ns - due_ns) > _GREATEST_SHIFT_NS:
-            self._node.counts.rejected["actuators:time"] += 1
-            return
-        name = f"chaser/{command.chaser}"
-        self._commanded_ns[name] = max(
-            self._timing.tick_time_ns(command.tick), self._commanded_ns.get(name, 0)
-        )
-        effective = self._timing.step_of_time(command.effective_time_ns)
-        actuators.command(command, effective, self._step_now())
-        self._command_latch(command.chaser, command.latch, effective)
-
-    def _take_leave(self) -> bool:
-        """Notes processes that are gone; True when that changes who is expected in the open tick."""
-        changed = False
-        for name in self._membership.who_left():
-            self._teller.forget(name)
-            self.warn("process lost", name)
-            if name == "recorder":
-                self._recorder_expected = False
-            elif name in self._controllers:
-                del self._controllers[name]
-                changed |= self._review_terms() or self._tick >= 0
-            elif name in self._actuators:
-                self._actuators[name].stop(self._step_now())
-                self._commanded_ns.pop(name, None)
-                changed |= any(f"chaser/{i}" == name for i in self.chasers)
-                self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
-        return changed and self._tick >= 0
-
-    def complete(self) -> bool:
-        """Whether all who are expected have answered the open tick and the recorder keeps up."""
-        kept_up = not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
-        return kept_up and self._answered.issuperset(self.chasers)
-
-    def warn(self, what: str, detail: str) -> None:
-        """Tells an event to the log and to people."""
-        time_ns = self._timing.tick_time_ns(max(self._tick, 0))
-        event = Event(
-            tick=self._tick, sim_time_ns=time_ns, process="world", level="warning", what=what, detail=detail
-        )
-        self._node.publish(topics.EVENT, event, "world")
-        say("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
-
-    def wait(
-        self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]
-    ) -> bool:
-        """Listens until ``done``; False when ``stopped`` first. Says now and then what it waits for."""
-        self._warned_s = time.monotonic()
-        while not done():
-            if stopped():
-                return False
-            self.listen(0.02)
-            if time.monotonic() - self._warned_s > _IMPATIENT_S:
-                self._warned_s = time.monotonic()
-                say("world", f"waiting for {waiting_for()}")
-        return True
-
-    def abandoned(self, rejoin_s: float, stopped: Callable[[], bool]) -> bool:
-        """Whether no chaser is left, and none comes back within ``rejoin_s`` of wall time.
-
-        Everybody is lost at once when the router starts again, or the world is cut off. In lock-step simulated time
-        then stands still until all are back, or the wait is over; in real time it goes on.
-        """
-        now_s = time.monotonic()
-        if self.chasers or rejoin_s <= 0.0:
-            self._alone_s = None
-            return not self.chasers
-        if self._alone_s is None:
-            self._alone_s = now_s
-            self.warn("all chasers lost", f"waiting for them for {rejoin_s:g} s")
-        if self._membership.realtime:
-            return now_s - self._alone_s > rejoin_s
-        self._recorder_expected = self._recorder_wanted
-        self.wait(
-            lambda: not self.missing_at_start() or time.monotonic() - now_s > rejoin_s,
-            stopped,
-            lambda: ", ".join(self.missing_at_start()),
-        )
-        still_away = self.missing_at_start()
-        self._recorder_expected &= "recorder" not in still_away
-        self.warn("waited for the lost", f"still away: {', '.join(still_away) or 'none'}")
-        self._alone_s = None
-        return not self._chasers_among(self._membership.linked(self._teller.heard()))
-
-    def listen_until(self, wall_s: float) -> None:
-        """Listens until a time of the monotonic wall clock."""
-        while (left := wall_s - time.monotonic()) > 0:
-            self.listen(min(left, 0.02))
-
-    def settle(self) -> None:
-        """All are there, the flight begins: presence is told less often, and who joins from now on holds up nobody."""
-        self._membership.flying = True
-        self._teller.settled.set()
-
-    def farewell(self, tick: int, time_ns: int) -> None:
-        """The world's last messages."""
-        self._teller.farewell(tick, time_ns)
-
-    def who_is_slow(self) -> str:
-        """Names those whose answer to the open tick has not come."""
-        late = [f"chaser/{i}" for i in self.chasers if i not in self._answered]
-        return ", ".join(late) or "recorder"

@@ -1,4 +1,4 @@
-"""PyBullet, loaded and connected without a word: it greets on standard output and error, which programs may read."""
+"""Import PyBullet and connect to it without its messages on standard output and error, which other programs may parse."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def hushed() -> Iterator[None]:
-    """Standard output and error of this process, libraries in C included, go nowhere meanwhile."""
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    kept = {}
+def silenced() -> Iterator[None]:
+    """Discard what this process, C libraries included, writes to standard output and error."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    saved = {}
     for number, stream in ((1, sys.stdout), (2, sys.stderr)):
         stream.flush()
-        kept[number] = os.dup(number)
-        os.dup2(nowhere, number)
+        saved[number] = os.dup(number)
+        os.dup2(null, number)
     try:
         yield
     finally:
         if os.name == "posix":
-            ctypes.CDLL(None).fflush(None)  # C's own buffers, or it comes out later
-        for number, copy in kept.items():
+            ctypes.CDLL(None).fflush(None)  # else C's buffers are written after the restoration
+        for number, copy in saved.items():
             os.dup2(copy, number)
             os.close(copy)
-        os.close(nowhere)
+        os.close(null)
 
 
-with hushed():
+with silenced():
     import pybullet
     from pybullet_utils.bullet_client import BulletClient
 
-__all__ = ["connect", "hushed", "pybullet"]
+__all__ = ["connect", "pybullet", "silenced"]
 
 
 def connect() -> BulletClient:
-    """A Bullet world of one's own, without a window."""
-    with hushed():
+    """Return a new Bullet client without a window."""
+    with silenced():
         return BulletClient(connection_mode=pybullet.DIRECT)

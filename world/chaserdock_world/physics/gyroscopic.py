@@ -1,8 +1,8 @@
-"""A correction that makes Bullet's integration of rotation second order.
+"""Correction torque that makes Bullet's integration of rotation second order.
 
-Bullet takes the gyroscopic torque omega x I omega at the beginning of a step, which lets angular momentum drift in
-proportion to the step. Taking it in the middle of the step (the midpoint rule) removes that; the difference of the two is
-applied as an external torque.
+Bullet evaluates the gyroscopic torque omega x I omega at the beginning of a step, so that angular momentum drifts in
+proportion to the step. The midpoint rule evaluates it in the middle of the step; the difference is applied as an external
+torque.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 
-def _times_inertia(inertia: Sequence[float], a: float, b: float, c: float) -> tuple[float, float, float]:
-    """omega x I omega for principal moments ``inertia`` and rates (a, b, c)."""
+def _gyroscopic_torque(inertia: Sequence[float], a: float, b: float, c: float) -> tuple[float, float, float]:
+    """Return omega x I omega for principal moments ``inertia`` and rates (a, b, c)."""
     ia, ib, ic = inertia
     return (b * c * (ic - ib), c * a * (ia - ic), a * b * (ib - ia))
 
 
-def _in_body(xyzw: Sequence[float], omega_world: Sequence[float]) -> tuple[float, float, float]:
-    """A rate in body axes: q* omega q."""
+def _rotate_to_body(xyzw: Sequence[float], omega_world: Sequence[float]) -> tuple[float, float, float]:
+    """Return a rate in body axes: q* omega q."""
     x, y, z, w = xyzw
     u, v, s = omega_world
     tx, ty, tz = 2.0 * (v * z - s * y), 2.0 * (s * x - u * z), 2.0 * (u * y - v * x)
@@ -31,18 +31,18 @@ def midpoint_torque(
     torque: Sequence[float],
     step_s: float,
 ) -> tuple[float, float, float]:
-    """Torque (3,), N m, body axes, to add to ``torque`` (body axes) for one step of ``step_s``.
+    """Return the torque (3,), N m, body axes, to add to ``torque`` (body axes) for one step of ``step_s``.
 
     ``inertia``: principal moments, kg m^2; ``xyzw``: attitude body to world in Bullet's order; ``omega_world``: rate in
-    world axes, rad/s. Plain floats, as this runs once a body and physics step.
+    world axes, rad/s. Plain floats, as this runs for every body in every physics step.
     """
-    a, b, c = _in_body(xyzw, omega_world)
-    gx, gy, gz = _times_inertia(inertia, a, b, c)
+    a, b, c = _rotate_to_body(xyzw, omega_world)
+    gx, gy, gz = _gyroscopic_torque(inertia, a, b, c)
     h = 0.5 * step_s
     ma = a + h * (torque[0] - gx) / inertia[0]
     mb = b + h * (torque[1] - gy) / inertia[1]
     mc = c + h * (torque[2] - gz) / inertia[2]
-    nx, ny, nz = _times_inertia(inertia, ma, mb, mc)
+    nx, ny, nz = _gyroscopic_torque(inertia, ma, mb, mc)
     return (gx - nx, gy - ny, gz - nz)
 
 
@@ -52,11 +52,11 @@ def midpoint_torque_of_rates(
     omega_world: Sequence[float],
     omega_world_before: Sequence[float],
 ) -> tuple[float, float, float]:
-    """As ``midpoint_torque`` for a body that is held by another, whose torque on it nobody knows beforehand.
+    """Return the torque of ``midpoint_torque`` for a body with a joint, whose constraint torque is not known in advance.
 
-    The rate in the middle of the step is extrapolated from that of the step before, ``omega_world_before``.
+    The rate in the middle of the step is extrapolated from that of the previous step, ``omega_world_before``.
     """
     middle = [a + 0.5 * (a - b) for a, b in zip(omega_world, omega_world_before, strict=True)]
-    gx, gy, gz = _times_inertia(inertia, *_in_body(xyzw, omega_world))
-    nx, ny, nz = _times_inertia(inertia, *_in_body(xyzw, middle))
+    gx, gy, gz = _gyroscopic_torque(inertia, *_rotate_to_body(xyzw, omega_world))
+    nx, ny, nz = _gyroscopic_torque(inertia, *_rotate_to_body(xyzw, middle))
     return (gx - nx, gy - ny, gz - nz)

@@ -1,4 +1,4 @@
-"""A probe's latch: what it has been told, and what it makes of a touch. No physics in here."""
+"""State machine of a probe's latch: due commands, and whether a touch closes it. Contains no physics."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from chaserdock_models.docking_geometry import PortView
 from chaserdock_protocol.messages import Latch, ProbeTouch
 from chaserdock_protocol.scenario.docking import Port, Tolerances
 
-_APART_S = 0.02
-"""So long without a touch, and the next one is a new one."""
+_NEW_TOUCH_AFTER_S = 0.02
+"""Contact after at least this time without contact is a new touch."""
 
 
 @dataclass
 class ProbeLatch:
-    """The latch of one chaser's probe. Steps are physics steps; ``touches`` and ``touched`` collect until taken."""
+    """The latch of one chaser's probe. Steps are physics steps.
+
+    ``touches`` and ``touched`` accumulate until ``take_touches``.
+    """
 
     chaser: int
     port: Port
@@ -26,34 +29,35 @@ class ProbeLatch:
     touched: bool = False
     touches: list[ProbeTouch] = field(default_factory=list)
     _last_touch_step: int | None = None
-    _due: list[tuple[int, int, Latch]] = field(default_factory=list)
-    _told: int = 0
+    _queue: list[tuple[int, int, Latch]] = field(default_factory=list)
+    _received: int = 0
 
-    def command(self, told: Latch, effective_step: int) -> None:
-        """Notes what the latch is to do from ``effective_step`` on."""
-        if told != "keep":
-            self._told += 1
-            heapq.heappush(self._due, (effective_step, self._told, told))
+    def command(self, latch: Latch, effective_step: int) -> None:
+        """Queue a command that acts from ``effective_step`` on."""
+        if latch != "keep":
+            self._received += 1
+            heapq.heappush(self._queue, (effective_step, self._received, latch))
 
-    def obey(self, step: int) -> bool:
-        """Takes up the commands that are due; True when the latch opens."""
+    def apply_due_commands(self, step: int) -> bool:
+        """Apply the commands due at ``step``; return whether the latch opens."""
         opens = False
-        while self._due and self._due[0][0] <= step:
-            self.armed = heapq.heappop(self._due)[2] == "arm"
+        while self._queue and self._queue[0][0] <= step:
+            self.armed = heapq.heappop(self._queue)[2] == "arm"
             opens = self.latched and not self.armed
         if opens:
             self.latched = False
-            self._last_touch_step = step  # it still touches
+            self._last_touch_step = step  # the probe is still in contact
         return opens
 
     def touch(self, step: int, before: PortView) -> bool:
-        """The tip touches in the step from ``step`` on; ``before`` is the state at its beginning. True: it closes.
+        """Handle contact of the tip during ``step``; return whether the latch closes.
 
-        A touch is judged once, when it begins: in the middle of a bounce the tip stands still, too.
+        ``before``: relative state at the beginning of the step. Only the first contact of a touch is evaluated, as in the
+        middle of a bounce the tip is at rest, too.
         """
         self.touched = True
         last, self._last_touch_step = self._last_touch_step, step
-        if self.latched or (last is not None and step - last <= _APART_S * self.physics_hz):
+        if self.latched or (last is not None and step - last <= _NEW_TOUCH_AFTER_S * self.physics_hz):
             return False
         refused = "" if self.armed else "not armed"
         refused = refused or before.fault(self.tolerances, self.tolerances.closing_m_s)
@@ -72,9 +76,9 @@ class ProbeLatch:
         )
         return self.latched
 
-    def take(self) -> tuple[ProbeTouch, ...]:
-        """The touches that began since the last call; ``touched`` begins anew."""
-        taken = tuple(self.touches)
+    def take_touches(self) -> tuple[ProbeTouch, ...]:
+        """Return the touches that began since the last call, and reset ``touched``."""
+        touches = tuple(self.touches)
         self.touches.clear()
         self.touched = False
-        return taken
+        return touches

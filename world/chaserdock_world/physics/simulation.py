@@ -1,17 +1,16 @@
-"""The PyBullet adapter: the only module that knows its conventions.
+"""Rigid-body simulation in PyBullet; the only module that uses its conventions.
 
-PyBullet orders quaternions x, y, z, w and gives angular velocity in world axes; everything that leaves this module is
-scalar first and has body rates. There is no gravity, damping or sleeping.
+PyBullet orders quaternions x, y, z, w and expresses angular velocity in world axes; this module's interface is scalar first
+with body rates. There is no gravity, damping or sleeping.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.docking_geometry import Motion, view_of
+from chaserdock_models.docking_geometry import BodyState, view_of
 from chaserdock_models.rotations import Array
 from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.messages import Latch
@@ -25,37 +24,27 @@ from .latch import ProbeLatch
 TARGET = "target"
 PROBE_RADIUS_M = 0.006
 _Z_TO_X_XYZW = [0.0, 0.5**0.5, 0.0, 0.5**0.5]
-# A springy touch: restitution 0.4 and half a millimetre deep at 1 cm/s (shared notes, docking).
+# A compliant contact: restitution 0.4 and 0.5 mm penetration at 1 cm/s (docs/docking.md).
 _CONTACT = {"contactStiffness": 1e4, "contactDamping": 100.0}
 
 
-@dataclass(frozen=True)
-class BodyState:
-    """Position (3,) and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) in body axes."""
-
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-
-
 class Physics:
-    """The bodies of a scenario in a PyBullet world of their own; ``advance`` moves them on."""
+    """Simulates the bodies of a scenario in its own PyBullet client."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.step_count = 0
         self._scenario = scenario
         self._prescribed = scenario.target.motion != "torque_free"
-        # How often Bullet's copy of a prescribed target is moved along; its ``state`` is exact at any step.
-        self._steps_per_move = max(1, scenario.time.physics_hz // 120)
+        # Interval at which Bullet's copy of a prescribed target is moved; ``state`` is exact at every step.
+        self._steps_per_target_update = max(1, scenario.time.physics_hz // 120)
         self._bullet = connect()
-        self._client: int = self._bullet._client  # the wrapper is too slow for what happens every step
+        self._client: int = self._bullet._client  # direct calls: the wrapper is too slow for every step
         self._bullet.setGravity(0, 0, 0)
         self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)
         self._bodies: dict[str, int] = {TARGET: self._add_target(scenario)}
         for i in range(len(scenario.chasers)):
             self._bodies[f"chaser/{i}"] = self._add_chaser(scenario, i)
-        # Bodies whose motion is Bullet's, with their principal moments of inertia.
+        # Bodies that Bullet integrates, with their principal moments of inertia.
         self._free = {f"chaser/{i}": scenario.chaser.inertia for i in range(len(scenario.chasers))}
         if not self._prescribed:
             self._free[TARGET] = self._target_inertia(scenario)
@@ -64,12 +53,12 @@ class Physics:
         ports = docking.ports if docking.kind == "capture" else ()
         self.latches = {f"chaser/{p.chaser}": ProbeLatch(p.chaser, p, docking.tolerances, hz) for p in ports}
         self._joints: dict[str, int] = {}
-        # Of every free body at the beginning of the last step, as Bullet gives them: pose and rates.
+        # Pose and rates of every free body at the beginning of the last step, in Bullet's conventions.
         self._before: dict[int, tuple[Any, Any]] = {}
 
     @property
     def bodies(self) -> tuple[str, ...]:
-        """Names of all bodies: ``target``, ``chaser/0``, …"""
+        """Names of all bodies: ``target``, ``chaser/0``, ..."""
         return tuple(self._bodies)
 
     def _add(self, shape: int, mass_kg: float, inertia: tuple[float, float, float], state: BodyState) -> int:
@@ -115,7 +104,7 @@ class Physics:
         body = scenario.chaser
         half = [s / 2 for s in body.size_m]
         if scenario.docking.kind == "capture":
-            # The probe: a rod from the body's front to the tip, both ends round; massless, part of the body.
+            # The probe: a massless capsule from the body's front to the tip.
             length = body.probe_reach_m - half[0] - PROBE_RADIUS_M
             shape = self._bullet.createCollisionShapeArray(
                 shapeTypes=[pybullet.GEOM_BOX, pybullet.GEOM_CAPSULE],
@@ -132,7 +121,7 @@ class Physics:
         return self._add(shape, body.mass_kg, body.inertia, state)
 
     def state(self, name: str) -> BodyState:
-        """State of a body now; the prescribed target's is exact."""
+        """Return the current state of a body; that of a prescribed target is exact."""
         if name == TARGET and self._prescribed:
             return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
         body = self._bodies[name]
@@ -142,22 +131,22 @@ class Physics:
         )
 
     def place(self, name: str, state: BodyState) -> None:
-        """Puts a body into a state, touching or not: for tests and for what starts in the middle of a mission."""
+        """Set the state of a body. Contacts are not checked."""
         body = self._bodies[name]
         position, attitude = state.position_m.tolist(), _xyzw(state.q_wxyz)
         pybullet.resetBasePositionAndOrientation(body, position, attitude, self._client)
         self._set_velocity(body, state)
 
     def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
-        """Makes ``steps`` physics steps under constant wrenches; returns the pairs of bodies that touched.
+        """Make ``steps`` physics steps under constant wrenches; return the pairs of bodies that touched.
 
         ``wrenches`` maps a chaser's name to force and torque (6,) in its body axes, N and N m.
         """
-        still = np.zeros(6)
-        pushes = []
+        zero = np.zeros(6)
+        loads = []
         for name, inertia in self._free.items():
-            wrench = wrenches.get(name, still)
-            pushes.append((self._bodies[name], inertia, wrench[:3].tolist(), wrench[3:].tolist()))
+            wrench = wrenches.get(name, zero)
+            loads.append((self._bodies[name], inertia, wrench[:3].tolist(), wrench[3:].tolist()))
         step_s = 1.0 / self._scenario.time.physics_hz
         moves = self._prescribed and self._scenario.target.motion != "static"
         touched: set[tuple[str, str]] = set()
@@ -167,13 +156,13 @@ class Physics:
         before = self._before
         for _ in range(steps):
             for name, latch in self.latches.items():
-                if latch.obey(self.step_count):
-                    self._let_go(name)
-            held = {self._bodies[name] for name in (*self._joints, TARGET)} if self._joints else ()
-            # Bullet forgets external forces after every step.
-            for body, inertia, force, torque in pushes:
+                if latch.apply_due_commands(self.step_count):
+                    self._remove_joint(name)
+            jointed = {self._bodies[name] for name in (*self._joints, TARGET)} if self._joints else ()
+            # Bullet clears external forces after every step.
+            for body, inertia, force, torque in loads:
                 pose, rates = pose_of(body, client), rates_of(body, client)
-                if body in held:
+                if body in jointed:
                     last = before.get(body, (pose, rates))[1]
                     x, y, z = midpoint_torque_of_rates(inertia, pose[1], rates[1], last[1])
                 else:
@@ -183,27 +172,24 @@ class Physics:
                 torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
             pybullet.stepSimulation(client)
             self.step_count += 1
-            # A bounce lasts a single step: look after every one.
+            # A bounce may last a single step, so contacts are checked after each.
             if pybullet.getContactPoints(physicsClientId=client):
-                pairs, tips = self._touching()
+                pairs, tips = self._find_contacts()
                 touched.update(pairs)
-                self._judge(tips)
-            if moves and self.step_count % self._steps_per_move == 0:
-                self._move_target()
+                self._update_latches(tips)
+            if moves and self.step_count % self._steps_per_target_update == 0:
+                self.place(TARGET, self.state(TARGET))
         return touched
 
-    def _move_target(self) -> None:
-        self.place(TARGET, self.state(TARGET))
-
     def contacts(self) -> tuple[tuple[str, str], ...]:
-        """Pairs of bodies that touched or overlapped in the last step, sorted; a probe's tip on the target is none."""
-        return self._touching()[0]
+        """Return the pairs of bodies in contact after the last step, sorted, without probe tips on the target."""
+        return self._find_contacts()[0]
 
-    def _touching(self) -> tuple[tuple[tuple[str, str], ...], set[str]]:
-        """As ``contacts``, and the chasers whose probe's tip touched the target."""
+    def _find_contacts(self) -> tuple[tuple[tuple[str, str], ...], set[str]]:
+        """Return ``contacts``, and the chasers whose probe tip touches the target."""
         pairs, tips = set(), set()
         for c in self._bullet.getContactPoints():
-            # Bullet stops bodies at a distance (c[8]) of zero, give or take rounding: the force (c[9]) tells as well.
+            # Bullet stops bodies at a distance (c[8]) of zero up to rounding, so the force (c[9]) is checked as well.
             if not (c[8] <= 0.0 or c[9] > 0.0):
                 continue
             for name, other, point in ((c[1], c[2], c[5]), (c[2], c[1], c[6])):
@@ -215,32 +201,32 @@ class Physics:
         return tuple(sorted((a, b) for a, b in pairs)), tips
 
     def _is_tip(self, name: str, point_m: tuple[float, float, float]) -> bool:
-        """Whether a point (3,), WRF, of a chaser's surface is on the round end of its probe."""
+        """Return whether a point (3,), WRF, of a chaser's surface is on the round end of its probe."""
         if name not in self.latches:
             return False
         s = self.state(name)
         ahead_m = float(rotations.rotate_inverse(s.q_wxyz, np.array(point_m) - s.position_m)[0])
         return ahead_m > self._scenario.chaser.probe_reach_m - 2.0 * PROBE_RADIUS_M
 
-    def command_latch(self, chaser: int, told: Latch, effective_step: int) -> None:
-        """Tells a chaser's latch what to do from ``effective_step`` on; a chaser without a port has none."""
+    def command_latch(self, chaser: int, command: Latch, effective_step: int) -> None:
+        """Command a chaser's latch from ``effective_step`` on; ignored for a chaser without a port."""
         latch = self.latches.get(f"chaser/{chaser}")
         if latch is not None:
-            latch.command(told, effective_step)
+            latch.command(command, effective_step)
 
-    def _judge(self, tips: set[str]) -> None:
-        """Puts the touches of the last step to the latches of these chasers."""
+    def _update_latches(self, tips: set[str]) -> None:
+        """Pass the contacts of the last step to the latches of these chasers."""
         for name in sorted(tips):
             chaser, target = (_state_of(*self._before[self._bodies[n]]) for n in (name, TARGET))
             latch = self.latches[name]
             q_off = np.asarray(self._scenario.chasers[latch.chaser].q_wxyz)
             reach_m = self._scenario.chaser.probe_reach_m
-            view = view_of(latch.port, reach_m, q_off, _motion(chaser), _motion(target))
+            view = view_of(latch.port, reach_m, q_off, chaser, target)
             if latch.touch(self.step_count - 1, view):
-                self._hold_on(name)
+                self._add_joint(name)
 
-    def _hold_on(self, name: str) -> None:
-        """Fixes a chaser to the target as they stand now, by the tip."""
+    def _add_joint(self, name: str) -> None:
+        """Fix a chaser's probe tip to the target in their current relative pose."""
         chaser, target = self.state(name), self.state(TARGET)
         tip = np.array([self._scenario.chaser.probe_reach_m, 0.0, 0.0])
         tip_world = chaser.position_m + rotations.rotate(chaser.q_wxyz, tip)
@@ -260,32 +246,28 @@ class Physics:
             parentFrameOrientation=_xyzw(relative),
             childFrameOrientation=[0.0, 0.0, 0.0, 1.0],
         )
-        # What is one body now cannot touch itself: the spring of the touch would work against the joint.
+        # The contact spring would work against the joint.
         self._bullet.setCollisionFilterPair(a, b, -1, -1, 0)
-        self._before.clear()  # the rates have jumped
+        self._before.clear()  # the joint changes the rates abruptly
 
-    def _let_go(self, name: str) -> None:
+    def _remove_joint(self, name: str) -> None:
         self._bullet.removeConstraint(self._joints.pop(name))
         self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 1)
 
     def close(self) -> None:
-        """Frees the PyBullet world."""
+        """Disconnect the PyBullet client."""
         self._bullet.disconnect()
 
 
 def _state_of(pose: Any, rates: Any) -> BodyState:
-    """From what Bullet gives: position and attitude, velocity and rate in world axes."""
+    """Return a body's state from Bullet's pose and its velocity and rate in world axes."""
     (position, xyzw), (velocity, omega_world) = pose, rates
     q = rotations.normalize([xyzw[3], *xyzw[:3]])
     return BodyState(np.array(position), np.array(velocity), q, rotations.rotate_inverse(q, omega_world))
 
 
-def _motion(s: BodyState) -> Motion:
-    return Motion(s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s)
-
-
 def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:
-    """The target's state at a simulated time under constant rates (exact); at zero, its initial state."""
+    """Return the target's exact state at a simulated time under constant velocity and body rate."""
     target = scenario.target
     still = target.motion == "static"
     velocity = np.zeros(3) if still else np.asarray(target.velocity_m_s)

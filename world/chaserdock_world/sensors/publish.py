@@ -1,4 +1,4 @@
-"""What the world tells at the beginning of a tick: odometry to those who fly, the truth to the log."""
+"""Publish the world's messages at the beginning of a tick: odometry, docking sensors and ground truth."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from chaserdock_world.actuators.ideal import Actuators
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import BodyState
 
-from .errors import Navigation
+from .errors import OdometrySensor
 
 
 def odometry_of(chaser: int, state: BodyState, tick: int, time_ns: int) -> Odometry:
-    """A chaser's own state as its navigation gives it."""
+    """Return the odometry message of a chaser whose measured state is ``state``."""
     return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **_state_fields(state))
 
 
 def publish_odometry(
-    node: Node, states: dict[str, BodyState], tick: int, timing: Timing, navigation: Navigation
+    node: Node, states: dict[str, BodyState], tick: int, timing: Timing, sensor: OdometrySensor
 ) -> None:
-    """Every chaser's own state, as its navigation knows it."""
+    """Publish every chaser's measured state."""
     for name, state in states.items():
         if not name.startswith("chaser/"):
             continue
         chaser = int(name.partition("/")[2])
-        known = navigation.sensed(chaser, tick, state)
-        node.publish(topics.ODOMETRY, odometry_of(chaser, known, tick, timing.tick_time_ns(tick)), chaser)
+        measured = sensor.measure(chaser, tick, state)
+        node.publish(topics.ODOMETRY, odometry_of(chaser, measured, tick, timing.tick_time_ns(tick)), chaser)
 
 
 def docking_status(latch: ProbeLatch, tick: int, time_ns: int) -> DockingStatus:
-    """What a chaser's docking sensor says of the time since the last tick."""
+    """Return the message of a chaser's docking sensor for the time since the last tick."""
     return DockingStatus(
         tick=tick,
         sim_time_ns=time_ns,
@@ -48,7 +48,7 @@ def docking_status(latch: ProbeLatch, tick: int, time_ns: int) -> DockingStatus:
 
 
 def publish_docking(node: Node, latches: dict[str, ProbeLatch], tick: int, timing: Timing) -> None:
-    """What the docking sensors say, of the chasers that have a port."""
+    """Publish the docking sensors of the chasers that have a port."""
     for latch in latches.values():
         node.publish(topics.DOCKING, docking_status(latch, tick, timing.tick_time_ns(tick)), latch.chaser)
 
@@ -62,25 +62,25 @@ def publish_truth(
     contacts: set[tuple[str, str]],
     latches: dict[str, ProbeLatch],
 ) -> None:
-    """Ground truth of all bodies, and what happened since the last tick; the latches' touches are taken."""
+    """Publish the ground truth of all bodies, and actuator outputs and touches since the last tick, which this takes."""
     time_ns = timing.tick_time_ns(tick)
     saturated, late = [], 0
     for name, state in states.items():
-        given: dict[str, Any] = {}
+        output: dict[str, Any] = {}
         if name in actuators:
-            took = actuators[name].take(timing.step_of_tick(tick))
-            given = {
-                "impulse_N_s": vector(took.impulse[:3]),
-                "angular_impulse_N_m_s": vector(took.impulse[3:]),
-                "absolute_impulse_N_s": took.absolute_impulse_N_s,
-                "thruster_impulse_N_s": took.thruster_impulse_N_s,
-                "thruster_open_s": took.thruster_open_s,
-                "propellant_kg": took.propellant_kg,
+            taken = actuators[name].take_output(timing.step_of_tick(tick))
+            output = {
+                "impulse_N_s": vector(taken.impulse[:3]),
+                "angular_impulse_N_m_s": vector(taken.impulse[3:]),
+                "absolute_impulse_N_s": taken.absolute_impulse_N_s,
+                "thruster_impulse_N_s": taken.thruster_impulse_N_s,
+                "thruster_open_s": taken.thruster_open_s,
+                "propellant_kg": taken.propellant_kg,
             }
-            late += took.late
-            if took.saturated:
+            late += taken.late
+            if taken.saturated:
                 saturated.append(int(name.partition("/")[2]))
-        message = BodyTruth(tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **given)
+        message = BodyTruth(tick=tick, sim_time_ns=time_ns, body=name, **_state_fields(state), **output)
         node.publish(topics.TRUTH_BODY, message, name)
     world = WorldTruth(
         tick=tick,
@@ -89,7 +89,7 @@ def publish_truth(
         saturated=tuple(saturated),
         late_commands=late,
         latched=tuple(latch.chaser for latch in latches.values() if latch.latched),
-        touches=tuple(touch for latch in latches.values() for touch in latch.take()),
+        touches=tuple(touch for latch in latches.values() for touch in latch.take_touches()),
     )
     node.publish(topics.TRUTH_WORLD, world)
 

@@ -1,4 +1,4 @@
-"""Rectangles to paint: disjoint, holding all that was asked for, and joined only where they must be."""
+"""Merging of overlapping rectangles: disjoint, covering, and merged only where necessary."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def pixels(r: Rectangle) -> set[tuple[int, int]]:
 
 
 @given(st.lists(rectangles, max_size=8))
-def test_each_is_held_by_one_patch_and_no_pixel_is_painted_twice(covered: list[Rectangle]) -> None:
+def test_patches_cover_each_rectangle_once_and_are_disjoint(covered: list[Rectangle]) -> None:
     found = patches(covered)
     assert sorted(i for _, members in found for i in members) == list(range(len(covered)))
     for patch, members in found:
@@ -29,7 +29,7 @@ def test_each_is_held_by_one_patch_and_no_pixel_is_painted_twice(covered: list[R
         assert not pixels(a) & pixels(b)
 
 
-def test_far_apart_stay_apart_and_a_bridge_joins() -> None:
+def test_distant_rectangles_stay_separate_until_a_third_joins_them() -> None:
     left, right = (0, 0, 10, 10), (50, 0, 60, 10)
     assert patches([left, right]) == [(left, frozenset([0])), (right, frozenset([1]))]
     assert patches([left, right, (5, 5, 55, 8)]) == [((0, 0, 60, 10), frozenset([0, 1, 2]))]

@@ -1,1 +1,1 @@
-"""Tools round the cameras: marker sheets and calibration."""
+"""Camera calibration and printable marker sheets."""

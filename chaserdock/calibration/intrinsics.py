@@ -1,7 +1,7 @@
-"""A camera's matrix and lens from images of a board, with OpenCV.
+"""Calibration of camera matrix and distortion from images of a board, with OpenCV.
 
-An image that fits the others badly is left out, and named: its root mean square is over three times the median
-and over half a pixel. (Not a cure for a board that is not flat.)
+Outlier images are excluded and named: those with an RMS error above three times the median and above half a pixel. This
+does not compensate for a board that is not flat.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 
 LEAST_IMAGES = 6
 _LEAST_CORNERS = 8
-_ODD_TIMES, _ODD_PX = 3.0, 0.5
+_OUTLIER_RATIO, _OUTLIER_PX = 3.0, 0.5
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 
 
 class BadBoard(Exception):
-    """A board that cannot be, or a folder without images."""
+    """Invalid board, or a folder without images."""
 
 
 class TooFew(Exception):
-    """Too few usable images; the text says why the others are not."""
+    """Too few usable images; the text gives the reason for each rejected one."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Board:
 @dataclass(frozen=True)
 class Calibration:
     """``matrix`` (3, 3), ``distortion`` (5,) k1, k2, p1, p2, k3; ``sigma`` (4,): one standard deviation of fx, fy,
-    cx, cy, pixels; ``rms_px``: by image used; ``left_out``: by image, why."""
+    cx, cy, pixels; ``rms_px``: by used image; ``excluded``: reason by image."""
 
     width_px: int
     height_px: int
@@ -52,21 +52,18 @@ class Calibration:
     sigma: Array
     total_rms_px: float
     rms_px: dict[str, float]
-    left_out: dict[str, str]
+    excluded: dict[str, str]
 
 
 def board_of(text: str, square_m: float, marker_m: float, dictionary: str) -> Board:
-    """The board that a text such as ``charuco 8x6`` (squares) or ``chessboard 9x6`` (inner corners) describes.
-
-    Raises BadBoard.
-    """
-    found = re.fullmatch(r"(charuco|chessboard)\s+(\d+)x(\d+)", text.strip())
-    if found is None or min(int(found[2]), int(found[3])) < 3:
+    """Parse a board such as ``charuco 8x6`` (squares) or ``chessboard 9x6`` (inner corners). Raise BadBoard."""
+    parsed = re.fullmatch(r"(charuco|chessboard)\s+(\d+)x(\d+)", text.strip())
+    if parsed is None or min(int(parsed[2]), int(parsed[3])) < 3:
         raise BadBoard(f"--board {text}: must be like 'charuco 8x6' or 'chessboard 9x6', 3 or more each way")
-    size = (int(found[2]), int(found[3]))
+    size = (int(parsed[2]), int(parsed[3]))
     if not square_m > 0.0:
         raise BadBoard(f"--square {square_m}: must be positive")
-    if found[1] == "chessboard":
+    if parsed[1] == "chessboard":
         grid = np.mgrid[: size[0], : size[1]].T.reshape(-1, 2) * square_m
         return Board(np.column_stack([grid, np.zeros(len(grid))]).astype(np.float32), size)
     if not 0.0 < marker_m < square_m:
@@ -82,10 +79,10 @@ def board_of(text: str, square_m: float, marker_m: float, dictionary: str) -> Bo
 
 
 def calibrate_folder(folder: Path, board: Board) -> Calibration:
-    """Calibration from all images in a folder. Raises BadBoard when there are none, TooFew when too few are good."""
+    """Calibrate with all images in a folder. Raise BadBoard without images, TooFew with too few usable ones."""
     paths = sorted(p for p in folder.glob("*") if p.suffix.lower() in _SUFFIXES) if folder.is_dir() else []
     if not paths:
-        raise BadBoard(f"{folder}: no images ({', '.join(_SUFFIXES)}) there")
+        raise BadBoard(f"{folder}: contains no images ({', '.join(_SUFFIXES)})")
     images: dict[str, NDArray[np.uint8] | None] = {}
     for path in paths:
         image: Any = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
@@ -94,37 +91,37 @@ def calibrate_folder(folder: Path, board: Board) -> Calibration:
 
 
 def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Calibration:
-    """Calibration from grey images by name (None: unreadable). Raises TooFew."""
-    left_out: dict[str, str] = {}
+    """Calibrate with grey images by name (None: unreadable). Raise TooFew."""
+    excluded: dict[str, str] = {}
     views: dict[str, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
     shapes = [p.shape for p in images.values() if p is not None]
     usual = max(sorted(set(shapes)), key=shapes.count) if shapes else (0, 0)
     for name, image in images.items():
         if image is None:
-            left_out[name] = "not an image"
+            excluded[name] = "not an image"
         elif image.shape != usual:
-            left_out[name] = f"{image.shape[1]} x {image.shape[0]}, others {usual[1]} x {usual[0]}"
+            excluded[name] = f"{image.shape[1]} x {image.shape[0]}, others {usual[1]} x {usual[0]}"
         else:
             points, px = find_board(image, board)
             if len(px) < _LEAST_CORNERS:
-                left_out[name] = f"{len(px)} corners of the board found, {_LEAST_CORNERS} needed"
+                excluded[name] = f"{len(px)} corners of the board found, {_LEAST_CORNERS} needed"
             else:
                 views[name] = (points, px)
     while True:
         if len(views) < LEAST_IMAGES:
-            reasons = "".join(f"\n{name}: {reason}" for name, reason in left_out.items())
+            reasons = "".join(f"\n{name}: {reason}" for name, reason in excluded.items())
             raise TooFew(f"{len(views)} usable images, at least {LEAST_IMAGES} are needed{reasons}")
         points = [v[0] for v in views.values()]
         px = [v[1] for v in views.values()]
         size = (usual[1], usual[0])
-        # Stubs ask for matrices to begin with, which OpenCV takes only as a guess.
+        # The type stubs require initial matrices, which OpenCV treats as optional.
         solve: Any = cv2.calibrateCameraExtended
         total, matrix, lens, _, _, sigma, _, each = solve(points, px, size, None, None)
         rms = dict(zip(views, np.ravel(each).tolist(), strict=True))
         worst = max(rms, key=lambda name: rms[name])
-        if rms[worst] <= max(_ODD_TIMES * float(np.median(list(rms.values()))), _ODD_PX):
+        if rms[worst] <= max(_OUTLIER_RATIO * float(np.median(list(rms.values()))), _OUTLIER_PX):
             break
-        left_out[worst] = f"fits the others badly: {rms[worst]:.2f} px"
+        excluded[worst] = f"outlier: RMS error {rms[worst]:.2f} px"
         del views[worst]
     return Calibration(
         usual[1],
@@ -134,25 +131,25 @@ def calibrate(images: dict[str, NDArray[np.uint8] | None], board: Board) -> Cali
         np.ravel(sigma)[:4].astype(float),
         float(total),
         rms,
-        left_out,
+        excluded,
     )
 
 
 def find_board(image: NDArray[np.uint8], board: Board) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Corners found, in the board's axes (n, 3), metres, and in the image (n, 2), pixels."""
-    none = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32)
+    """Detect corners: return them in board axes (n, 3), metres, and in the image (n, 2), pixels."""
+    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.float32)
     if board.charuco is None:
         find: Any = cv2.findChessboardCornersSB
         ok, px = find(image, board.size, flags=cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_ACCURACY)
-        return (board.points_m, np.asarray(px, np.float32).reshape(-1, 2)) if ok else none
+        return (board.points_m, np.asarray(px, np.float32).reshape(-1, 2)) if ok else nothing
     px, ids, _, _ = cv2.aruco.CharucoDetector(board.charuco).detectBoard(image)
     if ids is None or px is None:
-        return none
+        return nothing
     return board.points_m[np.asarray(ids, dtype=np.intp).ravel()], np.asarray(px, np.float32).reshape(-1, 2)
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Writes OpenCV's YAML, JSON or XML, by the file's ending. Raises OSError."""
+    """Write OpenCV's YAML, JSON or XML, by the file's suffix. Raise OSError."""
     store = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
     if not store.isOpened():
         raise OSError(f"{path} cannot be opened")

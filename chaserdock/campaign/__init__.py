@@ -1,1 +1,1 @@
-"""Many seeded runs of one scenario: planned, flown, gathered in a table, reported."""
+"""Campaigns: seeded runs of a scenario, planned, flown, tabulated and reported."""

@@ -1,6 +1,6 @@
-"""The campaign file and the runs that it asks for. Pure but for reading the file.
+"""Campaign file and the runs it defines.
 
-A campaign is a scenario, values that all runs share, and what varies: a grid (every combination of ``values``) or a
+A campaign is a scenario, values shared by all runs, and varied parameters: a grid (every combination of ``values``) or a
 random sample (each parameter drawn from its distribution). Equal files give equal runs with equal names.
 """
 
@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
-from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.fields import Name, Number, Positive, Section
 from chaserdock_protocol.scenario.overrides import ScenarioError, explain
 from pydantic import Field, ValidationError, model_validator
@@ -27,16 +27,16 @@ Seed = Annotated[int, Field(ge=0, lt=2**32)]
 
 
 class Variation(Section):
-    """How one parameter varies: ``values`` in a grid; ``uniform`` [low, high] or ``normal`` [mean, sigma] in a sample."""
+    """Variation of one parameter: ``values``, or in a sample ``uniform`` [low, high] or ``normal`` [mean, sigma]."""
 
     values: tuple[Any, ...] | None = None
     uniform: tuple[Number, Number] | None = None
     normal: tuple[Number, Positive] | None = None
 
     @model_validator(mode="after")
-    def _one(self) -> Variation:
-        given = [n for n in ("values", "uniform", "normal") if getattr(self, n) is not None]
-        if len(given) != 1:
+    def _check_one_kind(self) -> Variation:
+        kinds = [n for n in ("values", "uniform", "normal") if getattr(self, n) is not None]
+        if len(kinds) != 1:
             raise ValueError("needs exactly one of values, uniform, normal")
         if self.values is not None and not self.values:
             raise ValueError("values must not be empty")
@@ -46,7 +46,7 @@ class Variation(Section):
 
 
 class CampaignFile(Section):
-    """The whole file. ``seeds``: how many (0, 1, …) or which seeds every combination is flown with."""
+    """Content of a campaign file. ``seeds``: number of seeds (0, 1, ...) or list of seeds for every combination."""
 
     name: Name
     scenario: str
@@ -58,42 +58,40 @@ class CampaignFile(Section):
     vary: dict[str, Variation] = Field(default_factory=dict)
 
     @model_validator(mode="after")
-    def _fits(self) -> CampaignFile:
+    def _check_method(self) -> CampaignFile:
         if (self.method == "random") != (self.samples is not None):
-            raise ValueError('samples goes with method = "random", and that needs it')
+            raise ValueError('samples and method = "random" require each other')
         if isinstance(self.seeds, tuple) and not 0 < len(self.seeds) == len(set(self.seeds)):
-            raise ValueError("seeds must be different numbers, at least one")
+            raise ValueError("seeds must be one or more different numbers")
         for name, v in self.vary.items():
             if self.method == "grid" and v.values is None:
-                raise ValueError(
-                    f'vary.{name}: a grid needs values; for a distribution say method = "random"'
-                )
+                raise ValueError(f'vary.{name}: a grid needs values; a distribution needs method = "random"')
         if "seed" in self.vary or "seed" in self.set:
-            raise ValueError("seed: say seeds instead")
+            raise ValueError("seed: use seeds instead")
         return self
 
 
 class Run(msgspec.Struct, frozen=True):
-    """One run: its place in the campaign, a name made of all that it depends on, what is varied, and all overrides."""
+    """One run. ``name`` is a digest of the resolved scenario; ``varied`` holds the values that differ between runs."""
 
     index: int
     name: str
+    scenario: Path
     seed: int
     varied: dict[str, Any]
     overrides: tuple[str, ...]
 
 
 class Campaign(msgspec.Struct, frozen=True):
-    """A campaign ready to be flown."""
+    """Runs and the names of the varied parameters."""
 
     name: str
-    scenario: Path
     parameters: tuple[str, ...]
     runs: tuple[Run, ...]
 
 
 def load_campaign(path: Path) -> Campaign:
-    """Reads and checks a campaign file, every run's scenario included; raises ScenarioError, one line a fault."""
+    """Read a campaign file and validate every run's scenario; raise ScenarioError with one line per fault."""
     try:
         values = tomllib.loads(path.read_text(encoding="utf-8"))
         file = CampaignFile.model_validate(values)
@@ -103,13 +101,23 @@ def load_campaign(path: Path) -> Campaign:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     except ValidationError as error:
         raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error))) from None
-    beside = path.parent / file.scenario
-    scenario = beside if beside.is_file() else find_scenario(file.scenario)
+    local = path.parent / file.scenario
+    scenario = local if local.is_file() else find_scenario(file.scenario)
     if scenario is None:
         raise ScenarioError(
-            f"{path}: scenario: {file.scenario}: no such file, and none of that name is shipped"
+            f"{path}: scenario: {file.scenario}: no such file and no shipped scenario of that name"
         )
-    return Campaign(file.name, scenario, tuple(file.vary), _runs(file, scenario, path))
+    return Campaign(file.name, tuple(file.vary), _runs(file, scenario, path))
+
+
+def make_run(
+    index: int, scenario: Path, seed: int, varied: dict[str, Any], overrides: tuple[str, ...], salt: str = ""
+) -> tuple[Run, Scenario]:
+    """Return a run and its resolved scenario; ``salt`` also enters the name. Raise ScenarioError."""
+    overrides = (*overrides, f"seed={seed}")
+    resolved = load_scenario(scenario, overrides)
+    name = hashlib.sha256((salt + resolved.model_dump_json()).encode()).hexdigest()[:12]
+    return Run(index, name, scenario, seed, varied, overrides), resolved
 
 
 def _combinations(file: CampaignFile) -> list[dict[str, Any]]:
@@ -117,10 +125,10 @@ def _combinations(file: CampaignFile) -> list[dict[str, Any]]:
         axes = [v.values or () for v in file.vary.values()]
         return [dict(zip(file.vary, point, strict=True)) for point in itertools.product(*axes)]
     rng = np.random.default_rng(file.sample_seed)
-    return [{name: _drawn(v, rng) for name, v in file.vary.items()} for _ in range(file.samples or 0)]
+    return [{name: _draw(v, rng) for name, v in file.vary.items()} for _ in range(file.samples or 0)]
 
 
-def _drawn(v: Variation, rng: np.random.Generator) -> Any:
+def _draw(v: Variation, rng: np.random.Generator) -> Any:
     if v.uniform is not None:
         return float(rng.uniform(*v.uniform))
     if v.normal is not None:
@@ -134,39 +142,36 @@ def _runs(file: CampaignFile, scenario: Path, path: Path) -> tuple[Run, ...]:
     combinations = _combinations(file)
     if len(combinations) * len(seeds) > MAX_RUNS:
         raise ScenarioError(
-            f"{path}: {len(combinations)} combinations of {len(seeds)} seeds are more than {MAX_RUNS} runs"
+            f"{path}: {len(combinations)} combinations times {len(seeds)} seeds exceed {MAX_RUNS} runs"
         )
     shared = [f"{key}={toml_value(value)}" for key, value in file.set.items()]
     runs = []
     for varied in combinations:
         own = [f"{key}={toml_value(value)}" for key, value in varied.items()]
         for seed in seeds:
-            overrides = (*shared, *own, f"seed={seed}")
             try:
-                resolved = load_scenario(scenario, overrides)
+                runs.append(make_run(len(runs), scenario, seed, varied, (*shared, *own))[0])
             except ScenarioError as error:
                 raise ScenarioError(
                     f"{path}: run {len(runs)} ({', '.join(own) or 'nothing varied'}): {error}"
                 ) from None
-            name = hashlib.sha256(resolved.model_dump_json().encode()).hexdigest()[:12]
-            runs.append(Run(len(runs), name, seed, varied, overrides))
-    _refuse_twins(runs, path)
+    _reject_duplicates(runs, path)
     return tuple(runs)
 
 
-def _refuse_twins(runs: list[Run], path: Path) -> None:
+def _reject_duplicates(runs: list[Run], path: Path) -> None:
     seen: dict[str, int] = {}
     for run in runs:
         if run.name in seen:
             raise ScenarioError(
-                f"{path}: runs {seen[run.name]} and {run.index} are the same scenario; a value stands twice, or varies "
-                "nothing"
+                f"{path}: runs {seen[run.name]} and {run.index} are the same scenario; a value is repeated or has "
+                "no effect"
             )
         seen[run.name] = run.index
 
 
 def toml_value(value: Any) -> str:
-    """A value in TOML's notation, as ``--set`` takes it: numbers, texts, booleans, arrays and inline tables."""
+    """Format a number, string, boolean, array or inline table as TOML, the notation of ``--set``."""
     if isinstance(value, dict):
         inner = ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {toml_value(v)}" for k, v in value.items())
         return "{" + inner + "}"

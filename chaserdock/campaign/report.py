@@ -1,4 +1,4 @@
-"""A campaign's report: one HTML file with pass rate, causes, sensitivities and the way to every failure."""
+"""Report of a campaign: one HTML file with pass rate, causes, sensitivities and a link to every failure."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 
 from .plan import Campaign, Run
-from .table import Row, again, causes, metrics_of, numbers_of, rank_correlation, wilson
+from .table import Row, causes, metrics_of, numbers_of, rank_correlation, rerun_command, wilson
 
 _SHOWN = (
     ("steady_position_mse_m2", "steady position RMS, mm", lambda v: math.sqrt(v) * 1e3),
@@ -30,16 +30,17 @@ code { font-size: .85em; overflow-wrap: anywhere; } .big { font-size: 1.6rem; }
 
 
 def page(campaign: Campaign, rows: list[Row], folder: Path) -> str:
-    """The report as HTML; links to logs are relative to ``folder``. Raises ValueError without any run."""
-    passed, of = sum(bool(r["success"]) for r in rows), len(rows)
-    low, high = wilson(passed, of)
-    missing = len(campaign.runs) - of
+    """Return the report as HTML; links to logs are relative to ``folder``. Raise ValueError without any run."""
+    passed, finished = sum(bool(r["success"]) for r in rows), len(rows)
+    low, high = wilson(passed, finished)
+    missing = len(campaign.runs) - finished
+    scenarios = ", ".join(sorted({str(run.scenario) for run in campaign.runs}))
     parts = [
         f"<h1>{html.escape(campaign.name)}</h1>",
-        f"<p>Scenario <code>{html.escape(str(campaign.scenario))}</code>, {of} of {len(campaign.runs)} runs flown"
-        + (f"; <b>{missing} are missing</b>: start the same command again to go on" if missing else "")
+        f"<p>Scenario <code>{html.escape(scenarios)}</code>, {finished} of {len(campaign.runs)} runs flown"
+        + (f"; <b>{missing} are missing</b>; repeat the command to resume" if missing else "")
         + ".</p>",
-        f'<p class="big">{passed} of {of} passed: {100 * passed / of:.1f} % '
+        f'<p class="big">{passed} of {finished} passed: {100 * passed / finished:.1f} % '
         f"(95 % confidence: {100 * low:.1f} to {100 * high:.1f} %, Wilson)</p>",
         _causes(rows),
         _sensitivities(campaign, rows),
@@ -53,21 +54,21 @@ def page(campaign: Campaign, rows: list[Row], folder: Path) -> str:
 
 
 def _causes(rows: list[Row]) -> str:
-    found = causes(rows)
-    if not found:
+    counted = causes(rows)
+    if not counted:
         return ""
-    body = "".join(f'<tr><td class="n">{n}</td><td>{html.escape(cause)}</td></tr>' for cause, n in found)
-    return f"<h2>Outcomes by cause</h2><table><tr><th>runs</th><th>first failure (# is a figure)</th></tr>{body}</table>"
+    body = "".join(f'<tr><td class="n">{n}</td><td>{html.escape(cause)}</td></tr>' for cause, n in counted)
+    return f"<h2>Outcomes by cause</h2><table><tr><th>runs</th><th>first failure (# stands for a number)</th></tr>{body}</table>"
 
 
 def _sensitivities(campaign: Campaign, rows: list[Row]) -> str:
     numeric = [p for p in campaign.parameters if numbers_of(rows, f"vary.{p}") is not None]
-    words = [p for p in campaign.parameters if p not in numeric]
+    categorical = [p for p in campaign.parameters if p not in numeric]
     out = []
     if numeric and len(rows) > 1:
         out.append(f'<div class="figure">{_figure(numeric, rows)}</div>')
         out.append(_correlations(numeric, rows))
-    for p in words:
+    for p in categorical:
         out.append(_by_value(p, rows))
     return "<h2>Sensitivity</h2>" + "".join(out) if out else ""
 
@@ -78,12 +79,12 @@ def _figure(parameters: list[str], rows: list[Row]) -> str:
     shown = [m for m in _SHOWN if m[0] in metrics_of(rows)]
     figure = Figure(figsize=(3.2 * len(parameters) + 0.6, 2.5 * len(shown) + 0.4), layout="constrained")
     axes = figure.subplots(len(shown), len(parameters), squeeze=False, sharex="col", sharey="row")
-    for row, (metric, label, scaled) in enumerate(shown):
+    for row, (metric, label, scale) in enumerate(shown):
         for column, parameter in enumerate(parameters):
             ax = axes[row][column]
             for good, colour, marker in ((True, _GOOD, "o"), (False, _BAD, "x")):
                 points = [
-                    (float(r[f"vary.{parameter}"]), scaled(r[metric]))
+                    (float(r[f"vary.{parameter}"]), scale(r[metric]))
                     for r in rows
                     if r["success"] is good and math.isfinite(r[metric])
                 ]
@@ -96,7 +97,7 @@ def _figure(parameters: list[str], rows: list[Row]) -> str:
             if row == len(shown) - 1:
                 ax.set_xlabel(parameter, fontsize=8)
             ax.tick_params(labelsize=7)
-    figure.suptitle("passed: blue dots; failed: red crosses", fontsize=9)
+    figure.suptitle("blue dots: passed; red crosses: failed", fontsize=9)
     text = io.StringIO()
     figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()[text.getvalue().index("<svg") :]
@@ -144,8 +145,8 @@ def _failures(campaign: Campaign, rows: list[Row], folder: Path) -> str:
             link = f'<a href="{html.escape(shown)}">{html.escape(shown)}</a>'
         else:
             link = html.escape(log) or "not kept"
-        command = html.escape(again(campaign, runs[str(r["run"])]))
-        told = f"{html.escape(str(r['cause']))}<br>{link}<br><code>{command}</code>"
-        body += f'<tr><td class="n">{r["index"]}</td><td>{told}</td></tr>'
-    head = "<tr><th>run</th><th>cause, log, and the command to fly it again</th></tr>"
+        command = html.escape(rerun_command(runs[str(r["run"])]))
+        cell = f"{html.escape(str(r['cause']))}<br>{link}<br><code>{command}</code>"
+        body += f'<tr><td class="n">{r["index"]}</td><td>{cell}</td></tr>'
+    head = "<tr><th>run</th><th>cause, log and command that repeats the run</th></tr>"
     return f"<h2>Failures</h2><table>{head}{body}</table>"

@@ -1,4 +1,4 @@
-"""``chaserdock campaign``: flies, shows progress, writes the table and the report."""
+"""``chaserdock campaign``: fly the runs, print progress, write the table and the report."""
 
 from __future__ import annotations
 
@@ -7,41 +7,40 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 
 from .plan import Campaign, Run, load_campaign
 from .report import page
-from .table import Row, again, rows_of, wilson
+from .table import rerun_command, rows_of, wilson, write_table
 from .worker import CampaignError, Keep, Result, fly, fly_campaign
 
 
 def direct(
     file: Path, out: Path | None, jobs: int | None, cluster: str | None, keep: Keep, only: int | None
 ) -> int:
-    """Flies the campaign of ``file``; the exit status (``statuses``): 0 when every run has been flown.
+    """Fly the campaign of ``file``; return the exit status: 0 when every run has ended, whatever its outcome.
 
-    Raises ScenarioError for a file that is wrong, CampaignError when the campaign cannot go on.
+    Raise ScenarioError for an invalid file, CampaignError when the campaign cannot continue.
     """
     campaign = load_campaign(file)
     folder = (out or Path("campaigns") / campaign.name).absolute()
     if only is not None:
         return _fly_one(campaign, folder, only)
-    stop = threading.Event()
-    before = {s: signal.signal(s, lambda number, frame: _stop(stop)) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
-        told = _Teller()
-        flown = fly_campaign(campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, told, stop)
+        with stop_on_signal() as stop:
+            finished = fly_campaign(
+                campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, Progress(), stop
+            )
     except OSError as error:
         raise CampaignError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-    if not flown:
-        print("chaserdock: stopped before any run was over", file=sys.stderr)
+    if not finished:
+        print("chaserdock: stopped before any run ended", file=sys.stderr)
         return STOPPED
-    rows = rows_of(flown)
+    rows = rows_of(finished)
     write_table(rows, folder / "results.parquet")
     (folder / "report.html").write_text(page(campaign, rows, folder), encoding="utf-8")
     passed = sum(bool(r["success"]) for r in rows)
@@ -51,55 +50,55 @@ def direct(
         f"(95 %: {100 * low:.1f} to {100 * high:.1f} %)\n{folder / 'results.parquet'}\n{folder / 'report.html'}"
     )
     if len(rows) < len(campaign.runs):
-        print(
-            f"chaserdock: stopped, {len(campaign.runs) - len(rows)} runs left; the same command goes on",
-            file=sys.stderr,
-        )
+        remaining = len(campaign.runs) - len(rows)
+        print(f"chaserdock: stopped, {remaining} runs remain; repeat the command to resume", file=sys.stderr)
         return STOPPED
     return DONE
-
-
-def write_table(rows: list[Row], path: Path) -> None:
-    """The table as Parquet; units are in the columns' names."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    fresh = path.with_suffix(".tmp")
-    pq.write_table(pa.Table.from_pylist(rows), fresh)
-    fresh.replace(path)
 
 
 def _fly_one(campaign: Campaign, folder: Path, only: int) -> int:
     if not 0 <= only < len(campaign.runs):
         raise CampaignError(f"--only {only}: the runs are 0 to {len(campaign.runs) - 1}")
     run = campaign.runs[only]
-    print(again(campaign, run))
-    result = fly(run, campaign.scenario, "all", folder / "alone")
-    print(
-        f"run {only} ({run.name}): {'passed' if result.status == 0 else result.last_words}\n{result.log or 'no log'}"
-    )
+    print(rerun_command(run))
+    result = fly(run, "all", folder / "single-runs")
+    outcome = "passed" if result.status == 0 else result.last_words
+    print(f"run {only} ({run.name}): {outcome}\n{result.log or 'no log'}")
     return DONE if result.status == 0 else FAILED
 
 
-def _stop(stop: threading.Event) -> None:
-    if not stop.is_set():
-        print("\nchaserdock: stopping when the runs in flight are over", file=sys.stderr)
-    stop.set()
+@contextmanager
+def stop_on_signal() -> Iterator[threading.Event]:
+    """Provide an event that SIGINT or SIGTERM sets; active runs then finish and no new one starts."""
+    stop = threading.Event()
+
+    def request_stop(*_: object) -> None:
+        if not stop.is_set():
+            print("\nchaserdock: stopping after the active runs", file=sys.stderr)
+        stop.set()
+
+    before = {s: signal.signal(s, request_stop) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-class _Teller:
-    """One line a run that is over, with how many are left and for how long."""
+class Progress:
+    """Prints one line per finished run: its outcome and the estimated time left."""
 
     def __init__(self) -> None:
-        self._begun_s = time.monotonic()
-        self._first: int | None = None
+        self._start_s = time.monotonic()
+        self._finished_before: int | None = None
 
-    def __call__(self, done: int, of: int, run: Run, result: Result) -> None:
-        if self._first is None:
-            self._first = done - 1
-        each_s = (time.monotonic() - self._begun_s) / (done - self._first)
-        outcome = (
-            "passed" if result.status == 0 else f"FAILED: {result.last_words.removeprefix('chaserdock: ')}"
-        )
-        left = f", about {each_s * (of - done) / 60:.0f} min left" if done < of else ""
-        print(f"{done}/{of} run {run.index}: {outcome}{left}", flush=True)
+    def __call__(self, finished: int, total: int, run: Run, result: Result) -> None:
+        if self._finished_before is None:
+            self._finished_before = finished - 1
+        per_run_s = (time.monotonic() - self._start_s) / (finished - self._finished_before)
+        passed = result.status == 0
+        outcome = "passed" if passed else f"FAILED: {result.last_words.removeprefix('chaserdock: ')}"
+        left = f", about {per_run_s * (total - finished) / 60:.0f} min left" if finished < total else ""
+        varied = ", ".join(f"{name}={value}" for name, value in run.varied.items())
+        label = f"run {run.index}" + (f" ({varied})" if varied else "")
+        print(f"{finished}/{total} {label}: {outcome}{left}", flush=True)

@@ -1,4 +1,4 @@
-"""A campaign's results as one table, and what it says. Pure functions."""
+"""Results of a campaign as a table, and the statistics of the table."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import json
 import math
 import re
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
-import numpy as np
-
-from .plan import Campaign, Run
+from .plan import Run
 from .worker import Result
 
 Row = dict[str, Any]
@@ -18,13 +17,13 @@ _FIXED = ("run", "index", "seed", "success", "cause", "failures", "digest", "log
 
 
 def row_of(run: Run, result: Result) -> Row:
-    """One run as one row of plain values: what varied (``vary.…``), how it ended, and its figures in SI units.
+    """Return a run as a row of plain values: varied values (``vary.NAME``), outcome and results in SI units.
 
-    Nothing that depends on the machine's speed is in it: equal campaigns give equal tables.
+    No value depends on the speed of the machine: equal campaigns give equal tables.
     """
     s = result.summary or {}
     failures = list(s.get("failures", [])) or (
-        [result.last_words or "ended without a word"] if result.status else []
+        [result.last_words or "ended without output"] if result.status else []
     )
     row: Row = {
         "run": run.name,
@@ -41,7 +40,7 @@ def row_of(run: Run, result: Result) -> Row:
         for k, v in run.varied.items()
     }
     chasers = s.get("chasers", {}).values()
-    for name, path, worst in (
+    for name, path, aggregate in (
         ("steady_position_mse_m2", ("steady", "position_mse_m2"), max),
         ("steady_orientation_mse_rad2", ("steady", "orientation_mse_rad2"), max),
         ("position_mse_m2", ("position_mse_m2",), max),
@@ -49,8 +48,8 @@ def row_of(run: Run, result: Result) -> Row:
         ("min_distance_target_m", ("min_distance_target_m",), min),
         ("impulse_N_s", ("impulse_N_s",), sum),
     ):
-        values = [v for c in chasers if (v := _at(c, path)) is not None]
-        row[name] = float(worst(values)) if values else math.nan
+        values = [v for c in chasers if (v := _value_at(c, path)) is not None]
+        row[name] = float(aggregate(values)) if values else math.nan
     row["docked"] = sum(bool(c.get("docked")) for c in chasers)
     row["collisions"] = int(s.get("collisions", 0))
     row["min_distance_chasers_m"] = _number(s.get("min_distance_chasers_m"))
@@ -59,7 +58,7 @@ def row_of(run: Run, result: Result) -> Row:
     return row
 
 
-def _at(values: Any, path: tuple[str, ...]) -> float | None:
+def _value_at(values: Any, path: tuple[str, ...]) -> float | None:
     for key in path:
         values = values.get(key) if isinstance(values, dict) else None
     return values if isinstance(values, int | float) else None
@@ -70,66 +69,72 @@ def _number(value: Any) -> float:
 
 
 def cause_of(failure: str) -> str:
-    """What a failure is, without its figures: ``chaser 2: steady RMS: 9.1 mm`` and ``… 8.2 mm`` are one cause."""
+    """Replace the numbers in a failure by ``#``, so that failures of one kind count as one cause."""
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", failure)
 
 
-def rows_of(flown: list[tuple[Run, Result]]) -> list[Row]:
-    """The table, in the campaign's order; every row with the same columns."""
-    rows = [row_of(run, result) for run, result in flown]
+def rows_of(finished: list[tuple[Run, Result]]) -> list[Row]:
+    """Return the table in the campaign's order; all rows have the same columns."""
+    rows = [row_of(run, result) for run, result in finished]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return [{c: row.get(c, math.nan) for c in columns} for row in rows]
 
 
 def metrics_of(rows: list[Row]) -> list[str]:
-    """Columns that hold figures of the flight."""
+    """Return the names of the columns with numerical results."""
     names = [c for c in (rows[0] if rows else {}) if c not in _FIXED and not c.startswith("vary.")]
     return [c for c in names if any(isinstance(r[c], int | float) and math.isfinite(r[c]) for r in rows)]
 
 
-def wilson(passed: int, of: int, z: float = 1.959964) -> tuple[float, float]:
-    """Score interval (low, high) of a pass rate, 95 % by default (E. B. Wilson, 1927). Raises ValueError for none."""
-    if of < 1 or not 0 <= passed <= of:
-        raise ValueError(f"{passed} of {of} is no pass rate")
-    p, n = passed / of, float(of)
-    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-    return max(0.0, middle - half), min(1.0, middle + half)
+def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, float]:
+    """Return the Wilson score interval (low, high) of a pass rate. Raise ValueError for impossible counts."""
+    from scipy.stats import binomtest
+
+    if total < 1 or not 0 <= passed <= total:
+        raise ValueError(f"{passed} of {total} is not a pass rate")
+    interval = binomtest(passed, total).proportion_ci(confidence, method="wilson")
+    return float(interval.low), float(interval.high)
 
 
 def causes(rows: list[Row]) -> list[tuple[str, int]]:
-    """How many runs failed by what, most frequent first."""
+    """Return the causes of failures and their numbers of runs, most frequent first."""
     return sorted(
         Counter(r["cause"] for r in rows if not r["success"]).items(), key=lambda item: (-item[1], item[0])
     )
 
 
 def rank_correlation(x: list[float], y: list[float]) -> float:
-    """Spearman's rank correlation of two columns, ties by mean rank; NaN where one of them does not vary."""
+    """Return Spearman's rank correlation of the finite pairs; NaN for fewer than three or a constant column."""
+    from scipy.stats import spearmanr
+
     pairs = [(a, b) for a, b in zip(x, y, strict=True) if math.isfinite(a) and math.isfinite(b)]
     if len(pairs) < 3:
         return math.nan
-    a, b = (_ranks(np.array(column, dtype=float)) for column in zip(*pairs, strict=True))
-    if a.std() == 0.0 or b.std() == 0.0:
+    a, b = zip(*pairs, strict=True)
+    if len(set(a)) == 1 or len(set(b)) == 1:
         return math.nan
-    return float(np.corrcoef(a, b)[0, 1])
-
-
-def _ranks(values: np.ndarray) -> np.ndarray:
-    _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-    ends = np.cumsum(counts)
-    return (ends - (counts - 1) / 2.0)[inverse]
+    return float(spearmanr(a, b).statistic)
 
 
 def numbers_of(rows: list[Row], column: str) -> list[float] | None:
-    """A column as numbers, or None when it holds something else."""
+    """Return a column as numbers, or None when it contains text."""
     values = [r[column] for r in rows]
     if any(isinstance(v, str) for v in values):
         return None
     return [float(v) for v in values]
 
 
-def again(campaign: Campaign, run: Run) -> str:
-    """The command that flies one run of the campaign again, alone."""
+def rerun_command(run: Run) -> str:
+    """Return the command that flies one run again."""
     sets = " ".join(f"--set '{o}'" for o in run.overrides)
-    return f"chaserdock run {campaign.scenario} {sets}"
+    return f"chaserdock run {run.scenario} {sets}"
+
+
+def write_table(rows: list[Row], path: Path) -> None:
+    """Write the table as Parquet; column names include units."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    temporary = path.with_suffix(".tmp")
+    pq.write_table(pa.Table.from_pylist(rows), temporary)
+    temporary.replace(path)

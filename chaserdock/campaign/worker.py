@@ -1,6 +1,6 @@
-"""Flying a campaign's runs: each by ``chaserdock run`` in a process of its own, here or on a Dask cluster's workers.
+"""Execution of runs: one ``chaserdock run`` process each, on this machine or on the workers of a Dask cluster.
 
-A run that has ended leaves ``runs/NAME/result.json``, written at once or not at all: that is what resuming goes by.
+A finished run leaves ``runs/NAME/result.json``, written atomically. A later call skips the runs that have one.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ Keep = Literal["failures", "all", "none"]
 
 
 class CampaignError(ChaserdockError):
-    """The campaign cannot go on; one clear line."""
+    """The campaign cannot continue."""
 
 
 class Result(msgspec.Struct, frozen=True):
-    """How a run ended: the program's status and summary (None when it left none), its last words, where its log is."""
+    """Outcome of a run: exit status, summary (None without one), last output line, path of a kept log."""
 
     name: str
     status: int
@@ -42,12 +42,12 @@ class Result(msgspec.Struct, frozen=True):
 
 
 def result_path(folder: Path, run: Run) -> Path:
-    """Where a finished run's result lies."""
+    """Return the path of a finished run's result."""
     return folder / "runs" / run.name / "result.json"
 
 
-def finished(folder: Path, run: Run) -> Result | None:
-    """The result of a run that ended earlier, or None. Raises CampaignError for a file that is none."""
+def read_result(folder: Path, run: Run) -> Result | None:
+    """Return the result of an earlier run, or None. Raise CampaignError for a damaged file."""
     path = result_path(folder, run)
     try:
         return msgspec.json.decode(path.read_bytes(), type=Result)
@@ -55,88 +55,83 @@ def finished(folder: Path, run: Run) -> Result | None:
         return None
     except (OSError, msgspec.DecodeError) as error:
         raise CampaignError(
-            f"{path}: no result of a run: {error}; delete it to have the run flown again"
+            f"{path}: not a result of a run: {error}; delete it to fly the run again"
         ) from None
 
 
-def note(folder: Path, run: Run, result: Result) -> None:
-    """Writes a result so that a crash leaves all of it or nothing."""
+def write_result(folder: Path, run: Run, result: Result) -> None:
+    """Write a result atomically."""
     path = result_path(folder, run)
     path.parent.mkdir(parents=True, exist_ok=True)
-    fresh = path.with_suffix(f".{os.getpid()}.tmp")
-    with fresh.open("wb") as file:
+    temporary = path.with_suffix(f".{os.getpid()}.tmp")
+    with temporary.open("wb") as file:
         file.write(msgspec.json.format(msgspec.json.encode(result)) + b"\n")
         file.flush()
         os.fsync(file.fileno())
-    fresh.replace(path)
+    temporary.replace(path)
 
 
-def fly(run: Run, scenario: Path, keep: Keep, logs: Path) -> Result:
-    """Flies one run to its end, in a temporary folder; its log moves to ``logs`` if it is to be kept.
+def fly(run: Run, keep: Keep, logs: Path) -> Result:
+    """Fly one run in a temporary folder; move its log to ``logs`` if ``keep`` says so.
 
-    Runs on a Dask worker as well: nothing but plain values goes in and out. Where ``logs`` cannot be written there
-    (no shared disk), a kept log stays on the worker's machine, and the result says where.
+    Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not writable (no shared
+    disk), a kept log stays on the worker's machine and the result names host and path.
     """
-    work = Path(tempfile.mkdtemp(prefix=f"chaserdock-{run.name}-"))
+    folder = Path(tempfile.mkdtemp(prefix=f"chaserdock-{run.name}-"))
     try:
-        out = work / "run"
+        out = folder / "run"
         sets = [item for override in run.overrides for item in ("--set", override)]
-        command = [
-            sys.executable,
-            "-m",
-            "chaserdock",
-            "run",
-            str(scenario),
-            "--out",
-            str(out),
-            "--quiet",
-            *sets,
-        ]
-        # A group of its own: Ctrl-C in the terminal is this program's to pass on.
+        program = [sys.executable, "-m", "chaserdock", "run", str(run.scenario)]
+        # A session of its own: Ctrl-C in the terminal reaches this process only, which lets the run finish.
         done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", start_new_session=True
+            [*program, "--out", str(out), "--quiet", *sets],
+            capture_output=True,
+            text=True,
+            errors="replace",
+            start_new_session=True,
         )
         summary_file = out / "summary.json"
         summary = json.loads(summary_file.read_text()) if summary_file.is_file() else None
-        said = (done.stderr.strip() or done.stdout.strip()).splitlines()
-        wanted = keep == "all" or (keep == "failures" and done.returncode != 0)
-        kept = _keep(out / LOG_NAME, logs / run.name) if wanted and (out / LOG_NAME).is_file() else None
-        return Result(run.name, done.returncode, summary, said[-1] if said else "", kept)
+        output = (done.stderr.strip() or done.stdout.strip()).splitlines()
+        keep_log = keep == "all" or (keep == "failures" and done.returncode != 0)
+        log = out / LOG_NAME
+        kept = _move_log(log, logs / run.name) if keep_log and log.is_file() else None
+        return Result(run.name, done.returncode, summary, output[-1] if output else "", kept)
     finally:
-        shutil.rmtree(work, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
-def _keep(log: Path, folder: Path) -> str:
+def _move_log(log: Path, folder: Path) -> str:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         shutil.move(log, folder / LOG_NAME)
         return str(folder / LOG_NAME)
     except OSError:
-        stay = Path(tempfile.mkdtemp(prefix=f"chaserdock-log-{folder.name}-")) / LOG_NAME
-        shutil.move(log, stay)
-        return f"{socket.gethostname()}:{stay}"
+        local = Path(tempfile.mkdtemp(prefix=f"chaserdock-log-{folder.name}-")) / LOG_NAME
+        shutil.move(log, local)
+        return f"{socket.gethostname()}:{local}"
 
 
-def fly_here(
-    campaign: Campaign, runs: list[Run], keep: Keep, folder: Path, jobs: int, stop: threading.Event
+def fly_locally(
+    runs: list[Run], keep: Keep, folder: Path, jobs: int, stop: threading.Event
 ) -> Iterator[tuple[Run, Result]]:
-    """Runs and their results as they end, ``jobs`` at a time on this machine; no new one after ``stop``."""
+    """Fly ``jobs`` runs at a time on this machine; yield each as it ends. Start none after ``stop``."""
     waiting = iter(runs)
     with ThreadPoolExecutor(jobs) as pool:
-        flying: dict[Any, Run] = {}
+        active: dict[Any, Run] = {}
         while True:
-            while len(flying) < jobs and not stop.is_set() and (run := next(waiting, None)) is not None:
-                flying[pool.submit(fly, run, campaign.scenario, keep, folder / "runs")] = run
-            if not flying:
+            while len(active) < jobs and not stop.is_set() and (run := next(waiting, None)) is not None:
+                active[pool.submit(fly, run, keep, folder / "runs")] = run
+            if not active:
                 return
-            for future in wait(flying, return_when=FIRST_COMPLETED).done:
-                yield flying.pop(future), future.result()
+            for future in wait(active, return_when=FIRST_COMPLETED).done:
+                yield active.pop(future), future.result()
 
 
 def fly_on_cluster(
-    campaign: Campaign, runs: list[Run], keep: Keep, folder: Path, address: str, stop: threading.Event
+    runs: list[Run], keep: Keep, folder: Path, address: str, stop: threading.Event
 ) -> Iterator[tuple[Run, Result]]:
-    """The same on the workers of the Dask scheduler at ``address``; raises CampaignError if there is none."""
+    """Fly runs on the workers of the Dask scheduler at ``address``; yield each as it ends. Raise CampaignError."""
     try:
         from distributed import Client, as_completed
     except ImportError:
@@ -148,17 +143,14 @@ def fly_on_cluster(
     with client:
         by_key = {}
         for run in runs:
-            # Impure: Dask must not take an earlier result for this one, and a lost worker's run is flown again.
-            future = client.submit(
-                fly, run, campaign.scenario, keep, folder / "runs", key=f"{run.name}", pure=False, retries=1
-            )
+            # pure=False: Dask must not reuse a result. retries=1: the run of a lost worker is flown again.
+            future = client.submit(fly, run, keep, folder / "runs", key=f"{run.name}", pure=False, retries=1)
             by_key[future.key] = (run, future)
         for future in as_completed([f for _, f in by_key.values()]):
+            run = by_key[future.key][0]
             if future.status == "error":
-                raise CampaignError(
-                    f"run {by_key[future.key][0].name} could not be flown on the cluster: {future.exception()}"
-                )
-            yield by_key[future.key][0], future.result()
+                raise CampaignError(f"run {run.name} failed on the cluster: {future.exception()}")
+            yield run, future.result()
             if stop.is_set():
                 client.cancel([f for _, f in by_key.values()])
                 return
@@ -170,20 +162,23 @@ def fly_campaign(
     keep: Keep,
     jobs: int,
     cluster: str | None,
-    told: Callable[[int, int, Run, Result], None],
+    report_progress: Callable[[int, int, Run, Result], None],
     stop: threading.Event,
 ) -> list[tuple[Run, Result]]:
-    """Flies what has not been flown yet; all (run, result) in the campaign's order. ``told``: after each new one."""
+    """Fly the runs without a result; return all finished runs in the campaign's order.
+
+    ``report_progress`` receives the number of finished runs, the number of runs, and the run that has just ended.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    results = {r.name: found for r in campaign.runs if (found := finished(folder, r)) is not None}
-    left = [r for r in campaign.runs if r.name not in results]
-    flown = (
-        fly_here(campaign, left, keep, folder, jobs, stop)
+    results = {r.name: earlier for r in campaign.runs if (earlier := read_result(folder, r)) is not None}
+    remaining = [r for r in campaign.runs if r.name not in results]
+    flights = (
+        fly_locally(remaining, keep, folder, jobs, stop)
         if cluster is None
-        else fly_on_cluster(campaign, left, keep, folder, cluster, stop)
+        else fly_on_cluster(remaining, keep, folder, cluster, stop)
     )
-    for run, result in flown:
-        note(folder, run, result)
+    for run, result in flights:
+        write_result(folder, run, result)
         results[run.name] = result
-        told(len(results), len(campaign.runs), run, result)
+        report_progress(len(results), len(campaign.runs), run, result)
     return [(r, results[r.name]) for r in campaign.runs if r.name in results]

@@ -67,7 +67,7 @@ def calibrate(
         raise typer.Exit(1) from None
     for name, rms in result.rms_px.items():
         print(f"{name}: {rms:.3f} px")
-    for name, reason in result.left_out.items():
+    for name, reason in result.excluded.items():
         print(f"{name}: left out: {reason}")
     print(
         f"{len(result.rms_px)} images, RMS {result.total_rms_px:.3f} px; "

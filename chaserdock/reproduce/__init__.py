@@ -1,1 +1,1 @@
-"""``chaserdock reproduce``: the paper's table and missions, flown again and laid beside the paper's figures."""
+"""Reproduction of the paper's table and missions."""

@@ -1,4 +1,4 @@
-"""A page of sections, as Markdown and as one HTML file that needs nothing else. Pure functions."""
+"""A page of sections as Markdown and as one self-contained HTML file."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from html import escape
 
 @dataclass(frozen=True)
 class Table:
-    """A table; every row as long as ``header``. The first column is text, the others are numbers."""
+    """A table. The first column is text, the others are numbers. Raise ValueError for a row of another length."""
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
@@ -22,7 +22,7 @@ class Table:
 
 @dataclass(frozen=True)
 class Section:
-    """A heading, then paragraphs (plain text) and tables in their order."""
+    """A heading, followed by paragraphs (plain text) and tables."""
 
     title: str
     parts: tuple[str | Table, ...]
@@ -42,7 +42,7 @@ h2 { margin-top: 2rem; }
 
 
 def markdown(title: str, sections: Sequence[Section]) -> str:
-    """The page as Markdown."""
+    """Return the page as Markdown."""
     lines = [f"# {title}", ""]
     for section in sections:
         lines += [f"## {section.title}", ""]
@@ -63,7 +63,7 @@ def _markdown_table(table: Table) -> list[str]:
 
 
 def html(title: str, sections: Sequence[Section]) -> str:
-    """The page as HTML, without anything from elsewhere."""
+    """Return the page as HTML without external resources."""
     out = [
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',
         '<meta name="viewport" content="width=device-width, initial-scale=1">',

@@ -1,16 +1,16 @@
-"""The paper's figures: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, average of three runs."""
+"""The paper's results: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, average of three runs."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 PAPER_S = 120.0
-"""How long every run of the paper's took."""
+"""Duration of each of the paper's runs."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of the paper's single-chaser table; ``failed`` of its three runs failed. ``name`` can be a folder's."""
+    """A row of the paper's single-chaser table; ``failed`` of its three runs failed. ``name`` is a valid file name."""
 
     name: str
     horizon_s: float
@@ -22,13 +22,13 @@ class Row:
 
     @property
     def label(self) -> str:
-        """The row as people write it: dt=1/30, alpha=30 %."""
+        """The row in the paper's notation: dt=1/30, alpha=30 %."""
         text = self.name.replace("-alpha", ", alpha").replace("1-", "1/")
         return f"{text} %" if "alpha" in text else text
 
     @property
     def overrides(self) -> tuple[str, ...]:
-        """What makes a scenario this row's."""
+        """Scenario overrides of this row."""
         return (
             f"controller.horizon_s={self.horizon_s}",
             f"controller.dt_s={self.dt_s!r}",

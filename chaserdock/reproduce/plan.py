@@ -1,4 +1,4 @@
-"""What `reproduce` flies, as data: missions with images, and studies of the controller on perfect knowledge."""
+"""Plan of a reproduction: missions with images, and studies of the controller on perfect knowledge."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ SCENARIO = "paper-single"
 """The scenario of every single-chaser run: the paper's settings and its baseline row."""
 
 INFERRED = "inferred"
-"""The start of ``paper-single``, from which every row is flown with images."""
+"""The start of ``paper-single``, used for every row with images."""
 
 _ROLLED = "chasers.0.start_rotation_rad=[0.575, 0.0, 0.0]"
 STARTS: dict[str, tuple[str, ...]] = {
@@ -27,9 +27,9 @@ STARTS: dict[str, tuple[str, ...]] = {
         _ROLLED,
     ),
 }
-"""All are 0.85 m straight back, turned by 0.575 rad, at rest in WRF. The target flies away from a chaser that waits behind
-it (the paper's chaser 0, ``receding``) and towards one that waits in front of it (its chaser 3, the others). ``inferred``
-is turned about an axis for which the baseline's two figures come out, the others about the body's X."""
+"""All are 0.85 m straight back, turned by 0.575 rad, at rest in WRF. The target moves away from a chaser behind it (the
+paper's chaser 0, ``receding``) and towards one in front of it (its chaser 3, the others). ``inferred`` is turned about
+an axis that reproduces both errors of the baseline, the others about the body's X."""
 
 COLUMNS: dict[str, tuple[str, ...]] = {
     "paper": (),
@@ -41,12 +41,12 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "time.latency_s=0.0333333333333333",
     ),
 }
-"""The paper's settings are those of ``paper-single``; ours are the defaults of a scenario."""
+"""Overrides of ``paper-single``: none for the paper's settings, the scenario defaults for ours."""
 
 
 @dataclass(frozen=True)
 class Mission:
-    """One run of ``chaserdock run``. ``name`` is its folder; ``group`` the runs it is averaged with."""
+    """One run of ``chaserdock run``. Runs of one ``group`` are averaged."""
 
     name: str
     group: str
@@ -57,7 +57,7 @@ class Mission:
 
 @dataclass(frozen=True)
 class Plan:
-    """Everything to be flown. ``duration_s``: of each single-chaser run."""
+    """All missions and studies. ``duration_s``: of each single-chaser run."""
 
     quick: bool
     duration_s: float
@@ -66,7 +66,7 @@ class Plan:
 
 
 def table_group(start: str, column: str, row: str) -> str:
-    """The group of a table's cell, for missions and studies alike."""
+    """Return the group of a table cell, for missions and studies."""
     return f"{start}/{column}/{row}"
 
 
@@ -86,11 +86,10 @@ _PAPER_VIEW = (
 
 
 def missions(quick: bool, duration_s: float) -> tuple[Mission, ...]:
-    """The flights with images; the table first."""
+    """Return the flights with images; the table comes first."""
     seeds, length = range(1 if quick else 3), f"duration_s={duration_s}"
     out: list[Mission] = []
-    # From the other starts perfect knowledge says what the rows do (studies); images confirm the baseline. The quick
-    # table has our defaults where the paper gives no reason to look at more.
+    # From the other starts the studies cover all rows; images confirm the baseline.
     for start, turned in STARTS.items():
         for column, settings in COLUMNS.items():
             for row in ROWS:
@@ -158,12 +157,12 @@ _STARTS: dict[str, tuple[str, ...]] = {
 
 
 def has_alpaqa() -> bool:
-    """Whether the extra ``alpaqa`` is installed: what it would fly is left out otherwise, and the page says so."""
+    """Return whether the extra ``alpaqa`` is installed. Without it the page states that its studies are omitted."""
     return find_spec("alpaqa") is not None
 
 
 def measured_solvers() -> tuple[str, ...]:
-    """The solvers whose solve time is measured: ours, one that converges, and one of the paper's kind if it is there."""
+    """Return the solvers whose solve time is measured: ours, a converging one and, if installed, one of the paper's kind."""
     return ("rti", "ipopt", "alpaqa") if has_alpaqa() else ("rti", "ipopt")
 
 
@@ -172,7 +171,7 @@ DELAYED_HORIZONS_S = (3.0, 10.0)
 
 
 def studies(scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
-    """The flights on perfect knowledge, of the scenario at path ``scenario``."""
+    """Return the flights of the scenario file ``scenario`` on perfect knowledge."""
     length = f"duration_s={duration_s}"
     out: list[StudyCase] = []
 
@@ -190,7 +189,7 @@ def studies(scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
     for start, turned in STARTS.items():
         for column, settings in COLUMNS.items():
             for row in ROWS:
-                # One floor a start: it depends on the row only through how the chaser turns.
+                # One lower bound per start: the row affects it only through the rotation of the chaser.
                 floor = row.name == "baseline" and column == "paper"
                 add(table_group(start, column, row.name), *row.overrides, *settings, *turned, floor=floor)
     for name, changed in _STARTS.items():
@@ -198,7 +197,7 @@ def studies(scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
     for name, changed in _INGREDIENTS.items():
         if "alpaqa" in name and not has_alpaqa():
             continue
-        # Converging takes ten to a hundred times as long: these fly the transient alone.
+        # Other solvers take ten to a hundred times as long: they fly the transient only.
         short = ("duration_s=30.0",) if "controller.solver" in changed[0] else ()
         case = StudyCase(name=f"ingredient/{name}", scenario=scenario, overrides=(*changed, length, *short))
         out.append(case)
@@ -214,6 +213,6 @@ def studies(scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
 
 
 def make_plan(quick: bool, scenario: str) -> Plan:
-    """The whole plan; ``scenario`` is the path of ``paper-single``."""
+    """Return the whole plan; ``scenario`` is the path of ``paper-single``."""
     duration_s = QUICK_S if quick else PAPER_S
     return Plan(quick, duration_s, missions(quick, duration_s), studies(scenario, duration_s))

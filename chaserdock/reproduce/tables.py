@@ -1,4 +1,4 @@
-"""From results to the figures of the tables: means over runs, ratios, requirements. Pure functions."""
+"""Values of the tables: means over runs, ratios, requirements."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from .runner import Results
 class Errors:
     """Mean square errors of chaser 0 over two minutes and in steady state, averaged over ``runs``.
 
-    m^2 and rad^2. ``failed``: how many of the runs failed the scenario's own criteria.
+    m^2 and rad^2. ``failed``: number of runs that failed the scenario's criteria.
     """
 
     position: float
@@ -29,9 +29,9 @@ class Errors:
 
 
 def over_two_minutes(whole: float, steady: float, flown_s: float) -> float:
-    """The mean over the paper's two minutes of a run that was ``flown_s`` long.
+    """Return the mean over the paper's two minutes of a run of ``flown_s``, extrapolated with its steady state.
 
-    What follows a shorter run counts as its steady state. Raises ValueError unless 0 < flown_s <= two minutes.
+    Raise ValueError unless 0 < flown_s <= two minutes.
     """
     if not 0.0 < flown_s <= PAPER_S:
         raise ValueError(f"flown_s must be above 0 and at most {PAPER_S:g}, not {flown_s}")
@@ -39,7 +39,7 @@ def over_two_minutes(whole: float, steady: float, flown_s: float) -> float:
 
 
 def errors_of_study(result: StudyResult) -> Errors:
-    """The errors of a study; a failed solve makes it a failed run."""
+    """Return the errors of a study; a failed solve makes it a failed run."""
     r = result
     return Errors(
         position=over_two_minutes(r.position_mse_m2, r.steady_position_mse_m2, r.duration_s),
@@ -51,14 +51,14 @@ def errors_of_study(result: StudyResult) -> Errors:
 
 
 def floor_of_study(result: StudyResult) -> float:
-    """The least possible position MSE (m^2) over two minutes; raises ValueError if it was not asked for."""
+    """Return the lower bound of the position MSE (m^2) over two minutes. Raise ValueError if it was not computed."""
     if result.floor_m2_s is None:
-        raise ValueError(f"{result.case.name}: the floor was not asked for")
+        raise ValueError(f"{result.case.name}: the lower bound was not computed")
     return result.floor_m2_s / PAPER_S
 
 
 def errors_of_summary(summary: dict, duration_s: float) -> Errors:
-    """The errors in a run's ``summary.json``; NaN where a run ended before there was one."""
+    """Return the errors in a run's ``summary.json``; NaN for missing values."""
     chaser = summary["chasers"]["0"]
     steady = [chaser["steady"][k] for k in ("position_mse_m2", "orientation_mse_rad2")]
     whole = [chaser[k] for k in ("position_mse_m2", "orientation_mse_rad2")]
@@ -73,9 +73,9 @@ def errors_of_summary(summary: dict, duration_s: float) -> Errors:
 
 
 def mean(errors: Sequence[Errors]) -> Errors:
-    """The average of several runs; raises ValueError for none."""
+    """Return the average of several runs. Raise ValueError for none."""
     if not errors:
-        raise ValueError("there are no runs to average")
+        raise ValueError("no runs to average")
     n = len(errors)
     return Errors(
         position=sum(e.position for e in errors) / n,
@@ -88,7 +88,7 @@ def mean(errors: Sequence[Errors]) -> Errors:
 
 
 def flown(plan: Plan, results: Results, group: str) -> Errors | None:
-    """The average of a group's runs with images; None if the plan has none of that group or not all are flown."""
+    """Return the average of a group's runs with images; None without such runs or if one has no result."""
     members: list[Mission] = [m for m in plan.missions if m.group == group]
     if not members or any(m.name not in results.missions for m in members):
         return None
@@ -97,7 +97,7 @@ def flown(plan: Plan, results: Results, group: str) -> Errors | None:
 
 @dataclass(frozen=True)
 class Requirement:
-    """Something that is to hold, what was measured, and whether it does."""
+    """A requirement, the measured value, and whether it is met."""
 
     what: str
     measured: str
@@ -110,9 +110,9 @@ def _ratio(label: str, ours: float, paper: float, low: float, high: float, how: 
 
 
 def requirements(plan: Plan, results: Results, start: str) -> list[Requirement] | None:
-    """What a reproduction from ``start`` is to show, with images where the plan has them, else on perfect knowledge.
+    """Check the requirements from ``start``, with images where the plan has them, else on perfect knowledge.
 
-    None if not all of it is flown.
+    Return None if a result is missing.
     """
     out: list[Requirement] = []
     groups = [table_group(start, "paper", row.name) for row in ROWS]
@@ -143,13 +143,13 @@ def requirements(plan: Plan, results: Results, start: str) -> list[Requirement] 
     floor = floor_of_study(results.studies[groups[0]])
     ours, how = best(groups[-1])
     above = ours.position / floor
-    what = "our default: position MSE at most 20 % above the least possible"
+    what = "our default: position MSE at most 20 % above the lower bound"
     out.append(Requirement(what, f"{100 * (above - 1):.1f} % above, {how}", above <= 1.2))
     return out
 
 
 def steady_requirements(plan: Plan, results: Results) -> list[Requirement]:
-    """What our default's steady state is to show on either target, as far as it is flown."""
+    """Check the steady state of our default on both targets, as far as results exist."""
     out = []
     for group, target, limit in (
         (table_group(INFERRED, "default", "baseline"), "the paper's target", 2e-5),

@@ -1,4 +1,4 @@
-"""Campaigns: which runs a file asks for, what the table says, that nothing is flown twice or lost."""
+"""Campaigns: runs defined by a file, table and report, resumption."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import os
 import re
 import signal
 import subprocess
+import threading
 import time
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,15 +18,21 @@ from typing import Any
 import pyarrow.parquet as pq
 import pytest
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
-from harness import chaserdock, descendants
-from harness import finished as program
+from harness import chaserdock, descendants, finished
 from hypothesis import given
 from hypothesis import strategies as st
 
 from chaserdock.campaign.plan import Campaign, load_campaign, toml_value
 from chaserdock.campaign.report import page
 from chaserdock.campaign.table import cause_of, causes, rank_correlation, row_of, rows_of, wilson
-from chaserdock.campaign.worker import CampaignError, Result, finished, fly_campaign, note, result_path
+from chaserdock.campaign.worker import (
+    CampaignError,
+    Result,
+    fly_campaign,
+    read_result,
+    result_path,
+    write_result,
+)
 
 GRID = """
 name = "grid"
@@ -72,23 +79,23 @@ def campaign_of(text: str, folder: Path) -> Campaign:
     return load_campaign(file)
 
 
-def test_a_grid_is_every_combination_with_every_seed(tmp_path: Path) -> None:
+def test_grid_contains_every_combination_with_every_seed(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
-    flown = [
+    points = [
         (r.varied["chasers.0.start_offset_m.0"], r.varied["controller.solver"], r.seed) for r in campaign.runs
     ]
-    assert sorted(flown) == sorted(
+    assert sorted(points) == sorted(
         (x, s, seed) for x in (-0.05, -0.3) for s in ("rti", "ipopt") for seed in (3, 5)
     )
     assert len({r.name for r in campaign.runs}) == 8
-    for run in campaign.runs:  # the overrides make just that scenario
-        scenario = load_scenario(campaign.scenario, run.overrides)
+    for run in campaign.runs:
+        scenario = load_scenario(run.scenario, run.overrides)
         assert scenario.seed == run.seed
         assert scenario.duration_s == 8.0
         assert scenario.controller.solver == run.varied["controller.solver"]
 
 
-def test_a_sample_is_drawn_from_its_distributions_and_the_same_each_time(tmp_path: Path) -> None:
+def test_sample_follows_its_distributions_and_is_reproducible(tmp_path: Path) -> None:
     campaign = campaign_of(SAMPLE, tmp_path)
     rates = [r.varied["target.omega_rad_s.0"] for r in campaign.runs]
     masses = [r.varied["chaser.mass_kg"] for r in campaign.runs]
@@ -102,27 +109,27 @@ def test_a_sample_is_drawn_from_its_distributions_and_the_same_each_time(tmp_pat
 
 
 @pytest.mark.parametrize(
-    ("wrong", "told"),
+    ("wrong", "message"),
     [
         ('scenario = "nowhere"', "nowhere"),
         ("seeds = 0", "seeds"),
         ("seeds = [1, 1]", "different numbers"),
-        ('method = "random"', "samples goes with"),
+        ('method = "random"', "require each other"),
         ('[vary."chaser.mass_kg"]\nuniform = [1.0, 2.0]', "a grid needs values"),
         ('[vary."chaser.mass_kg"]\nvalues = []', "must not be empty"),
         ('[vary."chaser.mass_kg"]\nvalues = [1.0]\nnormal = [1.0, 2.0]', "exactly one"),
         ('[vary."chaser.mass_kg"]\nvalues = [-1.0]', "chaser.mass_kg"),
         ('[vary."chaser.weight"]\nvalues = [1.0]', "weight"),
         ('[vary."chaser.mass_kg"]\nvalues = [30.0, 30.0]', "same scenario"),
-        ("[vary.seed]\nvalues = [1]", "seeds instead"),
+        ("[vary.seed]\nvalues = [1]", "use seeds instead"),
         ("[vary", "not TOML"),
         ("colour = 1", "colour"),
     ],
 )
-def test_a_wrong_file_is_told(tmp_path: Path, wrong: str, told: str) -> None:
+def test_invalid_file_raises_a_clear_error(tmp_path: Path, wrong: str, message: str) -> None:
     base = 'name = "x"\n' + ("" if wrong.startswith("scenario") else 'scenario = "single"\n')
     (tmp_path / "c.toml").write_text(base + wrong)
-    with pytest.raises(ScenarioError, match=re.escape(told)) as caught:
+    with pytest.raises(ScenarioError, match=re.escape(message)) as caught:
         load_campaign(tmp_path / "c.toml")
     assert "c.toml" in str(caught.value)
 
@@ -138,13 +145,13 @@ def test_a_wrong_file_is_told(tmp_path: Path, wrong: str, told: str) -> None:
         ),
     )
 )
-def test_values_survive_toml(value: Any) -> None:
+def test_values_round_trip_through_toml(value: Any) -> None:
     import tomllib
 
     assert tomllib.loads(f"x = {toml_value(value)}")["x"] == value
 
 
-def test_wilson_against_published_values() -> None:
+def test_wilson_interval_equals_published_values() -> None:
     # R. G. Newcombe, Statistics in Medicine 17 (1998), table I: 81 of 263, 15 of 148, 0 of 20, 1 of 29.
     published = (
         (81, 263, 0.2553, 0.3662),
@@ -152,19 +159,19 @@ def test_wilson_against_published_values() -> None:
         (0, 20, 0.0, 0.1611),
         (1, 29, 0.0061, 0.1718),
     )
-    for passed, of, low, high in published:
-        assert wilson(passed, of) == pytest.approx((low, high), abs=6e-5)
-    with pytest.raises(ValueError, match="no pass rate"):
+    for passed, total, low, high in published:
+        assert wilson(passed, total) == pytest.approx((low, high), abs=6e-5)
+    with pytest.raises(ValueError, match="not a pass rate"):
         wilson(0, 0)
 
 
-def test_rank_correlation() -> None:
+def test_rank_correlation_handles_ties_constants_and_missing_values() -> None:
     x = [1.0, 2.0, 3.0, 4.0]
     assert rank_correlation(x, [math.exp(v) for v in x]) == pytest.approx(1.0)
     assert rank_correlation(x, [-v for v in x]) == pytest.approx(-1.0)
     assert rank_correlation([1.0, 2.0, 2.0, 3.0], [1.0, 2.0, 3.0, 4.0]) == pytest.approx(
         0.9486833
-    )  # ties: mean rank
+    )  # ties have their mean rank
     assert math.isnan(rank_correlation(x, [1.0] * 4))
     assert rank_correlation([*x, 5.0], [*x, math.nan]) == pytest.approx(1.0)
 
@@ -199,7 +206,7 @@ def results_of(campaign: Campaign) -> list[tuple[Any, Result]]:
     return out
 
 
-def test_a_row_takes_the_worst_chaser_and_nothing_of_the_wall_clock(tmp_path: Path) -> None:
+def test_row_holds_the_worst_chaser_and_no_wall_clock_values(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
     rows = rows_of(results_of(campaign))
     assert rows[0]["steady_position_mse_m2"] == 4e-6
@@ -214,7 +221,7 @@ def test_a_row_takes_the_worst_chaser_and_nothing_of_the_wall_clock(tmp_path: Pa
     assert crashed["cause"] == "chaserdock: no port"
 
 
-class Seen(HTMLParser):
+class LinkCollector(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
         self.links: list[str] = []
@@ -223,20 +230,24 @@ class Seen(HTMLParser):
         self.links += [v for k, v in attrs if k in ("href", "src") and v and not v.startswith("#")]
 
 
-def test_the_page_counts_names_and_links(tmp_path: Path) -> None:
+def test_report_counts_passes_and_links_failures(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
     results = results_of(campaign)
     text = page(campaign, rows_of(results[:-1]), Path("/logs/here"))
     assert "4 of 7 passed" in text
     assert "1 are missing" in text
     assert "--set 'seed=5'" in html.unescape(text)
-    seen = Seen()
-    seen.feed(text)
-    assert {link for link in seen.links if link.endswith(".mcap")} == {"../1.mcap", "../3.mcap", "../5.mcap"}
-    assert not [link for link in seen.links if link.startswith(("http:", "https:", "//"))]
+    collector = LinkCollector()
+    collector.feed(text)
+    assert {link for link in collector.links if link.endswith(".mcap")} == {
+        "../1.mcap",
+        "../3.mcap",
+        "../5.mcap",
+    }
+    assert not [link for link in collector.links if link.startswith(("http:", "https:", "//"))]
 
 
-def test_a_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     campaign = campaign_of(GRID, tmp_path)
     flown: list[str] = []
 
@@ -246,38 +257,36 @@ def test_a_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.M
 
     monkeypatch.setattr("chaserdock.campaign.worker.fly", fly)
     earlier = campaign.runs[2]
-    note(tmp_path, earlier, Result(earlier.name, 1, None, "was so"))
-    import threading
-
-    told: list[int] = []
+    write_result(tmp_path, earlier, Result(earlier.name, 1, None, "earlier"))
+    progress: list[int] = []
     results = fly_campaign(
         campaign,
         tmp_path,
         "none",
         2,
         None,
-        lambda done, of, run, result: told.append(done),
+        lambda finished, total, run, result: progress.append(finished),
         threading.Event(),
     )
     assert sorted(flown) == sorted(r.name for r in campaign.runs if r is not earlier)
     assert [r.name for r, _ in results] == [r.name for r in campaign.runs]
-    assert results[2][1].last_words == "was so"
-    assert told == [2, 3, 4, 5, 6, 7, 8]
+    assert results[2][1].last_words == "earlier"
+    assert progress == [2, 3, 4, 5, 6, 7, 8]
 
 
-def test_a_broken_result_is_told_not_taken(tmp_path: Path) -> None:
+def test_damaged_result_raises_an_error(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
     run = campaign.runs[0]
-    assert finished(tmp_path, run) is None
-    note(tmp_path, run, Result(run.name, 0, None, ""))
+    assert read_result(tmp_path, run) is None
+    write_result(tmp_path, run, Result(run.name, 0, None, ""))
     result_path(tmp_path, run).write_text(result_path(tmp_path, run).read_text()[:-9])
     with pytest.raises(CampaignError, match="delete it"):
-        finished(tmp_path, run)
+        read_result(tmp_path, run)
 
 
-def test_the_program_tells_bad_input(tmp_path: Path) -> None:
+def test_bad_arguments_print_one_line_errors(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(TINY)
-    for arguments, told in (
+    for arguments, message in (
         (("campaign", str(tmp_path / "none.toml")), "none.toml: cannot be read"),
         (("campaign", str(tmp_path / "c.toml"), "--only", "9"), "the runs are 0 to 3"),
         (("campaign", str(tmp_path / "c.toml"), "--only", "1", "--jobs", "2"), "--only flies one run"),
@@ -293,9 +302,9 @@ def test_the_program_tells_bad_input(tmp_path: Path) -> None:
             "no Dask",
         ),
     ):
-        status, said = program(*arguments)
+        status, said = finished(*arguments)
         assert status == 2, said
-        assert told in said
+        assert message in said
         assert "Traceback" not in said
 
 
@@ -307,7 +316,7 @@ def table(folder: Path) -> list[dict[str, Any]]:
 
 
 @pytest.mark.slow
-def test_killed_resumed_and_on_a_cluster_the_table_is_the_same(tmp_path: Path) -> None:
+def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -> None:
     file, here, there = tmp_path / "c.toml", tmp_path / "here", tmp_path / "there"
     file.write_text(TINY)
     first = chaserdock("campaign", str(file), "--out", str(here), "--jobs", "1", stdout=subprocess.DEVNULL)
@@ -317,12 +326,12 @@ def test_killed_resumed_and_on_a_cluster_the_table_is_the_same(tmp_path: Path) -
     children = descendants(first)
     first.kill()
     first.wait()
-    for child in children:  # whoever flew for it must not go on for nobody
+    for child in children:  # each run has a session of its own and outlives the campaign
         if child.is_running():
             child.send_signal(signal.SIGKILL)
     before = {p: p.stat().st_mtime_ns for p in here.glob("runs/*/result.json")}
     assert 1 <= len(before) < 4
-    status, said = program("campaign", str(file), "--out", str(here), "--jobs", "2")
+    status, said = finished("campaign", str(file), "--out", str(here), "--jobs", "2")
     assert status == 0, said
     assert {p: p.stat().st_mtime_ns for p in before} == before
     assert len(table(here)) == len({row["digest"] for row in table(here)}) == 4
@@ -332,7 +341,7 @@ def test_killed_resumed_and_on_a_cluster_the_table_is_the_same(tmp_path: Path) -
     os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
     cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
     with cluster:
-        status, said = program(
+        status, said = finished(
             "campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address
         )
     assert status == 0, said

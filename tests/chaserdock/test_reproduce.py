@@ -1,14 +1,15 @@
-"""`chaserdock reproduce`: the plan, the arithmetic of its tables, the page, and that nothing is flown twice."""
+"""`chaserdock reproduce`: plan, arithmetic of the tables, page, resumption."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+import threading
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import msgspec
+import pyarrow.parquet as pq
 import pytest
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.study import StudyCase, StudyError, StudyResult, line_of, read_lines
@@ -16,12 +17,22 @@ from harness import finished
 from hypothesis import given
 from hypothesis import strategies as st
 
+from chaserdock.campaign.plan import Run
+from chaserdock.campaign.worker import CampaignError, Result
 from chaserdock.reproduce.content import sections
 from chaserdock.reproduce.main import fly_plan
 from chaserdock.reproduce.page import Section, Table, html, markdown
 from chaserdock.reproduce.paper import PAPER_S, ROWS
 from chaserdock.reproduce.plan import INFERRED, QUICK_S, SCENARIO, Mission, Plan, make_plan, table_group
-from chaserdock.reproduce.runner import Results, Runner, scenario_of, scenario_path
+from chaserdock.reproduce.runner import (
+    Results,
+    code_digest,
+    fly_missions,
+    mission_run,
+    open_cases,
+    results_of,
+    scenario_path,
+)
 from chaserdock.reproduce.tables import (
     errors_of_study,
     errors_of_summary,
@@ -44,17 +55,18 @@ def plan(quick: bool) -> Plan:
 
 
 @pytest.mark.parametrize("quick", [True, False])
-def test_every_run_of_the_plan_is_a_valid_scenario_and_has_its_own_name(quick: bool) -> None:
+def test_every_run_of_the_plan_is_valid_and_unique(quick: bool) -> None:
     p = plan(quick)
     assert len({m.name for m in p.missions}) == len(p.missions)
+    assert len({mission_run(m)[0].name for m in p.missions}) == len(p.missions)
     assert len({c.name for c in p.studies}) == len(p.studies)
-    lengths = {scenario_of(m)[1].duration_s for m in p.missions if m.scenario == SCENARIO}
+    lengths = {mission_run(m)[1].duration_s for m in p.missions if m.scenario == SCENARIO}
     assert lengths == {QUICK_S if quick else PAPER_S}
     for case in p.studies:
         load_scenario(Path(case.scenario), case.overrides)
 
 
-def test_the_full_plan_has_nine_rows_three_times_and_the_papers_baseline_from_the_others() -> None:
+def test_full_plan_repeats_nine_rows_three_times() -> None:
     groups = [m.group for m in plan(False).missions]
     studies = {c.name for c in plan(False).studies}
     for column in ("paper", "default"):
@@ -68,9 +80,8 @@ def test_the_full_plan_has_nine_rows_three_times_and_the_papers_baseline_from_th
     assert len(missions) == 6  # three missions in both settings
 
 
-def test_paper_settings_are_the_papers() -> None:
-    """Against shared/paper/reference.toml, as written there."""
-    wanted = {m.group: scenario_of(m)[1] for m in plan(False).missions}
+def test_paper_settings_equal_the_reference() -> None:
+    wanted = {m.group: mission_run(m)[1] for m in plan(False).missions}
     for row in ROWS:
         s = wanted[table_group(INFERRED, "paper", row.name)]
         assert (s.controller.horizon_s, s.controller.dt_s, s.controller.falloff) == (
@@ -99,8 +110,8 @@ def test_paper_settings_are_the_papers() -> None:
         assert math.hypot(0.42, 0.3927) == pytest.approx(0.575, abs=1e-4)
 
 
-def test_default_settings_are_those_of_a_scenario_that_says_nothing() -> None:
-    wanted = {m.group: scenario_of(m)[1] for m in plan(False).missions}
+def test_default_settings_equal_the_scenario_defaults() -> None:
+    wanted = {m.group: mission_run(m)[1] for m in plan(False).missions}
     ours = wanted[table_group(INFERRED, "default", "baseline")]
     plain = load_scenario(Path(PATH).with_name("single.toml"))
     assert ours.controller == plain.controller
@@ -166,7 +177,7 @@ def complete(p: Plan, factor: float = 1.0) -> Results:
     return Results(missions, {c.name: study_result(c, position, orientation) for c in p.studies})
 
 
-def test_mean_of_runs() -> None:
+def test_mean_of_runs_counts_failures() -> None:
     both = mean(
         [
             errors_of_summary(summary(0.01, 0.002), 120.0),
@@ -179,13 +190,13 @@ def test_mean_of_runs() -> None:
         mean([])
 
 
-def test_a_run_without_figures_does_not_count_as_perfect() -> None:
+def test_missing_values_become_nan() -> None:
     nothing = summary(0.01, 0.002)
     nothing["chasers"]["0"]["steady"]["position_mse_m2"] = None
     assert math.isnan(errors_of_summary(nothing, 40.0).position)
 
 
-def test_a_group_that_is_not_all_flown_has_no_figure() -> None:
+def test_incomplete_group_has_no_mean() -> None:
     p = plan(False)
     results, group = complete(p), table_group(INFERRED, "paper", "baseline")
     assert flown(p, results, group) is not None
@@ -198,14 +209,14 @@ def test_a_group_that_is_not_all_flown_has_no_figure() -> None:
 @pytest.mark.parametrize(
     ("factor", "met"), [(1.0, True), (1.14, True), (1.16, False), (0.86, True), (0.84, False)]
 )
-def test_baseline_is_held_to_fifteen_percent(factor: float, met: bool) -> None:
+def test_baseline_must_be_within_fifteen_percent(factor: float, met: bool) -> None:
     p = plan(False)
     held = requirements(p, complete(p, factor), INFERRED)
     assert held is not None
     assert [r.met for r in held if r.what.startswith("baseline")] == [met, met]
 
 
-def test_other_rows_may_be_better_but_not_35_percent_worse() -> None:
+def test_other_rows_may_be_at_most_35_percent_worse() -> None:
     p = plan(False)
     for factor, met in ((0.1, True), (1.1, True), (1.2, False)):
         held = requirements(p, complete(p, factor), INFERRED)
@@ -214,7 +225,7 @@ def test_other_rows_may_be_better_but_not_35_percent_worse() -> None:
         assert next(r.met for r in held if r.what.startswith("dt=1/30: position")) is met
 
 
-def test_default_is_held_to_the_floor() -> None:
+def test_default_must_be_close_to_the_lower_bound() -> None:
     p = plan(False)
     for floor_m2_s, met in (
         (1.64e-2 * 120, True),
@@ -231,7 +242,7 @@ def test_default_is_held_to_the_floor() -> None:
         assert floor_of_study(results.studies[name]) == pytest.approx(floor_m2_s / 120)
 
 
-def test_steady_state_is_held() -> None:
+def test_steady_state_has_a_limit() -> None:
     p, results = plan(False), complete(plan(False))
     assert [r.met for r in steady_requirements(p, results)] == [True, True]
     for m in p.missions:
@@ -239,12 +250,12 @@ def test_steady_state_is_held() -> None:
     assert [r.met for r in steady_requirements(p, results)] == [True, False]
 
 
-def test_rows_are_called_as_in_the_paper() -> None:
+def test_row_labels_follow_the_paper() -> None:
     assert [row.label for row in ROWS][3:6] == ["dt=1/5", "dt=1/30", "alpha=10 %"]
     assert ROWS[-1].label == "dt=1/30, alpha=30 %"
 
 
-def test_failed_solve_is_a_failed_run() -> None:
+def test_failed_solve_counts_as_failed_run() -> None:
     case = StudyCase(name="x", scenario=PATH)
     good = study_result(case, 1.0, 1.0)
     assert errors_of_study(good).failed == 0
@@ -256,7 +267,7 @@ def test_failed_solve_is_a_failed_run() -> None:
 
 
 class _Checker(HTMLParser):
-    """Counts cells by row, and holds that every tag is closed."""
+    """Counts cells by row and checks that every tag is closed."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -277,7 +288,7 @@ class _Checker(HTMLParser):
         assert self.open.pop() == tag
 
 
-def test_page_is_whole_and_escaped() -> None:
+def test_page_is_well_formed_and_escaped() -> None:
     section = Section(
         "A <b> & c", ("text with <script>", Table(("a | b", "n"), (("x | <y>", "1"), ("z", "2"))))
     )
@@ -293,7 +304,7 @@ def test_page_is_whole_and_escaped() -> None:
         Table(("a", "b"), (("1", "2", "3"),))
 
 
-def test_the_whole_page_of_a_complete_plan() -> None:
+def test_page_of_a_complete_plan_has_all_rows() -> None:
     p = plan(False)
     parts = sections(p, complete(p))
     text = markdown("t", parts)
@@ -307,7 +318,7 @@ def test_the_whole_page_of_a_complete_plan() -> None:
     assert checker.links == []
 
 
-def test_the_page_says_what_is_missing() -> None:
+def test_page_reports_missing_results() -> None:
     p = plan(True)
     text = markdown("t", sections(p, Results({}, {})))
     n, k = len(p.missions), len(p.studies)
@@ -318,22 +329,34 @@ def test_the_page_says_what_is_missing() -> None:
 # -- flying -----------------------------------------------------------------------------------------------
 
 
-def test_cut_off_result_counts_as_not_flown(tmp_path: Path) -> None:
-    runner = Runner(tmp_path, 1, False, lambda text: None)
+def test_incomplete_study_line_counts_as_not_flown(tmp_path: Path) -> None:
     cases = tuple(StudyCase(name=name, scenario=PATH) for name in "abc")
-    place = runner._results()
-    place.parent.mkdir(parents=True)
+    path = tmp_path / "studies" / f"{code_digest()}-0.jsonl"
+    path.parent.mkdir(parents=True)
     lines = [line_of(study_result(c, 1.0, 1.0)) for c in cases]
-    place.write_text(lines[0] + lines[1][:40])
-    p = Plan(True, 40.0, (), cases)
-    assert list(runner.results(p).studies) == ["a"]
-    assert [c.name for c in runner._open_cases(p)] == ["b", "c"]
-    # The same name with other overrides is another case.
-    changed = replace(p, studies=(StudyCase(name="a", scenario=PATH, delay_s=0.1),))
-    assert runner._open_cases(changed) == [changed.studies[0]]
+    path.write_text(lines[0] + lines[1][:40])
+    assert list(results_of(Plan(True, 40.0, (), cases), tmp_path).studies) == ["a"]
+    assert [c.name for c in open_cases(cases, tmp_path)] == ["b", "c"]
+    changed = (StudyCase(name="a", scenario=PATH, delay_s=0.1),)
+    assert open_cases(changed, tmp_path) == list(changed)
 
 
-def test_study_lines_name_what_is_wrong(tmp_path: Path) -> None:
+def test_mission_without_summary_is_flown_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    attempts: list[str] = []
+
+    def crash(run: Run, *_: Any) -> Result:
+        attempts.append(run.name)
+        return Result(run.name, 2, None, "chaserdock: no port")
+
+    monkeypatch.setattr("chaserdock.campaign.worker.fly", crash)
+    missions = (Mission("group/0", "group", SCENARIO),)
+    for _ in range(2):
+        with pytest.raises(CampaignError, match="group: chaserdock: no port"):
+            fly_missions(missions, tmp_path, 1, False, threading.Event())
+    assert len(attempts) == 2
+
+
+def test_invalid_study_line_is_named(tmp_path: Path) -> None:
     path = tmp_path / "cases.jsonl"
     path.write_text(line_of(StudyCase(name="a", scenario=PATH)) + '{"name": 3, "scenario": "x"}\n')
     with pytest.raises(StudyError, match=r"line 2: Expected `str`, got `int` - at `\$.name`"):
@@ -342,11 +365,11 @@ def test_study_lines_name_what_is_wrong(tmp_path: Path) -> None:
         read_lines(tmp_path / "none", StudyCase)
 
 
-def test_bad_input_is_one_clear_line(tmp_path: Path) -> None:
+def test_bad_input_prints_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     status, said = finished("reproduce", "--quick", "--out", str(tmp_path / "file"))
     assert status == 2
-    assert said.strip() == f"chaserdock: {tmp_path / 'file'}: cannot be made: File exists"
+    assert said.strip() == f"chaserdock: {tmp_path / 'file'}: cannot be written: File exists"
     cases = tmp_path / "cases.jsonl"
     cases.write_text(line_of(StudyCase(name="a", scenario=PATH, overrides=("controller.dt_s=-1",))))
     status, said = finished("study", str(cases), "--out", str(tmp_path / "results"))
@@ -356,8 +379,8 @@ def test_bad_input_is_one_clear_line(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_cut_down_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two missions with small images and two studies; a second call flies nothing and writes the same page."""
+def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two missions with small images and two studies; a second call flies nothing and writes an equal page."""
     small = ("duration_s=25.0", "camera.width_px=480", "camera.height_px=270", "time.rate_hz=15")
     group = table_group(INFERRED, "paper", "baseline")
     runs = tuple(
@@ -369,15 +392,19 @@ def test_a_cut_down_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFix
     )
     cut = Plan(True, 25.0, runs, cases)
     assert fly_plan(cut, tmp_path, 2, False) == 0
-    assert "2 missions and 2 studies to fly" in capsys.readouterr().err
+    flights = capsys.readouterr()
+    assert "2 studies to fly, 0 are finished" in flights.err
+    assert "2/2 run" in flights.out
     pages = [(tmp_path / f"reproduction.{kind}").read_text() for kind in ("md", "html")]
-    results = Runner(tmp_path, 1, False, lambda text: None).results(cut)
+    table = pq.read_table(tmp_path / "results.parquet").to_pylist()
+    assert [(row["vary.group"], row["seed"]) for row in table] == [(group, 0), (group, 1)]
+    results = results_of(cut, tmp_path)
     seen, perfect = flown(cut, results, group), errors_of_study(results.studies[group])
     assert seen is not None
     assert seen.failed == 0
-    # Seeing costs little, even with images in which the far start's marker is 20 pixels wide.
+    # The cost of vision is small, even with images in which the marker is only 20 pixels wide at the start.
     assert perfect.position < seen.position < 1.2 * perfect.position
     assert floor_of_study(results.studies[group]) < perfect.position
     assert fly_plan(cut, tmp_path, 2, False) == 0
-    assert "0 missions and 0 studies to fly; 2 missions are finished already" in capsys.readouterr().err
+    assert "run" not in capsys.readouterr().out
     assert [(tmp_path / f"reproduction.{kind}").read_text() for kind in ("md", "html")] == pages

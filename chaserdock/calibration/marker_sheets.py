@@ -28,7 +28,7 @@ _EDGE_MM, _GAP_MM, _TEXT_MM, _MARK_MM, _LINE_MM = 12.0, 8.0, 3.0, 3.0, 0.1
 _FOOT_MM = 14.0
 _MM_PER_INCH = 25.4
 _POINTS_PER_MM = 72.0 / _MM_PER_INCH
-_STYLE: dict[str, Any] = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fonttype": 42}
+_STYLE: Any = {"svg.fonttype": "none", "svg.hashsalt": "chaserdock", "pdf.fonttype": 42}
 
 
 @dataclass

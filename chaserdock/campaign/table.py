@@ -113,7 +113,8 @@ def rank_correlation(x: list[float], y: list[float]) -> float:
     a, b = zip(*pairs, strict=True)
     if len(set(a)) == 1 or len(set(b)) == 1:
         return math.nan
-    return float(spearmanr(a, b).statistic)
+    result: Any = spearmanr(a, b)
+    return float(result.statistic)
 
 
 def numbers_of(rows: list[Row], column: str) -> list[float] | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.guidance.docking import Senses
+from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import PortView
 from chaserdock_models.rotations import Array
@@ -86,7 +86,7 @@ def world(
     return physics
 
 
-def senses(offset_m: Any, **changes: Any) -> Senses:
+def senses(offset_m: Any, **changes: Any) -> DockingObservation:
     """Perfectly in line, at rest, at ``offset_m`` (3,), unless said otherwise."""
     view: dict[str, float] = {
         "gap_m": 0.1,
@@ -97,4 +97,6 @@ def senses(offset_m: Any, **changes: Any) -> Senses:
     }
     contact, latched = changes.pop("contact", False), changes.pop("latched", False)
     q: Array = changes.pop("q_wxyz", np.array([1.0, 0.0, 0.0, 0.0]))
-    return Senses(PortView(**(view | changes)), contact, latched, np.asarray(offset_m, dtype=float), q)
+    return DockingObservation(
+        PortView(**(view | changes)), contact, latched, np.asarray(offset_m, dtype=float), q
+    )

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.trajectories import Motion
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
@@ -35,6 +36,11 @@ def scenario(**changes: Any) -> Scenario:
 def at(move: Motion, t: float) -> tuple[Array, Array, Array]:
     p, v, a = move.at(np.array([t]))
     return p[0], v[0], a[0]
+
+
+def drain(guidance: PhaseMachine) -> list[tuple[int, str, str]]:
+    """Return the phase changes since the last call: chaser, phase, detail."""
+    return [(c.chaser, c.phase, c.detail) for c in guidance.drain_changes()]
 
 
 def odometry(chaser: int = 0, tick: int = 0, time_ns: int = 0, **changes: Any) -> Odometry:

@@ -28,7 +28,8 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_controller.estimation.types import CameraPose, Estimator, Measurement, TargetState
 from chaserdock_controller.guidance.approach_cone import corridor_rows
 from chaserdock_controller.guidance.composite_body import Captures, pose_in_target
-from chaserdock_controller.guidance.phases import CALIBRATED, Guidance
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.target_search import Searches, settled
 from chaserdock_controller.ingest.lost_chasers import LostChasers, with_lost_chasers
 from chaserdock_controller.nmpc.budget import Bounded, SolveBudget
@@ -69,7 +70,7 @@ class ControllerCore:
         realtime: bool = False,
     ) -> None:
         self.scenario = scenario
-        self.guidance = Guidance(scenario)
+        self.guidance = PhaseMachine(scenario)
         self._thrusters = ThrusterCommandHandler(scenario)
         self._now_s = now_s
         self._camera = scenario.camera_model()
@@ -103,18 +104,18 @@ class ControllerCore:
         out = TickOutputs(target=target)
         self._events(out, inputs, [(e.level, e.text) for e in self.estimator.drain_events()])
         if fused.status in ("tracking", "predicting"):
-            self.guidance.watch(now_s, seen=fused.status == "tracking")
-            self.guidance.found(now_s)
+            self.guidance.update_visibility(now_s, visible=fused.status == "tracking")
+            self.guidance.target_acquired(now_s)
             if settled(fused):
                 for i, odometry in inputs.odometry.items():
                     offset = rotations.rotate_inverse(fused.q_wxyz, odometry.position_m - fused.position_m)
-                    self.guidance.follow(i, now_s, offset)
+                    self.guidance.target_settled(i, now_s, offset)
         else:
             if fused.status == "lost":
-                self.guidance.lost(now_s)
-            self.guidance.search(now_s)
+                self.guidance.target_lost(now_s)
+            self.guidance.target_unknown(now_s)
         commands = (*self.guidance.due_commands(now_s), *inputs.commands)
-        self.guidance.expect(commands)
+        self.guidance.set_pending_goals(commands)
         for command in commands:
             if command.command in THRUSTER_COMMANDS:
                 answer = self._thrusters.command(command, now_s)
@@ -187,7 +188,7 @@ class ControllerCore:
         took_s = 0.0
         # Who holds on to the target is planned for only where others have to fly around it.
         held = {i for i in ids if self._is_held(i)}
-        searching = {i for i in ids if self.guidance.chasers[i].phase == "searching"}
+        searching = {i for i in ids if self.guidance.chasers[i].phase is Phase.SEARCHING}
         planned = tuple(i for i in ids if i not in searching) if held != set(ids) else ()
         problem, away = None, {}
         if known and planned:
@@ -246,7 +247,10 @@ class ControllerCore:
 
     def _is_held(self, i: int) -> bool:
         """Whether a chaser holds on to the target and is to stay: then its actuators are quiet unless told."""
-        return i in self._captures.latched and self.guidance.chasers[i].phase not in ("retreat", "abort")
+        return i in self._captures.latched and self.guidance.chasers[i].phase not in (
+            Phase.RETREAT,
+            Phase.ABORT,
+        )
 
     def _send(
         self, i: int, inputs: TickInputs, effective_ns: int, mode: Mode, wrench: Array, out: TickOutputs
@@ -330,7 +334,7 @@ class ControllerCore:
         c, q = self.scenario.chasers[i], np.array(self.scenario.chasers[i].q_wxyz)
         if self.scenario.approach.face_target or self.guidance.chasers[i].faces:
             q = facing_attitudes(c.position_m, c.q_wxyz, offsets)
-        turns = self.guidance.turns(i, times_s)
+        turns = self.guidance.body_rotations(i, times_s)
         return q if turns is None else rotations.multiply(q, turns)
 
     def _margin_m(self, ahead: TargetState) -> float:
@@ -351,29 +355,29 @@ class ControllerCore:
             odometry = inputs.odometry[i]
             error_m = float(np.linalg.norm(position - odometry.position_m))
             error_rad = float(rotations.angle_between(attitude, odometry.q_wxyz))
-            self.guidance.placed(i, pose_in_target(fused, odometry)[0])
-            self.guidance.observe(i, now_s, error_m, error_rad)
+            self.guidance.set_position(i, pose_in_target(fused, odometry)[0])
+            self.guidance.update_tracking(i, now_s, error_m, error_rad)
             senses = self._captures.senses(i, fused, odometry, inputs.docking.get(i))
             if senses is not None:
-                self.guidance.sense(i, now_s, senses)
+                self.guidance.update_docking(i, now_s, senses)
             phase = self.guidance.chasers[i]
             out.references[i] = Reference(
                 tick=inputs.tick,
                 sim_time_ns=inputs.time_ns,
                 chaser=i,
-                phase=phase.phase,  # type: ignore[arg-type]
+                phase=phase.phase.value,
                 phase_time_s=now_s - phase.since_s,
                 position_m=vector(position),
                 q_wxyz=vector(attitude),
                 offset_m=vector(offset),
                 min_distance_target_m=self.guidance.min_distance_target_m(i),
             )
-        changes = self.guidance.drain_events()
-        self._events(out, inputs, [("info", f"chaser {i}: {what} ({detail})") for i, what, detail in changes])
-        for i, _, detail in changes:
-            found = next((c for c in out.target.cameras if c.chaser == i), None)
-            if detail.endswith(CALIBRATED) and found is not None:
-                self._events(out, inputs, [("info", f"chaser {i}: {in_words(found)}")])
+        changes = self.guidance.drain_changes()
+        self._events(out, inputs, [("info", f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in changes])
+        for change in changes:
+            camera = next((c for c in out.target.cameras if c.chaser == change.chaser), None)
+            if change.calibration_complete and camera is not None:
+                self._events(out, inputs, [("info", f"chaser {change.chaser}: {in_words(camera)}")])
 
     def _events(self, out: TickOutputs, inputs: TickInputs, told: list[tuple[str, str]]) -> None:
         for level, text in told:

@@ -197,11 +197,14 @@ class Controller:
             self.shadow.words[word.tick] = word.operated
         elif self.shadow.wants_state(word.tick, self.done_tick):
             try:
-                self._memory.recall(word.state)
+                self._memory.restore(word.state)
             except CheckpointError as error:
                 self.node.counts.rejected["controller/state:format"] += 1
                 self._tell(
-                    "error", f"the commander's state cannot be used: {error}", word.tick, word.sim_time_ns
+                    "error",
+                    f"the state of the commanding controller cannot be restored: {error}",
+                    word.tick,
+                    word.sim_time_ns,
                 )
                 return
             self.done_tick = max(self.done_tick, word.tick)
@@ -380,9 +383,9 @@ class Controller:
         """All that this controller knows after a tick, for one that came late."""
         self._given_state_to = dict(newest.standing_by)
         try:
-            state = self._memory.told()
+            state = self._memory.save()
         except CheckpointError as error:
-            self._tell("warning", f"its state cannot be given on: {error}", tick.tick, tick.sim_time_ns)
+            self._tell("warning", f"the state cannot be serialized: {error}", tick.tick, tick.sim_time_ns)
             return
         self._say_word(tick, ControllerState(process=self.name, term=newest.term, state=state))
 

@@ -178,7 +178,7 @@ def test_the_controller_asks_for_no_more_than_the_thrusters_left_can_give() -> N
         (
             {"chaser": 0, "thruster": 3, "expires_ns": 10**9},
             False,
-            "stale: it was to be done by 1.00 s, it is 2.00 s",
+            "stale: the command expired at 1.00 s, now is 2.00 s",
         ),
     ],
 )

@@ -69,7 +69,7 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
     assert flight.touched == set()
     assert sorted(holding_on) == [0, 1, 3]
     assert abs(holding_on[0] - holding_on[3]) < 5.0
-    assert "chaser 1: wait (from hold: 2 are under way already)" in [what for _, what in flight.events]
+    assert "chaser 1: wait (from hold: 2 are docking already)" in [what for _, what in flight.events]
     first_latch = min(t for t, what in flight.events if ": latched" in what)
     (its_turn,) = [t for t, what in flight.events if what.startswith("chaser 1: align")]
     assert its_turn == pytest.approx(first_latch, abs=0.1)

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.guidance.phases import Guidance
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario, senses
-from flight_cases import at
+from flight_cases import at, drain
 
 DT_S = 0.1
 
@@ -19,10 +19,10 @@ class Pilot:
 
     def __init__(self, chasers: int = 1, **changes: Any) -> None:
         self.scenario = scenario(chasers, **changes)
-        self.guidance = Guidance(self.scenario)
+        self.guidance = PhaseMachine(self.scenario)
         self.now_s = 0.0
         self.told: dict[int, dict[str, Any]] = {}
-        self.guidance.found(0.0)
+        self.guidance.target_acquired(0.0)
         self.fly(DT_S)
 
     def phase(self, i: int = 0) -> str:
@@ -38,8 +38,8 @@ class Pilot:
             self.now_s += DT_S
             for i in range(len(self.scenario.chasers)):
                 position = at(self.guidance.chasers[i].move, self.now_s)[0]
-                self.guidance.observe(i, self.now_s, 0.0, 0.0)
-                self.guidance.sense(i, self.now_s, senses(position, **self.told.get(i, {})))
+                self.guidance.update_tracking(i, self.now_s, 0.0, 0.0)
+                self.guidance.update_docking(i, self.now_s, senses(position, **self.told.get(i, {})))
 
     def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
         begun_s = self.now_s
@@ -72,7 +72,7 @@ def test_all_phases_in_order_and_the_latch_armed_only_where_it_should_be() -> No
         ("latched", "arm"),
         ("verified", "arm"),
     ]
-    told = [what for _, what, _ in pilot.guidance.drain_events()]
+    told = [what for _, what, _ in drain(pilot.guidance)]
     assert told == ["hold", "align", "approach", "final", "contact", "latched", "verified"]
 
 
@@ -112,11 +112,11 @@ def test_a_broken_limit_leads_back_out_and_to_another_attempt(
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to(phase)
-    pilot.guidance.drain_events()
+    drain(pilot.guidance)
     pilot.told[0] = told
     pilot.fly(2 * DT_S)
     assert pilot.phase() == "retreat"
-    (event,) = pilot.guidance.drain_events()
+    (event,) = drain(pilot.guidance)
     assert why in event[2]
     assert pilot.guidance.latch(0) == "release"
     pilot.told[0] = {}
@@ -162,9 +162,9 @@ def test_a_latch_that_slips_under_the_pull_is_not_verified() -> None:
     pilot.fly(docking.settle_s + 2 * DT_S)
     assert pilot.guidance.pull_N(0, pilot.now_s) == docking.pull_N
     slipped = at(pilot.guidance.chasers[0].move, pilot.now_s)[0] - (0.006, 0.0, 0.0)
-    pilot.guidance.sense(0, pilot.now_s, senses(slipped, latched=True))
+    pilot.guidance.update_docking(0, pilot.now_s, senses(slipped, latched=True))
     assert pilot.phase() == "retreat"
-    assert "moved 6.00 mm" in pilot.guidance.drain_events()[-1][2]
+    assert "moved 6.00 mm" in drain(pilot.guidance)[-1][2]
 
 
 def test_the_pull_gives_back_the_impulse_that_it_takes() -> None:
@@ -209,11 +209,11 @@ def test_commands_that_do_not_fit_are_refused_with_the_reason() -> None:
     pilot.fly(5.0)
     accepted, reason = pilot.ask("approach", expires_ns=1_000_000_000)
     assert not accepted
-    assert reason.startswith("stale: it was to be done by 1.00 s")
+    assert reason.startswith("stale: the command expired at 1.00 s")
     assert pilot.ask("approach", expires_ns=10_000_000_000)[0]
     assert pilot.ask("approach") == (True, "already in phase align")
     pilot.fly_to("latched")
-    assert pilot.ask("hold") == (False, "in phase latched it can only retreat or abort")
+    assert pilot.ask("hold") == (False, "in phase latched permitted: abort, retreat")
     assert not pilot.ask("goto", offset_m=(0.0, 2.0, 0.0))[0]
 
 
@@ -234,7 +234,7 @@ def test_from_far_beside_the_axis_it_must_come_round_first() -> None:
     pilot.fly_to("hold", limit_s=200.0)
     accepted, reason = pilot.ask("approach")
     assert not accepted
-    assert "beside its port's axis" in reason
+    assert "beside the port's axis" in reason
 
 
 def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
@@ -271,10 +271,10 @@ def test_when_the_target_is_lost_an_approach_is_broken_off_and_a_latch_is_not() 
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to("final")
-    pilot.guidance.lost(pilot.now_s)
+    pilot.guidance.target_lost(pilot.now_s)
     assert pilot.phase() == "retreat"
     other = Pilot()
     other.ask("approach")
     other.fly_to("verified")
-    other.guidance.lost(other.now_s)
+    other.guidance.target_lost(other.now_s)
     assert other.phase() == "verified"

@@ -44,8 +44,8 @@ def ask(flight: Offline, *wishes: dict[str, Any]) -> list[tuple[bool, str]]:
         ({"command": "approach", "chaser": 7}, "there is no chaser 7; this mission has 0 to 0"),
         ({"command": "isolate", "chaser": 7, "thruster": 0}, "there is no chaser 7; this mission has 0 to 0"),
         ({"command": "isolate", "thruster": 12}, "isolate needs a thruster; this body has 0 to 11"),
-        ({"command": "approach", "expires_ns": 10**9}, "stale: it was to be done by 1.00 s, it is 2.00 s"),
-        ({"command": "isolate", "thruster": 1, "expires_ns": 10**9}, "stale: it was to be done by 1.00 s"),
+        ({"command": "approach", "expires_ns": 10**9}, "stale: the command expired at 1.00 s, now is 2.00 s"),
+        ({"command": "isolate", "thruster": 1, "expires_ns": 10**9}, "stale: the command expired at 1.00 s"),
         ({"command": "goto"}, "goto needs an offset"),
         ({"command": "goto", "offset_m": (0.1, 0.0, 0.0)}, "the offset is 0.1 m from the target"),
     ],
@@ -74,7 +74,7 @@ def test_in_a_wrong_phase(flight: Offline) -> None:
     while flight.phase(0) != "approach":
         flight.step()
     assert ask(flight, {"command": "goto", "offset_m": V}) == [
-        (False, "it is in its corridor: retreat or abort first")
+        (False, "in phase approach permitted: abort, hold, retreat")
     ]
     assert flight.phase(0) == "approach"
 

@@ -18,7 +18,8 @@ from chaserdock_controller.guidance.approach_cone import (
     cone_of,
     corridor_rows,
 )
-from chaserdock_controller.guidance.phases import Guidance
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.phases import Phase
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario as capture_scenario
@@ -85,9 +86,9 @@ def test_every_way_into_a_port_lies_in_its_cone() -> None:
             assert min(cone.room_m(centre + aside), cone.room_m(centre - aside)) > 0.0
 
 
-def approaching(**changes: Any) -> Guidance:
-    guidance = Guidance(scenario(**NEAR | changes))
-    guidance.found(0.0)
+def approaching(**changes: Any) -> PhaseMachine:
+    guidance = PhaseMachine(scenario(**NEAR | changes))
+    guidance.target_acquired(0.0)
     assert guidance.command(OperatorCommand(command="approach", chaser=0), 1.0).accepted
     return guidance
 
@@ -96,7 +97,7 @@ def test_who_approaches_has_its_corridor_and_the_others_keep_their_ball() -> Non
     guidance = approaching()
     assert guidance.corridor(0) is None  # nobody knows yet where it is
     for i, place in enumerate(([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0])):
-        guidance.placed(i, np.array(place))
+        guidance.set_position(i, np.array(place))
     assert isinstance(guidance.corridor(0), Cone)
     assert guidance.min_distance_target_m(0) == pytest.approx(0.25 - 0.03)
     assert guidance.corridor(1) is None
@@ -106,7 +107,7 @@ def test_who_approaches_has_its_corridor_and_the_others_keep_their_ball() -> Non
 def test_who_has_left_its_corridor_keeps_its_distance_like_everybody() -> None:
     guidance = approaching()
     for aside, inside in ((BESIDE_LINE_M, True), (0.35, False)):
-        guidance.placed(0, np.array([-0.4, aside, 0.0]))
+        guidance.set_position(0, np.array([-0.4, aside, 0.0]))
         assert (guidance.corridor(0) is not None) == inside
         assert (guidance.min_distance_target_m(0) < LIMIT_M) == inside
 
@@ -114,25 +115,27 @@ def test_who_has_left_its_corridor_keeps_its_distance_like_everybody() -> None:
 @pytest.mark.parametrize("what", ["hold", "retreat", "abort"])
 def test_the_corridor_lasts_until_the_way_out_is_over(what: Any) -> None:
     guidance = approaching()
-    guidance.placed(0, np.array([-0.3, 0.0, 0.0]))
+    guidance.set_position(0, np.array([-0.3, 0.0, 0.0]))
     assert guidance.command(OperatorCommand(command=what, chaser=0), 30.0).accepted
     assert guidance.corridor(0) is not None
-    guidance.placed(0, np.array([-0.36, 0.0, 0.0]))
+    guidance.set_position(0, np.array([-0.36, 0.0, 0.0]))
     assert guidance.corridor(0) is None
     assert guidance.min_distance_target_m(0) == LIMIT_M
 
 
 def test_by_capture_the_corridor_is_there_in_the_corridor_and_gone_when_latched() -> None:
-    guidance = Guidance(capture_scenario(2))
-    guidance.found(0.0)
+    guidance = PhaseMachine(capture_scenario(2))
+    guidance.target_acquired(0.0)
     place = np.array([-0.7, 0.0, -0.05])
     seen: dict[str, bool] = {}
-    for phase in ("hold", "align", "approach", "final", "contact", "latched", "verified", "retreat"):
-        guidance._enter(0, phase, 1.0, guidance.chasers[0].move)
+    for phase in map(
+        Phase, ("hold", "align", "approach", "final", "contact", "latched", "verified", "retreat")
+    ):
+        guidance.chasers[0] = replace(guidance.chasers[0], phase=phase)
         outside = np.array([-1.0, 0.0, -0.05])
         at = outside if phase in ("hold", "align") else place
-        guidance.placed(0, at)
-        guidance._sensed[0] = senses(at)
+        guidance.set_position(0, at)
+        guidance._observed[0] = senses(at)
         seen[phase] = guidance.corridor(0) is not None
         assert guidance.corridor(1) is None
     assert [phase for phase, there in seen.items() if there] == ["approach", "final", "contact", "retreat"]

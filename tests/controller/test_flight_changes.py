@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from chaserdock_controller import core as flight_module
 from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.evaluation.closed_loop import fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_controller.guidance.phases import Phase
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import DockingStatus
 from chaserdock_protocol.scenario import Scenario, load_scenario, parse_scenario
@@ -75,9 +78,9 @@ def test_who_latches_is_quiet_at_once_and_the_others_have_their_plans() -> None:
             ),
         }
         if latched:
-            flight.guidance._enter(0, "latched", now_ns / 1e9, flight.guidance.chasers[0].move)
+            flight.guidance.chasers[0] = replace(flight.guidance.chasers[0], phase=Phase.LATCHED)
         elif tick == 4:
-            flight.guidance._enter(0, "retreat", now_ns / 1e9, flight.guidance.chasers[0].move)
+            flight.guidance.chasers[0] = replace(flight.guidance.chasers[0], phase=Phase.RETREAT)
         out = step(flight, tick, (0, 1), docking=docking)
         assert out.wrenches[0].mode == ("coast" if latched else "nmpc")
         assert out.wrenches[1].mode == "nmpc"

@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore, TickInputs
-from chaserdock_controller.guidance import loss_of_sight as vision
-from chaserdock_controller.guidance.phases import Guidance
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.phases import (
+    TRANSITIONS,
+    Phase,
+    Trigger,
+    next_phase,
+    permitted_commands,
+)
 from chaserdock_models import rotations
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import OperatorCommand
-from flight_cases import at, odometry, points, quick, scenario
+from chaserdock_protocol.messages import Phase as PhaseName
+from flight_cases import at, drain, odometry, points, quick, scenario
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -25,23 +32,23 @@ def operator(
     return OperatorCommand(command=command, chaser=chaser, offset_m=offset)
 
 
-def holding(**changes: Any) -> Guidance:
-    guidance = Guidance(scenario(**changes))
-    guidance.found(1.0)
-    guidance.drain_events()
+def holding(**changes: Any) -> PhaseMachine:
+    guidance = PhaseMachine(scenario(**changes))
+    guidance.target_acquired(1.0)
+    drain(guidance)
     return guidance
 
 
-def reference(guidance: Guidance, i: int, t: float) -> Array:
+def reference(guidance: PhaseMachine, i: int, t: float) -> Array:
     return at(guidance.chasers[i].move, t)[0]
 
 
-def phases(guidance: Guidance) -> list[str]:
+def phases(guidance: PhaseMachine) -> list[str]:
     return [c.phase for c in guidance.chasers]
 
 
 def test_nothing_is_accepted_before_the_target_is_found() -> None:
-    guidance = Guidance(scenario())
+    guidance = PhaseMachine(scenario())
     assert phases(guidance) == ["acquire", "acquire"]
     for what in ("approach", "hold", "retreat", "abort"):
         answer = guidance.command(operator(what), 1.0)
@@ -49,12 +56,12 @@ def test_nothing_is_accepted_before_the_target_is_found() -> None:
         assert "not been found" in answer.reason
     assert not guidance.command(operator("goto", 0, (2.0, 0.0, 0.0)), 1.0).accepted
     assert phases(guidance) == ["acquire", "acquire"]
-    assert guidance.drain_events() == []
-    guidance.found(2.0)
+    assert drain(guidance) == []
+    guidance.target_acquired(2.0)
     assert phases(guidance) == ["hold", "hold"]
-    assert guidance.drain_events() == [(0, "hold", "from acquire"), (1, "hold", "from acquire")]
-    guidance.found(3.0)
-    assert guidance.drain_events() == []
+    assert drain(guidance) == [(0, "hold", "from acquire"), (1, "hold", "from acquire")]
+    guidance.target_acquired(3.0)
+    assert drain(guidance) == []
     assert guidance.chasers[0].since_s == 2.0
 
 
@@ -85,22 +92,22 @@ def test_an_approach_goes_straight_in_to_the_docking_distance_and_docks() -> Non
         assert p[0] == p[2] == 0.0
         assert -1.2 - 1e-9 <= p[1] <= -0.4 + 1e-9
     # Under way good tracking is no docking.
-    guidance.observe(1, end - 1.0, 0.0, 0.0)
+    guidance.update_tracking(1, end - 1.0, 0.0, 0.0)
     assert guidance.chasers[1].inside_since_s is None
     angle = math.radians(1.0)
-    guidance.observe(1, end + 0.1, 0.009, angle * 0.99)
-    guidance.observe(1, end + 4.0, 0.011, 0.0)  # outside: from the beginning again
-    guidance.observe(1, end + 5.0, 0.009, 0.0)
-    guidance.observe(1, end + 9.9, 0.009, angle * 0.99)
+    guidance.update_tracking(1, end + 0.1, 0.009, angle * 0.99)
+    guidance.update_tracking(1, end + 4.0, 0.011, 0.0)  # outside: from the beginning again
+    guidance.update_tracking(1, end + 5.0, 0.009, 0.0)
+    guidance.update_tracking(1, end + 9.9, 0.009, angle * 0.99)
     assert phases(guidance)[1] == "approach"
-    guidance.observe(1, end + 10.0, 0.009, 0.0)
+    guidance.update_tracking(1, end + 10.0, 0.009, 0.0)
     assert phases(guidance) == ["hold", "docked"]
-    assert guidance.drain_events() == [(1, "approach", "from hold"), (1, "docked", "from approach")]
+    assert drain(guidance) == [(1, "approach", "from hold"), (1, "docked", "from approach")]
     # Docked is not for ever.
-    guidance.observe(1, end + 11.0, 0.0, angle * 1.01)
+    guidance.update_tracking(1, end + 11.0, 0.0, angle * 1.01)
     assert phases(guidance)[1] == "approach"
-    guidance.observe(1, end + 12.0, 0.0, 0.0)
-    guidance.observe(1, end + 17.0, 0.0, 0.0)
+    guidance.update_tracking(1, end + 12.0, 0.0, 0.0)
+    guidance.update_tracking(1, end + 17.0, 0.0, 0.0)
     assert phases(guidance)[1] == "docked"
 
 
@@ -113,8 +120,8 @@ def test_commands_are_idempotent() -> None:
     assert (again.accepted, again.reason) == (True, "already in phase approach")
     assert guidance.chasers[0] is before  # neither the move nor the clock begins anew
     end = 10.0 + before.move.duration_s
-    guidance.observe(0, end, 0.0, 0.0)
-    guidance.observe(0, end + 5.0, 0.0, 0.0)
+    guidance.update_tracking(0, end, 0.0, 0.0)
+    guidance.update_tracking(0, end + 5.0, 0.0, 0.0)
     assert phases(guidance)[0] == "docked"
     docked = guidance.chasers[0]
     again = guidance.command(operator("approach"), end + 6.0)
@@ -138,9 +145,11 @@ def test_retreat_and_abort_go_back_to_the_nominal_offset_and_hold(what: str, spe
     np.testing.assert_allclose(move.goal_m, [-1.0, 0.0, 0.0], rtol=0, atol=1e-9)
     speeds = np.linalg.norm(move.at(np.linspace(30.0, 30.0 + move.duration_s, 200))[1], axis=1)
     assert speeds.max() <= speed * 1.01
-    guidance.observe(0, 30.0 + move.duration_s - 0.1, 0.0, 0.0)
+    guidance.update_tracking(0, 30.0 + move.duration_s - 0.1, 0.0, 0.0)
     assert phases(guidance)[0] == what
-    guidance.observe(0, 30.0 + move.duration_s, 5.0, 3.0)  # the reference is there, wherever the chaser is
+    guidance.update_tracking(
+        0, 30.0 + move.duration_s, 5.0, 3.0
+    )  # the reference is there, wherever the chaser is
     assert phases(guidance)[0] == "hold"
     np.testing.assert_allclose(reference(guidance, 0, 1000.0), [-1.0, 0.0, 0.0], rtol=0, atol=1e-9)
 
@@ -170,7 +179,7 @@ def test_goto_goes_where_it_may() -> None:
     second = guidance.chasers[0].move
     np.testing.assert_allclose(second.goal_m, [0.0, 0.0, 2.0], rtol=0, atol=1e-9)
     np.testing.assert_allclose(at(second, 20.0)[1], at(first, 20.0)[1], rtol=0, atol=1e-12)
-    guidance.observe(0, 20.0 + second.duration_s, 1.0, 1.0)
+    guidance.update_tracking(0, 20.0 + second.duration_s, 1.0, 1.0)
     assert phases(guidance)[0] == "hold"
 
 
@@ -181,7 +190,7 @@ def test_goto_goes_where_it_may() -> None:
         ((0.0, 0.0, 0.0), "0 m from the target; allowed are more than 0.35 m"),
         ((0.35, 0.0, 0.0), "0.35 m from the target"),
         ((0.0, 0.0, 25.01), "25 m from the target"),
-        ((0.1, -1.2, 0.0), "0.1 m from where chaser 1 is to be"),
+        ((0.1, -1.2, 0.0), "0.1 m from the goal of chaser 1"),
     ],
 )
 def test_goto_is_refused_with_the_reason(offset: Any, reason: str) -> None:
@@ -191,7 +200,7 @@ def test_goto_is_refused_with_the_reason(offset: Any, reason: str) -> None:
     assert not answer.accepted
     assert reason in answer.reason
     assert guidance.chasers[0] is before
-    assert guidance.drain_events() == []
+    assert drain(guidance) == []
 
 
 def test_goto_keeps_away_from_where_others_are_going_not_where_they_were() -> None:
@@ -206,10 +215,10 @@ def test_an_approach_starts_on_its_line_only() -> None:
     guidance = holding()
     guidance.command(operator("goto", 0, (-1.0, 0.5, 0.0)), 10.0)
     end = 10.0 + guidance.chasers[0].move.duration_s
-    guidance.observe(0, end, 0.0, 0.0)
+    guidance.update_tracking(0, end, 0.0, 0.0)
     answer = guidance.command(operator("approach"), end)
     assert not answer.accepted
-    assert answer.reason == "its reference is 0.50 m beside its approach line; retreat or goto first"
+    assert answer.reason == "the reference is 0.50 m beside the approach line; retreat or goto first"
     assert phases(guidance)[0] == "hold"
     guidance.command(operator("retreat"), end)
     assert guidance.command(operator("approach"), end + guidance.chasers[0].move.duration_s).accepted
@@ -225,11 +234,11 @@ def test_an_approach_does_not_go_through_the_target() -> None:
 def test_losing_the_target_stops_whoever_moves() -> None:
     guidance = holding()
     guidance.command(operator("approach", 0), 10.0)
-    guidance.lost(30.0)
+    guidance.target_lost(30.0)
     assert phases(guidance) == ["hold", "hold"]
     assert np.linalg.norm(guidance.chasers[0].move.goal_m - reference(guidance, 0, 30.0)) < 0.06
     stopped = guidance.chasers[0]
-    guidance.lost(31.0)
+    guidance.target_lost(31.0)
     assert guidance.chasers[0] is stopped
 
 
@@ -239,7 +248,7 @@ def test_timeline_commands_come_due_once_and_in_order() -> None:
         {"at_s": 5.0, "command": "goto", "chasers": [0], "offset_m": [0.0, 0.0, 2.0]},
         {"at_s": 5.0, "command": "approach", "chasers": [1, 0]},
     ]
-    guidance = Guidance(scenario(timeline=timeline))
+    guidance = PhaseMachine(scenario(timeline=timeline))
     assert guidance.due_commands(4.99) == []
     assert guidance.due_commands(5.0 - 1e-10) == [
         operator("goto", 0, (0.0, 0.0, 2.0)),
@@ -274,7 +283,7 @@ def test_whatever_is_asked_the_reference_is_smooth_and_slow(
         assert 0.3 < np.linalg.norm(goal) < 10.0
         for t in np.linspace(now, now + wait_s, 5):
             assert np.linalg.norm(at(guidance.chasers[0].move, t)[1]) <= 0.06 * 1.3
-            guidance.observe(0, float(t), 0.0, 0.0)
+            guidance.update_tracking(0, float(t), 0.0, 0.0)
         now += wait_s
     assert guidance.chasers[1].phase == "hold"
 
@@ -313,16 +322,16 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
 
 def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple[float, str, str]]:
     """Phases of chaser 0, told to approach at 0 s, with their reasons; ``command`` at 10 s."""
-    guidance, out = Guidance(scenario()), []
-    guidance.found(0.0)
+    guidance, out = PhaseMachine(scenario()), []
+    guidance.target_acquired(0.0)
     for k in range(300):
         now_s = 0.1 * k
-        guidance.watch(now_s, seen(now_s))
+        guidance.update_visibility(now_s, seen(now_s))
         if k == 1:
             assert guidance.command(operator("approach"), now_s).accepted
         if k == 100 and command:
             guidance.command(operator(command), now_s)
-        out += [(round(now_s, 1), what, why) for i, what, why in guidance.drain_events() if i == 0]
+        out += [(round(now_s, 1), what, why) for i, what, why in drain(guidance) if i == 0]
     return out
 
 
@@ -331,8 +340,8 @@ def test_an_approach_holds_while_nobody_sees_and_then_goes_on() -> None:
     assert [(what, why.partition(": ")[2]) for _, what, why in told] == [
         ("hold", ""),
         ("approach", ""),
-        ("hold", "nobody has seen the target for 3 s"),
-        ("approach", "the target is seen again"),
+        ("hold", "no chaser has seen the target for 3 s"),
+        ("approach", "the target is in sight again"),
     ]
     assert told[2][0] == pytest.approx(8.0, abs=0.11)
     assert told[3][0] == pytest.approx(15.0, abs=0.11)
@@ -351,19 +360,50 @@ def test_who_was_told_otherwise_does_not_approach_again_by_itself() -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "port", "unseen_s", "instead"),
+    ("phase", "by_capture", "target"),
     [
-        ("approach", False, 2.9, None),
-        ("approach", False, 3.0, "hold"),
-        ("approach", True, 3.0, "back off"),
-        ("align", True, 3.0, "back off"),
-        ("final", True, 9.0, "back off"),
-        ("contact", True, 9.0, None),
-        ("latched", True, 9.0, None),
-        ("docked", False, 9.0, None),
-        ("retreat", True, 9.0, None),
-        ("goto", False, 9.0, None),
+        (Phase.APPROACH, False, Phase.HOLD),
+        (Phase.APPROACH, True, Phase.RETREAT),
+        (Phase.ALIGN, True, Phase.RETREAT),
+        (Phase.FINAL, True, Phase.RETREAT),
+        (Phase.CONTACT, True, None),
+        (Phase.LATCHED, True, None),
+        (Phase.DOCKED, False, None),
+        (Phase.RETREAT, True, None),
+        (Phase.GOTO, False, None),
     ],
 )
-def test_what_is_done_without_sight(phase: str, port: bool, unseen_s: float, instead: str | None) -> None:
-    assert vision.on_loss(phase, port, unseen_s) == instead
+def test_loss_of_sight_interrupts_approaches_only(
+    phase: Phase, by_capture: bool, target: Phase | None
+) -> None:
+    assert next_phase(phase, Trigger.SIGHT_LOST, by_capture) is target
+
+
+# -- the transition table -----------------------------------------------------------------------------------
+
+
+def test_every_transition_is_unique() -> None:
+    keys = [
+        (source, t.trigger, kind)
+        for t in TRANSITIONS
+        for source in t.sources
+        for kind in ((False, True) if t.by_capture is None else (t.by_capture,))
+    ]
+    assert len(keys) == len(set(keys))
+
+
+def test_every_phase_can_be_entered_and_left() -> None:
+    assert {t.target for t in TRANSITIONS} == set(Phase) - {Phase.ACQUIRE}
+    assert {source for t in TRANSITIONS for source in t.sources} == set(Phase)
+
+
+def test_abort_and_retreat_are_permitted_in_every_phase_with_a_known_target() -> None:
+    for by_capture in (False, True):
+        for phase in {s for t in TRANSITIONS if t.by_capture in (None, by_capture) for s in t.sources}:
+            permitted = permitted_commands(phase, by_capture)
+            expected = set() if phase in (Phase.ACQUIRE, Phase.SEARCHING) else {"abort", "retreat"} - {phase}
+            assert expected <= set(permitted)
+
+
+def test_phases_are_those_of_the_reference_message() -> None:
+    assert tuple(Phase) == get_args(PhaseName)

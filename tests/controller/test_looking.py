@@ -10,7 +10,7 @@ import pytest
 from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_controller.estimation import CameraPose, Measurement, Mekf, MekfParameters, PoseHypothesis
 from chaserdock_controller.estimation.camera_calibration import seen_by
-from chaserdock_controller.guidance.phases import Guidance
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.pointing import (
     CALIBRATION_S,
     calibration_turns,
@@ -103,20 +103,20 @@ def test_facing_turns_the_shortest_way(turn: list[float], direction: list[float]
 
 
 def test_nobody_seen_means_searching_and_then_going_to_its_place_facing_the_target() -> None:
-    guidance = Guidance(scenario())
-    guidance.search(0.5)
+    guidance = PhaseMachine(scenario())
+    guidance.target_unknown(0.5)
     assert guidance.chasers[0].phase == "acquire"
-    guidance.search(1.0)
+    guidance.target_unknown(1.0)
     assert [c.phase for c in guidance.chasers] == ["searching", "searching"]
     answer = guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
     assert not answer.accepted
-    guidance.found(3.0)
+    guidance.target_acquired(3.0)
     assert guidance.chasers[0].phase == "searching"  # until its motion is known, too
-    guidance.follow(0, 4.0, np.array([-1.2, 0.3, 0.1]))
+    guidance.target_settled(0, 4.0, np.array([-1.2, 0.3, 0.1]))
     c = guidance.chasers[0]
     assert (c.phase, c.faces) == ("goto", True)
     np.testing.assert_allclose(c.move.at([4.0])[0][0], [-1.2, 0.3, 0.1])
-    guidance.observe(0, 100.0, 0.0, 0.0)
+    guidance.update_tracking(0, 100.0, 0.0, 0.0)
     assert (guidance.chasers[0].phase, guidance.chasers[0].faces) == ("hold", False)
     assert guidance.chasers[1].phase == "searching"
 
@@ -159,15 +159,15 @@ def test_the_manoeuvre_begins_and_ends_at_rest_and_keeps_the_target_in_the_image
 
 
 def test_calibrate_is_refused_where_it_makes_no_sense() -> None:
-    def ask(guidance: Guidance, now_s: float) -> str:
+    def ask(guidance: PhaseMachine, now_s: float) -> str:
         return guidance.command(OperatorCommand(command="calibrate", chaser=0), now_s).reason
 
-    exact = Guidance(scenario())
+    exact = PhaseMachine(scenario())
     assert "not been found" in ask(exact, 0.0)
-    exact.found(1.0)
+    exact.target_acquired(1.0)
     assert "taken as exact" in ask(exact, 2.0)
-    guidance = Guidance(scenario(estimator={"camera_bias_attitude_deg": 0.3}))
-    guidance.found(1.0)
+    guidance = PhaseMachine(scenario(estimator={"camera_bias_attitude_deg": 0.3}))
+    guidance.target_acquired(1.0)
     guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
     assert "hold first" in ask(guidance, 3.0)
 

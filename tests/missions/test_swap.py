@@ -33,7 +33,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     if seed:
         omega = rotations.rotate(rotations.normalize(rng.normal(size=4)), omega)
     flight = ControllerCore(scenario, lambda: 0.0)
-    flight.guidance.found(0.0)
+    flight.guidance.target_acquired(0.0)
     states = np.zeros((n, 13))
     for i in range(n):
         p, q = scenario.start_pose(i)
@@ -45,7 +45,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     for tick in range(round(time_s / TICK_S)):
         now_s = tick * TICK_S
         due = flight.guidance.due_commands(now_s)
-        flight.guidance.expect(due)
+        flight.guidance.set_pending_goals(due)
         assert all(flight.guidance.command(c, now_s).accepted for c in due)
         p, q = (a[0] for a in predict_target(at, velocity, [1.0, 0, 0, 0], omega, [now_s]))
         exact = TargetState(round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ())
@@ -75,7 +75,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         least = min(least, float(gaps.min()))
         nearest = min(nearest, float(np.linalg.norm(states[:, :3] - p, axis=-1).min()))
     for i in range(n):
-        flight.guidance.observe(i, time_s, 0.0, 0.0)
+        flight.guidance.update_tracking(i, time_s, 0.0, 0.0)
         assert flight.guidance.chasers[i].phase == "hold"
     return least, nearest, float(np.linalg.norm(states[:, :3] - ends, axis=-1).max())
 

@@ -1,36 +1,56 @@
-"""What guidance knows of one chaser, and what it answers to a command."""
+"""Guidance state of one chaser, and the result of a command."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from chaserdock_models.rotations import Array
 
+from .phases import Phase
 from .trajectories import Motion
+
+
+class NextMove(StrEnum):
+    """What follows when the current move is complete."""
+
+    NONE = ""
+    NOMINAL = "nominal"
+    ATTEMPT = "attempt"
 
 
 @dataclass(frozen=True)
 class ChaserGuidance:
-    """One chaser: its phase since ``since_s``, the motion of its reference in TRF, how long it has been in place.
+    """Phase since ``since_s`` (simulated time) and motion of the reference in TRF.
 
-    By capture: ``then``, what follows when the move is over (``nominal``, ``align`` or nothing, which is to hold);
-    ``attempt``, from 1; ``held``, its pose in TRF when the pull began. ``faces``: it is on its way from where it found the
-    target, and its reference attitude turns with the offset.
+    ``inside_since_s``: since when the chaser is within its tolerances. ``attempt``: number of the docking attempt, from 1.
+    ``held``: position (3,) and attitude (4,) in TRF when the pull test began. ``faces``: the reference attitude turns
+    with the offset so that the chaser faces the target.
     """
 
-    phase: str
+    phase: Phase
     since_s: float
     move: Motion
     inside_since_s: float | None = None
-    then: str = ""
+    then: NextMove = NextMove.NONE
     attempt: int = 1
     held: tuple[Array, Array] | None = None
     faces: bool = False
 
 
 @dataclass(frozen=True)
-class Answer:
-    """To a command: accepted or not, and why."""
+class CommandResult:
+    """Whether a command is accepted, and why or why not."""
 
     accepted: bool
     reason: str
+
+
+@dataclass(frozen=True)
+class PhaseChange:
+    """A chaser entered ``phase``; ``detail`` names the phase before and the reason."""
+
+    chaser: int
+    phase: Phase
+    detail: str
+    calibration_complete: bool = False

@@ -18,7 +18,7 @@ from chaserdock_controller.estimation.types import Estimator, Shock, TargetState
 from chaserdock_controller.output.latency_compensation import CommandHistory
 
 from . import reference
-from .docking import Senses
+from .docking import DockingObservation
 
 # One sigma of what a touch, and the shock of a capture at the tolerances' speed, may do to the target's rates
 # (m/s, rad/s); share of the known effect of a pull that may be otherwise; and with thrusters, one of which may have failed
@@ -137,7 +137,7 @@ class Captures:
 
     def senses(
         self, i: int, fused: TargetState, odometry: Odometry, told: DockingStatus | None
-    ) -> Senses | None:
+    ) -> DockingObservation | None:
         """What guidance wants to know of a chaser at its port; None where it has none."""
         s = self._scenario
         port = s.docking.port_of(i)
@@ -152,7 +152,7 @@ class Captures:
         target = BodyState(fused.position_m, fused.velocity_m_s, fused.q_wxyz, fused.omega_rad_s)
         view = view_of(port, s.chaser.probe_reach_m, np.asarray(s.chasers[i].q_wxyz), chaser, target)
         contact = told is not None and told.contact
-        return Senses(view, contact, i in self.latched, *pose_in_target(fused, odometry))
+        return DockingObservation(view, contact, i in self.latched, *pose_in_target(fused, odometry))
 
 
 def pose_in_target(fused: TargetState, odometry: Odometry) -> tuple[Array, Array]:

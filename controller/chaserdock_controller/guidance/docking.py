@@ -1,12 +1,8 @@
-"""Docking by capture: when a chaser goes from phase to phase, and why. Pure functions; time is given.
-
-``wait`` (its corridor is taken), ``align`` (to the corridor's entry), ``approach`` and ``final`` (down the corridor,
-slowly at last), ``contact`` (the tip touches), ``latched`` (holds on; a pull tests it), ``verified``. What breaks a
-limit or takes too long leads to ``retreat``: back out along the axis, and another attempt while there are any left.
-"""
+"""Docking by capture: geometry of a port's corridor and the conditions of phase changes. Pure functions."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +12,8 @@ from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.docking import Docking, Port
 
-IN_CORRIDOR = ("align", "approach", "final", "contact")
-HOLDING_ON = ("latched", "verified")
+from .phases import CORRIDOR, Phase, Trigger
+
 _ALIGNED_S = 1.0
 _KEEP_OUT_MARGIN_M = 0.03
 _IN_LINE_M = 0.3
@@ -25,58 +21,58 @@ _IN_LINE_M = 0.3
 
 @dataclass(frozen=True)
 class Dock:
-    """A chaser's way in: its port, ``reach_m`` from its centre to the tip, the mission's docking figures."""
+    """A chaser's port, the distance ``reach_m`` from its centre to the probe tip, and the docking limits."""
 
     port: Port
     reach_m: float
     docking: Docking
 
     def offset(self, gap_m: float) -> Array:
-        """Where in TRF the chaser's centre is with its tip ``gap_m`` before the port, (3,)."""
+        """Return the chaser's centre (3,), TRF, when its tip is ``gap_m`` before the port."""
         return centre_offset(self.port, self.reach_m, gap_m)
 
-    def place_of(self, offset_m: Array) -> tuple[float, float]:
-        """Gap and lateral distance (m) of a centre at ``offset_m`` (3,), TRF, as if it were turned right."""
+    def gap_and_lateral(self, offset_m: Array) -> tuple[float, float]:
+        """Return gap and lateral distance (m) of a centre at ``offset_m`` (3,), TRF, for the nominal attitude."""
         off, axis = offset_m - self.offset(0.0), np.asarray(self.port.axis)
         gap = float(off @ axis)
         return gap, float(np.linalg.norm(off - gap * axis))
 
     def inside(self, offset_m: Array) -> bool:
-        """Whether a chaser there is in the corridor, nearer than its entry."""
-        gap, lateral = self.place_of(offset_m)
+        """Return whether a centre at ``offset_m`` (3,), TRF, is in the corridor, nearer than its entry."""
+        gap, lateral = self.gap_and_lateral(offset_m)
         return gap < self.docking.entry_m - 0.02 and lateral < 2.0 * self.docking.corridor.lateral_m
 
     def keep_out_m(self) -> float:
-        """How near to the target's centre a chaser in this corridor may plan to come."""
+        """Return the least distance from the target's centre that a plan in this corridor must keep."""
         return max(0.0, float(np.linalg.norm(self.offset(-self.docking.overdrive_m))) - _KEEP_OUT_MARGIN_M)
 
 
 def dock_of(scenario: Scenario, chaser: int) -> Dock | None:
-    """The dock of a chaser, None where it is not captured."""
+    """Return the dock of a chaser, or None if it does not dock by capture."""
     port = scenario.docking.port_of(chaser)
     return None if port is None else Dock(port, scenario.chaser.probe_reach_m, scenario.docking)
 
 
 def corridors_apart(a: Dock, b: Dock) -> float:
-    """Least distance (m) between where the centres of two chasers in their corridors may be."""
+    """Return the least distance (m) between the centre lines of two corridors."""
     ends = [(d.offset(0.0), d.offset(d.docking.entry_m)) for d in (a, b)]
     return segments_apart(*ends[0], *ends[1])
 
 
 def why_not_approach(dock: Dock, offset_m: Array) -> str:
-    """Why a chaser whose reference is at ``offset_m`` (3,), TRF, cannot fly to its corridor, or nothing."""
-    gap, lateral = dock.place_of(offset_m)
+    """Return why a chaser cannot fly from a reference at ``offset_m`` (3,), TRF, to its corridor, or an empty string."""
+    gap, lateral = dock.gap_and_lateral(offset_m)
     if gap < 0.0 or lateral > _IN_LINE_M:
         return (
-            f"its reference is {lateral:.2f} m beside its port's axis, {gap:.2f} m before the port; allowed are "
-            f"{_IN_LINE_M:g} m beside and no less than 0 m before: retreat or goto first"
+            f"the reference is {lateral:.2f} m beside the port's axis, {gap:.2f} m before the port; allowed are "
+            f"at most {_IN_LINE_M:g} m beside and at least 0 m before: retreat or goto first"
         )
     return ""
 
 
 @dataclass(frozen=True)
-class Senses:
-    """What is known of a chaser at its port: the estimated view, and its docking sensor's word.
+class DockingObservation:
+    """Estimated geometry of a chaser at its port, and the state of its docking sensor.
 
     ``offset_m`` (3,) and ``q_wxyz`` (4,): estimated pose of its centre and body in TRF.
     """
@@ -89,78 +85,101 @@ class Senses:
 
 
 @dataclass(frozen=True)
-class Situation:
-    """Where in its phase a chaser is: ``in_phase_s`` so long, the reference's motion over or not, the reference's gap,
-    aligned for ``inside_s``; ``held`` its pose in TRF (offset, attitude) when the pull began."""
+class PhaseProgress:
+    """Progress within a phase: duration, whether the reference move is complete, the reference's gap, the time within
+    the alignment limits, and the pose in TRF (offset, attitude) at the start of the pull test."""
 
-    phase: str
+    phase: Phase
     in_phase_s: float
-    move_over: bool
+    move_complete: bool
     reference_gap_m: float
     inside_s: float
     held: tuple[Array, Array] | None
 
 
 def pull_N(docking: Docking, in_phase_s: float) -> float:
-    """Force along -X (CRF) that tests a latch, ``in_phase_s`` into ``latched``: a pull, and as long a push."""
+    """Return the force along -X (CRF) of the latch test at ``in_phase_s``: a pull, then an equally long push."""
     into_s = in_phase_s - docking.settle_s
     if into_s < 0.0 or into_s >= 2.0 * docking.pull_s:
         return 0.0
     return docking.pull_N if into_s < docking.pull_s else -docking.pull_N
 
 
-def next_phase(docking: Docking, now: Situation, senses: Senses) -> tuple[str, str] | None:
-    """The phase that follows, and why; None to stay. ``retreat`` is the answer to everything that goes wrong."""
-    if senses.latched and now.phase in IN_CORRIDOR:
-        return "latched", "the latch has closed"
-    match now.phase:
-        case "align":
-            return _after_align(docking, now, senses)
-        case "approach":
-            fault = senses.view.fault(docking.corridor, docking.corridor.closing_m_s)
-            if fault:
-                return "retreat", f"left the corridor: {fault}"
-            if now.reference_gap_m <= docking.final_m:
-                fault = senses.view.fault(docking.final, docking.corridor.closing_m_s)
-                return ("retreat", f"not fit for the final approach: {fault}") if fault else ("final", "")
-            if now.in_phase_s > docking.approach_timeout_s:
-                return "retreat", f"approach took more than {docking.approach_timeout_s:g} s"
-        case "final":
-            if senses.contact:
-                return "contact", "the tip touches"
-            if fault := senses.view.fault(docking.final, docking.corridor.closing_m_s):
-                return "retreat", f"left the corridor: {fault}"
-            if now.move_over or now.in_phase_s > docking.final_timeout_s:
-                return "retreat", "no contact where the port should be"
-        case "contact":
-            if fault := senses.view.fault(docking.corridor, docking.corridor.closing_m_s):
-                return "retreat", f"left the corridor: {fault}"
-            if now.in_phase_s > docking.contact_timeout_s:
-                return "retreat", f"the latch has not closed within {docking.contact_timeout_s:g} s"
-        case "latched" | "verified" if not senses.latched:
-            return "retreat", "the latch has let go"
-        case "latched" if now.held is not None:
-            return _after_pull(docking, now, senses)
-    return None
+Outcome = tuple[Trigger, str]
+"""A trigger and its reason for the log."""
 
 
-def _after_align(docking: Docking, now: Situation, senses: Senses) -> tuple[str, str] | None:
-    if now.move_over and now.inside_s >= _ALIGNED_S:
-        return "approach", "aligned"
+def docking_trigger(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+    """Return the condition that ends the phase, with its reason, or None to stay."""
+    if observed.latched and now.phase in CORRIDOR:
+        return Trigger.LATCH_CLOSED, "the latch closed"
+    check = _CHECKS.get(now.phase)
+    return None if check is None else check(docking, now, observed)
+
+
+def _failed(reason: str) -> Outcome:
+    return Trigger.ATTEMPT_FAILED, reason
+
+
+def _check_align(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+    if now.move_complete and now.inside_s >= _ALIGNED_S:
+        return Trigger.ALIGNED, "aligned"
     if now.in_phase_s > docking.align_timeout_s:
-        fault = senses.view.fault(docking.corridor, docking.corridor.closing_m_s)
-        return "retreat", f"not aligned within {docking.align_timeout_s:g} s: {fault}"
+        fault = observed.view.fault(docking.corridor, docking.corridor.closing_m_s)
+        return _failed(f"not aligned within {docking.align_timeout_s:g} s: {fault}")
     return None
 
 
-def _after_pull(docking: Docking, now: Situation, senses: Senses) -> tuple[str, str] | None:
-    assert now.held is not None
+def _check_approach(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+    if fault := observed.view.fault(docking.corridor, docking.corridor.closing_m_s):
+        return _failed(f"left the corridor: {fault}")
+    if now.reference_gap_m <= docking.final_m:
+        fault = observed.view.fault(docking.final, docking.corridor.closing_m_s)
+        return _failed(f"not fit for the final approach: {fault}") if fault else (Trigger.FINAL_DISTANCE, "")
+    if now.in_phase_s > docking.approach_timeout_s:
+        return _failed(f"approach took more than {docking.approach_timeout_s:g} s")
+    return None
+
+
+def _check_final(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+    if observed.contact:
+        return Trigger.TIP_CONTACT, "the tip touches"
+    if fault := observed.view.fault(docking.final, docking.corridor.closing_m_s):
+        return _failed(f"left the corridor: {fault}")
+    if now.move_complete or now.in_phase_s > docking.final_timeout_s:
+        return _failed("no contact at the estimated port")
+    return None
+
+
+def _check_contact(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+    if fault := observed.view.fault(docking.corridor, docking.corridor.closing_m_s):
+        return _failed(f"left the corridor: {fault}")
+    if now.in_phase_s > docking.contact_timeout_s:
+        return _failed(f"the latch did not close within {docking.contact_timeout_s:g} s")
+    return None
+
+
+def _check_latched(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+    if not observed.latched:
+        return _failed("the latch opened")
+    if now.phase is not Phase.LATCHED or now.held is None:
+        return None
     offset, q = now.held
-    moved_m = float(np.linalg.norm(senses.offset_m - offset))
-    turned_deg = float(np.degrees(rotations.angle_between(q, senses.q_wxyz)))
-    what = f"moved {moved_m * 1e3:.2f} mm and {turned_deg:.2f} deg under the pull"
+    moved_m = float(np.linalg.norm(observed.offset_m - offset))
+    turned_deg = float(np.degrees(rotations.angle_between(q, observed.q_wxyz)))
+    reason = f"moved {moved_m * 1e3:.2f} mm and {turned_deg:.2f} deg under the pull"
     if moved_m > docking.verify_position_m or turned_deg > docking.verify_angle_deg:
-        return "retreat", what
+        return _failed(reason)
     if now.in_phase_s >= docking.settle_s + 2.0 * docking.pull_s:
-        return "verified", what
+        return Trigger.PULL_WITHSTOOD, reason
     return None
+
+
+_CHECKS: dict[Phase, Callable[[Docking, PhaseProgress, DockingObservation], Outcome | None]] = {
+    Phase.ALIGN: _check_align,
+    Phase.APPROACH: _check_approach,
+    Phase.FINAL: _check_final,
+    Phase.CONTACT: _check_contact,
+    Phase.LATCHED: _check_latched,
+    Phase.VERIFIED: _check_latched,
+}

@@ -1,23 +1,22 @@
-"""Smooth changes of a reference position: polynomials between states of motion. Pure functions.
+"""Smooth motions of a reference position: polynomials between states of motion. Pure functions.
 
-A change from rest to rest is the fifth-degree polynomial, the motion of least jerk between two places (T. Flash and
-N. Hogan, 1985). One out of a motion is that, plus what brings the motion so far to rest: a single polynomial with
-initial acceleration overshoots the more the longer it takes, and a bound on its speed may be out of reach.
-Acceleration is continuous throughout, so that the feed-forward is.
+A motion from rest to rest is the fifth-degree polynomial of least jerk (T. Flash and N. Hogan, 1985). A motion from
+a moving state adds the polynomial that brings the current motion to rest: a single polynomial with initial acceleration
+overshoots more the longer it takes, and may not reach a bound on its speed. Acceleration is continuous, and so is the
+feed-forward.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from chaserdock_models.rotations import Array
+from msgspec import Struct
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
-
+_RAMP_S = 2.0
 _SHORTEST_S = 2.0
 _STOP_S = 3.0
 # Factors of the derivatives of powers 1 to 5, and 2 to 5.
@@ -26,9 +25,8 @@ _SECOND = np.array([2.0, 6.0, 12.0, 20.0])[:, None]
 _SAMPLES_PER_PART = np.linspace(0.0, 1.0, 41)
 
 
-@dataclass(frozen=True)
-class Part:
-    """``duration_s`` long; ``coefficients`` (6, 3) of powers of time, metres and seconds. Ends at rest."""
+class Part(Struct, frozen=True, eq=False, dict=True):
+    """A polynomial over ``duration_s`` with ``coefficients`` (6, 3) of powers of time, metres and seconds. Ends at rest."""
 
     duration_s: float
     coefficients: Array
@@ -38,33 +36,32 @@ class Part:
         return {}
 
     def rest(self, count: int) -> Array:
-        """Where it ends, (count, 3): the last row of its powers, as often, times its coefficients."""
-        found = self._rests.get(count)
-        if found is None:
+        """Return the end position, repeated (count, 3)."""
+        end = self._rests.get(count)
+        if end is None:
             powers = np.vander(np.full(count, self.duration_s), 6, increasing=True)
-            found = self._rests[count] = powers @ self.coefficients
-        return found
+            end = self._rests[count] = powers @ self.coefficients
+        return end
 
 
-@dataclass(frozen=True)
-class Move:
-    """From ``start_s`` on, ``duration_s`` long: the sum of ``parts``, which all begin at ``start_s``."""
+class Move(Struct, frozen=True, eq=False, tag=True):
+    """The sum of ``parts``, which all begin at ``start_s``."""
 
     start_s: float
     parts: tuple[Part, ...]
 
     @property
     def duration_s(self) -> float:
-        """Until the last part has ended, seconds."""
+        """Return the time until the last part ends."""
         return max(part.duration_s for part in self.parts)
 
     @property
     def goal_m(self) -> Array:
-        """Where it ends, (3,)."""
+        """Return the end position (3,)."""
         return self.at(np.array([self.start_s + self.duration_s]))[0][0]
 
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Positions, velocities, accelerations (K, 3) at times (K,); at rest before and after."""
+        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
         t = np.asarray(times_s, dtype=float) - self.start_s
         position, velocity, acceleration = np.zeros((3, len(t), 3))
         earliest_s = float(t.min(initial=math.inf))
@@ -81,7 +78,7 @@ class Move:
         return position, velocity, acceleration
 
     def over_at(self, time_s: float) -> bool:
-        """Whether it has ended."""
+        """Return whether the move is complete."""
         return time_s >= self.start_s + self.duration_s
 
     def _fastest(self) -> float:
@@ -90,32 +87,17 @@ class Move:
 
 
 def stay(position_m: ArrayLike, time_s: float) -> Move:
-    """A move that stays where it is."""
+    """Return a move that stays at a position (3,)."""
     coefficients = np.zeros((6, 3))
     coefficients[0] = position_m
     return Move(time_s, (Part(0.0, coefficients),))
 
 
-class Motion(Protocol):
-    """What a reference position does: a ``Move`` or a ``Glide``."""
+class Glide(Struct, frozen=True, eq=False, tag=True):
+    """A straight path at piecewise constant speeds with smooth changes, from rest to rest.
 
-    @property
-    def duration_s(self) -> float: ...
-
-    @property
-    def goal_m(self) -> Array: ...
-
-    def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]: ...
-
-    def over_at(self, time_s: float) -> bool: ...
-
-
-@dataclass(frozen=True)
-class Glide:
-    """A straight way at speeds that change smoothly, from rest to rest.
-
-    ``from_m`` (3,) WRF or TRF, ``along`` (3,) unit; ``speeds_m_s`` (n,) are held for ``holds_s`` (n,), with ramps of
-    ``ramps_s`` (n + 1,) before, between and after them, on which the speed is the cubic with level ends.
+    It begins at ``from_m`` (3,) along the unit vector ``along`` (3,). ``speeds_m_s`` (n,) are held for ``holds_s`` (n,), with
+    ramps of ``ramps_s`` (n + 1,) before, between and after them: cubics in speed with zero slope at both ends.
     """
 
     start_s: float
@@ -131,47 +113,47 @@ class Glide:
 
     @property
     def goal_m(self) -> Array:
-        """Where it ends, (3,)."""
+        """Return the end position (3,)."""
         return self.at(np.array([self.start_s + self.duration_s]))[0][0]
 
     def over_at(self, time_s: float) -> bool:
-        """Whether it has ended."""
+        """Return whether the move is complete."""
         return time_s >= self.start_s + self.duration_s
 
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
-        """Positions, velocities, accelerations (K, 3) at times (K,); at rest before and after."""
+        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
         t = np.asarray(times_s, dtype=float) - self.start_s
-        way, speed, acceleration = np.zeros((3, len(t)))
+        distance, speed, acceleration = np.zeros((3, len(t)))
         begin, v = 0.0, 0.0
         for ramp_s, following, hold_s in zip(
             self.ramps_s, (*self.speeds_m_s, 0.0), (*self.holds_s, 0.0), strict=True
         ):
             x, step = np.clip((t - begin) / ramp_s, 0.0, 1.0), following - v
-            way += ramp_s * (v * x + step * (x**3 - x**4 / 2.0))
+            distance += ramp_s * (v * x + step * (x**3 - x**4 / 2.0))
             inside = (t >= begin) & (t < begin + ramp_s)
             speed += np.where(inside, v + step * (3.0 * x**2 - 2.0 * x**3), 0.0)
             acceleration += np.where(inside, step * 6.0 * (x - x**2) / ramp_s, 0.0)
             begin, v = begin + ramp_s, following
-            way += v * np.clip(t - begin, 0.0, hold_s)
+            distance += v * np.clip(t - begin, 0.0, hold_s)
             speed += np.where((t >= begin) & (t < begin + hold_s), v, 0.0)
             begin += hold_s
         along = self.along
-        return self.from_m + way[:, None] * along, speed[:, None] * along, acceleration[:, None] * along
+        return self.from_m + distance[:, None] * along, speed[:, None] * along, acceleration[:, None] * along
 
 
-_RAMP_S = 2.0
+Motion = Move | Glide
 
 
 def glide(
     from_m: ArrayLike, along: ArrayLike, now_s: float, fast: tuple[float, float], slow: tuple[float, float]
 ) -> Glide:
-    """From rest at ``from_m`` (3,) along a unit vector (3,): ``fast`` and then ``slow``, each (way m, speed m/s).
+    """Return a glide from rest at ``from_m`` (3,) along a unit vector (3,): ``fast``, then ``slow``, each (length m, speed m/s).
 
-    The change from fast to slow has ended where the first way ends; the second holds the stop. A way too short for
-    its ramps is flown at the speed that it allows. Raises ValueError for ways or speeds that are not positive.
+    The ramp from fast to slow ends where the first length ends; the second length includes the stop. A length too short
+    for its ramps is flown at the speed that it allows. Raises ValueError for lengths or speeds that are not positive.
     """
     if min(*fast, *slow) <= 0.0:
-        raise ValueError(f"ways and speeds must be positive, not {fast} and {slow}")
+        raise ValueError(f"lengths and speeds must be positive, not {fast} and {slow}")
     v2 = min(slow[1], slow[0] / _RAMP_S)
     # Ramps cover their mean speed: v1/2 up, (v1 + v2)/2 down.
     v1 = min(fast[1], max(v2, fast[0] / _RAMP_S - v2 / 2.0))
@@ -188,9 +170,9 @@ def glide(
 
 
 def stop(current: Motion, now_s: float) -> Move:
-    """A move that brings ``current`` to rest a little further on its way.
+    """Return a move that brings ``current`` to rest in 3 s.
 
-    Its velocity is the cubic from that of ``current``, with its acceleration, to zero and zero.
+    Its velocity is the cubic from the velocity and acceleration of ``current`` to zero velocity and acceleration.
     """
     p, v, a = (x[0] for x in current.at(np.array([now_s])))
     if not (v.any() or a.any()):
@@ -200,26 +182,26 @@ def stop(current: Motion, now_s: float) -> Move:
     return Move(now_s, (Part(t, np.array([p, v, a / 2.0, cubic, quartic, none])),))
 
 
-def _straight(way: Array, duration_s: float) -> Part:
+def _straight(displacement: Array, duration_s: float) -> Part:
     share = np.array([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]) / duration_s ** np.arange(6)
-    return Part(duration_s, np.outer(share, way))
+    return Part(duration_s, np.outer(share, displacement))
 
 
 def move_to(current: Motion, goal_m: ArrayLike, now_s: float, max_speed_m_s: float) -> Move:
-    """A move from wherever ``current`` is at ``now_s`` to rest at ``goal_m`` (3,), not faster than ``max_speed_m_s``.
+    """Return a move from the state of ``current`` at ``now_s`` to rest at ``goal_m`` (3,), at most at ``max_speed_m_s``.
 
-    If stopping takes more than that, it is not faster than ``stop`` (both within half a percent). Raises
-    ValueError unless the speed is positive.
+    Where ``stop`` is faster than that, its speed is the limit (both within half a percent). Raises ValueError unless the
+    speed is positive.
     """
     if not max_speed_m_s > 0.0:
         raise ValueError(f"max_speed_m_s must be positive, not {max_speed_m_s}")
     stopping = stop(current, now_s)
-    way = np.asarray(goal_m, dtype=float) - stopping.goal_m
+    displacement = np.asarray(goal_m, dtype=float) - stopping.goal_m
     limit = max(max_speed_m_s, stopping._fastest()) * 1.005  # more than what lies between two samples
-    duration_s = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(way)) / max_speed_m_s)
-    move = Move(now_s, (*stopping.parts, _straight(way, duration_s)))
-    # The longer the way takes, the less it adds to the speed of stopping: this ends.
+    duration_s = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(displacement)) / max_speed_m_s)
+    move = Move(now_s, (*stopping.parts, _straight(displacement, duration_s)))
+    # Terminates: the longer the displacement takes, the less it adds to the speed of stopping.
     while move._fastest() > limit:
         duration_s *= 1.1
-        move = Move(now_s, (*stopping.parts, _straight(way, duration_s)))
+        move = Move(now_s, (*stopping.parts, _straight(displacement, duration_s)))
     return move

@@ -10,8 +10,8 @@ from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 
-from chaserdock_controller.guidance.command_validation import why_stale
-from chaserdock_controller.guidance.phases import Answer
+from chaserdock_controller.guidance import command_validation as validation
+from chaserdock_controller.guidance.chaser_state import CommandResult
 
 THRUSTER_COMMANDS = ("isolate", "restore")
 
@@ -63,33 +63,33 @@ class ThrusterCommandHandler:
         """Thrusters that an operator vouches for."""
         return tuple(sorted(self._trusted.get(chaser, ())))
 
-    def command(self, command: OperatorCommand, now_s: float) -> Answer:
+    def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
         """Does what an operator or the time line asks for, or says why not.
 
         Of ``isolate`` and ``restore`` for one thruster in one tick the first counts.
         """
         i, thruster = command.chaser, command.thruster
-        if i >= self._chasers:
-            return Answer(False, f"there is no chaser {i}; this mission has 0 to {self._chasers - 1}")
-        if late := why_stale(command, now_s):
-            return Answer(False, late)
+        reason = validation.why_unknown_chaser(i, self._chasers) or validation.why_stale(command, now_s)
+        if reason:
+            return CommandResult(False, reason)
         if self._thrusters == 0:
-            return Answer(False, 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")')
+            return CommandResult(
+                False, 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
+            )
         if thruster is None or thruster >= self._thrusters:
-            return Answer(
+            return CommandResult(
                 False, f"{command.command} needs a thruster; this body has 0 to {self._thrusters - 1}"
             )
         done_s, done = self._done.get((i, thruster), (-math.inf, command))
         if done_s == now_s and done.command != command.command:
-            whose = f" by {done.operator}" if done.operator else ""
-            return Answer(False, f"{done.command}{whose} came first in this tick")
+            return validation.superseded_by(done)
         self._done[i, thruster] = now_s, command
         shut, trusted = self._isolated.setdefault(i, set()), self._trusted.setdefault(i, set())
         wanted, other = (shut, trusted) if command.command == "isolate" else (trusted, shut)
         if thruster in wanted:
-            return Answer(
+            return CommandResult(
                 True, f"thruster {thruster} is already {'isolated' if wanted is shut else 'restored'}"
             )
         wanted.add(thruster)
         other.discard(thruster)
-        return Answer(True, f"thruster {thruster} {'isolated' if wanted is shut else 'restored'}")
+        return CommandResult(True, f"thruster {thruster} {'isolated' if wanted is shut else 'restored'}")

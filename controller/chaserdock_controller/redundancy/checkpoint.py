@@ -1,167 +1,239 @@
-"""All that a controller knows after a tick, as bytes for one that comes late; and such bytes taken over.
+"""Serialize and restore controller state for a standby that joins late.
 
-Of the filter's buffer only the newest exposure goes along: a sighting that is older reaches who took over in vain. What
-estimators and solvers of installed packages know is left out: these begin anew.
+Of the filter's buffer only the newest exposure is included: a sighting older than that cannot be used after a restore. The
+state of estimators and solvers of installed packages is not included: they start from their initial state.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from collections import deque
+from typing import Any, TypeVar
 
-import msgspec
-from chaserdock_models.docking_geometry import PortView
+from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
+from msgspec import Struct
 
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import Mekf
 from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
 from chaserdock_controller.estimation.filter_update import FilterState
-from chaserdock_controller.estimation.hypothesis import Branch
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.rigid_target import TargetBody
-from chaserdock_controller.estimation.types import (
-    CameraPose,
-    EstimatorEvent,
-    Measurement,
-    PoseHypothesis,
-    Shock,
-)
-from chaserdock_controller.guidance.docking import Senses
-from chaserdock_controller.guidance.phases import ChaserGuidance
-from chaserdock_controller.guidance.trajectories import Glide, Move, Part
+from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
+from chaserdock_controller.guidance.chaser_state import ChaserGuidance
+from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 
-from . import serialization as plain
+from .serialization import decode, encode
 
-CLASSES: tuple[type, ...] = (
-    Branch,
-    ChaserGuidance,
-    EstimatorEvent,
-    Exposure,
-    CameraPose,
-    FilterState,
-    Glide,
-    ThrusterReport,
-    Known,
-    Measurement,
-    MekfParameters,
-    Move,
-    Odometry,
-    OperatorCommand,
-    PaperParameters,
-    Part,
-    PortView,
-    PoseHypothesis,
-    Senses,
-    Shock,
-    TargetBody,
-)
-"""What may be in a controller's state, beside numbers, texts and containers."""
-
-_GUIDANCE = ("chasers", "_leaving", "_sensed", "_places", "_done", "_due", "_seen_s", "_blind")
-_THRUSTERS = ("_reports", "_isolated", "_trusted", "_done")
-_CAPTURES = ("body", "latched", "_changed")
-_FLIGHT = ("_odometry", "_last_solve_ns", "_troubled")
+Part = TypeVar("Part", bound=Struct)
 
 
 class CheckpointError(ValueError):
-    """Bytes that are no controller's state, or not of this mission; the text says why."""
+    """The bytes are not a controller state of this mission; the text says why."""
 
 
-@dataclass(frozen=True)
-class _Drawer:
-    """Some attributes of one object."""
+# The fields of each part are the attributes of the object that it is taken from.
 
-    owner: Callable[[], Any]
-    names: tuple[str, ...]
+
+class CoreState(Struct, forbid_unknown_fields=True):
+    _odometry: dict[tuple[int, int], Odometry]
+    _last_solve_ns: int | None
+    _troubled: set[int]
+
+
+class GuidanceState(Struct, forbid_unknown_fields=True):
+    chasers: list[ChaserGuidance]
+    _pending_goals: dict[int, Array]
+    _observed: dict[int, DockingObservation]
+    _positions: dict[int, Array]
+    _last_commands: dict[int, tuple[float, OperatorCommand]]
+    _seen_s: float | None
+    _interrupted: set[int]
+
+
+class ThrusterCommandState(Struct, forbid_unknown_fields=True):
+    _reports: dict[int, ThrusterReport]
+    _isolated: dict[int, set[int]]
+    _trusted: dict[int, set[int]]
+    _done: dict[tuple[int, int], tuple[float, OperatorCommand]]
+
+
+class CaptureState(Struct, forbid_unknown_fields=True):
+    body: TargetBody
+    latched: frozenset[int]
+    _changed: bool
+
+
+class CommandHistoryState(Struct, forbid_unknown_fields=True):
+    _sent: dict[int, list[tuple[int, Array]]]
+
+
+class SearchState(Struct, forbid_unknown_fields=True):
+    _from: dict[int, tuple[float, Array]]
+
+
+class LostChaserState(Struct, forbid_unknown_fields=True):
+    known: dict[int, Odometry]
+    told: set[int]
+
+
+class OdometryState(Struct, forbid_unknown_fields=True):
+    _known: dict[int, Known]
+
+
+class ConsistencyState(Struct, forbid_unknown_fields=True):
+    disagreeing: set[int]
+    _since_s: dict[int, tuple[bool, float]]
+
+
+class MekfState(Struct, forbid_unknown_fields=True, tag=True):
+    parameters: MekfParameters
+    late_dropped: int
+    early_dropped: int
+    invalid: int
+    duplicates: int
+    _buffer: list[Exposure]
+    _base: FilterState | None
+    _pending: list[EstimatorEvent]
+    _drained: set[EstimatorEvent]
+    _was_lost: bool
+
+
+class PaperState(Struct, forbid_unknown_fields=True, tag=True):
+    parameters: PaperParameters
+    accepted: int
+    gated: int
+    late_dropped: int
+    early_dropped: int
+    invalid: int
+    reinitialisations: int
+    _latest: dict[int, Measurement]
+    _poses: list[tuple[Array, Array]]
+    _rates: list[tuple[Array, Array]]
+    _mean: tuple[int, Array, Array] | None
+    _newest_ns: int | None
+    _seen: int
+    _rejected: tuple[int, ...]
+    _removed_in_a_row: int
+    _events: list[EstimatorEvent]
+    _was_lost: bool
+
+
+class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
+    """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline that are not yet due.
+    ``plans``: warm starts of the NMPC solver, inputs by chaser."""
+
+    core: CoreState
+    guidance: GuidanceState
+    timeline_left: int
+    thrusters: ThrusterCommandState
+    captures: CaptureState
+    history: CommandHistoryState
+    searches: SearchState
+    lost_chasers: LostChaserState
+    odometry: OdometryState
+    consistency: ConsistencyState
+    estimator: MekfState | PaperState | None
+    plans: dict[int, Array]
 
 
 class Checkpoint:
-    """What is told and taken over of one controller."""
+    """Saves and restores the state of one controller."""
 
     def __init__(
-        self, flight: ControllerCore, watch: OdometryValidation, agreement: SensorConsistency
+        self, core: ControllerCore, odometry: OdometryValidation, consistency: SensorConsistency
     ) -> None:
-        self._flight = flight
-        # The flight's parts are looked up when they are needed: a replay of fusion alone has none.
-        parts: dict[str, Any] = {
-            "flight": (lambda: flight, _FLIGHT),
-            "guidance": (lambda: flight.guidance, _GUIDANCE),
-            "thrusters": (lambda: vars(flight)["_thrusters"], _THRUSTERS),
-            "captures": (lambda: vars(flight)["_captures"], _CAPTURES),
-            "history": (lambda: vars(flight)["_history"], ("_sent",)),
-            "searches": (lambda: vars(flight)["_searches"], ("_from",)),
-            "absent": (lambda: flight.absent, ("known", "told")),
-            "watch": (lambda: watch, ("_known",)),
-            "agreement": (lambda: agreement, ("disagreeing", "_since_s")),
-        }
-        self._drawers = {name: _Drawer(*part) for name, part in parts.items()}
+        self._core, self._odometry, self._consistency = core, odometry, consistency
 
-    def told(self) -> bytes:
-        """The state now. Raises CheckpointError when something in it cannot be told."""
-        values: dict[str, Any] = {
-            name: {attribute: vars(drawer.owner())[attribute] for attribute in drawer.names}
-            for name, drawer in self._drawers.items()
+    def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
+        """Return the objects whose attributes are copied, and what is copied of them, by field of the checkpoint."""
+        core = self._core
+        attributes = vars(core)
+        return {
+            "core": (core, CoreState),
+            "guidance": (core.guidance, GuidanceState),
+            "thrusters": (attributes["_thrusters"], ThrusterCommandState),
+            "captures": (attributes["_captures"], CaptureState),
+            "history": (attributes["_history"], CommandHistoryState),
+            "searches": (attributes["_searches"], SearchState),
+            "lost_chasers": (core.absent, LostChaserState),
+            "odometry": (self._odometry, OdometryState),
+            "consistency": (self._consistency, ConsistencyState),
         }
-        values["guidance"]["_due"] = len(values["guidance"]["_due"])
-        values["estimator"] = _of_estimator(self._flight.estimator)
-        frame = _frame_of(self._flight)
-        values["plans"] = dict(frame.plans) if frame is not None else {}
-        try:
-            return msgspec.msgpack.encode(plain.told(values, CLASSES))
-        except plain.NotPlain as error:
-            raise CheckpointError(f"not to be told: {error}") from None
 
-    def recall(self, state: bytes) -> None:
-        """Takes a state over, whole or not at all. Raises CheckpointError."""
+    def save(self) -> bytes:
+        """Return the state now. Raises CheckpointError when it contains something other than data."""
+        parts: dict[str, Any] = {name: _read(*part) for name, part in self._parts().items()}
+        frame = self._warm_starts()
         try:
-            values = plain.understood(msgspec.msgpack.decode(state), CLASSES)
-            for name, drawer in self._drawers.items():
-                if set(values[name]) != set(drawer.names):
-                    raise CheckpointError(f"{name}: {', '.join(map(str, values[name]))}")
-            chasers = values["guidance"]["chasers"]
-            due, there = int(values["guidance"]["_due"]), self._flight.scenario.timeline
-            plans, estimator = dict(values["plans"]), dict(values["estimator"])
-        except (msgspec.DecodeError, plain.NotPlain, LookupError, TypeError, ValueError) as error:
+            return encode(
+                ControllerCheckpoint(
+                    **parts,
+                    timeline_left=len(vars(self._core.guidance)["_timeline"]),
+                    estimator=_estimator_state(self._core.estimator),
+                    plans=dict(frame.plans) if frame is not None else {},
+                )
+            )
+        except TypeError as error:
             raise CheckpointError(str(error)) from None
-        if len(chasers) != len(self._flight.scenario.chasers) or not 0 <= due <= len(there):
-            raise CheckpointError("it is of another mission")
-        values["guidance"]["_due"] = sorted(there, key=lambda entry: entry.at_s)[len(there) - due :]
-        for name, drawer in self._drawers.items():
-            _put(drawer.owner(), values[name])
-        if type(self._flight.estimator).__name__ == estimator.pop("kind", ""):
-            _put(self._flight.estimator, estimator)
-        frame = _frame_of(self._flight)
+
+    def restore(self, data: bytes) -> None:
+        """Replace the state by a saved one, completely or not at all. Raises CheckpointError."""
+        try:
+            state = decode(data, ControllerCheckpoint)
+        except (ValueError, RecursionError) as error:
+            raise CheckpointError(str(error)) from None
+        timeline = sorted(self._core.scenario.timeline, key=lambda entry: entry.at_s)
+        chasers = len(self._core.scenario.chasers)
+        if len(state.guidance.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
+            raise CheckpointError("the state is of another mission")
+        for name, (owner, _) in self._parts().items():
+            _write(owner, getattr(state, name))
+        vars(self._core.guidance)["_timeline"] = timeline[len(timeline) - state.timeline_left :]
+        if state.estimator is not None and type(state.estimator) is _estimator_kind(self._core.estimator):
+            _write(self._core.estimator, state.estimator)
+        frame = self._warm_starts()
         if frame is not None:
-            frame.plans = plans
+            frame.plans = state.plans
+
+    def _warm_starts(self) -> Any:
+        """Return the object that holds the solver's warm starts; None for an installed solver."""
+        return vars(vars(self._core)["_solver"]).get("_frame")
 
 
-def _put(owner: Any, values: dict[str, Any]) -> None:
-    for name, value in values.items():
-        there = vars(owner).get(name)
-        if isinstance(there, dict):  # in place: it may be one with a default
-            there.clear()
-            there.update(value)
+def _read(owner: Any, kind: type[Part]) -> Part:
+    values = vars(owner)
+    return kind(**{name: values[name] for name in kind.__struct_fields__})
+
+
+def _write(owner: Any, state: Struct) -> None:
+    for name in state.__struct_fields__:
+        value, current = getattr(state, name), vars(owner).get(name)
+        if isinstance(current, dict):  # in place: it may have a default factory
+            current.clear()
+            current.update(value)
+        elif isinstance(current, deque):
+            setattr(owner, name, deque(value, current.maxlen))
         else:
             setattr(owner, name, value)
 
 
-def _of_estimator(estimator: Any) -> dict[str, Any]:
-    """What one of our own estimators knows, with its ``kind``; nothing of others'."""
-    if not isinstance(estimator, Mekf | PaperEstimator):
-        return {}
-    values = dict(vars(estimator))
-    if isinstance(estimator, Mekf) and len(values["_buffer"]) > 1:
-        newest, before = values["_buffer"][-1], values["_buffer"][-2]
-        values |= {"_buffer": [newest], "_base": before.state}
-        values["_drained"] = {event for event in values["_drained"] if event in newest.events}
-    return {"kind": type(estimator).__name__, **values}
+def _estimator_kind(estimator: Any) -> type[MekfState] | type[PaperState] | None:
+    return {Mekf: MekfState, PaperEstimator: PaperState}.get(type(estimator))
 
 
-def _frame_of(flight: ControllerCore) -> Any:
-    """Where the solver keeps its warm starts, if it is one of ours."""
-    return vars(vars(flight)["_solver"]).get("_frame")
+def _estimator_state(estimator: Any) -> MekfState | PaperState | None:
+    kind = _estimator_kind(estimator)
+    if kind is None:
+        return None
+    state = _read(estimator, kind)
+    if isinstance(state, PaperState):
+        state._poses, state._rates = list(state._poses), list(state._rates)
+    elif len(state._buffer) > 1:
+        newest, before = state._buffer[-1], state._buffer[-2]
+        state._buffer, state._base = [newest], before.state
+        state._drained = {event for event in state._drained if event in newest.events}
+    return state

@@ -1,0 +1,445 @@
+"""State machine of every chaser: phase, and motion of the reference position in TRF. No I/O; time is an argument.
+
+Phases and transitions: ``phases``. Every phase change looks up its target in the transition table.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from chaserdock_models.rotations import Array
+from chaserdock_protocol.messages import Latch, OperatorCommand
+from chaserdock_protocol.scenario import Scenario
+from numpy.typing import ArrayLike
+
+from . import command_validation as validation
+from .approach_cone import Cone, cone_of
+from .chaser_state import ChaserGuidance, CommandResult, NextMove, PhaseChange
+from .docking import (
+    DockingObservation,
+    PhaseProgress,
+    corridors_apart,
+    dock_of,
+    docking_trigger,
+    pull_N,
+    why_not_approach,
+)
+from .phases import (
+    APPROACHING,
+    ATTACHED,
+    Phase,
+    Trigger,
+    next_phase,
+    permitted_commands,
+    trigger_of,
+)
+from .pointing import CALIBRATION_S, calibration_turns
+from .trajectories import Motion, glide, move_to, stay, stop
+
+_ABORT_SPEED_FACTOR = 2.0
+_GOTO_SPEED_FACTOR = 2.0
+_SEARCH_AFTER_S = 1.0
+_SIGHT_LOSS_S = 3.0
+"""An approach stops when no chaser has seen the target for this long."""
+_HELD_MARGIN_M = 0.03
+"""A chaser that docks at a distance may be planned this much nearer than that distance."""
+_OUTSIDE_M = 0.02
+"""A chaser this far outside of its cone is planned without it."""
+
+
+class PhaseMachine:
+    """Phases of all chasers (``chasers``, by number)."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self._changes: list[PhaseChange] = []
+        self.chasers = [ChaserGuidance(Phase.ACQUIRE, 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
+        self._pending_goals: dict[int, Array] = {}
+        self._docks = [dock_of(scenario, i) for i in range(len(scenario.chasers))]
+        self._cones = [cone_of(scenario, i) for i in range(len(scenario.chasers))]
+        self._observed: dict[int, DockingObservation] = {}
+        self._positions: dict[int, Array] = {}
+        self._last_commands: dict[int, tuple[float, OperatorCommand]] = {}
+        self._timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
+        self._seen_s: float | None = None
+        self._interrupted: set[int] = set()
+
+    # -- the target's estimate -------------------------------------------------------------------------------
+
+    def target_acquired(self, now_s: float) -> None:
+        """Let every chaser in ``acquire`` hold: the target's pose is known."""
+        for i, c in enumerate(self.chasers):
+            self._transition(i, Trigger.TARGET_ACQUIRED, now_s, c.move)
+
+    def target_unknown(self, now_s: float) -> None:
+        """Start the search with every chaser that has waited for the target's pose for a second."""
+        for i, c in enumerate(self.chasers):
+            if now_s - c.since_s >= _SEARCH_AFTER_S:
+                self._transition(i, Trigger.TARGET_UNKNOWN, now_s, c.move)
+
+    def target_settled(self, i: int, now_s: float, offset_m: Array) -> None:
+        """Send a searching chaser at ``offset_m`` (3,), TRF, to its nominal offset, facing the target on the way."""
+        speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED_FACTOR
+        if not self._permits(i, Trigger.TARGET_SETTLED):
+            return
+        move = move_to(stay(offset_m, now_s), self._scenario.chasers[i].position_m, now_s, speed)
+        self._transition(i, Trigger.TARGET_SETTLED, now_s, move, "the target is found")
+        self.chasers[i] = replace(self.chasers[i], faces=True)
+
+    def target_lost(self, now_s: float) -> None:
+        """Stop every chaser that moves relative to the target; one in a port's corridor backs out."""
+        for i in range(len(self.chasers)):
+            self._stop_or_back_out(i, Trigger.TARGET_LOST, now_s, "the target is lost")
+
+    def update_visibility(self, now_s: float, visible: bool) -> None:
+        """Interrupt approaches to a target that no chaser has seen for a while, and resume them afterwards."""
+        self._seen_s = now_s if visible or self._seen_s is None else self._seen_s
+        unseen_s = now_s - self._seen_s
+        for i, c in enumerate(self.chasers):
+            if unseen_s >= _SIGHT_LOSS_S:
+                reason = f"no chaser has seen the target for {_SIGHT_LOSS_S:g} s"
+                if self._stop_or_back_out(i, Trigger.SIGHT_LOST, now_s, reason) is Phase.HOLD:
+                    self._interrupted.add(i)
+            elif i in self._interrupted and unseen_s == 0.0 and self._permits(i, Trigger.SIGHT_REGAINED):
+                move = move_to(c.move, self.dock_offset(i), now_s, self._scenario.approach.max_speed_m_s)
+                self._transition(i, Trigger.SIGHT_REGAINED, now_s, move, "the target is in sight again")
+            if self.chasers[i].phase is not Phase.HOLD:
+                self._interrupted.discard(i)
+
+    def _stop_or_back_out(self, i: int, trigger: Trigger, now_s: float, reason: str) -> Phase | None:
+        phase = next_phase(self.chasers[i].phase, trigger, self._docks[i] is not None)
+        if phase is Phase.RETREAT:
+            self._back_out(i, trigger, now_s, reason)
+        elif phase is not None:
+            # TARGET_LOST is an event of its own in the log; the phase change needs no reason.
+            why = reason if trigger is Trigger.SIGHT_LOST else ""
+            self._transition(i, trigger, now_s, stop(self.chasers[i].move, now_s), why)
+        return phase
+
+    # -- commands --------------------------------------------------------------------------------------------
+
+    def due_commands(self, now_s: float) -> list[OperatorCommand]:
+        """Return the commands of the scenario's timeline that are due and were not returned before."""
+        out = []
+        while self._timeline and self._timeline[0].at_s <= now_s + 1e-9:
+            entry = self._timeline.pop(0)
+            for chaser in entry.chasers:
+                fields = {"command": entry.command, "offset_m": entry.offset_m, "thruster": entry.thruster}
+                out.append(OperatorCommand(chaser=chaser, **fields))
+        return out
+
+    def set_pending_goals(self, commands: Sequence[OperatorCommand]) -> None:
+        """Note the goals of one tick's commands together, so that two chasers can swap their places."""
+        self._pending_goals = {
+            c.chaser: np.asarray(c.offset_m)
+            for c in commands
+            if c.command == "goto"
+            and c.offset_m is not None
+            and not validation.why_not_offset(self._scenario, c.offset_m)
+        }
+
+    def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
+        """Apply or refuse a command.
+
+        Of different commands to a chaser in one tick only the first is accepted, except that an abort always is.
+        """
+        i, what = command.chaser, command.command
+        reason = validation.why_unknown_chaser(i, len(self.chasers)) or validation.why_stale(command, now_s)
+        if reason:
+            return CommandResult(False, reason)
+        if self.chasers[i].phase in (Phase.ACQUIRE, Phase.SEARCHING):
+            return CommandResult(False, "the target has not been found yet")
+        done_s, done = self._last_commands.get(i, (-math.inf, command))
+        differs = (done.command, done.offset_m) != (what, command.offset_m)
+        if done_s == now_s and differs and what != "abort":
+            return validation.superseded_by(done)
+        result = self._apply_command(command, now_s)
+        if result.accepted:
+            self._last_commands[i] = now_s, command
+        return result
+
+    def _apply_command(self, command: OperatorCommand, now_s: float) -> CommandResult:
+        i, what = command.chaser, command.command
+        self._interrupted.discard(i)  # a new command cancels the automatic resumption of the one before
+        c, dock = self.chasers[i], self._docks[i]
+        if what != "goto" and (what == c.phase or (what == "approach" and c.phase in APPROACHING)):
+            return CommandResult(True, f"already in phase {c.phase}")
+        if reason := self._why_not(command, now_s):
+            return CommandResult(False, reason)
+        trigger, speed = trigger_of(what), self._scenario.approach.max_speed_m_s
+        match trigger:
+            case Trigger.COMMAND_RETREAT | Trigger.COMMAND_ABORT:
+                self._back_out(i, trigger, now_s)
+            case Trigger.COMMAND_HOLD if self.in_corridor(i):
+                self._transition(i, trigger, now_s, stay(self._observed[i].offset_m, now_s))
+            case Trigger.COMMAND_HOLD:
+                self._transition(i, trigger, now_s, stop(c.move, now_s))
+            case Trigger.COMMAND_CALIBRATE:
+                self._transition(i, trigger, now_s, c.move)
+            case Trigger.COMMAND_APPROACH if dock is None:
+                self._transition(i, trigger, now_s, move_to(c.move, self.dock_offset(i), now_s, speed))
+            case Trigger.COMMAND_APPROACH:
+                occupied = self._why_corridor_occupied(i)
+                if occupied:
+                    blocked = Trigger.COMMAND_APPROACH_BLOCKED
+                    self._transition(i, blocked, now_s, stop(c.move, now_s), occupied)
+                else:
+                    self._align(i, trigger, now_s, 1)
+            case _:
+                goal = np.asarray(command.offset_m)
+                self._transition(i, trigger, now_s, move_to(c.move, goal, now_s, speed * _GOTO_SPEED_FACTOR))
+        return CommandResult(True, f"phase {self.chasers[i].phase}")
+
+    def _why_not(self, command: OperatorCommand, now_s: float) -> str:
+        i, c, dock = command.chaser, self.chasers[command.chaser], self._docks[command.chaser]
+        by_capture = dock is not None
+        if command.command == "calibrate":
+            return validation.why_not_calibrate(self._scenario, c.phase, c.move.over_at(now_s))
+        if next_phase(c.phase, trigger_of(command.command), by_capture) is None:
+            return f"in phase {c.phase} permitted: {', '.join(permitted_commands(c.phase, by_capture))}"
+        if command.command == "approach":
+            offset_m = c.move.at(np.array([now_s]))[0][0]
+            return (
+                validation.why_not_along(self._scenario, i, offset_m)
+                if dock is None
+                else why_not_approach(dock, offset_m)
+            )
+        if command.command == "goto":
+            if by_capture and self.in_corridor(i):
+                return "the chaser is in its corridor: retreat or abort first"
+            goals = {
+                j: self._pending_goals.get(j, other.move.goal_m)
+                for j, other in enumerate(self.chasers)
+                if j != i
+            }
+            return validation.why_not_goto(self._scenario, command.offset_m, goals)
+        return ""
+
+    # -- progress --------------------------------------------------------------------------------------------
+
+    def update_tracking(self, i: int, now_s: float, position_error_m: float, angle_error_rad: float) -> None:
+        """Advance a chaser's phase by its estimated errors from the reference pose."""
+        c, approach = self.chasers[i], self._scenario.approach
+        if c.phase is Phase.CALIBRATE and now_s - c.since_s >= CALIBRATION_S:
+            self._transition(i, Trigger.CALIBRATION_COMPLETE, now_s, c.move, "the manoeuvre is complete")
+        elif c.phase in (Phase.RETREAT, Phase.ABORT, Phase.GOTO) and c.move.over_at(now_s):
+            self._continue_move(i, now_s)
+        elif self._docks[i] is None and c.phase in (Phase.APPROACH, Phase.DOCKED) and c.move.over_at(now_s):
+            inside = position_error_m <= approach.docked_position_m and angle_error_rad <= math.radians(
+                approach.docked_angle_deg
+            )
+            since = self._inside_since(i, inside, now_s)
+            self.chasers[i] = ChaserGuidance(c.phase, c.since_s, c.move, since, faces=c.faces)
+            if since is not None and now_s - since >= approach.docked_time_s:
+                self._transition(i, Trigger.WITHIN_TOLERANCE, now_s, c.move, inside_since_s=since)
+            elif since is None:
+                self._transition(i, Trigger.OUTSIDE_TOLERANCE, now_s, c.move)
+
+    def _continue_move(self, i: int, now_s: float) -> None:
+        c = self.chasers[i]
+        match c.then:
+            case NextMove.ATTEMPT:
+                self._align(i, Trigger.NEXT_ATTEMPT, now_s, c.attempt + 1)
+            case NextMove.NOMINAL:
+                nominal, speed = self._scenario.chasers[i].position_m, self._back_out_speed(c.phase)
+                self.chasers[i] = replace(c, move=move_to(c.move, nominal, now_s, speed), then=NextMove.NONE)
+            case NextMove.NONE:
+                self._transition(i, Trigger.MOVE_COMPLETE, now_s, c.move)
+                self.chasers[i] = replace(self.chasers[i], faces=False)
+
+    def update_docking(self, i: int, now_s: float, observed: DockingObservation) -> None:
+        """Advance the phase of a chaser that docks by capture by its observed state at the port."""
+        self._observed[i] = observed
+        c, dock = self.chasers[i], self._docks[i]
+        if dock is None:
+            return
+        if c.phase is Phase.WAIT:
+            if not self._why_corridor_occupied(i):
+                self._align(i, Trigger.CORRIDOR_FREE, now_s, 1)
+            return
+        docking = dock.docking
+        if c.phase is Phase.ALIGN:
+            inside = not observed.view.fault(docking.corridor, docking.corridor.closing_m_s)
+            c = replace(c, inside_since_s=self._inside_since(i, inside, now_s))
+        elif c.phase is Phase.LATCHED and c.held is None and now_s - c.since_s >= docking.settle_s:
+            c = replace(c, held=(observed.offset_m, observed.q_wxyz))
+        self.chasers[i] = c
+        progress = PhaseProgress(
+            phase=c.phase,
+            in_phase_s=now_s - c.since_s,
+            move_complete=c.move.over_at(now_s),
+            reference_gap_m=dock.gap_and_lateral(c.move.at(np.array([now_s]))[0][0])[0],
+            inside_s=0.0 if c.inside_since_s is None else now_s - c.inside_since_s,
+            held=c.held,
+        )
+        outcome = docking_trigger(docking, progress, observed)
+        if outcome is not None:
+            self._apply_docking_trigger(i, now_s, *outcome)
+
+    def _apply_docking_trigger(self, i: int, now_s: float, trigger: Trigger, reason: str) -> None:
+        c, dock = self.chasers[i], self._docks[i]
+        assert dock is not None
+        docking, move = dock.docking, c.move
+        match trigger:
+            case Trigger.ATTEMPT_FAILED:
+                again = c.attempt < docking.attempts and c.phase not in ATTACHED
+                self._back_out(i, trigger, now_s, reason, NextMove.ATTEMPT if again else NextMove.NOMINAL)
+                return
+            case Trigger.ALIGNED:
+                fast = (docking.entry_m - docking.final_m, docking.approach_speed_m_s)
+                slow = (docking.final_m + docking.overdrive_m, docking.contact_speed_m_s)
+                inward = -np.asarray(dock.port.axis)
+                move = glide(dock.offset(docking.entry_m), inward, now_s, fast, slow)
+            case Trigger.LATCH_CLOSED:
+                move = stay(self._observed[i].offset_m, now_s)
+            case _:
+                pass
+        self._transition(i, trigger, now_s, move, reason, attempt=c.attempt)
+
+    def _inside_since(self, i: int, inside: bool, now_s: float) -> float | None:
+        since_s = self.chasers[i].inside_since_s
+        if not inside:
+            return None
+        return now_s if since_s is None else since_s
+
+    # -- what the plan and the commands depend on ------------------------------------------------------------
+
+    def body_rotations(self, i: int, times_s: ArrayLike) -> Array | None:
+        """Return rotations (K, 4) of the body from its reference attitude at times (K,), or None without any."""
+        c = self.chasers[i]
+        if c.phase is not Phase.CALIBRATE:
+            return None
+        return calibration_turns(np.asarray(times_s, dtype=float) - c.since_s)
+
+    def is_free(self, i: int) -> bool:
+        """Return whether a chaser's docking sensor reports neither contact nor a closed latch."""
+        observed = self._observed.get(i)
+        return observed is None or not (observed.contact or observed.latched)
+
+    def in_corridor(self, i: int) -> bool:
+        """Return whether a chaser is in its corridor or at its port, by its phase or its estimated position."""
+        c, dock = self.chasers[i], self._docks[i]
+        if dock is None or i not in self._observed:
+            return False
+        at_port = c.phase in (Phase.APPROACH, Phase.FINAL, Phase.CONTACT, *ATTACHED)
+        return at_port or dock.inside(self._observed[i].offset_m)
+
+    def set_position(self, i: int, offset_m: Array) -> None:
+        """Set a chaser's estimated centre (3,), TRF."""
+        self._positions[i] = offset_m
+
+    def corridor(self, i: int) -> Cone | None:
+        """Return the cone in which a chaser on its way in or out is planned; None outside of it.
+
+        A chaser that docks at a distance has its cone from the command on, and on its way out until it is at the
+        distance that every chaser keeps.
+        """
+        position, dock = self._positions.get(i), self._docks[i]
+        if position is None or self.chasers[i].phase in ATTACHED:
+            return None
+        if dock is None:
+            near = float(np.linalg.norm(position)) < self._scenario.limits.min_distance_target_m
+            applies = near or self.chasers[i].phase in (Phase.APPROACH, Phase.DOCKED)
+        else:
+            applies = self.in_corridor(i)
+        return self._cones[i] if applies and self._cones[i].room_m(position) > -_OUTSIDE_M else None
+
+    def min_distance_target_m(self, i: int) -> float:
+        """Return the distance from the target that a chaser's plan keeps; 0 when its latch holds the target."""
+        limit, dock = self._scenario.limits.min_distance_target_m, self._docks[i]
+        if dock is None:
+            docked_m = max(0.0, self._scenario.approach.dock_distance_m - _HELD_MARGIN_M)
+            return min(limit, docked_m) if self.corridor(i) is not None else limit
+        if not self.in_corridor(i):
+            return limit
+        return 0.0 if self.chasers[i].phase in ATTACHED else min(limit, dock.keep_out_m())
+
+    def latch(self, i: int) -> Latch:
+        """Return the latch command: armed from the final approach on, open before and when backing out."""
+        if self._docks[i] is None:
+            return "keep"
+        return "arm" if self.chasers[i].phase in (Phase.FINAL, Phase.CONTACT, *ATTACHED) else "release"
+
+    def pull_N(self, i: int, now_s: float) -> float:
+        """Return the force along -X, CRF, of the latch test."""
+        c = self.chasers[i]
+        return pull_N(self._scenario.docking, now_s - c.since_s) if c.phase is Phase.LATCHED else 0.0
+
+    def dock_offset(self, i: int) -> Array:
+        """Return a docked chaser's centre (3,), TRF, for docking at a distance."""
+        nominal = np.asarray(self._scenario.chasers[i].position_m)
+        return nominal / np.linalg.norm(nominal) * self._scenario.approach.dock_distance_m
+
+    def drain_changes(self) -> list[PhaseChange]:
+        """Return the phase changes since the last call."""
+        changes, self._changes = self._changes, []
+        return changes
+
+    # -- transitions -----------------------------------------------------------------------------------------
+
+    def _permits(self, i: int, trigger: Trigger) -> bool:
+        return next_phase(self.chasers[i].phase, trigger, self._docks[i] is not None) is not None
+
+    def _transition(
+        self,
+        i: int,
+        trigger: Trigger,
+        now_s: float,
+        move: Motion,
+        reason: str = "",
+        inside_since_s: float | None = None,
+        then: NextMove = NextMove.NONE,
+        attempt: int | None = None,
+    ) -> None:
+        """Enter the phase that the transition table gives for ``trigger``; do nothing where it gives none."""
+        before = self.chasers[i]
+        phase = next_phase(before.phase, trigger, self._docks[i] is not None)
+        if phase is None:
+            return
+        number = before.attempt if attempt is None else attempt
+        self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
+        if phase is not before.phase:
+            detail = f"from {before.phase}" + (f": {reason}" if reason else "")
+            complete = trigger is Trigger.CALIBRATION_COMPLETE
+            self._changes.append(PhaseChange(i, phase, detail, complete))
+
+    def _back_out_speed(self, phase: Phase) -> float:
+        factor = _ABORT_SPEED_FACTOR if phase is Phase.ABORT else 1.0
+        return self._scenario.approach.max_speed_m_s * factor
+
+    def _back_out(
+        self, i: int, trigger: Trigger, now_s: float, reason: str = "", then: NextMove = NextMove.NOMINAL
+    ) -> None:
+        """Move to the nominal offset; from inside a corridor first along its axis to the entry."""
+        c, dock = self.chasers[i], self._docks[i]
+        speed = self._back_out_speed(Phase.ABORT if trigger is Trigger.COMMAND_ABORT else Phase.RETREAT)
+        if dock is None or not self.in_corridor(i):
+            nominal = self._scenario.chasers[i].position_m
+            self._transition(i, trigger, now_s, move_to(c.move, nominal, now_s, speed), reason)
+            return
+        entry = dock.offset(dock.docking.entry_m)
+        move = move_to(stay(self._observed[i].offset_m, now_s), entry, now_s, speed)
+        self._transition(i, trigger, now_s, move, reason, then=then)
+
+    def _align(self, i: int, trigger: Trigger, now_s: float, attempt: int) -> None:
+        dock = self._docks[i]
+        assert dock is not None
+        speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED_FACTOR
+        move = move_to(self.chasers[i].move, dock.offset(dock.docking.entry_m), now_s, speed)
+        self._transition(i, trigger, now_s, move, attempt=attempt)
+
+    def _why_corridor_occupied(self, i: int) -> str:
+        """Return which chaser blocks an approach, or an empty string."""
+        own, docking, active = self._docks[i], self._scenario.docking, 0
+        assert own is not None
+        for j, other in enumerate(self._docks):
+            phase = self.chasers[j].phase
+            if j == i or other is None or not (phase is Phase.ALIGN or self.in_corridor(j)):
+                continue
+            active += phase not in ATTACHED
+            if corridors_apart(own, other) < docking.clearance_m:
+                return f"chaser {j} is in the way"
+        return f"{active} are docking already" if active >= docking.at_once else ""

@@ -32,7 +32,7 @@ import viser
 import websockets
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd
-from chaserdock_protocol.transport import Node, Raw
+from chaserdock_protocol.transport import Node, RawSample
 from results import options_of, write_json
 from websockets.asyncio.client import connect
 
@@ -78,7 +78,7 @@ class Ear:
     commands: dict[tuple[int, int], int] = field(default_factory=dict)
     last_tick: int = -1
 
-    def take(self, raw: Raw) -> None:
+    def take(self, raw: RawSample) -> None:
         """Called on Zenoh's thread."""
         # No more than is needed: what is measured shares the cores with this.
         head = _head.decode(raw.payload)

@@ -27,7 +27,7 @@ import psutil
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import ActuatorCommand, MissionEnd, Tick, WrenchCommand
 from chaserdock_protocol.recording.log import read_log
-from chaserdock_protocol.transport import Link, Node, Raw
+from chaserdock_protocol.transport import Link, Node, RawSample
 from results import options_of, write_json
 
 from chaserdock.analysis.flight import load_flight
@@ -94,7 +94,7 @@ class Ear:
     term: int = 0
     ended: bool = False
 
-    def take(self, raw: Raw) -> None:
+    def take(self, raw: RawSample) -> None:
         """Called on Zenoh's thread."""
         found = topics.topic_of_key(raw.key)
         message = codec.decode(found[0].kind, raw.payload) if found is not None else None

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from chaserdock_protocol.topics import TOPICS
 from chaserdock_protocol.transport import Link, Node, Tls
-from chaserdock_protocol.transport.access_control import LOOK_ON, access_control, common_name, identities
+from chaserdock_protocol.transport.access_control import OBSERVERS, access_control, common_name, identities
 
 from chaserdock.launch.keys import init_keys
 from chaserdock.launch.launcher import free_port
@@ -17,7 +17,7 @@ from chaserdock.launch.launcher import free_port
 NAMESPACE = "rights"
 CHASERS = 3
 EVERYONE = identities(CHASERS)
-PUBLISHERS = {w.process: w for w in EVERYONE if w.role not in LOOK_ON}
+PUBLISHERS = {w.process: w for w in EVERYONE if w.role not in OBSERVERS}
 PATIENCE_S = 20.0
 _OWN = tuple(f"controller/{what}" for what in ("event", "health", "presence", "farewell"))
 

@@ -118,7 +118,7 @@ def play(
     config: ConfigOpt = None,
 ) -> None:
     """Send a log's messages again, as they were, once `chaserdock record` listens; in the place of a world."""
-    from chaserdock_protocol.process import Stop
+    from chaserdock_protocol.process import StopSignal
     from chaserdock_protocol.transport import DEFAULT_ENDPOINT
 
     from chaserdock.logs.player import play as send
@@ -126,6 +126,6 @@ def play(
     if listen is None and connect is None and net_mode == "peer":
         listen = [DEFAULT_ENDPOINT]
     link = link_of(namespace, connect or [], listen, net_mode, config, 60_000)
-    stop = Stop(watch_parent=False)
+    stop = StopSignal(watch_parent=False)
     print(f"{send(_source(log), link, speed, patience, stopped=stop)} messages sent")
     raise typer.Exit(STOPPED if stop() else DONE)

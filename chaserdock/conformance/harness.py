@@ -18,9 +18,9 @@ from chaserdock_protocol.messages import JoinReply, JoinRequest, Message, Missio
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.recording.log import LogSource
 from chaserdock_protocol.topics import Topic
-from chaserdock_protocol.transport import Node, Raw
+from chaserdock_protocol.transport import Node, RawSample
 from chaserdock_protocol.transport import session as presence
-from chaserdock_protocol.transport.bounded_queue import Inbox
+from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 
 from chaserdock.launch.launcher import open_hub
 
@@ -94,21 +94,21 @@ class Stand:
 
     def __init__(self, node: Node, ledger: Ledger, scenario_json: str) -> None:
         self._node, self._ledger, self._scenario_json = node, ledger, scenario_json
-        self._inbox: Inbox[Raw | JoinRequest | tuple[str, bool]] = Inbox()
+        self._inbox: BoundedQueue[RawSample | JoinRequest | tuple[str, bool]] = BoundedQueue()
         # What this stand has sent comes back to it, too; the rest is the checked process'.
         self._sent: Counter[tuple[str, str, bytes]] = Counter()
         self._numbers: Counter[str] = Counter()
         self._alive: set[str] = set()
         self._was_alive = False
         present = {"world", "controller", *(f"chaser/{i}" for i in range(len(ledger.scenario.chasers)))}
-        self._partners = presence.partners_of(ledger.process, present) - {ledger.process}
+        self._partners = presence.required_peers(ledger.process, present) - {ledger.process}
         self._instances = {name: presence.new_instance() for name in sorted(self._partners)}
         self._told_s = 0.0
         self._period_s = presence.EARLY_PERIOD_S
         node.subscribe_raw("**", self._arrived)
         node.watch_liveliness(self._alive_changed)
-        node.answer(topics.JOIN_KEY, JoinRequest, self._joins)
-        node.announce()
+        node.declare_queryable(topics.JOIN_KEY, JoinRequest, self._joins)
+        node.declare_liveliness()
 
     def fly(
         self, child: subprocess.Popen[bytes], turns: list[Turn], start_s: float, patience_s: float
@@ -207,9 +207,9 @@ class Stand:
         key = topic.key_of(place)
         numbered = codec.encode(msgspec.structs.replace(message, seq=self._numbers[key]))
         self._numbers[key] += 1
-        self._send(Raw(key, encoding_of(topic.kind), numbered, 0))
+        self._send(RawSample(key, encoding_of(topic.kind), numbered, 0))
 
-    def _send(self, raw: Raw) -> None:
+    def _send(self, raw: RawSample) -> None:
         self._sent[raw.key, raw.encoding, raw.payload] += 1
         self._node.publish_raw(raw)
 
@@ -228,7 +228,7 @@ class Stand:
             self._listen(0.3 if ended else 0.02)
         return True
 
-    def _arrived(self, raw: Raw) -> None:
+    def _arrived(self, raw: RawSample) -> None:
         self._inbox.put(raw, len(raw.payload))
 
     def _alive_changed(self, name: str, alive: bool) -> None:
@@ -243,9 +243,9 @@ class Stand:
         except queue.Empty:
             return
 
-    def _take(self, item: Raw | JoinRequest | tuple[str, bool]) -> None:
+    def _take(self, item: RawSample | JoinRequest | tuple[str, bool]) -> None:
         ledger = self._ledger
-        if isinstance(item, Raw):
+        if isinstance(item, RawSample):
             sent = (item.key, item.encoding, item.payload)
             if self._sent[sent]:
                 self._sent[sent] -= 1

@@ -12,7 +12,7 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.messages import ActuatorCommand, Farewell, Message, Presence, WrenchCommand
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.topics import Role, Topic
-from chaserdock_protocol.transport import Raw
+from chaserdock_protocol.transport import RawSample
 
 from .ticks import Turn, role_of
 
@@ -97,7 +97,7 @@ class Ledger:
         """Keys that the open tick still needs an answer on, ``but`` those of some topics."""
         return [key for key, topic in self._duties.items() if key not in self._came and topic not in but]
 
-    def take(self, raw: Raw) -> None:
+    def take(self, raw: RawSample) -> None:
         """A message of the process, as it came."""
         self.counts[raw.key] += 1
         if self.instance is None:

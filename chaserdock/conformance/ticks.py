@@ -11,7 +11,7 @@ from chaserdock_protocol.messages import Image, Tick, encoding_of
 from chaserdock_protocol.recording.log import LogSource, read_log, read_scenario
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Role, Topic
-from chaserdock_protocol.transport import Raw
+from chaserdock_protocol.transport import RawSample
 
 # By so many ticks the messages of a lock-step flight may come late to a recorder, by far.
 _LATE_TICKS = 64
@@ -29,8 +29,8 @@ class Turn:
     """
 
     tick: Tick
-    opening: list[Raw] = field(default_factory=list)
-    answers: list[Raw] = field(default_factory=list)
+    opening: list[RawSample] = field(default_factory=list)
+    answers: list[RawSample] = field(default_factory=list)
     exposure_ns: int | None = None
 
 
@@ -97,12 +97,12 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
         for place in (_places(number, len(scenario.chasers)) if "{chaser}" in topic.key else (None,))
     ]
     turns: dict[int, Turn] = {}
-    waiting: dict[int, list[tuple[int, Raw, int | None]]] = {}
+    waiting: dict[int, list[tuple[int, RawSample, int | None]]] = {}
     for record in read_log(log, keys):
         message = record.message
         if message.tick >= most + _LATE_TICKS:
             break
-        raw = Raw(record.key, encoding_of(type(message)), codec.encode(message), 0)
+        raw = RawSample(record.key, encoding_of(type(message)), codec.encode(message), 0)
         if isinstance(message, Tick):
             if message.revision or not _expected(message, number):
                 most = min(most, message.tick)

@@ -9,7 +9,7 @@ from pathlib import Path
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import MissionEnd
-from chaserdock_protocol.process import Stop
+from chaserdock_protocol.process import StopSignal
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
@@ -40,7 +40,7 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
     """
     node = Node("operator", "operator", link)
     try:
-        stop = Stop(watch_parent=False)
+        stop = StopSignal(watch_parent=False)
         mission = join(node, new_instance(), stop, patience_s)
         if mission is None:
             return STOPPED
@@ -75,7 +75,7 @@ def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s:
         node.close()  # only now, as the router may end with this
 
 
-def _watch(node: Node, reporter: ProgressReporter, stop: Stop, world_away_s: float) -> str | None:
+def _watch(node: Node, reporter: ProgressReporter, stop: StopSignal, world_away_s: float) -> str | None:
     """Shows the flight until it has ended; why it failed, or None."""
     seen = {"world": time.monotonic()}
 
@@ -86,7 +86,7 @@ def _watch(node: Node, reporter: ProgressReporter, stop: Stop, world_away_s: flo
     node.subscribe(topics.END)
     reporter.subscribe(node)
     node.watch_liveliness(changed)
-    node.announce()
+    node.declare_liveliness()
     while not stop():
         received = node.receive(0.1)
         if received is not None:

@@ -65,7 +65,7 @@ def _answer(link: Link, key: str, request: Struct, timeout_s: float, who: str) -
     try:
         begun_s = time.monotonic()
         while time.monotonic() - begun_s < timeout_s:
-            reply = node.ask(key, request, CommandReply, timeout_s)
+            reply = node.query(key, request, CommandReply, timeout_s)
             if reply is not None:
                 return reply
             time.sleep(0.05)  # not connected yet

@@ -9,7 +9,7 @@ import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.recording.log import LogSource, read_scenario
-from chaserdock_protocol.recording.scan import VIEWER_PREFIX, FileState, files_of, stored_messages
+from chaserdock_protocol.recording.scan import VIEWER_PREFIX, FileState, log_files, stored_messages
 from chaserdock_protocol.recording.schema_migrations import decode_logged
 from chaserdock_protocol.scenario import scenario_from_json
 
@@ -65,7 +65,7 @@ def info_of(log: LogSource) -> LogInfo:
     rejected: Counter[str] = Counter()
     files: list[FileInfo] = []
     viewer, sent = 0, [0, 0]
-    for path in files_of(log):
+    for path in log_files(log):
         state = FileState()
         for channel, stored in stored_messages(path, state):
             if channel.topic.startswith(VIEWER_PREFIX):

@@ -9,21 +9,21 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
 from chaserdock_protocol.recording.log import LogSource, read_scenario
-from chaserdock_protocol.recording.scan import VIEWER_PREFIX, files_of, stored_messages
-from chaserdock_protocol.transport import Link, Node, Raw
+from chaserdock_protocol.recording.scan import VIEWER_PREFIX, log_files, stored_messages
+from chaserdock_protocol.transport import Link, Node, RawSample
 
 
 class PlayError(ChaserdockError):
     """The log could not be sent."""
 
 
-def sent_again(log: LogSource) -> Iterator[tuple[int, Raw]]:
+def sent_again(log: LogSource) -> Iterator[tuple[int, RawSample]]:
     """Simulated time (ns) and content of every message but the recorder's own and the viewers', in file order."""
-    for path in files_of(log):
+    for path in log_files(log):
         for channel, stored in stored_messages(path):
             if not channel.topic.startswith((VIEWER_PREFIX, "recorder/")):
                 encoding = channel.metadata.get("zenoh_encoding", "")
-                yield stored.log_time, Raw(channel.topic, encoding, stored.data, stored.publish_time)
+                yield stored.log_time, RawSample(channel.topic, encoding, stored.data, stored.publish_time)
 
 
 def play(
@@ -31,7 +31,7 @@ def play(
     link: Link,
     speed: float | None,
     patience_s: float,
-    sent: Callable[[Raw], None] | None = None,
+    sent: Callable[[RawSample], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> int:
     """Waits for a recorder, then sends all of a log; how many messages.
@@ -54,7 +54,7 @@ def play(
                 answer = JoinReply(accepted=False, reason="a log is played here; only a recorder can join")
             reply(answer)
 
-        node.answer(topics.JOIN_KEY, JoinRequest, admit)
+        node.declare_queryable(topics.JOIN_KEY, JoinRequest, admit)
         _wait_for_recorder(node, patience_s, stopped)
         number, begun_s, first_ns = 0, time.monotonic(), None
         for time_ns, raw in sent_again(log):

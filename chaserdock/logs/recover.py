@@ -16,10 +16,10 @@ from chaserdock_protocol.recording.scan import (
     DAMAGE,
     MAX_RECORD_BYTES,
     RECOVERED,
-    attachment_of,
-    chunk_records,
-    metadata_of,
-    seal,
+    parse_attachment,
+    parse_chunk,
+    parse_metadata,
+    with_checksum,
 )
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -93,7 +93,7 @@ def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
 
 def _is_whole(chunk: bytes) -> bool:
     try:
-        chunk_records(chunk)
+        parse_chunk(chunk)
     except DAMAGE:
         return False
     return True
@@ -147,21 +147,21 @@ def _copy(
 ) -> None:
     writer = Writer(target, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_data_crcs=True)
     writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')} recover")
-    writer.add_metadata(RECOVERED, seal({"from": source}))
+    writer.add_metadata(RECOVERED, with_checksum({"from": source}))
     new_channels: dict[int, int] = {}
     new_schemas: dict[int, int] = {}
     for opcode, content in _walk(data, found):
         try:
             if opcode == Opcode.ATTACHMENT:
-                a: Attachment = attachment_of(content)
+                a: Attachment = parse_attachment(content)
                 writer.add_attachment(a.create_time, a.log_time, a.name, a.media_type, a.data)
             elif opcode == Opcode.METADATA:
-                metadata: Metadata = metadata_of(content)
+                metadata: Metadata = parse_metadata(content)
                 if metadata.name != RECOVERED:
                     writer.add_metadata(metadata.name, metadata.metadata)
             elif opcode == Opcode.CHUNK:
                 found.chunks += 1
-                for record in chunk_records(content):
+                for record in parse_chunk(content):
                     if isinstance(record, Schema):
                         schemas[record.id] = record
                     elif isinstance(record, Channel):

@@ -9,11 +9,11 @@ from importlib.metadata import entry_points
 import msgspec
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError, LogSource, read_log, read_scenario
-from chaserdock_protocol.replay_node import Stage, by_tick
+from chaserdock_protocol.replay_node import Stage, order_by_tick
 from chaserdock_protocol.scenario import parse_scenario
 from chaserdock_protocol.scenario.overrides import override
 from chaserdock_protocol.topics import Topic
-from chaserdock_protocol.transport import Received
+from chaserdock_protocol.transport import ReceivedMessage
 
 from .difference import Comparison, TopicDifference
 
@@ -61,21 +61,23 @@ def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolera
     scenario = parse_scenario(values, "the log's scenario")
     keys = [
         topic.key_of(place)
-        for topic in (*stage.inputs, *stage.answers)
+        for topic in (*stage.inputs, *stage.outputs)
         for place in _places(topic, stage, len(scenario.chasers))
     ]
-    answers = {id(t) for t in stage.answers}
+    answers = {id(t) for t in stage.outputs}
     comparison = Comparison(tolerance)
 
-    def recorded() -> Iterator[Received]:
+    def recorded() -> Iterator[ReceivedMessage]:
         for record in read_log(log, keys):
             if id(record.topic) in answers:
                 comparison.add(0, record.key, record.message)
-            yield Received(record.topic, record.place, record.message, record.sent_ns)
+            yield ReceivedMessage(record.topic, record.place, record.message, record.sent_ns)
 
     lockstep = run.get("mode") != "realtime"
     played = 0
-    for topic, place, message in stage.play(scenario, by_tick(stage, recorded()) if lockstep else recorded()):
+    for topic, place, message in stage.play(
+        scenario, order_by_tick(stage, recorded()) if lockstep else recorded()
+    ):
         if id(topic) in answers:
             comparison.add(1, topic.key_of(place), message)
             played += 1

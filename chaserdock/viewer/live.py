@@ -19,9 +19,9 @@ import viser
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, OperatorCommand
-from chaserdock_protocol.process import Stop, say
+from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.scenario import scenario_from_json
-from chaserdock_protocol.transport import Link, Node, Received
+from chaserdock_protocol.transport import Link, Node, ReceivedMessage
 from chaserdock_protocol.transport.session import new_instance
 
 from .address import DEFAULT_HOST, url_of
@@ -52,7 +52,7 @@ class ViewOptions:
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
     """Serves the page until stopped; 0. Raises ViewError or TransportError when it cannot begin."""
-    stop = Stop(watch_parent)
+    stop = StopSignal(watch_parent)
     with ThreadPoolExecutor(1, "ears") as ears:
         ears.submit(int).result()
         # Drawing gives way to those who fly. Listening does not: Zenoh's threads inherit the priority of the one that
@@ -63,7 +63,9 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
             return ears.submit(Node, "viewer", "viewer", link).result()
 
         with page_server(options.host, options.port) as server:
-            say("viewer", f"{url_of(options.host, server.get_port())} shows the mission; Ctrl-C ends this")
+            print_status(
+                "viewer", f"{url_of(options.host, server.get_port())} shows the mission; Ctrl-C ends this"
+            )
             run_id = ""
             while not stop():
                 mission = _next_mission(listen, server, run_id, stop)
@@ -78,11 +80,11 @@ _INSTANCE = new_instance()
 
 
 def _ask(node: Node) -> JoinReply | None:
-    return node.ask(topics.JOIN_KEY, JoinRequest(process="viewer", instance=_INSTANCE), JoinReply, 0.5)
+    return node.query(topics.JOIN_KEY, JoinRequest(process="viewer", instance=_INSTANCE), JoinReply, 0.5)
 
 
 def _next_mission(
-    listen: Callable[[], Node], server: viser.ViserServer, past: str, stop: Stop
+    listen: Callable[[], Node], server: viser.ViserServer, past: str, stop: StopSignal
 ) -> JoinReply | None:
     """Waits for a mission other than the ``past`` one; None when stopped. The page says what it waits for."""
     said = None
@@ -106,23 +108,23 @@ def _next_mission(
 class _Feed:
     """What is followed of a mission, in an order in which nothing comes before what it follows from."""
 
-    takers: list[Callable[[], list[Received]]] = field(default_factory=list)
+    takers: list[Callable[[], list[ReceivedMessage]]] = field(default_factory=list)
 
     @classmethod
     def of(cls, node: Node, chasers: int, truth: bool) -> _Feed:
-        feed = cls([node.follow(topics.TICK, _STATES)])
+        feed = cls([node.subscribe_newest(topics.TICK, _STATES)])
         if truth:
             bodies = ["target", *(f"chaser/{i}" for i in range(chasers))]
-            feed.takers += [node.follow(topics.TRUTH_BODY, _STATES, body) for body in bodies]
+            feed.takers += [node.subscribe_newest(topics.TRUTH_BODY, _STATES, body) for body in bodies]
         for topic in OF_CHASERS:
             depth = 1 if topic is topics.IMAGE else _STATES
-            feed.takers += [node.follow(topic, depth, i) for i in range(chasers)]
-        feed.takers += [node.follow(topic, _STATES) for topic in (topics.TARGET, topics.SOLVER)]
+            feed.takers += [node.subscribe_newest(topic, depth, i) for i in range(chasers)]
+        feed.takers += [node.subscribe_newest(topic, _STATES) for topic in (topics.TARGET, topics.SOLVER)]
         told = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
-        feed.takers += [node.follow(topic, _EVENTS) for topic in told]
+        feed.takers += [node.subscribe_newest(topic, _EVENTS) for topic in told]
         return feed
 
-    def new(self) -> list[Received]:
+    def new(self) -> list[ReceivedMessage]:
         """What has come since the last call."""
         return [received for take in self.takers for received in take()]
 
@@ -152,7 +154,7 @@ class _Watch:
             timeline=None,
         )
 
-    def run(self, stop: Stop) -> None:
+    def run(self, stop: StopSignal) -> None:
         """Follows and draws at most ten times a second, and never more than half of the time."""
         operator = threading.Thread(target=self._operate, name="operator", daemon=True)
         operator.start()
@@ -230,7 +232,7 @@ class _Watch:
             self._page.answer(f"{what} chaser {chaser}: asked …")
             command = OperatorCommand(command=what, chaser=chaser, operator="viewer")  # type: ignore[arg-type]
             try:
-                reply = self._node.ask(topics.OPERATE_KEY, command, CommandReply, _ANSWER_S)
+                reply = self._node.query(topics.OPERATE_KEY, command, CommandReply, _ANSWER_S)
             except ChaserdockError as error:
                 self._page.answer(f"⚠ {what} chaser {chaser}: {error}")
                 continue

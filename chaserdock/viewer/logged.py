@@ -19,8 +19,8 @@ from chaserdock_protocol.recording.scan import (
     FileState,
     LogError,
     LogSource,
-    chunk_records,
-    files_of,
+    log_files,
+    parse_chunk,
     record_at,
     records,
 )
@@ -80,7 +80,7 @@ class LoggedMission:
         bodies = ("target", *(f"chaser/{i}" for i in range(self.chasers)))
         self._shown |= {topics.TRUTH_BODY.key_of(body): topics.TRUTH_BODY for body in bodies}
         self._chunk = lru_cache(maxsize=_CHUNKS_KEPT)(self._read_chunk)
-        for path in files_of(source):
+        for path in log_files(source):
             self._read_through(path)
 
     def _read_through(self, path: Path) -> None:
@@ -89,7 +89,7 @@ class LoggedMission:
             if opcode != Opcode.CHUNK:
                 continue
             try:
-                inside = chunk_records(content)
+                inside = parse_chunk(content)
             except DAMAGE as error:
                 raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
             channels |= {record.id: record for record in inside if isinstance(record, Channel)}
@@ -136,7 +136,7 @@ class LoggedMission:
         """A chunk's messages by key."""
         path, place = self._chunks[number]
         try:
-            inside = chunk_records(record_at(path, place))
+            inside = parse_chunk(record_at(path, place))
         except DAMAGE as error:
             raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
         out: dict[str, list[tuple[Channel, McapMessage]]] = defaultdict(list)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from chaserdock_protocol.process import Stop, say
+from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.recording.scan import LogSource
 
 from .address import url_of
@@ -20,7 +20,7 @@ def view_log(
     """Serves the page on a log until stopped; 0. It plays from the start, or stands still at ``at_s``.
 
     Raises LogError, or ViewError when the page cannot be served."""
-    stop = Stop(watch_parent)
+    stop = StopSignal(watch_parent)
     mission = LoggedMission(source)
     line = TimeLine(mission.end_s)
     if at_s is not None:
@@ -29,7 +29,7 @@ def view_log(
     with page_server(options.host, options.port) as server:
         truth = mission.truth and options.truth
         page = Page(server, mission.scenario, dark=options.dark, truth=truth, command=None, timeline=line)
-        say("viewer", f"{url_of(options.host, server.get_port())} shows the log; Ctrl-C ends this")
+        print_status("viewer", f"{url_of(options.host, server.get_port())} shows the log; Ctrl-C ends this")
         before_s = time.monotonic()
         while not stop():
             begun_s = time.monotonic()

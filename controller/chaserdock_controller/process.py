@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.extrapolation import extrapolate
-from chaserdock_protocol.fault_injection import Lost, layer_of
+from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -27,11 +27,11 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
     Tick,
 )
-from chaserdock_protocol.process import ProcessOptions, Stop, built
+from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
-from chaserdock_protocol.transport import Node, Received
-from chaserdock_protocol.transport.session import Heartbeat, health_of, take_part
+from chaserdock_protocol.transport import Node, ReceivedMessage
+from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
@@ -51,19 +51,19 @@ _PATIENCE_TICKS = 0.5
 def main(options: ProcessOptions) -> int:
     """Runs the controller; 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
 
-    def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+    def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
         flight = ControllerCore(scenario, time.perf_counter, realtime=mission.mode == "realtime")
         controller = Controller(node, scenario, flight, mission.mode == "realtime")
-        node.faults = layer_of(scenario, node.name, lockstep=mission.mode == "lockstep")
+        node.message_filter = create_fault_layer(scenario, node.name, lockstep=mission.mode == "lockstep")
         controller.open(instance)
-        built()
+        finish_startup()
         while not (controller.ended or stop()):
             controller.listen()
         controller.farewell()
         return 0 if controller.ended else 1
 
-    return take_part("standby" if options.standby else "controller", "controller", options, work)
+    return run_member("standby" if options.standby else "controller", "controller", options, work)
 
 
 @dataclass
@@ -159,17 +159,17 @@ class Controller:
             before = self.shadow.commands
             for text in self.shadow.note(message):
                 self._tell("warning", text, message.tick, message.sim_time_ns)
-            self.heartbeat.settled.set()
+            self.heartbeat.in_flight.set()
             if self.shadow.commands != before:
                 self._take_or_leave_command(message)
         return False
 
     def _take_or_leave_command(self, tick: Tick) -> None:
         if self._on_network and self.shadow.commands:
-            self.node.number_anew()
-            self.node.answer(topics.OPERATE_KEY, OperatorCommand, self.operate)
+            self.node.restart_numbering()
+            self.node.declare_queryable(topics.OPERATE_KEY, OperatorCommand, self.operate)
         elif self._on_network:
-            self.node.answer_no_more(topics.OPERATE_KEY)
+            self.node.undeclare_queryable(topics.OPERATE_KEY)
             self._refuse_what_is_asked(tick)
         if tick.term > 1:
             text = f"commands in term {tick.term}" if self.shadow.commands else "stands by"
@@ -221,7 +221,7 @@ class Controller:
             return self.now_s() >= self._due_s
         return self._idle >= _IDLE and not self.realtime and self.shadow.idle(tick.tick)
 
-    def _take(self, received: Received) -> None:
+    def _take(self, received: ReceivedMessage) -> None:
         match received.message:
             case Tick() as tick:
                 if self.tick is not None and tick.tick > self.tick.tick > self.done_tick:
@@ -242,7 +242,7 @@ class Controller:
                 self.heartbeat.take(presence)
             case MissionEnd():
                 self.ended = True
-            case Lost(tick=tick):
+            case LostMessage(tick=tick):
                 self._miss(received.topic, int(received.place or 0), tick)
 
     def _know(self, odometry: Odometry) -> None:
@@ -350,7 +350,7 @@ class Controller:
         if commands_it:
             self._publish(tick, out, took_s, commands)
         if tick.tick % self.scenario.time.rate_hz == 0:
-            health = health_of(self.node, tick.tick, tick.sim_time_ns)
+            health = create_health(self.node, tick.tick, tick.sim_time_ns)
             self.node.publish(topics.HEALTH, health, self.name)
 
     def _publish(

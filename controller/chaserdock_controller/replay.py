@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import msgspec
 from chaserdock_protocol import topics
-from chaserdock_protocol.replay_node import ReplayNode, Said, SilentHeartbeat, Stage
+from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbeat, Stage
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.transport import Node, Received
+from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .core import ControllerCore, TickInputs, TickOutputs
 from .process import Controller
@@ -30,7 +30,7 @@ def _flight_of(scenario: Scenario) -> ControllerCore:
     return ControllerCore(scenario, now_s=lambda: 0.0)
 
 
-def _named_once(recorded: Iterable[Received]) -> Iterator[tuple[str, list[Received]]]:
+def _named_once(recorded: Iterable[ReceivedMessage]) -> Iterator[tuple[str, list[ReceivedMessage]]]:
     """Messages tick by tick, with who commanded at its end; a tick that was told again names that one from the start."""
     for _, group in groupby(recorded, key=lambda r: r.message.tick):
         came = list(group)
@@ -51,7 +51,9 @@ def _named_once(recorded: Iterable[Received]) -> Iterator[tuple[str, list[Receiv
         )
 
 
-def _play(scenario: Scenario, recorded: Iterable[Received], flight_of: Callable[[], Any]) -> Iterator[Said]:
+def _play(
+    scenario: Scenario, recorded: Iterable[ReceivedMessage], flight_of: Callable[[], Any]
+) -> Iterator[Published]:
     """The answers of whoever commanded. One that takes over knows what the other knew; one started again does not."""
     tape, controller, last_seq, last_commander = ReplayNode("controller"), None, -1, ""
     for named, came in _named_once(recorded):
@@ -71,16 +73,18 @@ def _play(scenario: Scenario, recorded: Iterable[Received], flight_of: Callable[
                 tape.put(received)
                 controller.listen()
                 # What a standby tells is on a branch of its own, which is not compared.
-                yield from (s for s in tape.said() if s[0] is not topics.EVENT or commander != "standby")
+                yield from (
+                    s for s in tape.take_published() if s[0] is not topics.EVENT or commander != "standby"
+                )
         last_commander = commander
 
 
-def play_controller(scenario: Scenario, recorded: Iterable[Received]) -> Iterator[Said]:
+def play_controller(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """All that the controller publishes."""
     return _play(scenario, recorded, lambda: _flight_of(scenario))
 
 
-def play_fusion(scenario: Scenario, recorded: Iterable[Received]) -> Iterator[Said]:
+def play_fusion(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """The target's estimate alone."""
     return _play(scenario, recorded, lambda: _FusionAlone(_flight_of(scenario)))
 

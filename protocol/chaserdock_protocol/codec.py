@@ -15,7 +15,7 @@ from .messages import Message, encoding_of
 
 MAX_BYTES = 17_000_000
 UNIT_QUATERNION_TOLERANCE = 1e-6
-GREATEST_NUMBER = 1e15
+MAX_MAGNITUDE = 1e15
 """Bounds every float (SI units): far beyond any mission, and its powers stay finite in all that is worked out."""
 
 T = TypeVar("T", bound=Struct)
@@ -61,7 +61,7 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 
 
 def check_numbers(message: Struct) -> None:
-    """Raises Rejected unless every float is finite and within ``GREATEST_NUMBER``, every ``q_wxyz`` of unit length and
+    """Raises Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of unit length and
     no variance negative."""
     if not _surely_good(message):
         _check_one_by_one(message)
@@ -87,11 +87,11 @@ def _surely_good(message: Struct) -> bool:
     if plan is None:
         return False
     numbers, rows, quaternions, covariances, parts = plan
-    if numbers is not None and not hypot(*numbers(message)) <= GREATEST_NUMBER:
+    if numbers is not None and not hypot(*numbers(message)) <= MAX_MAGNITUDE:
         return False
     if rows is not None:
         for row in rows(message):
-            if not hypot(*row) <= GREATEST_NUMBER:
+            if not hypot(*row) <= MAX_MAGNITUDE:
                 return False
     if quaternions is not None:
         for quaternion in quaternions(message):
@@ -149,7 +149,7 @@ def _check_one_by_one(message: Struct) -> None:
     for name in _fields_with_floats(type(message)):
         value = getattr(message, name)
         if isinstance(value, float):
-            if not -GREATEST_NUMBER <= value <= GREATEST_NUMBER:
+            if not -MAX_MAGNITUDE <= value <= MAX_MAGNITUDE:
                 raise _bad_number(name, value)
         elif value and isinstance(value, tuple):
             if isinstance(value[0], Struct):
@@ -158,9 +158,9 @@ def _check_one_by_one(message: Struct) -> None:
                 continue
             # Long ones (a plan has hundreds) at the speed of C: NaN and infinity come through, and no part is greater.
             length = hypot(*value)
-            if not length <= GREATEST_NUMBER:
+            if not length <= MAX_MAGNITUDE:
                 for item in value:
-                    if not -GREATEST_NUMBER <= item <= GREATEST_NUMBER:
+                    if not -MAX_MAGNITUDE <= item <= MAX_MAGNITUDE:
                         raise _bad_number(name, item)
             if name == "q_wxyz":
                 if abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
@@ -198,7 +198,7 @@ def holds_floats(kind: inspect.Type) -> bool:
 
 def _bad_number(name: str, value: float) -> Rejected:
     reason = "range" if isfinite(value) else "not_finite"
-    return Rejected(reason, f"{name} holds {value}, beyond {GREATEST_NUMBER:g}")
+    return Rejected(reason, f"{name} holds {value}, beyond {MAX_MAGNITUDE:g}")
 
 
 def _check_covariance(values: tuple[float, ...]) -> None:

@@ -1,5 +1,5 @@
-"""The one family of errors that a person is to read: their text is one clear line a fault, and no traceback is shown."""
+"""Base class of errors for users: one line of text per fault, printed without a traceback."""
 
 
 class ChaserdockError(Exception):
-    """Something that was asked for cannot be done; the text says what, where and what would be right."""
+    """A request cannot be carried out. The text states what failed, where, and what is valid."""

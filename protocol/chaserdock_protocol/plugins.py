@@ -1,7 +1,7 @@
-"""Parts that users bring along: entry points of installed packages, by name.
+"""Plugins: entry points of installed packages, by name.
 
-A scenario names a part; only what is installed on the machine of the process that needs it is ever loaded, so a
-scenario that comes over the network can name nothing else.
+A scenario names a plugin. Only packages installed on the machine of the process are loaded, so that a scenario received
+over the network cannot load other code.
 """
 
 from __future__ import annotations
@@ -21,33 +21,31 @@ _GROUPS: dict[Kind, str] = {
 
 
 class PluginError(ChaserdockError):
-    """A part that is not installed, or cannot be used; the text says which ones there are."""
+    """A plugin is not installed or cannot be loaded. The text lists the installed ones."""
 
 
 def installed(kind: Kind) -> dict[str, EntryPoint]:
-    """Parts of that kind that installed packages bring along, by name."""
+    """Return the plugins of a kind that installed packages provide, by name."""
     return {e.name: e for e in sorted(entry_points(group=_GROUPS[kind]), key=lambda e: (e.name, e.value))}
 
 
 def require(kind: Kind, name: str, own: tuple[str, ...]) -> None:
-    """Raises PluginError unless ``name`` is one of chaserdock's ``own`` or installed."""
+    """Raise PluginError unless ``name`` is built in (``own``) or installed."""
     known = installed(kind)
     if name not in own and name not in known:
         raise PluginError(
-            f"{kind} {name!r} is unknown here; chaserdock's own: {', '.join(own)}; installed (entry points of "
+            f"{kind} {name!r} is unknown; built in: {', '.join(own)}; installed (entry points of "
             f"{_GROUPS[kind]!r}): {', '.join(known) or 'none'}"
         )
 
 
 def load(kind: Kind, name: str, own: tuple[str, ...]) -> Callable[..., Any]:
-    """The factory that an installed package gives under ``name``. Raises PluginError, also when importing it fails."""
+    """Return the factory that an installed package provides as ``name``. Raises PluginError, also if its import fails."""
     require(kind, name, own)
     try:
         factory = installed(kind)[name].load()
-    except Exception as error:  # a stranger's module may raise anything
+    except Exception as error:  # a plugin's import may raise anything
         raise PluginError(f"{kind} {name!r} cannot be loaded: {type(error).__name__}: {error}") from error
     if not callable(factory):
-        raise PluginError(
-            f"{kind} {name!r} is a {type(factory).__name__}, not a function or class to be called"
-        )
+        raise PluginError(f"{kind} {name!r} is a {type(factory).__name__}, not a function or class")
     return factory

@@ -1,4 +1,4 @@
-"""What every process' main shares: its options, stopping cleanly, one thread for the number crunchers."""
+"""Options, stop signal and start-up steps that all processes share."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SINGLE_THREADED = {
     "OPENBLAS_NUM_THREADS": "1",
     "MKL_NUM_THREADS": "1",
 }
-"""Environment of every process: one thread each, as there are more processes than cores, and for determinism."""
+"""Environment of every process: single-threaded numerics, as processes outnumber cores, and for determinism."""
 
 
 @dataclass(frozen=True)
 class Rotation:
-    """When a recorder begins a new file: after so many bytes, after so many seconds of simulated time."""
+    """Limits after which a recorder starts a new file: bytes, seconds of simulated time."""
 
     size_bytes: int | None = None
     seconds: float | None = None
@@ -37,11 +37,11 @@ class Rotation:
 
 @dataclass(frozen=True)
 class ProcessOptions:
-    """How a process was started. Which fields count depends on the process.
+    """Start options of a process. Each process uses a subset.
 
-    ``rejoin_s``: wall seconds that a world in lock-step waits when it has lost everybody; ``by_run``: a recorder
-    makes a folder for each run in ``out``; ``until``: a router ends once that process has come and gone; ``standby``: a
-    controller begins as the second one.
+    ``rejoin_s``: wall-clock time (s) that a lock-step world waits after it lost all processes. ``by_run``: the recorder
+    creates one folder per run in ``out``. ``until``: the router ends when this process has joined and left.
+    ``standby``: the controller starts as the standby.
     """
 
     link: Link = field(default_factory=Link)
@@ -62,14 +62,14 @@ class ProcessOptions:
     standby: bool = False
 
 
-class Stop:
-    """Set by SIGINT, SIGTERM or, where asked for, the end of standard input (the parent is gone)."""
+class StopSignal:
+    """Set by SIGINT, SIGTERM and, with ``watch_parent``, the end of standard input (the parent has ended)."""
 
     def __init__(self, watch_parent: bool) -> None:
         self._event = threading.Event()
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self._on_signal)
-            # Under `run`, Ctrl-C is the launcher's to handle; the terminal sends it to all.
+            # The terminal sends Ctrl-C to all processes of `run`; the launcher handles it.
             signal.signal(signal.SIGINT, signal.SIG_IGN if watch_parent else self._on_signal)
         if watch_parent:
             threading.Thread(target=self._watch, name="parent", daemon=True).start()
@@ -89,13 +89,12 @@ class Stop:
         return self._event.is_set()
 
 
-def built() -> None:
-    """Says that this process is about to fly: what it holds by now stays, and the garbage collector, which would stop it
-    for some 10 ms, need not go through all of that again and again."""
+def finish_startup() -> None:
+    """Exclude the objects created so far from garbage collection, which would otherwise pause the flight for some 10 ms."""
     gc.collect()
     gc.freeze()
 
 
-def say(process: str, text: str) -> None:
-    """One line on standard error."""
+def print_status(process: str, text: str) -> None:
+    """Print one line to standard error."""
     print(f"{process}: {text}", file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""A process without a network: recorded messages in, what it publishes out. What replaying a log stands on."""
+"""Stand-ins for a process' network node and heartbeat, which replay a log through today's code."""
 
 from __future__ import annotations
 
@@ -11,85 +11,85 @@ from typing import Any
 from .messages import Message
 from .scenario import Scenario
 from .topics import Topic
-from .transport import Counts, Received
+from .transport import ReceivedMessage, TrafficCounters
 
-Said = tuple[Topic, int | str | None, Message]
-"""What a process publishes: topic, place, message (not numbered)."""
+Published = tuple[Topic, int | str | None, Message]
+"""A published message: topic, place, message (``seq`` not set)."""
 
 
 class ReplayNode:
-    """Stands in for a process' ``Node``: it hears what is put in, and what it says is kept."""
+    """Stands in for a ``Node``: delivers the messages that were put in, and collects published ones."""
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.counts = Counts()
-        self._heard: deque[Received] = deque()
-        self._said: list[Said] = []
+        self.counts = TrafficCounters()
+        self._pending: deque[ReceivedMessage] = deque()
+        self._published: list[Published] = []
 
-    def put(self, received: Received) -> None:
-        """What the process receives next."""
-        self._heard.append(received)
+    def put(self, received: ReceivedMessage) -> None:
+        """Append a message to receive."""
+        self._pending.append(received)
 
-    def receive(self, timeout_s: float | None) -> Received | None:
-        """As ``Node.receive``, without waiting."""
-        return self._heard.popleft() if self._heard else None
+    def receive(self, timeout_s: float | None) -> ReceivedMessage | None:
+        """Return the next message, as ``Node.receive`` does, without waiting."""
+        return self._pending.popleft() if self._pending else None
 
     def publish(self, topic: Topic, message: Message, place: int | str | None = None) -> None:
-        """As ``Node.publish``."""
-        self._said.append((topic, place, message))
+        """Collect a message, as ``Node.publish`` sends it."""
+        self._published.append((topic, place, message))
 
-    def said(self) -> list[Said]:
-        """What was published since the last call."""
-        said, self._said = self._said, []
-        return said
+    def take_published(self) -> list[Published]:
+        """Return the messages published since the last call."""
+        published, self._published = self._published, []
+        return published
 
 
 class SilentHeartbeat:
-    """Stands in for a process' ``Heartbeat``: nobody needs to be told."""
+    """Stands in for a ``Heartbeat``: publishes and records nothing."""
 
     def __init__(self) -> None:
-        self.settled = threading.Event()
+        self.in_flight = threading.Event()
 
     def take(self, message: Any) -> None:
-        """Nobody needs to be heard."""
+        """Ignore a presence."""
 
 
 @dataclass(frozen=True)
 class Stage:
-    """A part of the flying software that can be run again on a log.
+    """A part of the flight software that can be replayed on a log.
 
-    ``play(scenario, recorded)`` yields what today's code says to the ``inputs`` among the recorded messages. It gets
-    the recorded ``answers``, too, before the inputs of their tick, to learn from their numbering when a process was
-    started again, and for nothing else. Within a tick inputs come in the order of ``inputs``.
+    ``play(scenario, recorded)`` yields the messages that today's code publishes for the recorded ``inputs``. It also
+    gets the recorded ``outputs``, before the inputs of their tick, only to detect from their ``seq`` that a process was
+    restarted. Within a tick, messages come in the order of ``inputs``.
     """
 
     process: str
     inputs: tuple[Topic, ...]
-    answers: tuple[Topic, ...]
-    play: Callable[[Scenario, Iterable[Received]], Iterator[Said]]
+    outputs: tuple[Topic, ...]
+    play: Callable[[Scenario, Iterable[ReceivedMessage]], Iterator[Published]]
 
 
-# Ticks that the messages of a tick may come late to a recorder in lock-step, by far: the flight waits for it.
-_LATE_TICKS = 64
+# Upper bound on the delay of a lock-step message in a log, in ticks: the flight waits for the recorder.
+_MAX_DELAY_TICKS = 64
 
 
-def by_tick(stage: Stage, recorded: Iterable[Received]) -> Iterator[Received]:
-    """The messages of a lock-step flight in the order of their ticks, and of the stage's within one.
+def order_by_tick(stage: Stage, recorded: Iterable[ReceivedMessage]) -> Iterator[ReceivedMessage]:
+    """Yield the messages of a lock-step flight by tick, and within a tick in the order of the stage's topics.
 
-    A recorder hears different processes in any order; what belongs to a tick is what they agree on.
+    A recorder receives messages of different processes in any order.
     """
-    rank = {id(topic): k for k, topic in enumerate((*stage.answers, *stage.inputs))}
-    ticks: dict[int, list[Received]] = {}
+    rank = {id(topic): k for k, topic in enumerate((*stage.outputs, *stage.inputs))}
+    ticks: dict[int, list[ReceivedMessage]] = {}
     for received in recorded:
         tick = received.message.tick
         ticks.setdefault(tick, []).append(received)
-        for done in sorted(t for t in ticks if t < tick - _LATE_TICKS):
-            yield from sorted(ticks.pop(done), key=lambda r: _order(r, rank))
-    for done in sorted(ticks):
-        yield from sorted(ticks[done], key=lambda r: _order(r, rank))
+        for complete in sorted(t for t in ticks if t < tick - _MAX_DELAY_TICKS):
+            yield from sorted(ticks.pop(complete), key=lambda r: _order(r, rank))
+    for complete in sorted(ticks):
+        yield from sorted(ticks[complete], key=lambda r: _order(r, rank))
 
 
-def _order(received: Received, rank: dict[int, int]) -> tuple[int, int]:
-    # A tick that was revised: its processes knew of the revision last.
+def _order(received: ReceivedMessage, rank: dict[int, int]) -> tuple[int, int]:
+    # Processes received a revised tick after the other messages of the tick.
     revision = getattr(received.message, "revision", 0)
     return (len(rank) if revision else rank[id(received.topic)]), revision

@@ -1,4 +1,4 @@
-"""How a run's folder is called when several processes have to find it."""
+"""Name of a run's folder, which several processes must agree on."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from .scenario import scenario_from_json
 
 
 def run_name(mission: JoinReply) -> str:
-    """Scenario and run, such as ``four-chaser-docking-3f2a9c01d4e5``; the same for all who joined the run."""
+    """Return scenario name and run id, such as ``four-chaser-docking-3f2a9c01d4e5``."""
     return f"{scenario_from_json(mission.scenario_json, 'the world').name}-{mission.run_id}"

@@ -117,7 +117,7 @@ TOPICS: tuple[Topic, ...] = (
     FAREWELL,
 )
 
-AT_ONCE = (WRENCH, ACTUATORS, ACK, STATE)
+EXPRESS = (WRENCH, ACTUATORS, ACK, STATE)
 """Sent without waiting for more, with all of their priority that was published before them."""
 NEVER_DROPPED = (END, FAREWELL)
 """Published once, at the end, and waited for even in real time."""

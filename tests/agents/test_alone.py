@@ -27,7 +27,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate, Tick, WrenchCommand
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.transport import Received
+from chaserdock_protocol.transport import ReceivedMessage
 
 ROOT = Path(__file__).resolve().parents[2]
 STEP_S, DT_S, STAGES = 0.1, 0.1, 30
@@ -194,9 +194,9 @@ def test_clear_is_outside_of_the_keep_out_ball_and_of_the_corridor() -> None:
 
 def tell(chaser: Chaser, topic: Any, message: Any) -> list[tuple[Any, Any]]:
     tape: Any = chaser.node
-    tape.put(Received(topic, None if topic is topics.TICK else "0", message, 0))
+    tape.put(ReceivedMessage(topic, None if topic is topics.TICK else "0", message, 0))
     chaser.listen()
-    return [(t, m) for t, _, m in tape.said()]
+    return [(t, m) for t, _, m in tape.take_published()]
 
 
 def tick_of(scenario: Scenario, tick: int, commander: str, term: int, revision: int = 0) -> Tick:

@@ -16,7 +16,7 @@ import zenoh
 from chaserdock_agents.router.acl_audit import MOST_NAMED, TARGET, TLS_TARGET, Account, Denial, Reader
 from chaserdock_protocol import codec
 from chaserdock_protocol.messages import Event
-from chaserdock_protocol.transport import Node, Raw
+from chaserdock_protocol.transport import Node, RawSample
 from chaserdock_protocol.transport.node import zenoh_config
 from harness import chaserdock
 from mission_keys import EVERYONE, NAMESPACE, PATIENCE_S, client, keys_with_owners, make_keys
@@ -132,7 +132,7 @@ def test_every_wrong_identity_on_every_key_is_noted(
     keys, endpoint, process = router
     noted: list[str] = []
 
-    def arrived(raw: Raw) -> None:
+    def arrived(raw: RawSample) -> None:
         if raw.key == "router/event":
             event = codec.decode(Event, raw.payload, raw.encoding)
             assert (event.process, event.level, event.what) == ("router", "warning", "denied")

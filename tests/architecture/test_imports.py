@@ -72,6 +72,19 @@ def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:
     assert users == homes
 
 
+def test_transport_depends_on_neither_faults_nor_scenario() -> None:
+    """Directly or through other modules of the protocol: both are passed in."""
+    start = {name for name in NAMES if name.startswith("chaserdock_protocol.transport")}
+    reached, waiting = set(start), list(start)
+    while waiting:
+        for name in own_imports(NAMES[waiting.pop()]) - reached:
+            reached.add(name)
+            waiting.append(name)
+    forbidden = ("chaserdock_protocol.fault_injection", "chaserdock_protocol.scenario")
+    assert [name for name in sorted(reached) if name.startswith(forbidden)] == []
+    assert "chaserdock_protocol.topics" in reached
+
+
 # -- the truth --------------------------------------------------------------------------------------------
 
 TRUTHS = {name for name in vars(topics) if name.startswith("TRUTH")}

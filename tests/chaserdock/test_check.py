@@ -13,7 +13,7 @@ import pytest
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import encoding_of
 from chaserdock_protocol.recording.log import read_log
-from chaserdock_protocol.transport import Raw
+from chaserdock_protocol.transport import RawSample
 from harness import ROOT, finished
 
 from chaserdock.conformance.rules import Ledger
@@ -25,23 +25,23 @@ PROCESSES = ("controller", "chaser/0", "chaser/1")
 
 
 @pytest.fixture(scope="module")
-def said() -> dict[str, list[tuple[int, Raw]]]:
+def said() -> dict[str, list[tuple[int, RawSample]]]:
     """What every process said in the golden flight, with the tick."""
-    out: dict[str, list[tuple[int, Raw]]] = {name: [] for name in PROCESSES}
+    out: dict[str, list[tuple[int, RawSample]]] = {name: [] for name in PROCESSES}
     for record in read_log(LOG):
-        raw = Raw(record.key, encoding_of(type(record.message)), codec.encode(record.message), 0)
+        raw = RawSample(record.key, encoding_of(type(record.message)), codec.encode(record.message), 0)
         for name in PROCESSES:
             if record.key.startswith(f"{name}/"):
                 out[name].append((record.message.tick, raw))
     return out
 
 
-def instance_of(messages: list[tuple[int, Raw]]) -> str:
+def instance_of(messages: list[tuple[int, RawSample]]) -> str:
     raw = next(r for _, r in messages if r.key.endswith("/presence"))
     return codec.decode(topics.PRESENCE.kind, raw.payload).instance  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def keep(process: str, messages: list[tuple[int, Raw]], recorded: Recorded) -> Ledger:
+def keep(process: str, messages: list[tuple[int, RawSample]], recorded: Recorded) -> Ledger:
     """The ledger after a whole flight, each tick's messages after its opening, as a check would hear them."""
     ledger = Ledger(process, recorded.scenario, instance_of(messages))
     end = recorded.turns[-1].tick.tick
@@ -65,7 +65,7 @@ def keep(process: str, messages: list[tuple[int, Raw]], recorded: Recorded) -> L
 
 @pytest.mark.parametrize("process", PROCESSES)
 def test_what_our_own_processes_said_is_in_order(
-    process: str, said: dict[str, list[tuple[int, Raw]]]
+    process: str, said: dict[str, list[tuple[int, RawSample]]]
 ) -> None:
     recorded = read_turns(LOG, process, 1000)
     assert len(recorded.turns) == 18
@@ -74,14 +74,14 @@ def test_what_our_own_processes_said_is_in_order(
     assert ledger.messages == len(said[process])
 
 
-def changed(raw: Raw, **fields: Any) -> Raw:
+def changed(raw: RawSample, **fields: Any) -> RawSample:
     found = topics.topic_of_key(raw.key)
     assert found is not None
     message = msgspec.structs.replace(codec.decode(found[0].kind, raw.payload), **fields)
     return msgspec.structs.replace(raw, payload=codec.encode(message))
 
 
-BREACHES: list[tuple[str, Callable[[Raw], list[Raw]], str, str]] = [
+BREACHES: list[tuple[str, Callable[[RawSample], list[RawSample]], str, str]] = [
     ("controller/target", lambda r: [msgspec.structs.replace(r, encoding="application/msgpack")], "", "wrong encoding"),
     ("controller/target", lambda r: [msgspec.structs.replace(r, payload=b"\xff")], "", "not of the message's type"),
     ("controller/target", lambda r: [changed(r, position_m=(math.nan, 0.0, 0.0))], "", "not finite"),
@@ -110,10 +110,10 @@ BREACHES: list[tuple[str, Callable[[Raw], list[Raw]], str, str]] = [
 @pytest.mark.parametrize(("key", "breach", "where", "what"), BREACHES)
 def test_a_breach_is_found(
     key: str,
-    breach: Callable[[Raw], list[Raw]],
+    breach: Callable[[RawSample], list[RawSample]],
     where: str,
     what: str,
-    said: dict[str, list[tuple[int, Raw]]],
+    said: dict[str, list[tuple[int, RawSample]]],
 ) -> None:
     recorded = read_turns(LOG, "controller", 1000)
     # At tick 5; presence and farewell, which answer no tick, always.

@@ -19,9 +19,9 @@ from chaserdock_protocol import messages as m
 from chaserdock_protocol.process import Rotation
 from chaserdock_protocol.recording import schema_migrations as upgrades
 from chaserdock_protocol.recording.log import LogError, LogWriter, count_messages, read_log, read_scenario
-from chaserdock_protocol.recording.scan import FileState, files_of, stored_messages
+from chaserdock_protocol.recording.scan import FileState, log_files, stored_messages
 from chaserdock_protocol.scenario import scenario_from_json
-from chaserdock_protocol.transport import Raw
+from chaserdock_protocol.transport import RawSample
 from harness import finished
 from mcap.reader import make_reader
 from message_samples import BY_TYPE
@@ -35,14 +35,14 @@ GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 ONE_FILE = Rotation()
 
 
-def raws(log: Path) -> list[tuple[Raw, Any]]:
+def raws(log: Path) -> list[tuple[RawSample, Any]]:
     out = []
     for channel, stored in stored_messages(log):
         if channel.topic.startswith("/viewer/"):
             continue
         found = topics.topic_of_key(channel.topic)
         assert found is not None
-        raw = Raw(channel.topic, channel.metadata["zenoh_encoding"], stored.data, stored.publish_time)
+        raw = RawSample(channel.topic, channel.metadata["zenoh_encoding"], stored.data, stored.publish_time)
         out.append((raw, codec.decode(found[0].kind, stored.data)))
     return out
 
@@ -109,7 +109,7 @@ def test_viewers_get_schemas_images_and_frames(tmp_path: Path) -> None:
 
 def test_rotation_by_size_keeps_every_message(tmp_path: Path) -> None:
     folder = recorded(tmp_path / "r", Rotation(size_bytes=400_000), repeat=4)
-    parts = files_of(folder)
+    parts = log_files(folder)
     assert len(parts) >= 3
     whole = recorded(tmp_path / "w", repeat=4)
     assert [r.message for r in read_log(folder)] == [r.message for r in read_log(whole)]

@@ -17,8 +17,8 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.recording.log import LogWriter, Record, read_log, read_scenario
 from chaserdock_protocol.recording.scan import stored_messages
-from chaserdock_protocol.replay_node import by_tick
-from chaserdock_protocol.transport import Received
+from chaserdock_protocol.replay_node import order_by_tick
+from chaserdock_protocol.transport import ReceivedMessage
 from harness import finished
 from message_samples import BY_TYPE
 
@@ -179,9 +179,9 @@ def test_command_line(tmp_path: Path) -> None:
 def test_by_tick_puts_a_ticks_messages_in_the_stages_order() -> None:
     from chaserdock_controller.replay import CONTROLLER
 
-    def received(topic: topics.Topic, tick: int, **changes: Any) -> Received:
+    def received(topic: topics.Topic, tick: int, **changes: Any) -> ReceivedMessage:
         message: Any = msgspec.structs.replace(BY_TYPE[topic.kind], tick=tick, **changes)  # type: ignore[type-var]
-        return Received(topic, None, message, 0)
+        return ReceivedMessage(topic, None, message, 0)
 
     given = [
         received(topics.SIGHTING, 1),
@@ -193,7 +193,8 @@ def test_by_tick_puts_a_ticks_messages_in_the_stages_order() -> None:
         received(topics.TICK, 0, revision=0),
     ]
     order = [
-        (r.message.tick, r.topic.key, getattr(r.message, "revision", 0)) for r in by_tick(CONTROLLER, given)
+        (r.message.tick, r.topic.key, getattr(r.message, "revision", 0))
+        for r in order_by_tick(CONTROLLER, given)
     ]
     assert order == [
         (0, "world/tick", 0),

@@ -310,7 +310,9 @@ def test_rights_show_the_truth_to_a_viewer_and_not_with_an_operators_keys(tmp_pa
         nodes = {who: Node("viewer", "viewer", client(keys, who, endpoint)) for who in ("viewer", "operator")}
         try:
             takers = {
-                (who, topic.key): node.follow(topic, 4, "target" if topic is topics.TRUTH_BODY else None)
+                (who, topic.key): node.subscribe_newest(
+                    topic, 4, "target" if topic is topics.TRUTH_BODY else None
+                )
                 for who, node in nodes.items()
                 for topic in (topics.TICK, topics.TRUTH_BODY, topics.EVENT)
             }
@@ -342,7 +344,7 @@ def test_who_follows_gets_the_newest_and_never_holds_up_the_publisher() -> None:
     world, looker = Node("world", "world", link), None
     try:
         looker = Node("viewer", "viewer", Link("follow", ("tcp/127.0.0.1:17999",), ()))
-        take = looker.follow(topics.TICK, 4)
+        take = looker.subscribe_newest(topics.TICK, 4)
         world.advertise(topics.TICK)
         deadline, got = time.monotonic() + 30.0, []
         while not got and time.monotonic() < deadline:  # until they know each other

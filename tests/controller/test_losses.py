@@ -11,12 +11,12 @@ from chaserdock_agents.chaser.process import Chaser
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.process import Controller
 from chaserdock_protocol import topics
-from chaserdock_protocol.fault_injection import Lost
+from chaserdock_protocol.fault_injection import LostMessage
 from chaserdock_protocol.messages import Image, Message, Odometry, Sighting, Tick, WrenchCommand
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
-from chaserdock_protocol.transport import Received
+from chaserdock_protocol.transport import ReceivedMessage
 
 ROOT = Path(__file__).resolve().parents[2]
 ZERO = (0.0, 0.0, 0.0)
@@ -52,13 +52,13 @@ def tick_of(scenario: Scenario, tick: int, chasers: tuple[int, ...]) -> Tick:
 
 def tell(process: Any, topic: Topic, place: int | None, message: Any) -> list[tuple[Topic, Any]]:
     """Hands a process one message; what it says to that."""
-    process.node.put(Received(topic, None if place is None else str(place), message, 0))
+    process.node.put(ReceivedMessage(topic, None if place is None else str(place), message, 0))
     process.listen()
-    return [(t, m) for t, _, m in process.node.said()]
+    return [(t, m) for t, _, m in process.node.take_published()]
 
 
-def lost(scenario: Scenario, tick: int) -> Lost:
-    return Lost(tick, scenario.timing.tick_time_ns(tick))
+def lost(scenario: Scenario, tick: int) -> LostMessage:
+    return LostMessage(tick, scenario.timing.tick_time_ns(tick))
 
 
 # -- chaser -------------------------------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def flown_tick(
     for topic, make in makers.items():
         for i in range(chasers):
             gone = i in without.get(topic, set())
-            message: Message | Lost = lost(scenario, tick) if gone else make(scenario, i, tick)
+            message: Message | LostMessage = lost(scenario, tick) if gone else make(scenario, i, tick)
             said += tell(controller, topic, i, message)
     return {m.chaser: m for t, m in said if t is topics.WRENCH}
 
@@ -243,7 +243,9 @@ def test_in_real_time_a_tick_waits_for_its_sightings_and_not_for_ever(scenario: 
     assert not [m for t, m in said if t is topics.WRENCH]
     clock.now_s = 0.9 / scenario.time.rate_hz
     controller.listen()  # nothing comes
-    commands: list[Any] = [m for t, _, m in cast(ReplayNode, controller.node).said() if t is topics.WRENCH]
+    commands: list[Any] = [
+        m for t, _, m in cast(ReplayNode, controller.node).take_published() if t is topics.WRENCH
+    ]
     assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]
     # The sighting that is late belongs to the next tick's estimate, and makes no second command.
     said = tell(controller, topics.SIGHTING, 1, sighting(scenario, 1, 1))

@@ -22,7 +22,7 @@ from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
 from chaserdock_protocol.recording.log import read_log, read_scenario
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
-from chaserdock_protocol.transport import Node, Received
+from chaserdock_protocol.transport import Node, ReceivedMessage
 
 LOG = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING)
@@ -34,9 +34,9 @@ def scenario() -> Scenario:
 
 
 @pytest.fixture(scope="module")
-def ticks() -> dict[int, list[Received]]:
+def ticks() -> dict[int, list[ReceivedMessage]]:
     """The golden flight's inputs, by tick, as a standby would get them."""
-    out: dict[int, list[Received]] = {}
+    out: dict[int, list[ReceivedMessage]] = {}
     for r in read_log(LOG):
         if r.topic in INPUTS:
             message = r.message
@@ -45,7 +45,7 @@ def ticks() -> dict[int, list[Received]]:
                 message = msgspec.structs.replace(
                     message, term=1, commander="controller", instance="c", standing_by=standing_by
                 )
-            out.setdefault(message.tick, []).append(Received(r.topic, r.place, message, 0))
+            out.setdefault(message.tick, []).append(ReceivedMessage(r.topic, r.place, message, 0))
     last = max(tick for tick, came in out.items() if any(r.topic is topics.TICK for r in came))
     return {tick: came for tick, came in sorted(out.items()) if tick <= last}
 
@@ -57,20 +57,20 @@ def member(scenario: Scenario, name: str, instance: str) -> Controller:
     return made
 
 
-def hear(process: Controller, *messages: Received) -> list[tuple[Any, Any]]:
+def hear(process: Controller, *messages: ReceivedMessage) -> list[tuple[Any, Any]]:
     """Hands a controller messages; what it says to them, without what is measured by the wall clock."""
     tape = cast(ReplayNode, process.node)
     for message in messages:
         tape.put(message)
     before = None
-    while tape._heard or before != (process.done_tick, len(process.shadow._held)):
+    while tape._pending or before != (process.done_tick, len(process.shadow._held)):
         before = process.done_tick, len(process.shadow._held)
         process.listen()
-    return [(t, m) for t, _, m in tape.said()]
+    return [(t, m) for t, _, m in tape.take_published()]
 
 
-def words(said: list[tuple[Any, Any]]) -> list[Received]:
-    return [Received(t, None, m, 0) for t, m in said if t is topics.STATE]
+def words(said: list[tuple[Any, Any]]) -> list[ReceivedMessage]:
+    return [ReceivedMessage(t, None, m, 0) for t, m in said if t is topics.STATE]
 
 
 def flown(said: list[tuple[Any, Any]]) -> list[Any]:
@@ -83,11 +83,15 @@ def flown(said: list[tuple[Any, Any]]) -> list[Any]:
     return out
 
 
-def named(came: list[Received], commander: str, instance: str, term: int, revision: int = 1) -> Received:
+def named(
+    came: list[ReceivedMessage], commander: str, instance: str, term: int, revision: int = 1
+) -> ReceivedMessage:
     """A tick again, with another commander."""
     tick = next(r for r in came if r.topic is topics.TICK)
     fields = {"commander": commander, "instance": instance, "term": term, "revision": revision}
-    return Received(topics.TICK, None, msgspec.structs.replace(tick.message, **fields, standing_by={}), 0)
+    return ReceivedMessage(
+        topics.TICK, None, msgspec.structs.replace(tick.message, **fields, standing_by={}), 0
+    )
 
 
 def test_a_standby_says_nothing_and_then_the_same(scenario: Scenario, ticks: Any) -> None:

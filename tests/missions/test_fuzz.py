@@ -9,7 +9,7 @@ import msgspec
 import pytest
 from chaserdock_protocol import codec
 from chaserdock_protocol import messages as m
-from chaserdock_protocol.messages.fields import GREATEST_COUNT
+from chaserdock_protocol.messages.fields import MAX_COUNT
 from fuzz import boundaries, fuzz_logs, fuzz_messages, fuzz_scenarios
 from message_samples import BY_TYPE
 from mutations import garbage_in, mutate
@@ -56,7 +56,7 @@ def test_the_judge_sees_garbage() -> None:
         ("q_wxyz", (1.0, 1.0, 0.0, 0.0)),
         ("chaser", 256),
         ("chaser", True),
-        ("seq", GREATEST_COUNT + 1),
+        ("seq", MAX_COUNT + 1),
     ):
         assert garbage_in(msgspec.structs.replace(odometry, **{name: bad})) is not None, (name, bad)
     assert garbage_in(msgspec.structs.replace(BY_TYPE[m.WrenchCommand], mode="ram")) is not None
@@ -66,7 +66,7 @@ def test_the_judge_sees_garbage() -> None:
     ("kind", "field", "bad", "reason"),
     [
         (m.Odometry, "seq", 2**63, "format"),
-        (m.Odometry, "sim_time_ns", GREATEST_COUNT + 1, "format"),
+        (m.Odometry, "sim_time_ns", MAX_COUNT + 1, "format"),
         (m.Odometry, "position_m", [0.0, 0.0, 1e16], "range"),
         (m.Health, "lost", 2**64 - 1, "format"),
         (m.Farewell, "published", {"k": 2**63}, "format"),

@@ -12,7 +12,7 @@ from chaserdock_models import rotations
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.extrapolation import extrapolate
-from chaserdock_protocol.fault_injection import FaultLayer, Lost, sender_of
+from chaserdock_protocol.fault_injection import FaultLayer, LostMessage, sender_of
 from chaserdock_protocol.messages import Image, Odometry, Sighting, WrenchCommand
 from chaserdock_protocol.scenario.faults import Fault
 from chaserdock_protocol.topics import Topic
@@ -39,12 +39,12 @@ def message(kind: type[msgspec.Struct], tick: int, chaser: int = 0) -> Any:
 def heard(
     on: FaultLayer, topic: Topic, kind: type[msgspec.Struct], ticks: range, chaser: int = 0
 ) -> list[Any]:
-    """What comes of a message a tick; a Lost as the negative tick."""
+    """What comes of a message a tick; a LostMessage as the negative tick."""
     out = []
     for tick in ticks:
         sent = message(kind, tick, chaser)
         for came in on.incoming(topic, str(chaser), sent, codec.encode(sent)):
-            out.append(-came.tick if isinstance(came, Lost) else came.tick)
+            out.append(-came.tick if isinstance(came, LostMessage) else came.tick)
     return out
 
 
@@ -103,7 +103,7 @@ def test_corrupt_gives_nothing_or_a_sound_message() -> None:
     for tick in range(10, 500):
         sent = message(WrenchCommand, tick)
         (came,) = on.incoming(topics.WRENCH, "0", sent, codec.encode(sent))
-        if isinstance(came, Lost):
+        if isinstance(came, LostMessage):
             lost += 1
         else:
             codec.check_numbers(came)
@@ -213,7 +213,7 @@ def test_flood() -> None:
 
 def test_a_process_dies_once_before_anything_of_its_tick() -> None:
     ends: list[str] = []
-    on = layer("controller", fault(kind="kill", process="controller"), end=lambda: ends.append("killed"))
+    on = layer("controller", fault(kind="kill", process="controller"), kill=lambda: ends.append("killed"))
     for tick in range(8, 14):
         sent = message(Odometry, tick)
         on.incoming(topics.ODOMETRY, "0", sent, codec.encode(sent))
@@ -222,28 +222,28 @@ def test_a_process_dies_once_before_anything_of_its_tick() -> None:
 
 def test_one_that_was_started_again_lives_on() -> None:
     ends: list[str] = []
-    on = layer("controller", fault(kind="kill", process="controller"), end=lambda: ends.append("killed"))
+    on = layer("controller", fault(kind="kill", process="controller"), kill=lambda: ends.append("killed"))
     for tick in (10, 11, 12):
-        on.strike(tick)
+        on.apply_process_faults(tick)
     assert ends == []
 
 
 def test_freeze_stops_for_so_long() -> None:
     stops: list[float] = []
-    freeze = fault(kind="freeze", process="recorder", duration_s=1.5)
-    on = layer("recorder", freeze, stop=stops.append)
+    freezing = fault(kind="freeze", process="recorder", duration_s=1.5)
+    on = layer("recorder", freezing, freeze=stops.append)
     for tick in range(5, 30):
-        on.strike(tick)
+        on.apply_process_faults(tick)
     assert stops == [1.5]
-    others = layer("controller", freeze, stop=stops.append)
+    others = layer("controller", freezing, freeze=stops.append)
     for tick in range(5, 30):
-        others.strike(tick)
+        others.apply_process_faults(tick)
     assert stops == [1.5]
 
 
 def test_begin_and_end_are_told() -> None:
     on = layer("world", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3, share=0.5))
-    told = {tick: on.told_at(tick) for tick in range(20) if on.told_at(tick)}
+    told = {tick: on.transitions_at(tick) for tick in range(20) if on.transitions_at(tick)}
     assert told == {
         10: [("fault begins", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],
         13: [("fault ends", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],

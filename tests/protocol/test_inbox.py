@@ -1,15 +1,15 @@
-"""The queue between threads: in order, and bounded."""
+"""The queue between threads keeps order and is bounded."""
 
 from __future__ import annotations
 
 import queue
 
 import pytest
-from chaserdock_protocol.transport.bounded_queue import Inbox
+from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 
 
-def test_in_order_until_full_and_room_again() -> None:
-    inbox: Inbox[str] = Inbox(most_bytes=10)
+def test_queue_keeps_order_and_drops_when_full() -> None:
+    inbox: BoundedQueue[str] = BoundedQueue(max_bytes=10)
     assert [inbox.put(text, len(text)) for text in ("1234", "56789", "ab", "c")] == [True, True, False, True]
     assert inbox.dropped == 1
     assert [inbox.get(0), inbox.get(0)] == ["1234", "56789"]
@@ -21,7 +21,7 @@ def test_in_order_until_full_and_room_again() -> None:
             inbox.get(timeout_s)
 
 
-def test_bounded_in_number_too() -> None:
-    inbox: Inbox[int] = Inbox(most_items=3)
+def test_number_of_items_is_bounded() -> None:
+    inbox: BoundedQueue[int] = BoundedQueue(max_items=3)
     assert [inbox.put(k, 0) for k in range(5)] == [True, True, True, False, False]
     assert inbox.dropped == 2

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 from chaserdock_protocol.recording.log import read_scenario
-from chaserdock_protocol.recording.scan import files_of, stored_messages
-from chaserdock_protocol.transport import Link, Raw
+from chaserdock_protocol.recording.scan import log_files, stored_messages
+from chaserdock_protocol.transport import Link, RawSample
 from harness import chaserdock, finished
 
 from chaserdock.launch.launcher import free_port
@@ -59,11 +59,11 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
     info = info_of(tmp_path / "again")
     assert info.whole
     assert (info.viewer > 100) == ("--no-viewer" not in options)
-    names = [path.name for path in files_of(tmp_path / "again")]
+    names = [path.name for path in log_files(tmp_path / "again")]
     assert names == (
         ["mission-0000.mcap", "mission-0001.mcap"] if "--rotate-s" in options else ["mission.mcap"]
     )
-    for path in files_of(tmp_path / "again"):  # each stands for itself
+    for path in log_files(tmp_path / "again"):  # each stands for itself
         assert read_scenario(path)[1]["run_id"] == read_scenario(GOLDEN)[1]["run_id"]
 
 
@@ -83,7 +83,7 @@ def test_killed_recorder_loses_the_last_second_at_most(tmp_path: Path, seed: int
     killed_s: list[float] = []
     over = threading.Event()
 
-    def note(raw: Raw) -> None:
+    def note(raw: RawSample) -> None:
         sent.append((time.monotonic(), raw.key, raw.payload))
 
     def kill() -> None:

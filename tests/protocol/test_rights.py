@@ -124,7 +124,7 @@ def test_only_its_answerer_answers_a_query_and_only_those_meant_may_ask(
     ]
     time.sleep(SETTLE_S)
     for who in EVERYONE:
-        meant = {query.answerer} - {who.process} if who.role in query.askers else set()
+        meant = {query.server} - {who.process} if who.role in query.clients else set()
         deadline = time.monotonic() + PATIENCE_S
         while True:
             replies = mission.sessions[who.process].get(query.key, timeout=0.5, target=zenoh.QueryTarget.ALL)
@@ -142,7 +142,7 @@ def test_nobody_lives_under_anothers_name(mission: Mission) -> None:
         session.liveliness().declare_token(topics.LIVE_KEY.format(process=other))
         for name, session in mission.sessions.items()
         for other in (*PUBLISHERS, "chaser/9")
-        if name not in rights.LOOK_ON and other != name  # a session sees its own tokens without any router
+        if name not in rights.OBSERVERS and other != name  # a session sees its own tokens without any router
     ]
     own = mission.sessions["chaser/1"].liveliness().declare_token("live/chaser/1")
     time.sleep(SETTLE_S)

@@ -147,7 +147,7 @@ def test_a_part_that_is_not_installed_is_told_where_the_file_is_read(
     file = tmp_path / "s.toml"
     file.write_text(GOOD)
     assert load_scenario(file, (f"{path}={own}",))
-    with pytest.raises(ScenarioError, match=f"{path}: .*'magic' is unknown here; chaserdock's own: {own}"):
+    with pytest.raises(ScenarioError, match=f"{path}: .*'magic' is unknown; built in: {own}"):
         load_scenario(file, (f"{path}=magic",))
     # Who reads a log, or flies another part of the mission, need not have it.
     text = load_scenario(file).model_dump_json().replace(f'"{own}"', '"magic"')

@@ -59,7 +59,7 @@ def test_who_waits_for_slow_readers() -> None:
     node = Node("world", "world", Link(namespace="waits"))
     try:
         assert congestion_of(node, topics.TICK) == "BLOCK"
-        node.waits = False
+        node.blocking = False
         for topic, place in ((topics.IMAGE, 0), (topics.ODOMETRY, 0), (topics.EVENT, "world")):
             assert congestion_of(node, topic, place) == "DROP"
         assert congestion_of(node, topics.END) == "BLOCK"

@@ -12,9 +12,9 @@ import uuid
 import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.fault_injection import layer_of
+from chaserdock_protocol.fault_injection import create_fault_layer
 from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd, ThrusterFaultCommand
-from chaserdock_protocol.process import ProcessOptions, Stop, built, say
+from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup, print_status
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 from chaserdock_protocol.transport import Node, TransportError
 from chaserdock_protocol.transport.session import Heartbeat, new_instance
@@ -41,9 +41,9 @@ def main(options: ProcessOptions) -> int:
         scenario = load_world_scenario(options)
         node = Node("world", "world", options.link)
         refuse_second_world(node)
-        return World(scenario, options, node).run(Stop(options.watch_parent))
+        return World(scenario, options, node).run(StopSignal(options.watch_parent))
     except ChaserdockError as error:
-        say("world", str(error))
+        print_status("world", str(error))
         return 2
     finally:
         if node is not None:
@@ -60,7 +60,7 @@ def load_world_scenario(options: ProcessOptions) -> Scenario:
 
 def refuse_second_world(node: Node) -> None:
     """Raise TransportError if a world is already running in this namespace."""
-    reply = node.ask(
+    reply = node.query(
         topics.JOIN_KEY, JoinRequest(process="world", instance=new_instance()), JoinReply, timeout_s=0.5
     )
     if reply is not None:
@@ -79,8 +79,10 @@ class World:
         self._faults = ThrusterFaultHandler(scenario, self._actuators)
         self._contacts: set[tuple[str, str]] = set()
         self._started_s = 0.0
-        node.faults = layer_of(scenario, "world", lockstep=not self._realtime)
+        faults = create_fault_layer(scenario, "world", lockstep=not self._realtime)
+        node.message_filter = faults
         self._barrier = self._open_mission()
+        self._barrier.faults = faults
 
     def _open_mission(self) -> TickBarrier:
         """Subscribe, advertise and announce the world; return the barrier of its ticks."""
@@ -92,11 +94,13 @@ class World:
             scenario_json=scenario.model_dump_json(),
             instance=new_instance(),
         )
-        node.waits = not self._realtime
+        node.blocking = not self._realtime
         node.subscribe(topics.ACTUATORS)
         node.subscribe(topics.ACK)
         node.watch_liveliness(membership.set_alive)
-        node.answer(topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request)))
+        node.declare_queryable(
+            topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
+        )
         for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD):
             node.advertise(topic)
         for i in range(len(scenario.chasers)):
@@ -105,8 +109,8 @@ class World:
                 node.advertise(topics.DOCKING, i)
             node.advertise(topics.IMAGE, i)
         heartbeat = Heartbeat(node, membership.instance)
-        node.announce()
-        node.answer(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
+        node.declare_liveliness()
+        node.declare_queryable(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
         return TickBarrier(
             node,
             membership,
@@ -120,11 +124,11 @@ class World:
             scenario.controller.standby,
         )
 
-    def run(self, stop: Stop) -> int:
+    def run(self, stop: StopSignal) -> int:
         """Wait for the processes, simulate all ticks and end the mission; return the exit status."""
         if not self._wait_for_processes(stop):
             return self._end_mission(0, "stopped before the first tick", complete=False)
-        built()
+        finish_startup()
         self._started_s, tick = time.monotonic(), 0
         while True:
             states = self._publish_state(tick)
@@ -140,14 +144,14 @@ class World:
                 return self._end_mission(tick, "stopped" if stop() else "no chaser is left", complete=False)
             tick += 1
 
-    def _wait_for_processes(self, stop: Stop) -> bool:
+    def _wait_for_processes(self, stop: StopSignal) -> bool:
         """Wait until all expected processes are connected; return False if stopped before."""
         barrier = self._barrier
 
         def missing() -> str:
             return ", ".join(barrier.missing_processes())
 
-        say("world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing()}")
+        print_status("world", f"{self._scenario.name}, {self._options.mode}: waiting for {missing()}")
         started = barrier.wait_until(lambda: not barrier.missing_processes(), stop, missing)
         barrier.start_flight()
         return started
@@ -179,7 +183,7 @@ class World:
         for image in self._cameras.images(chasers, *exposure) if self._realtime else one_by_one:
             self._node.publish(topics.IMAGE, image, image.chaser)
 
-    def _await_replies_and_step(self, tick: int, stop: Stop) -> None:
+    def _await_replies_and_step(self, tick: int, stop: StopSignal) -> None:
         """Lock-step: step the physics to the end of the tick, waiting for all replies before they take effect."""
         timing, barrier = self._timing, self._barrier
         end = timing.step_of_tick(tick + 1)
@@ -209,5 +213,5 @@ class World:
             topics.END, MissionEnd(tick=tick, sim_time_ns=time_ns, reason=reason, complete=complete)
         )
         self._barrier.publish_farewell(tick, time_ns)
-        say("world", f"{reason} at {time_ns / 1e9:.2f} s")
+        print_status("world", f"{reason} at {time_ns / 1e9:.2f} s")
         return 0 if complete else 1

@@ -10,7 +10,7 @@ import cv2
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.extrapolation import extrapolate
-from chaserdock_protocol.fault_injection import Lost, layer_of
+from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     DockingStatus,
@@ -27,11 +27,11 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.process import ProcessOptions, Stop, built
+from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
-from chaserdock_protocol.transport.session import Heartbeat, health_of, take_part
+from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 
@@ -46,17 +46,19 @@ def main(options: ProcessOptions) -> int:
     cv2.setNumThreads(1)
     number = int(options.chaser or 0)
 
-    def work(node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+    def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
         chaser = Chaser(node, scenario_from_json(mission.scenario_json, "the world's scenario"), number)
-        node.faults = layer_of(chaser.scenario, node.name, lockstep=mission.mode == "lockstep")
+        node.message_filter = create_fault_layer(
+            chaser.scenario, node.name, lockstep=mission.mode == "lockstep"
+        )
         chaser.open(instance, realtime=mission.mode == "realtime")
-        built()
+        finish_startup()
         while not (chaser.ended or stop()):
             chaser.listen()
         chaser.farewell()
         return 0 if chaser.ended else 1
 
-    return take_part(f"chaser/{number}", "chaser", options, work)
+    return run_member(f"chaser/{number}", "chaser", options, work)
 
 
 @dataclass
@@ -136,17 +138,17 @@ class Chaser:
                 self._fly(command)
             case Tick() as tick:
                 self.tick = tick
-                self.heartbeat.settled.set()
+                self.heartbeat.in_flight.set()
                 self._watch_thrusters()
                 self._brake_if_alone()
                 if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
-                    health = health_of(self.node, tick.tick, tick.sim_time_ns)
+                    health = create_health(self.node, tick.tick, tick.sim_time_ns)
                     self.node.publish(topics.HEALTH, health, self.name)
             case Presence() as presence:
                 self.heartbeat.take(presence)
             case MissionEnd():
                 self.ended = True
-            case Lost() as lost if received is not None:
+            case LostMessage() as lost if received is not None:
                 self._miss(received.topic, lost)
 
     def _know(self, odometry: Odometry) -> None:
@@ -159,7 +161,7 @@ class Chaser:
         self._brake_if_alone()
         self._brake_if_forgotten(odometry)
 
-    def _miss(self, topic: Topic, lost: Lost) -> None:
+    def _miss(self, topic: Topic, lost: LostMessage) -> None:
         """In lock-step: something has been lost on its way here, and the tick must be answered nevertheless."""
         if topic is topics.IMAGE:
             nothing = Sighting(

@@ -7,14 +7,14 @@ from typing import Any, cast
 
 import cv2
 from chaserdock_protocol import topics
-from chaserdock_protocol.replay_node import ReplayNode, Said, SilentHeartbeat, Stage
+from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbeat, Stage
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.transport import Node, Received
+from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .process import Chaser
 
 
-def play_perception(scenario: Scenario, recorded: Iterable[Received]) -> Iterator[Said]:
+def play_perception(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """The sightings of all chasers."""
     cv2.setNumThreads(1)
     chasers: dict[int, tuple[ReplayNode, Chaser]] = {}
@@ -33,7 +33,7 @@ def play_perception(scenario: Scenario, recorded: Iterable[Received]) -> Iterato
         tape, chaser = chasers[number]
         tape.put(received)
         chaser.listen()
-        yield from (said for said in tape.said() if said[0] is topics.SIGHTING)
+        yield from (said for said in tape.take_published() if said[0] is topics.SIGHTING)
 
 
 PERCEPTION = Stage("chaser", (topics.IMAGE,), (topics.SIGHTING,), play_perception)

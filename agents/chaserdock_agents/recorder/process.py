@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.fault_injection import layer_of
+from chaserdock_protocol.fault_injection import FaultLayer, create_fault_layer
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Farewell,
@@ -27,12 +27,12 @@ from chaserdock_protocol.messages import (
     SolverStatus,
     Tick,
 )
-from chaserdock_protocol.process import ProcessOptions, Stop, say
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
-from chaserdock_protocol.transport import Node, Raw
-from chaserdock_protocol.transport.bounded_queue import Inbox
-from chaserdock_protocol.transport.session import Heartbeat, health_of, take_part
+from chaserdock_protocol.transport import Node, RawSample
+from chaserdock_protocol.transport.bounded_queue import BoundedQueue
+from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from .foxglove_layer import SHOWN
 from .rotation import Recording
@@ -48,7 +48,7 @@ _MAPPED_FROM_BYTES = 1 << 18
 def main(options: ProcessOptions) -> int:
     """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
     _give_memory_back()
-    return take_part("recorder", "recorder", options, lambda *member: record(options, *member))
+    return run_member("recorder", "recorder", options, lambda *member: record(options, *member))
 
 
 def _give_memory_back() -> None:
@@ -63,7 +63,7 @@ def _give_memory_back() -> None:
         mallopt(_M_ARENA_MAX, 2)
 
 
-def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: Stop) -> int:
+def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
     """Records until the mission is over and all that was published is in the file; the process' status."""
     source = "the world's scenario"
     scenario = scenario_from_json(mission.scenario_json, source) if options.viewer_layer else None
@@ -71,8 +71,9 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
     recording = Recording(out, mission, options.rotation, scenario)
     try:
         flown = scenario or scenario_from_json(mission.scenario_json, source)
-        node.faults = layer_of(flown, node.name, lockstep=mission.mode == "lockstep")
-        recorder = Recorder(node, recording)
+        faults = create_fault_layer(flown, node.name, lockstep=mission.mode == "lockstep")
+        node.message_filter = faults
+        recorder = Recorder(node, recording, faults)
         recorder.open(instance)
         if mission.mode == "realtime":
             # Writing gives way to those who fly; what has been heard waits in the queue.
@@ -82,11 +83,13 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
     finally:
         recording.close()
     if recorder.ended_s is None:
-        say("recorder", f"stopped before the mission's end; {recording.path} holds what came until then")
+        print_status(
+            "recorder", f"stopped before the mission's end; {recording.path} holds what came until then"
+        )
         return 1
     missing = recorder.missing()
     for key, number in missing.items():
-        say("recorder", f"{number} messages of {key} never came")
+        print_status("recorder", f"{number} messages of {key} never came")
     # In real time images are dropped rather than waited for; anything else must be here.
     excused = {k for k in missing if mission.mode == "realtime" and k.endswith("/image")}
     return 1 if missing.keys() - excused else 0
@@ -98,8 +101,9 @@ class Recorder:
 
     node: Node
     recording: Recording
+    faults: FaultLayer | None
     ended_s: float | None = None
-    _waiting: Inbox[Raw] = field(default_factory=Inbox)
+    _waiting: BoundedQueue[RawSample] = field(default_factory=BoundedQueue)
     _received: dict[str, int] = field(default_factory=dict)
     _promised: dict[str, dict[str, int]] = field(default_factory=dict)
     _controllers: set[str] = field(default_factory=lambda: {"controller"})
@@ -113,7 +117,7 @@ class Recorder:
         self.node.subscribe_raw("**", self._arrived)
         self.heartbeat = Heartbeat(self.node, instance)
 
-    def _arrived(self, raw: Raw) -> None:
+    def _arrived(self, raw: RawSample) -> None:
         if not self._waiting.put(raw, len(raw.payload)):
             self.node.counts.rejected["queue full"] += 1
 
@@ -138,9 +142,9 @@ class Recorder:
             case Presence():
                 self.heartbeat.take(message)
             case Tick() as tick:
-                if self.node.faults is not None:
-                    self.node.faults.strike(tick.tick)
-                self.heartbeat.settled.set()
+                if self.faults is not None:
+                    self.faults.apply_process_faults(tick.tick)
+                self.heartbeat.in_flight.set()
                 self._expected = {topics.ACTUATORS.key_of(i) for i in tick.chasers}
                 self._controllers = {tick.commander or "controller", *tick.standing_by}
                 if tick.controller:
@@ -162,7 +166,7 @@ class Recorder:
             self._acked = held
             self.node.publish(topics.ACK, RecorderAck(tick=held))
             if held % _HEALTH_TICKS == 0:
-                self.node.publish(topics.HEALTH, health_of(self.node, held, 0), "recorder")
+                self.node.publish(topics.HEALTH, create_health(self.node, held, 0), "recorder")
 
     def missing(self) -> dict[str, int]:
         """Messages that were published, by their publishers' own account, and never came."""

@@ -10,7 +10,7 @@ from chaserdock_protocol.process import Rotation
 from chaserdock_protocol.recording.log import LogError, LogWriter
 from chaserdock_protocol.recording.scan import LOG_NAME, part_name
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.transport import Raw
+from chaserdock_protocol.transport import RawSample
 
 from .foxglove_layer import ViewerLayer
 
@@ -50,7 +50,7 @@ class Recording:
         self._viewer = ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
         self._from_ns = None
 
-    def write(self, raw: Raw, message: Any) -> None:
+    def write(self, raw: RawSample, message: Any) -> None:
         """Appends what came over the wire; ``message`` is the same opened, or None if nobody here needs it."""
         if self._rotation.wanted and self._is_full():
             self._writer.close()

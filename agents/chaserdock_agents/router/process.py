@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Event
-from chaserdock_protocol.process import ProcessOptions, Stop, say
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.access_control import access_control
 
@@ -36,15 +36,15 @@ def main(options: ProcessOptions) -> int:
     try:
         node = Node(NAME, "operator", link)
     except ChaserdockError as error:
-        say(NAME, str(error))
+        print_status(NAME, str(error))
         return 2
-    stop, last = Stop(options.watch_parent), _Guest(options.until or "")
+    stop, last = StopSignal(options.watch_parent), _Guest(options.until or "")
     clerk = _Clerk(node, log) if log is not None else None
     try:
         if options.until is not None:
             node.watch_liveliness(last.changed)
         how = "TLS, with access rules" if link.tls is not None else "without TLS and access rules"
-        say(NAME, f"listens on {', '.join(link.listen)} {how}")
+        print_status(NAME, f"listens on {', '.join(link.listen)} {how}")
         while not (stop() or last.gone_for_s() > AFTERWARDS_S):
             time.sleep(LOOK_S)
             if clerk is not None:
@@ -62,7 +62,7 @@ class _Clerk:
     def __init__(self, node: Node, log: ZenohLog) -> None:
         self._node, self._log = node, log
         self._account = Account()
-        self._ticks = node.follow(topics.TICK, 1)
+        self._ticks = node.subscribe_newest(topics.TICK, 1)
         self._tick, self._time_ns = 0, 0
 
     def note(self) -> None:
@@ -70,7 +70,7 @@ class _Clerk:
         for tick in self._ticks():
             self._tick, self._time_ns = tick.message.tick, tick.message.sim_time_ns
         for text in filter(None, map(self._account.add, self._log.take())):
-            say(NAME, f"denied: {text}")
+            print_status(NAME, f"denied: {text}")
             event = Event(
                 tick=self._tick,
                 sim_time_ns=self._time_ns,
@@ -87,7 +87,7 @@ class _Clerk:
         for denial in self._log.take():
             self._account.add(denial)
         if self._account.total:
-            say(NAME, f"denied {self._account.total} messages and declarations in all")
+            print_status(NAME, f"denied {self._account.total} messages and declarations in all")
 
 
 @dataclass

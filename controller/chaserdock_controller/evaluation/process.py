@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from chaserdock_models.rotations import rotate
-from chaserdock_protocol.process import say
+from chaserdock_protocol.process import print_status
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.study import StudyCase, StudyError, StudyResult, line_of, read_lines
 
@@ -26,7 +26,7 @@ def main(cases: Path, results: Path) -> int:
     """
     asked = read_lines(cases, StudyCase)
     for number, case in enumerate(asked, start=1):
-        say("study", f"{number} of {len(asked)}: {case.name}")
+        print_status("study", f"{number} of {len(asked)}: {case.name}")
         result = fly_case(case)
         try:
             with results.open("a", encoding="utf-8") as file:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol.messages import OperatorCommand, Tick
 from chaserdock_protocol.topics import CONTROLLERS
-from chaserdock_protocol.transport import Received
+from chaserdock_protocol.transport import ReceivedMessage
 
 _MISSABLE_TICKS = 10
 """In real time so many ticks may be missed without asking for the commander's state."""
@@ -32,7 +32,7 @@ class HotStandby:
     since: int = -1
     newest: Tick | None = None
     words: dict[int, tuple[OperatorCommand, ...]] = field(default_factory=dict)
-    _held: deque[Received] = field(default_factory=lambda: deque(maxlen=_MOST_HELD))
+    _held: deque[ReceivedMessage] = field(default_factory=lambda: deque(maxlen=_MOST_HELD))
     _synced: bool = True
     _free: bool = False
 
@@ -73,7 +73,7 @@ class HotStandby:
         """Whether the answer to a tick is this one's to publish."""
         return self.commands and tick >= self.since
 
-    def holds_back(self, received: Received, done_tick: int) -> bool:
+    def holds_back(self, received: ReceivedMessage, done_tick: int) -> bool:
         """Whether a message is to wait, which it then does: it belongs to a tick after the next one to be worked out."""
         if self.realtime or self.replaying or received.message.tick < 0:
             return False
@@ -82,7 +82,7 @@ class HotStandby:
         self._held.append(received)
         return True
 
-    def due(self, done_tick: int) -> Received | None:
+    def due(self, done_tick: int) -> ReceivedMessage | None:
         """A message that was held back and may be taken now."""
         if not self._synced:
             return None

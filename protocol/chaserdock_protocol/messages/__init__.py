@@ -2,7 +2,7 @@
 
 from .base import Message
 from .fields import (
-    GREATEST_COUNT,
+    MAX_COUNT,
     CameraCalibration,
     ChaserId,
     ChaserIds,
@@ -55,7 +55,7 @@ from .session import Farewell, JoinReply, JoinRequest, Presence
 from .thruster_fault import ThrusterFaultCommand
 
 __all__ = [
-    "GREATEST_COUNT",
+    "MAX_COUNT",
     "VERSION",
     "ActuatorCommand",
     "BodyTruth",

@@ -6,12 +6,12 @@ from typing import Annotated
 
 from msgspec import Meta, Struct
 
-from .fields import GREATEST_COUNT, Count
+from .fields import MAX_COUNT, Count
 
 
 class Message(Struct, frozen=True, kw_only=True):
     """Fields that every message has."""
 
     seq: Count = 0
-    tick: Annotated[int, Meta(ge=-1, le=GREATEST_COUNT)] = -1
+    tick: Annotated[int, Meta(ge=-1, le=MAX_COUNT)] = -1
     sim_time_ns: Count = 0

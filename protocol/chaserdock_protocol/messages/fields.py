@@ -8,9 +8,9 @@ from msgspec import Meta, Struct
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
-GREATEST_COUNT = 2**53
+MAX_COUNT = 2**53
 """Bounds every whole number: 104 days in nanoseconds; exact as a double, too, and sums of some stay encodable."""
-Count = Annotated[int, Meta(ge=0, le=GREATEST_COUNT)]
+Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 ChaserId = Annotated[int, Meta(ge=0, le=255)]
 ChaserIds = Annotated[tuple[ChaserId, ...], Meta(max_length=256)]
 MarkerIds = Annotated[tuple[Annotated[int, Meta(ge=0, le=2**31)], ...], Meta(max_length=1024)]

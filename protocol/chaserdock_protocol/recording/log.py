@@ -37,10 +37,10 @@ from .scan import (
     FileState,
     LogError,
     LogSource,
-    files_of,
-    head_of,
-    seal,
+    log_files,
+    read_head,
     stored_messages,
+    with_checksum,
 )
 from .schema_migrations import decode_logged
 
@@ -159,12 +159,12 @@ class LogWriter:
             for name, kind, data in attached:
                 if data is not None:
                     self._writer.add_attachment(now, now, name, kind, data)
-            self._writer.add_metadata(METADATA, seal({**run, **versions}))
+            self._writer.add_metadata(METADATA, with_checksum({**run, **versions}))
 
     def note(self, name: str, data: dict[str, str]) -> None:
         """Adds a metadata record of another name."""
         with self._writing():
-            self._writer.add_metadata(name, seal(data))
+            self._writer.add_metadata(name, with_checksum(data))
 
     def write(
         self, key: str, encoding: str, payload: bytes, sent_ns: int, time_ns: int | None = None
@@ -262,7 +262,7 @@ def _raw_messages(
     source: LogSource, keys: Iterable[str] | None, state: FileState | None = None
 ) -> Iterator[tuple[Channel, McapMessage]]:
     wanted = None if keys is None else set(keys)
-    for path in files_of(source):
+    for path in log_files(source):
         for channel, message in stored_messages(path, state):
             key = channel.topic
             if not key.startswith(VIEWER_PREFIX) and (wanted is None or key in wanted):
@@ -304,7 +304,7 @@ def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
 
     All files of a rotated log must be parts of one run.
     """
-    files = files_of(source)
+    files = log_files(source)
     first, scenario = _scenario_of(files[0])
     for path in files[1:]:
         data = _scenario_of(path)[0]
@@ -314,7 +314,7 @@ def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
 
 
 def _scenario_of(path: Path) -> tuple[dict[str, str], str]:
-    data, attachments = head_of(path)
+    data, attachments = read_head(path)
     if SCENARIO_ATTACHMENT not in attachments:
         raise LogError(f"{path}: holds no scenario; was it recorded by chaserdock?")
     try:

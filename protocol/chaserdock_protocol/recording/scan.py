@@ -69,7 +69,7 @@ def part_name(part: int) -> str:
     return f"mission-{part:04d}.mcap"
 
 
-def files_of(source: LogSource) -> list[Path]:
+def log_files(source: LogSource) -> list[Path]:
     """The files of a log in their order. Raises LogError for a folder without one, or with parts missing."""
     if not isinstance(source, Path):
         return list(source)
@@ -142,7 +142,7 @@ def record_at(path: Path, place: int) -> bytes:
     raise LogError(f"{path}: changed while it was open: no whole record at byte {place}")
 
 
-def chunk_records(content: bytes) -> list[McapMessage | Channel | Schema]:
+def parse_chunk(content: bytes) -> list[McapMessage | Channel | Schema]:
     """Channels, schemas and messages of a chunk record, its checksum held; raises one of ``DAMAGE``."""
     stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
     data, place = stream.read(size), 0
@@ -166,7 +166,7 @@ def chunk_records(content: bytes) -> list[McapMessage | Channel | Schema]:
     return out
 
 
-def attachment_of(content: bytes) -> Attachment:
+def parse_attachment(content: bytes) -> Attachment:
     """An attachment record, its checksum held; raises one of ``DAMAGE``."""
     attachment = Attachment.read(ReadDataStream(BytesIO(content)))
     if _CRC.unpack(content[-_CRC.size :])[0] not in (0, zlib.crc32(content[: -_CRC.size])):
@@ -174,13 +174,13 @@ def attachment_of(content: bytes) -> Attachment:
     return attachment
 
 
-def seal(data: dict[str, str]) -> dict[str, str]:
+def with_checksum(data: dict[str, str]) -> dict[str, str]:
     """Metadata with a checksum among them, as MCAP has none for metadata records."""
     return {**data, "crc32": f"{_metadata_crc(data):08x}"}
 
 
-def metadata_of(content: bytes) -> Metadata:
-    """A metadata record, its checksum held where ``seal`` put one; raises one of ``DAMAGE``."""
+def parse_metadata(content: bytes) -> Metadata:
+    """A metadata record, its checksum held where ``with_checksum`` put one; raises one of ``DAMAGE``."""
     metadata = Metadata.read(ReadDataStream(BytesIO(content)))
     data = metadata.metadata
     if "crc32" in data and data["crc32"] != f"{_metadata_crc(data):08x}":
@@ -200,10 +200,10 @@ def stored_messages(path: Path, state: FileState | None = None) -> Iterator[tupl
     for opcode, content in records(path, state):
         try:
             if opcode == Opcode.METADATA:
-                state.recovered |= metadata_of(content).name == RECOVERED
+                state.recovered |= parse_metadata(content).name == RECOVERED
             if opcode != Opcode.CHUNK:
                 continue
-            inside = chunk_records(content)
+            inside = parse_chunk(content)
             channels |= {record.id: record for record in inside if isinstance(record, Channel)}
             found = [(channels[r.channel_id], r) for r in inside if isinstance(r, McapMessage)]
         except DAMAGE as error:
@@ -218,7 +218,7 @@ def stored_messages(path: Path, state: FileState | None = None) -> Iterator[tupl
             yield channel, message
 
 
-def head_of(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
+def read_head(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
     """Our metadata and all attachments (by name) of a file; raises LogError.
 
     They lie before the first chunk, where a recorder of ours puts them; with none there, the file is searched.
@@ -228,10 +228,10 @@ def head_of(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
     try:
         for opcode, content in records(path):
             if opcode == Opcode.ATTACHMENT:
-                attachment = attachment_of(content)
+                attachment = parse_attachment(content)
                 attachments[attachment.name] = attachment.data
             elif opcode == Opcode.METADATA:
-                metadata = metadata_of(content)
+                metadata = parse_metadata(content)
                 if metadata.name == METADATA:
                     data = metadata.metadata
             elif opcode == Opcode.CHUNK and data and attachments:

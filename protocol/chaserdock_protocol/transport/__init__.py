@@ -1,16 +1,17 @@
 """Transport over Eclipse Zenoh: nodes, their configuration and access control."""
 
-from .config import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, Raw, Received, Tls
-from .node import Counts, Node, TransportError
+from .config import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, RawSample, ReceivedMessage, Tls
+from .node import MessageFilter, Node, TrafficCounters, TransportError
 
 __all__ = [
     "DEFAULT_ENDPOINT",
     "DEFAULT_NAMESPACE",
-    "Counts",
     "Link",
+    "MessageFilter",
     "Node",
-    "Raw",
-    "Received",
+    "RawSample",
+    "ReceivedMessage",
     "Tls",
+    "TrafficCounters",
     "TransportError",
 ]

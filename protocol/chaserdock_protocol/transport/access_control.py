@@ -1,8 +1,8 @@
-"""Who may do what on a mission's network, worked out of the topics table as Zenoh access-control rules.
+"""Zenoh access-control rules of a mission, derived from the topics table.
 
-A process is known by the common name in its certificate. The router denies whatever no rule allows: a process
-publishes on its own branch alone, and receives only what the table lets its role read. The rules hold where
-they are enforced, so every process but the router connects as a client (peers would go past it).
+The common name in its certificate identifies a process. The router denies everything that no rule allows: a process
+publishes only on its own branch, and receives only topics that its role may read. The router enforces the rules, so
+every other process connects as a client (peers would bypass it).
 """
 
 from __future__ import annotations
@@ -16,21 +16,21 @@ from chaserdock_protocol.topics import TOPICS, Role, Topic, may_read, may_write
 
 @dataclass(frozen=True)
 class Query:
-    """A question over the network: who may ask it, and which role answers."""
+    """A query key, the roles that may query it, and the role that replies."""
 
     key: str
-    askers: frozenset[Role]
-    answerer: Role
+    clients: frozenset[Role]
+    server: Role
 
 
-# A world asks, too: whether there is one already.
+# A starting world also queries the join key, to detect another world.
 QUERIES = (
     Query(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
     Query(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
     Query(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
 )
-LOOK_ON: frozenset[Role] = frozenset({"analysis", "viewer"})
-"""These publish nothing, and have no name of their own on the network."""
+OBSERVERS: frozenset[Role] = frozenset({"analysis", "viewer"})
+"""Roles that publish nothing and have no process name on the network."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +42,17 @@ class Identity:
 
     @property
     def common_name(self) -> str:
-        """The name in its certificate: ``chaser-0``."""
+        """Return the name in its certificate, such as ``chaser-0``."""
         return common_name(self.process)
 
 
 def common_name(process: str) -> str:
-    """The name of a process where no slash may stand: in certificates, folders and services."""
+    """Return the name of a process without slashes, for certificates, folders and services."""
     return process.replace("/", "-")
 
 
 def identities(chasers: int) -> tuple[Identity, ...]:
-    """Everyone who may connect to the router of a mission with at most so many chasers."""
+    """Return all processes that may connect to the router of a mission with at most ``chasers`` chasers."""
     single: tuple[Role, ...] = ("world", "recorder", "operator", "analysis", "viewer")
     return (
         *(Identity(role, role) for role in single),
@@ -62,7 +62,7 @@ def identities(chasers: int) -> tuple[Identity, ...]:
 
 
 def _expression(topic: Topic, who: Identity, *, writes: bool) -> str:
-    """A topic's keys as far as they are this process' own to write, or meant for it to read."""
+    """Return the key expression of a topic, limited to the keys that the process may write or read."""
     if "{chaser}" in topic.key:
         return topic.key_of(who.process.partition("/")[2] if who.role == "chaser" else "*")
     if "{process}" in topic.key:
@@ -71,14 +71,14 @@ def _expression(topic: Topic, who: Identity, *, writes: bool) -> str:
 
 
 def writes(who: Identity) -> list[str]:
-    """Key expressions, without the namespace, on which a process may publish."""
-    if who.role in LOOK_ON:
+    """Return the key expressions (without the namespace) on which a process may publish."""
+    if who.role in OBSERVERS:
         return []
     return [_expression(t, who, writes=True) for t in TOPICS if may_write(who.role, t)]
 
 
 def reads(who: Identity) -> list[str]:
-    """Key expressions, without the namespace, that a process may subscribe; ``**`` for those who read all."""
+    """Return the key expressions (without the namespace) that a process may subscribe; ``**`` if it may read all."""
     readable = [t for t in TOPICS if may_read(who.role, t)]
     if len(readable) == len(TOPICS):
         return ["**"]
@@ -86,7 +86,7 @@ def reads(who: Identity) -> list[str]:
 
 
 def access_control(namespace: str, chasers: int) -> dict[str, Any]:
-    """Zenoh's ``access_control`` section for the router of a mission. Whatever it does not list is denied."""
+    """Return Zenoh's ``access_control`` section for the router of a mission. Everything not listed is denied."""
     rules: list[dict[str, Any]] = []
 
     def rule(name: str, flow: str, messages: list[str], keys: list[str]) -> list[str]:
@@ -104,27 +104,34 @@ def access_control(namespace: str, chasers: int) -> dict[str, Any]:
         return [name]
 
     living = [topics.LIVE_KEY.format(process="**")]
-    # What the router tells its clients of one another's interests carries no data.
+    # Declarations that the router forwards between clients carry no data.
     common = [
-        *rule("all-hear-of-interests", "egress", ["declare_subscriber", "declare_queryable"], ["**"]),
-        *rule("all-see-who-lives", "egress", ["liveliness_token", "reply"], living),
-        *rule("all-ask-who-lives", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], living),
+        *rule("all-receive-declarations", "egress", ["declare_subscriber", "declare_queryable"], ["**"]),
+        *rule("all-receive-liveliness", "egress", ["liveliness_token", "reply"], living),
+        *rule(
+            "all-query-liveliness", "ingress", ["declare_liveliness_subscriber", "liveliness_query"], living
+        ),
     ]
     policies: list[dict[str, Any]] = []
     everyone = identities(chasers)
     for who in everyone:
         name, live = who.common_name, [topics.LIVE_KEY.format(process=who.process)]
-        asks = [q.key for q in QUERIES if who.role in q.askers]
-        answers = [q.key for q in QUERIES if who.role == q.answerer]
+        queried = [q.key for q in QUERIES if who.role in q.clients]
+        served = [q.key for q in QUERIES if who.role == q.server]
         own = [
             *rule(f"{name}-publishes", "ingress", ["put"], writes(who)),
             *rule(f"{name}-subscribes", "ingress", ["declare_subscriber"], reads(who)),
             *rule(f"{name}-receives", "egress", ["put"], reads(who)),
-            *rule(f"{name}-asks", "ingress", ["query"], asks),
-            *rule(f"{name}-is-answered", "egress", ["reply"], asks),
-            *rule(f"{name}-offers-answers", "ingress", ["declare_queryable", "reply"], answers),
-            *rule(f"{name}-is-asked", "egress", ["query"], answers),
-            *rule(f"{name}-lives", "ingress", ["liveliness_token"], live if who.role not in LOOK_ON else []),
+            *rule(f"{name}-queries", "ingress", ["query"], queried),
+            *rule(f"{name}-receives-replies", "egress", ["reply"], queried),
+            *rule(f"{name}-serves-queries", "ingress", ["declare_queryable", "reply"], served),
+            *rule(f"{name}-receives-queries", "egress", ["query"], served),
+            *rule(
+                f"{name}-declares-liveliness",
+                "ingress",
+                ["liveliness_token"],
+                live if who.role not in OBSERVERS else [],
+            ),
         ]
         policies.append({"subjects": [name], "rules": [*common, *own]})
     return {

@@ -1,4 +1,4 @@
-"""How a process reaches the others, and what comes over the wire; ``transport`` makes sessions of it."""
+"""Link configuration, and the messages that a session delivers."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ DEFAULT_NAMESPACE = "chaserdock"
 _QUEUES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
-PATIENT_QUEUES: dict[str, Any] = {
-    # Zenoh's largest: what is droppable is dropped for a reader only when 16 batches (1 MB) wait for it, not 2.
+QUEUE_OPTIONS: dict[str, Any] = {
+    # Zenoh's maximum: droppable messages are dropped for a reader when 16 batches (1 MB) wait for it, instead of 2.
     "transport/link/tx/queue/size": dict.fromkeys(_QUEUES, 16),
-    # Then the first message waits this long (us), and the others, until it reads again, not at all.
+    # The first message then waits this long (us); later ones do not wait until the reader reads again.
     "transport/link/tx/queue/congestion_control/drop": {
         "wait_before_drop": 2000,
         "max_wait_before_drop_fragments": 4000,
@@ -28,7 +28,7 @@ PATIENT_QUEUES: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Tls:
-    """PEM files for mutual TLS: the mission's authority, this process' certificate, its private key."""
+    """PEM files for mutual TLS: certificate authority of the mission, certificate and private key of this process."""
 
     ca: Path
     certificate: Path
@@ -36,15 +36,15 @@ class Tls:
 
     @classmethod
     def in_folder(cls, folder: Path) -> Tls:
-        """Those of one process, as ``chaserdock keys init`` lays them down."""
+        """Return the files of one process in the layout that ``chaserdock keys init`` writes."""
         return cls(folder / "ca.pem", folder / "cert.pem", folder / "key.pem")
 
 
 @dataclass(frozen=True)
 class Link:
-    """How a process reaches the others. ``lease_ms``: after that long a silent peer counts as lost.
+    """Endpoints and options of a Zenoh session. ``lease_ms``: time after which a silent peer counts as lost.
 
-    ``access_control`` is what a router enforces (see ``rights``).
+    ``access_control``: rules that a router enforces (see ``access_control.py``).
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -57,8 +57,8 @@ class Link:
     access_control: dict[str, Any] | None = None
 
 
-class Received(Struct, frozen=True):
-    """A message that passed all checks. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
+class ReceivedMessage(Struct, frozen=True):
+    """A valid message. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
 
     topic: Topic
     place: str | None
@@ -66,8 +66,8 @@ class Received(Struct, frozen=True):
     sent_ns: int
 
 
-class Raw(Struct, frozen=True):
-    """What came over the wire, unopened."""
+class RawSample(Struct, frozen=True):
+    """A sample from the wire, not decoded."""
 
     key: str
     encoding: str
@@ -76,7 +76,7 @@ class Raw(Struct, frozen=True):
 
 
 def open_error(error: Exception, link: Link) -> str:
-    """Why a session could not be opened, in one line."""
+    """Return one line on why a session could not be opened."""
     text = " ".join(str(error).split())
     if link.config is not None:
         return f"cannot open the Zenoh session of {link.config}: {text}"

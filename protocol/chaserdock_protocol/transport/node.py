@@ -1,8 +1,8 @@
-"""The only module that imports zenoh: sessions with safe defaults, and typed topics on them.
+"""Zenoh sessions with safe defaults, and typed topics on them. No other module imports zenoh.
 
-Defaults: no multicast, loopback only, an own namespace for every run, no shared memory. Callbacks run on
-Zenoh's threads and only put raw bytes into a queue, so that a slow reader of one topic never delays another
-(head-of-line blocking); decoding and checking happen in the reader's own thread.
+Defaults: no multicast, loopback only, one namespace per run, no shared memory. Callbacks run on Zenoh's threads
+and only enqueue raw bytes, so that a slow reader of one topic does not delay another (head-of-line blocking).
+The reader's thread decodes and validates.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import zenoh
@@ -21,12 +21,11 @@ import zenoh
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.fault_injection import FaultLayer
 from chaserdock_protocol.messages import Message, encoding_of
 from chaserdock_protocol.topics import Role, Topic
 
-from .bounded_queue import Inbox
-from .config import PATIENT_QUEUES, Link, Raw, Received, Tls, open_error
+from .bounded_queue import BoundedQueue
+from .config import QUEUE_OPTIONS, Link, RawSample, ReceivedMessage, Tls, open_error
 
 _PRIORITY = {
     "bulk": zenoh.Priority.DATA,
@@ -37,11 +36,11 @@ _PRIORITY = {
 
 
 class TransportError(ChaserdockError):
-    """The network could not be had as asked; the text is one clear line."""
+    """The network cannot be used as configured. The text is one line."""
 
 
 def zenoh_config(link: Link) -> zenoh.Config:
-    """Zenoh configuration of a link; raises TransportError for a bad file, namespace or endpoint."""
+    """Return the Zenoh configuration of a link. Raises TransportError for a bad file, namespace or endpoint."""
     if not link.namespace or any(c in link.namespace for c in "/*$?#@ "):
         raise TransportError(f"namespace {link.namespace!r}: must be one word without / * $ ? # @ or blanks")
     try:
@@ -53,20 +52,20 @@ def zenoh_config(link: Link) -> zenoh.Config:
         "transport/shared_memory/enabled": False,
         "timestamping/enabled": True,
     }
-    # Processes start in any order: keep trying to connect, unless the file says otherwise.
-    patient = {
+    # Processes start in any order: retry the connection, unless the file configures it.
+    retry = {
         "connect/timeout_ms": -1,
         "connect/exit_on_failure": False,
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
     }
-    values |= {name: value for name, value in patient.items() if config.get_json(name) in ("null", None)}
+    values |= {name: value for name, value in retry.items() if config.get_json(name) in ("null", None)}
     if link.config is None:
         values |= {
             "mode": link.mode,
             "listen/endpoints": list(link.listen) if link.mode != "client" else [],
             "connect/endpoints": list(link.connect),
             "transport/link/tx/lease": link.lease_ms,
-            **PATIENT_QUEUES,
+            **QUEUE_OPTIONS,
         }
     if link.tls is not None:
         values |= _tls_values(link.tls)
@@ -82,7 +81,7 @@ def zenoh_config(link: Link) -> zenoh.Config:
 
 
 def _tls_values(tls: Tls) -> dict[str, Any]:
-    """Nothing but TLS, both sides with a certificate of the mission."""
+    """Return the options that allow TLS only, with mission certificates on both sides."""
     return {
         "transport/link/protocols": ["tls"],
         "transport/link/tls": {
@@ -96,23 +95,35 @@ def _tls_values(tls: Tls) -> dict[str, Any]:
     }
 
 
-def _raw(sample: zenoh.Sample, key: str) -> Raw:
+def _raw_sample(sample: zenoh.Sample, key: str) -> RawSample:
     stamp = sample.timestamp
     sent_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
-    return Raw(key, str(sample.encoding), sample.payload.to_bytes(), sent_ns)
+    return RawSample(key, str(sample.encoding), sample.payload.to_bytes(), sent_ns)
 
 
 @dataclass
-class Counts:
-    """What a node has refused and missed, by topic."""
+class TrafficCounters:
+    """Messages that a node rejected and lost, by topic, and the number of stale ones."""
 
     rejected: Counter[str] = field(default_factory=Counter)
     lost: Counter[str] = field(default_factory=Counter)
     stale: int = 0
 
 
+class MessageFilter(Protocol):
+    """Replaces the messages that a node sends and receives. Fault injection implements it."""
+
+    def outgoing(self, topic: Topic, place: int | str | None, message: Any) -> list[Any]:
+        """Return the messages to publish instead of ``message``."""
+        ...
+
+    def incoming(self, topic: Topic, place: str | None, message: Any, payload: bytes) -> list[Any]:
+        """Return the messages to deliver instead of ``message``, which was decoded from ``payload``."""
+        ...
+
+
 class Node:
-    """One process on the network: publishes, subscribes and answers by the topics table.
+    """One process on the network: publishers, subscribers and queries, restricted by the topics table.
 
     Raises TransportError if the session cannot be opened, PermissionError for a topic that this role may
     not read or write.
@@ -121,22 +132,21 @@ class Node:
     def __init__(self, name: str, role: Role, link: Link) -> None:
         self.name = name
         self.role: Role = role
-        self.counts = Counts()
-        self.faults: FaultLayer | None = None
-        """What the mission's scenario does to this process' messages."""
-        self.waits = True
-        """Whether a slow reader holds up who publishes (lock-step) or misses what it cannot take. Set before publishing."""
-        self._inbox: Inbox[tuple[Topic, str | None, Raw] | None] = Inbox()
-        self._ready: deque[Received] = deque()
-        self._latest: dict[str, tuple[Topic, str | None, Raw]] = {}
+        self.counts = TrafficCounters()
+        self.message_filter: MessageFilter | None = None
+        self.blocking = True
+        """True (lock-step): a slow reader blocks the publisher. False: it misses messages. Set before publishing."""
+        self._inbox: BoundedQueue[tuple[Topic, str | None, RawSample] | None] = BoundedQueue()
+        self._ready: deque[ReceivedMessage] = deque()
+        self._latest: dict[str, tuple[Topic, str | None, RawSample]] = {}
         self._latest_lock = threading.Lock()
         self._publishers: dict[str, zenoh.Publisher] = {}
-        self._numbers: Counter[str] = Counter()
-        self._before_anew: Counter[str] = Counter()
+        self._next_seq: Counter[str] = Counter()
+        self._published_before_restart: Counter[str] = Counter()
         self._last_seq: dict[str, int] = {}
         self._declared: list[Any] = []
-        self._answering: dict[str, Any] = {}
-        self._before_close: list[Callable[[], None]] = []
+        self._queryables: dict[str, Any] = {}
+        self._close_callbacks: list[Callable[[], None]] = []
         zenoh.init_log_from_env_or("error")
         try:
             self._session = zenoh.open(zenoh_config(link))
@@ -146,7 +156,7 @@ class Node:
     # -- publishing ---------------------------------------------------------------------------------------
 
     def advertise(self, topic: Topic, place: int | str | None = None) -> str:
-        """Declares a publisher."""
+        """Declare a publisher and return its key."""
         if not topics.may_write(self.role, topic):
             raise PermissionError(f"{self.role} may not write {topic.key}")
         key = topic.key_of(place)
@@ -155,27 +165,30 @@ class Node:
                 key,
                 encoding=encoding_of(topic.kind),
                 priority=_PRIORITY[topic.qos],
-                express=topic in topics.AT_ONCE,
+                express=topic in topics.EXPRESS,
                 reliability=zenoh.Reliability.RELIABLE,
                 congestion_control=zenoh.CongestionControl.BLOCK
-                if self.waits or topic in topics.NEVER_DROPPED
+                if self.blocking or topic in topics.NEVER_DROPPED
                 else zenoh.CongestionControl.DROP,
             )
         return key
 
     def publish(self, topic: Topic, message: Message, place: int | str | None = None) -> None:
-        """Numbers, encodes and sends a message."""
+        """Number, encode and send a message."""
         key = topic.key_of(place)
         publisher = self._publishers.get(key) or self._publishers[self.advertise(topic, place)]
-        for said in (message,) if self.faults is None else self.faults.outgoing(topic, place, message):
-            payload = codec.encode(msgspec.structs.replace(said, seq=self._numbers[key]))
-            self._numbers[key] += 1
+        messages = [message]
+        if self.message_filter is not None:
+            messages = self.message_filter.outgoing(topic, place, message)
+        for outgoing in messages:
+            payload = codec.encode(msgspec.structs.replace(outgoing, seq=self._next_seq[key]))
+            self._next_seq[key] += 1
             publisher.put(payload, timestamp=self._session.new_timestamp())
 
-    def publish_raw(self, raw: Raw) -> None:
-        """Sends a recorded message as it was, with a new time stamp: for analysis alone."""
+    def publish_raw(self, raw: RawSample) -> None:
+        """Send a recorded message unchanged, with a new time stamp. Only for the role ``analysis``."""
         if self.role != "analysis":
-            raise PermissionError(f"{self.role} may not write {raw.key} unopened")
+            raise PermissionError(f"{self.role} may not write raw samples ({raw.key})")
         self._session.put(
             raw.key,
             raw.payload,
@@ -186,24 +199,24 @@ class Node:
 
     @property
     def published(self) -> dict[str, int]:
-        """Messages published so far, by key."""
-        return dict(self._numbers + self._before_anew)
+        """Return the number of messages published so far, by key."""
+        return dict(self._next_seq + self._published_before_restart)
 
-    def number_anew(self) -> None:
-        """Numbers from 0 again on the keys of its role, on which another process may have published since."""
-        for key in list(self._numbers):
+    def restart_numbering(self) -> None:
+        """Restart ``seq`` at 0 on the keys of this role, on which another process may have published meanwhile."""
+        for key in list(self._next_seq):
             found = topics.topic_of_key(key)
             if found is not None and found[0].writer == self.role:
-                self._before_anew[key] += self._numbers.pop(key)
+                self._published_before_restart[key] += self._next_seq.pop(key)
 
     # -- receiving ----------------------------------------------------------------------------------------
 
     def subscribe(self, topic: Topic, place: int | str | None = None, *, latest: bool = False) -> None:
-        """Subscribes a topic, of all chasers or processes when ``place`` is None.
+        """Subscribe to a topic, for all chasers or processes if ``place`` is None.
 
-        ``latest`` keeps only the newest sample of a key that waits to be read (images in real time).
+        ``latest`` keeps only the newest unread sample of each key (images in real time).
         """
-        expression = self._readable(topic, place)
+        expression = self._key_expression(topic, place)
 
         def arrived(sample: zenoh.Sample) -> None:
             key = str(sample.key_expr)
@@ -211,7 +224,7 @@ class Node:
             if found is None or found[0] is not topic:
                 self.counts.rejected["key"] += 1
                 return
-            raw = _raw(sample, key)
+            raw = _raw_sample(sample, key)
             if latest:
                 with self._latest_lock:
                     waiting = key in self._latest
@@ -223,58 +236,56 @@ class Node:
 
         self._declared.append(self._session.declare_subscriber(expression, arrived))
 
-    def follow(
+    def subscribe_newest(
         self, topic: Topic, depth: int, place: int | str | None = None
-    ) -> Callable[[], list[Received]]:
-        """Subscribes a topic for a reader who looks on; each call of what is returned gives what came since the last.
+    ) -> Callable[[], list[ReceivedMessage]]:
+        """Subscribe through a ring buffer of the newest ``depth`` samples, and return a function that drains it.
 
-        Of all that comes only the newest ``depth`` are kept. Zenoh itself drops the others, so that a reader who is
-        slow or stands still costs the publishers nothing.
+        Zenoh drops older samples, so that a slow or stopped reader does not slow down the publishers.
         """
         newest = zenoh.handlers.RingChannel(depth)
-        ring = self._session.declare_subscriber(self._readable(topic, place), newest)
+        ring = self._session.declare_subscriber(self._key_expression(topic, place), newest)
         self._declared.append(ring)
 
-        def take() -> list[Received]:
-            out: list[Received] = []
+        def drain() -> list[ReceivedMessage]:
+            out: list[ReceivedMessage] = []
             while (sample := ring.try_recv()) is not None and len(out) < depth:
-                raw = _raw(sample, str(sample.key_expr))
+                raw = _raw_sample(sample, str(sample.key_expr))
                 found = topics.topic_of_key(raw.key)
-                received = self._checked(topic, found[1], raw) if found and found[0] is topic else None
+                received = self._decode(topic, found[1], raw) if found and found[0] is topic else None
                 if received is not None:
                     out.append(received)
             return out
 
-        return take
+        return drain
 
-    def _readable(self, topic: Topic, place: int | str | None) -> str:
-        """The key expression of a topic that this role may read; raises PermissionError."""
+    def _key_expression(self, topic: Topic, place: int | str | None) -> str:
+        """Return the key expression of a topic. Raises PermissionError if this role may not read it."""
         if not topics.may_read(self.role, topic):
             raise PermissionError(f"{self.role} may not read {topic.key}")
         if place is None and "{" in topic.key:
             return topic.key.format(chaser="*", process="**")
         return topic.key_of(place)
 
-    def subscribe_raw(self, expression: str, arrived: Callable[[Raw], None]) -> None:
-        """Everything on a key expression, unopened, on Zenoh's thread: for recorder and analysis alone."""
+    def subscribe_raw(self, expression: str, arrived: Callable[[RawSample], None]) -> None:
+        """Pass every sample on a key expression to ``arrived`` on Zenoh's thread. Only for recorder and analysis."""
         if self.role not in ("recorder", "analysis"):
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def callback(sample: zenoh.Sample) -> None:
-            arrived(_raw(sample, str(sample.key_expr)))
+            arrived(_raw_sample(sample, str(sample.key_expr)))
 
         self._declared.append(self._session.declare_subscriber(expression, callback))
 
-    def receive(self, timeout_s: float | None) -> Received | None:
-        """The next message that passes all checks, or None when none came in time.
+    def receive(self, timeout_s: float | None) -> ReceivedMessage | None:
+        """Return the next valid message, or None on timeout.
 
-        Messages that do not pass are counted in ``counts.rejected`` by topic and reason; gaps in ``seq``
-        in ``counts.lost``.
+        Counts invalid messages in ``counts.rejected`` by topic and reason, and gaps in ``seq`` in ``counts.lost``.
         """
         if self._ready:
             return self._ready.popleft()
         if timeout_s == 0 and self._inbox.empty():
-            return None  # without an exception, for who looks often
+            return None  # fast path for polling: no exception
         try:
             item = self._inbox.get(timeout_s)
         except queue.Empty:
@@ -283,23 +294,23 @@ class Node:
             with self._latest_lock:
                 key = next(iter(self._latest))
                 item = self._latest.pop(key)
-        return self._open(*item)
+        return self._filter(*item)
 
-    def _open(self, topic: Topic, place: str | None, raw: Raw) -> Received | None:
-        received = self._checked(topic, place, raw)
+    def _filter(self, topic: Topic, place: str | None, raw: RawSample) -> ReceivedMessage | None:
+        received = self._decode(topic, place, raw)
         if received is None:
             return None
         seq, last = received.message.seq, self._last_seq.get(raw.key)
         if last is not None and seq > last + 1:
             self.counts.lost[raw.key] += seq - last - 1
         self._last_seq[raw.key] = seq
-        if self.faults is None:
+        if self.message_filter is None:
             return received
-        came = self.faults.incoming(topic, place, received.message, raw.payload)
-        self._ready.extend(Received(topic, place, m, raw.sent_ns) for m in came)
+        delivered = self.message_filter.incoming(topic, place, received.message, raw.payload)
+        self._ready.extend(ReceivedMessage(topic, place, m, raw.sent_ns) for m in delivered)
         return self._ready.popleft() if self._ready else None
 
-    def _checked(self, topic: Topic, place: str | None, raw: Raw) -> Received | None:
+    def _decode(self, topic: Topic, place: str | None, raw: RawSample) -> ReceivedMessage | None:
         try:
             message: Any = codec.decode(topic.kind, raw.payload, raw.encoding)
             if place is not None and str(getattr(message, "chaser", place)) != place:
@@ -307,19 +318,19 @@ class Node:
         except Rejected as refusal:
             self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
             return None
-        return Received(topic, place, message, raw.sent_ns)
+        return ReceivedMessage(topic, place, message, raw.sent_ns)
 
-    # -- questions and presence ---------------------------------------------------------------------------
+    # -- queries and liveliness ----------------------------------------------------------------------------
 
-    def answer(
+    def declare_queryable(
         self,
         key: str,
         request: type[msgspec.Struct],
         handle: Callable[[Any, Callable[[msgspec.Struct], None]], None],
     ) -> None:
-        """Answers queries on a key: ``handle(message, reply)`` is called on Zenoh's thread and must not block.
+        """Serve queries on a key: Zenoh's thread calls ``handle(message, reply)``, which must not block.
 
-        ``reply`` may be called later and from any thread, once. A malformed query gets an error reply.
+        ``reply`` may be called once, later and from any thread. A malformed query gets an error reply.
         """
 
         def arrived(query: zenoh.Query) -> None:
@@ -338,35 +349,37 @@ class Node:
 
             handle(message, reply)
 
-        self._answering[key] = self._session.declare_queryable(key, arrived)
+        self._queryables[key] = self._session.declare_queryable(key, arrived)
 
-    def answer_no_more(self, key: str) -> None:
-        """Leaves the queries on a key to others."""
-        if key in self._answering:
-            self._answering.pop(key).undeclare()
+    def undeclare_queryable(self, key: str) -> None:
+        """Stop serving queries on a key."""
+        if key in self._queryables:
+            self._queryables.pop(key).undeclare()
 
-    def ask(self, key: str, request: msgspec.Struct, reply: type[msgspec.Struct], timeout_s: float) -> Any:
-        """The first answer to a query, or None when nobody answers. Raises TransportError for an error reply."""
+    def query(self, key: str, request: msgspec.Struct, reply: type[msgspec.Struct], timeout_s: float) -> Any:
+        """Return the first reply to a query, or None without any. Raises TransportError for an error reply."""
         replies = self._session.get(
             key, payload=codec.encode(request), encoding=encoding_of(type(request)), timeout=timeout_s
         )
-        for answer in replies:
-            if answer.ok is not None:
+        for reply_sample in replies:
+            if reply_sample.ok is not None:
                 try:
-                    return codec.decode(reply, answer.ok.payload.to_bytes(), str(answer.ok.encoding))
+                    return codec.decode(
+                        reply, reply_sample.ok.payload.to_bytes(), str(reply_sample.ok.encoding)
+                    )
                 except Rejected as refusal:
-                    raise TransportError(f"answer on {key}: {refusal}") from None
-            if answer.err is not None and answer.err.payload.to_bytes() not in (b"Timeout", b""):
-                raise TransportError(f"{key}: {answer.err.payload.to_string()}")
+                    raise TransportError(f"reply on {key}: {refusal}") from None
+            if reply_sample.err is not None and reply_sample.err.payload.to_bytes() not in (b"Timeout", b""):
+                raise TransportError(f"{key}: {reply_sample.err.payload.to_string()}")
         return None
 
-    def announce(self) -> None:
-        """Declares this process' liveliness token."""
+    def declare_liveliness(self) -> None:
+        """Declare this process' liveliness token."""
         token = self._session.liveliness().declare_token(topics.LIVE_KEY.format(process=self.name))
         self._declared.append(token)
 
     def watch_liveliness(self, changed: Callable[[str, bool], None]) -> None:
-        """Calls ``changed(process, alive)`` on Zenoh's thread for every process that comes or goes."""
+        """Call ``changed(process, alive)`` on Zenoh's thread for every process that appears or disappears."""
         prefix = topics.LIVE_KEY.format(process="")
 
         def callback(sample: zenoh.Sample) -> None:
@@ -378,12 +391,12 @@ class Node:
             self._session.liveliness().declare_subscriber(expression, callback, history=True)
         )
 
-    def before_close(self, stop: Callable[[], None]) -> None:
-        """Has ``stop`` called before the session closes: for threads that publish on this node."""
-        self._before_close.append(stop)
+    def on_close(self, stop: Callable[[], None]) -> None:
+        """Register a callback to run before the session closes: stops threads that publish on this node."""
+        self._close_callbacks.append(stop)
 
     def close(self) -> None:
-        """Stops the threads that publish, then closes the session; what was published is sent first."""
-        for stop in self._before_close:
+        """Run the callbacks of ``on_close``, then close the session, which first sends all published messages."""
+        for stop in self._close_callbacks:
             stop()
         self._session.close()

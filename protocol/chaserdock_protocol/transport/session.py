@@ -1,10 +1,10 @@
-"""Joining a mission, and the barrier before its first tick.
+"""Joining a mission, and the discovery barrier before its first tick.
 
-Declarations reach the others one by one, so a message published too early could miss its reader. Every process
-therefore tells at intervals whose presence has reached it. Its presence subscription is declared after all others
-of its own; whoever's presence a process hears must know that subscription, hence all those declared before it.
-So once the reader of a topic has heard its writer, nothing that the writer publishes can miss it, whatever the
-topology and start order. The world opens the first tick when all such pairs have heard each other.
+Zenoh propagates declarations one by one, so that a message published too early may miss a subscriber. Every process
+therefore publishes at intervals from which processes it has received ``Presence``. It declares its presence
+subscription after all its other subscriptions. A writer whose presence reaches a reader hence knows all subscriptions
+of that reader, and no later message is lost, for any topology and start order. The world opens the first tick when
+all pairs that exchange messages have received each other's presence.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from collections.abc import Callable
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Farewell, Health, JoinReply, JoinRequest, Presence
-from chaserdock_protocol.messages.fields import GREATEST_COUNT
-from chaserdock_protocol.process import ProcessOptions, Stop, say
+from chaserdock_protocol.messages.fields import MAX_COUNT
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.topics import Role
 
 from . import Node
@@ -28,24 +28,24 @@ STEADY_PERIOD_S = 1.0
 
 
 class JoinRefused(ChaserdockError):
-    """The world does not take this process; the text says why."""
+    """The world rejects this process. The text gives the reason."""
 
 
 def new_instance() -> str:
-    """A name for one start of one process."""
+    """Return a unique id for one start of one process."""
     return uuid.uuid4().hex[:12]
 
 
 def join(
     node: Node, instance: str, stopped: Callable[[], bool], patience_s: float | None = None
 ) -> JoinReply | None:
-    """Asks the world for the mission until it answers; None when ``stopped``.
+    """Query the world for the mission until it replies. Return None if ``stopped``.
 
-    Raises JoinRefused when the world refuses, or after ``patience_s`` of wall time without any answer.
+    Raises JoinRefused if the world rejects the process, or after ``patience_s`` of wall time without a reply.
     """
     begun = time.monotonic()
     while not stopped():
-        reply = node.ask(topics.JOIN_KEY, JoinRequest(process=node.name, instance=instance), JoinReply, 0.5)
+        reply = node.query(topics.JOIN_KEY, JoinRequest(process=node.name, instance=instance), JoinReply, 0.5)
         if reply is not None:
             if not reply.accepted:
                 raise JoinRefused(reply.reason)
@@ -58,41 +58,41 @@ def join(
     return None
 
 
-def take_part(
-    name: str, role: Role, options: ProcessOptions, work: Callable[[Node, JoinReply, str, Stop], int]
+def run_member(
+    name: str, role: Role, options: ProcessOptions, work: Callable[[Node, JoinReply, str, StopSignal], int]
 ) -> int:
-    """The main of every process but the world: opens its node, joins the mission, does its ``work``; its status.
+    """Run a process other than the world: open its node, join the mission, and return the status of ``work``.
 
-    ``work(node, mission, instance, stop)`` is called once the world has answered. 1 when stopped before that, 2, with
-    the reason said, for a ChaserdockError.
+    ``work(node, mission, instance, stop)`` runs once the world has replied. Return 1 if stopped before, or print the
+    text of a ChaserdockError and return 2.
     """
     node: Node | None = None
     try:
         node = Node(name, role, options.link)
-        stop, instance = Stop(options.watch_parent), new_instance()
+        stop, instance = StopSignal(options.watch_parent), new_instance()
         mission = join(node, instance, stop, options.patience_s)
         if mission is None:
             return 1
-        node.waits = mission.mode == "lockstep"
-        node.announce()  # at once: while it prepares itself (compiling, say) nobody else may take its place
+        node.blocking = mission.mode == "lockstep"
+        node.declare_liveliness()  # before the start-up work (compilation): reserves the process' name
         return work(node, mission, instance, stop)
     except ChaserdockError as error:
-        say(name, str(error))
+        print_status(name, str(error))
         return 2
     finally:
         if node is not None:
             node.close()
 
 
-def partners_of(process: str, present: set[str]) -> set[str]:
-    """Those among ``present`` that ``process`` must have heard, and that must have heard it, before it flies."""
+def required_peers(process: str, present: set[str]) -> set[str]:
+    """Return the processes among ``present`` with which ``process`` must exchange presence before it flies."""
     if process.startswith("chaser/"):
         return {"world", *topics.CONTROLLERS} & present
     return present - {process}
 
 
 class Heartbeat:
-    """Publishes this process' presence at intervals and collects the others'; a daemon thread of its own.
+    """Publishes this process' presence at intervals from a daemon thread, and collects that of the others.
 
     Construct it after all other subscriptions of the node.
     """
@@ -103,27 +103,27 @@ class Heartbeat:
         self._heard: dict[str, str] = {}
         self._lock = threading.Lock()
         self._stop = threading.Event()
-        self.settled = threading.Event()
-        """Set once flying: presence is then told once a second only."""
+        self.in_flight = threading.Event()
+        """Set at the first tick: presence is then published once a second only."""
         node.advertise(topics.PRESENCE, node.name)
         node.subscribe(topics.PRESENCE)
         self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
         self._thread.start()
-        # On every way out: a thread caught in Zenoh while the interpreter ends takes the process down with it.
-        node.before_close(self.stop)
+        # A thread inside Zenoh while the interpreter shuts down crashes the process.
+        node.on_close(self.stop)
 
     def take(self, message: Presence) -> None:
-        """Notes a presence that the process' loop received."""
+        """Record a presence that the process' loop received."""
         with self._lock:
             self._heard[message.process] = message.instance
 
     def heard(self) -> dict[str, str]:
-        """Processes heard so far, with the instance that was heard."""
+        """Return the processes whose presence was received, with their instances."""
         with self._lock:
             return dict(sorted(self._heard.items()))
 
     def forget(self, process: str) -> None:
-        """A process is gone; it has to be heard again."""
+        """Forget a process that was lost."""
         with self._lock:
             self._heard.pop(process, None)
 
@@ -131,17 +131,17 @@ class Heartbeat:
         while not self._stop.is_set():
             message = Presence(process=self._node.name, instance=self._instance, heard=self.heard())
             self._node.publish(topics.PRESENCE, message, self._node.name)
-            self._stop.wait(STEADY_PERIOD_S if self.settled.is_set() else EARLY_PERIOD_S)
+            self._stop.wait(STEADY_PERIOD_S if self.in_flight.is_set() else EARLY_PERIOD_S)
 
     def stop(self) -> None:
-        """Tells no more; returns when the thread has ended, which a blocked network may delay by its own patience."""
+        """Stop publishing and join the thread, which may take as long as a blocked publication."""
         self._stop.set()
         self._thread.join()
 
     def farewell(self, tick: int, time_ns: int) -> None:
-        """Stops telling and publishes this process' last message: how many of each it has sent."""
+        """Stop the heartbeat and publish this process' last messages: health, and the message count of each key."""
         self.stop()
-        health = health_of(self._node, tick, time_ns)
+        health = create_health(self._node, tick, time_ns)
         self._node.publish(topics.HEALTH, health, self._node.name)
         last = Farewell(
             tick=tick, sim_time_ns=time_ns, process=self._node.name, published=self._node.published
@@ -149,13 +149,13 @@ class Heartbeat:
         self._node.publish(topics.FAREWELL, last, self._node.name)
 
 
-def health_of(node: Node, tick: int, time_ns: int) -> Health:
-    """What a node has refused and missed so far."""
+def create_health(node: Node, tick: int, time_ns: int) -> Health:
+    """Return the health message of a node's traffic counters."""
     return Health(
         tick=tick,
         sim_time_ns=time_ns,
         process=node.name,
         rejected=dict(node.counts.rejected),
-        lost=min(sum(node.counts.lost.values()), GREATEST_COUNT),
+        lost=min(sum(node.counts.lost.values()), MAX_COUNT),
         stale=node.counts.stale,
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
-from chaserdock_protocol.transport.session import partners_of
+from chaserdock_protocol.transport.session import required_peers
 
 JOIN_TIMEOUT_S = 5.0
 """An admitted process keeps its name reserved for so long before its liveliness token appears."""
@@ -128,7 +128,7 @@ class Membership:
             connected = {
                 name
                 for name in heard
-                if name != "world" and all(pair_is_connected(name, p) for p in partners_of(name, present))
+                if name != "world" and all(pair_is_connected(name, p) for p in required_peers(name, present))
             }
             if self.flying:
                 self._connected = set(connected)

@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
-from chaserdock_protocol.fault_injection import Lost
+from chaserdock_protocol.fault_injection import FaultLayer, LostMessage
 from chaserdock_protocol.messages import ActuatorCommand, Event, Latch, Presence, RecorderAck, Tick
-from chaserdock_protocol.process import say
+from chaserdock_protocol.process import print_status
 from chaserdock_protocol.transport import Node
-from chaserdock_protocol.transport.session import Heartbeat, health_of
+from chaserdock_protocol.transport.session import Heartbeat, create_health
 
 from chaserdock_world.actuators.ideal import Actuators
 
@@ -46,6 +46,7 @@ class TickBarrier:
         standby_expected: bool = False,
     ) -> None:
         self.chasers: tuple[int, ...] = ()
+        self.faults: FaultLayer | None = None
         self.election = LeaderElection(lease_s(timing.rate_hz))
         self._oldest_term = 0
         self._controllers: dict[str, str] = {}
@@ -80,7 +81,7 @@ class TickBarrier:
     def start_flight(self) -> None:
         """Start the flight: heartbeats slow down, and joining processes no longer hold back connected ones."""
         self._membership.flying = True
-        self._heartbeat.settled.set()
+        self._heartbeat.in_flight.set()
 
     def open_tick(self, tick: int, images: bool) -> None:
         """Open a tick: determine whose reply it expects, elect the leader and publish the tick."""
@@ -96,13 +97,13 @@ class TickBarrier:
         self._replied.clear()
         self._update_leader()
         self._oldest_term = self.election.term.number
-        if self._node.faults is not None:
-            for what, detail in self._node.faults.told_at(tick):
+        if self.faults is not None:
+            for what, detail in self.faults.transitions_at(tick):
                 self.publish_warning(what, detail)
         self._check_watchdogs()
         self._publish_tick()
         if tick > 0 and tick % self._timing.rate_hz == 0:
-            health = health_of(self._node, tick, self._timing.tick_time_ns(tick))
+            health = create_health(self._node, tick, self._timing.tick_time_ns(tick))
             self._node.publish(topics.HEALTH, health, "world")
 
     def is_complete(self) -> bool:
@@ -149,7 +150,7 @@ class TickBarrier:
             tick=self._tick, sim_time_ns=time_ns, process="world", level="warning", what=what, detail=detail
         )
         self._node.publish(topics.EVENT, event, "world")
-        say("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
+        print_status("world", f"{time_ns / 1e9:.2f} s: {what}: {detail}")
 
     def publish_farewell(self, tick: int, time_ns: int) -> None:
         """Publish the world's last messages."""
@@ -168,7 +169,7 @@ class TickBarrier:
             self.process_message(_POLL_S)
             if time.monotonic() - printed_s > _STATUS_INTERVAL_S:
                 printed_s = time.monotonic()
-                say("world", f"waiting for {waiting_for()}")
+                print_status("world", f"waiting for {waiting_for()}")
         return True
 
     def process_until(self, wall_s: float) -> None:
@@ -188,7 +189,7 @@ class TickBarrier:
                 if self._membership.update_presence(presence):
                     self._heartbeat.take(presence)
                     self.election.mark_responsive(presence.instance)
-            case Lost(tick=tick) if received is not None and tick == self._tick:
+            case LostMessage(tick=tick) if received is not None and tick == self._tick:
                 self._replied.add(int(received.place or 0))  # its actuators keep their last command
         changed = self._remove_departed()
         if self._tick >= 0 and self._membership.realtime and self._update_leader():
@@ -250,7 +251,7 @@ class TickBarrier:
         return bool(reason)
 
     def _check_watchdogs(self) -> None:
-        """Stop actuators that no longer receive commands, as the watchdog of a valve driver does."""
+        """StopSignal actuators that no longer receive commands, as the watchdog of a valve driver does."""
         now_ns = self._timing.tick_time_ns(self._tick)
         for name in [n for n, since in self._commanded_ns.items() if now_ns - since > self._watchdog_ns]:
             self._actuators[name].stop(self._current_step())

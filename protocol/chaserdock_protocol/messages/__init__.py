@@ -1,4 +1,13 @@
-"""Messages that travel between processes and are stored in logs; ``flight`` states their conventions."""
+"""Messages that processes exchange and logs store.
+
+On the wire a message is a msgpack map of its field names; the Zenoh encoding carries its type and version (see
+``codec``). A new field gets a default, so that old logs stay readable. A renamed field or a changed meaning gets a new
+``VERSION`` and a migration in ``recording/schema_migrations.py``.
+
+Common fields: ``seq`` numbers the messages of one publisher on one key from 0 (set when published);
+``tick`` is the world's tick of the message; ``sim_time_ns`` is simulated time, and for everything derived from an image
+the time of its *exposure*. No field depends on a wall clock, except those whose name begins with ``wall_``.
+"""
 
 from .base import Message
 from .fields import (

@@ -9,7 +9,7 @@ from importlib.metadata import distributions
 from pathlib import Path
 
 # In a source tree; an installed package has none.
-_LOCK_FILE = Path(__file__).resolve().parents[2] / "uv.lock"
+_LOCK_FILE = Path(__file__).resolve().parents[3] / "uv.lock"
 
 
 @lru_cache

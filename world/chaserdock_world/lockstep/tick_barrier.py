@@ -251,7 +251,7 @@ class TickBarrier:
         return bool(reason)
 
     def _check_watchdogs(self) -> None:
-        """StopSignal actuators that no longer receive commands, as the watchdog of a valve driver does."""
+        """Stop actuators that no longer receive commands, as the watchdog of a valve driver does."""
         now_ns = self._timing.tick_time_ns(self._tick)
         for name in [n for n, since in self._commanded_ns.items() if now_ns - since > self._watchdog_ns]:
             self._actuators[name].stop(self._current_step())

@@ -1,7 +1,7 @@
-"""Builds the documentation as a site that needs no network: ``python docs/make_site.py [OUT]`` (``site/`` by default).
+"""Build the documentation as a self-contained site: ``python docs/make_site.py [OUT]`` (default: ``site/``).
 
-The pages are written for GitHub. Here their mathematics becomes MathML, and what they link to outside docs/ becomes pages
-of its own, so that every link can be checked: a warning is an error.
+Needs the packages of requirements-dev.txt. The pages are written for GitHub. Here their mathematics becomes MathML, and files outside
+docs/ that they link to become pages, so that every link is checked. A warning is an error.
 """
 
 from __future__ import annotations
@@ -17,7 +17,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from latex2mathml.converter import convert
+try:
+    from latex2mathml.converter import convert
+except ImportError:
+    sys.exit("make_site: latex2mathml is missing; pip install -r requirements-dev.txt")
 
 DOCS = Path(__file__).resolve().parent
 ROOT = DOCS.parent
@@ -32,7 +35,7 @@ class SiteError(Exception):
 
 
 def with_mathematics(text: str) -> str:
-    """GitHub's ```math fences and $`…`$ as MathML."""
+    """Convert GitHub's ```math fences and $`…`$ to MathML."""
 
     def fence(found: re.Match[str]) -> str:
         if found[2] != "math":
@@ -53,21 +56,21 @@ def _inline(text: str) -> str:
 
 
 class Stage:
-    """Pages as the site has them, in ``folder``; ``add`` puts one there with all it links to."""
+    """The pages of the site, collected in ``folder``; ``add`` copies a page with everything it links to."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self._staged: set[Path] = set()
 
     def place_of(self, file: Path) -> str:
-        """Where a file of the repository lies in the site, relative to its root."""
+        """Return the path of a repository file in the site, relative to its root."""
         if file.is_relative_to(DOCS) and file.suffix in (".md", ".jpg", ".png", ".webp", ".svg"):
             return file.relative_to(DOCS).as_posix()
         place = f"source/{file.relative_to(ROOT).as_posix()}"
         return place if file.suffix == ".md" else f"{place}.md"
 
     def add(self, file: Path) -> None:
-        """A page or image; a source file becomes a page that shows it. Raises SiteError for a link to nowhere."""
+        """Add a page or image; a source file becomes a page that shows it. Raises SiteError for a broken link."""
         if file in self._staged:
             return
         self._staged.add(file)
@@ -104,34 +107,34 @@ class Stage:
 
 
 def pages_of(nav: list[Any]) -> Iterator[str]:
-    """Pages that a navigation names, in their order."""
+    """Yield the pages of a navigation in order."""
     for entry in nav:
         for place in entry.values():
             yield from pages_of(place) if isinstance(place, list) else (place,)
 
 
 def configuration(stage: Path) -> str:
-    """site.toml with the pages of docs/ that it does not name put behind the others, by their headings.
+    """Return site.toml with the pages of docs/ that it does not list appended under their headings.
 
-    Raises SiteError when it names a page that is not there, or one twice.
+    Raises SiteError if it lists a page twice or one that does not exist.
     """
     text = (DOCS / "site.toml").read_text(encoding="utf-8")
     named = list(pages_of(tomllib.loads(text)["project"]["nav"]))
     wrong = [place for place in named if not (stage / place).is_file() or named.count(place) > 1]
     if wrong:
-        raise SiteError(f"site.toml: nav: not there, or named twice: {', '.join(wrong)}")
+        raise SiteError(f"site.toml: nav: missing or listed twice: {', '.join(wrong)}")
     more = [
         f'    {{ "{page.read_text(encoding="utf-8").partition(chr(10))[0].lstrip("# ")}" = "{page.name}" }},'
         for page in sorted(DOCS.glob("*.md"))
         if page.name not in named
     ]
     if "# MORE" not in text:
-        raise SiteError("site.toml: nav: the line # MORE is gone")
+        raise SiteError("site.toml: nav: the line # MORE is missing")
     return re.sub(r"^ *# MORE.*$", lambda _: "\n".join(more), text, flags=re.M)
 
 
 def build(out: Path) -> None:
-    """Builds the site into ``out``, which is replaced. Raises SiteError, after what is wrong has been printed."""
+    """Build the site into ``out``, which is replaced. Raises SiteError with the output of the site generator."""
     with tempfile.TemporaryDirectory(prefix="chaserdock-docs-") as name:
         work = Path(name)
         stage = Stage(work / "pages")
@@ -155,7 +158,7 @@ def build(out: Path) -> None:
 def main() -> int:
     out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "site"
     if out.exists() and not (out / "sitemap.xml").is_file():
-        print(f"make_site: {out} is there and no site; it would be replaced", file=sys.stderr)
+        print(f"make_site: {out} exists and is not a site; it would be replaced", file=sys.stderr)
         return 2
     try:
         build(out)

@@ -73,7 +73,7 @@ def test_every_page_is_there_and_asks_nobody_else(site: Path) -> None:
 
 
 def test_mathematics_is_in_the_page_itself(site: Path) -> None:
-    for name, least in (("controller", 8), ("fusion", 4)):
+    for name, least in (("controller", 8), ("estimation", 4)):
         seen = Requests()
         text = (site / f"{name}.html").read_text(encoding="utf-8")
         seen.feed(text)
@@ -92,7 +92,7 @@ def test_a_link_to_nowhere_is_an_error(tmp_path: Path) -> None:
 
 
 def test_navigation_names_pages_that_are_there(tmp_path: Path) -> None:
-    with pytest.raises(make_site.SiteError, match=r"not there.*index\.md"):
+    with pytest.raises(make_site.SiteError, match=r"missing.*index\.md"):
         make_site.configuration(tmp_path)
 
 

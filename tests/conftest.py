@@ -1,7 +1,49 @@
-"""Shared by all tests."""
+"""Fixtures shared by all tests."""
 
-import sys
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-# ``harness`` is a module beside the tests, ``closed_loop`` one of the benchmarks: no packages of ours.
-sys.path[:0] = [str(Path(__file__).resolve().parent), str(Path(__file__).resolve().parents[1] / "benchmarks")]
+import pytest
+from harness import SHORT, run
+
+Fly = Callable[..., Path]
+
+
+@pytest.fixture(scope="session")
+def shared_flight(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> Fly:
+    """Return a function that flies a scenario once per test session, whichever worker asks first, and returns its folder."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base if worker_id == "master" else base.parent) / "shared-flights"
+    folder.mkdir(exist_ok=True)
+
+    def fly(name: str, scenario: str, *overrides: str, **options: Any) -> Path:
+        out = folder / name
+        with (folder / f"{name}.lock").open("w") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            failure = folder / f"{name}.failed"
+            if failure.exists():
+                raise AssertionError(failure.read_text())
+            if not out.exists():
+                status, output = run(scenario, out, *overrides, **options)
+                if status != 0:
+                    failure.write_text(output)
+                assert status == 0, output
+        return out
+
+    return fly
+
+
+@pytest.fixture(scope="session")
+def short_flight(shared_flight: Fly) -> Path:
+    """A two-chaser flight of six seconds, with which others are compared."""
+    return shared_flight("short", "two-chaser-tracking", *SHORT)
+
+
+@pytest.fixture(scope="session")
+def main_job(shared_flight: Fly) -> Path:
+    """The main job in full length."""
+    return shared_flight("main-job", "four-chaser-docking", timeout_s=1800)

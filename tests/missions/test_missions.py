@@ -28,15 +28,6 @@ OTHER_SIMD = {
 """OpenCV, NumPy and the BLAS one or two levels below what this machine has."""
 
 
-@pytest.fixture(scope="session")
-def short_flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A short two-chaser flight that others are compared with."""
-    out = tmp_path_factory.mktemp("short") / "run"
-    status, said = run(TWO, out, *SHORT)
-    assert status == 0, said
-    return out
-
-
 def test_same_flight_twice(short_flight: Path, tmp_path: Path) -> None:
     status, said = run(TWO, tmp_path / "again", *SHORT, arguments=["--quiet"])
     assert status == 0, said
@@ -194,15 +185,6 @@ def test_collision_avoidance(tmp_path: Path) -> None:
     # At the end chaser 0 looks away from the target: it has seen nothing for a while.
     assert not flight.sightings[0].seen[-150:].any()
     assert result["target_estimate"]["max_position_error_m"] < 0.01
-
-
-@pytest.fixture(scope="session")
-def main_job(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The main job, whole."""
-    out = tmp_path_factory.mktemp("main") / "run"
-    status, said = run("four-chaser-docking", out, timeout_s=1800)
-    assert status == 0, said
-    return out
 
 
 @pytest.mark.slow

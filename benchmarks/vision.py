@@ -19,8 +19,9 @@ from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.rotations import Array
 from chaserdock_models.targets import face_rotation, target_model
+from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
-from chaserdock_world.rendering.effects import CameraEffects, Effects
+from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from numpy.typing import NDArray

@@ -6,8 +6,9 @@ from chaserdock_agents.chaser.perception import Method, Perception, corners, det
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import target_model
+from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
-from chaserdock_world.rendering.effects import CameraEffects, Effects
+from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.rasterizer import Renderer
 from hypothesis import given, settings
 from hypothesis import strategies as st

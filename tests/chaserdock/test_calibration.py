@@ -57,7 +57,7 @@ def board_images(board, count, seed=3):
         size = (4 * lens.size_px[0], 4 * lens.size_px[1])
         fine = cv2.warpPerspective(drawing, homography, size, flags=cv2.INTER_AREA, borderValue=90)
         ideal = np.asarray(cv2.resize(fine, lens.size_px, interpolation=cv2.INTER_AREA), np.uint8)
-        noisy = lens.distorted(ideal) * 0.85 + generator.normal(0.0, 1.5, (480, 640))
+        noisy = lens.distort(ideal) * 0.85 + generator.normal(0.0, 1.5, (480, 640))
         out[f"{k:02}.png"] = np.clip(noisy, 0, 255).astype(np.uint8)
     return out
 

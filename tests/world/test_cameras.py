@@ -34,7 +34,7 @@ def states_of(scenario, target_omega=(0.0, 0.0, 0.0)):
 
 def taken(*changes, omega=(0.0, 0.0, 0.0), time_ns=0):
     scenario = scenario_with(*changes)
-    return Cameras(scenario).taken(0, 0, time_ns, states_of(scenario, omega)).astype(float)
+    return Cameras(scenario).render(0, 0, time_ns, states_of(scenario, omega)).astype(float)
 
 
 @pytest.mark.parametrize("renderer", ["exact", "pybullet"])
@@ -57,7 +57,7 @@ def test_motion_blur_is_the_mean_over_the_exposure():
         target = turned[TARGET]
         q = rotations.integrate(target.q_wxyz, np.array(omega), share * exposure_s)
         turned[TARGET] = BodyState(target.position_m, np.zeros(3), q, np.zeros(3))
-        images.append(cameras.taken(0, 0, 0, turned).astype(float))
+        images.append(cameras.render(0, 0, 0, turned).astype(float))
     blurred = taken(f"camera.effects.exposure_s={exposure_s}", omega=omega)
     mean = np.mean(images, axis=0)
     assert np.abs(blurred - mean).mean() < 0.2 * np.abs(blurred - images[10]).mean()

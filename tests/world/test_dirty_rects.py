@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import combinations
 
-from chaserdock_world.rendering.dirty_rects import Rectangle, patches
+from chaserdock_world.rendering.dirty_rects import Rectangle, merge_overlapping
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -19,7 +19,7 @@ def pixels(r: Rectangle) -> set[tuple[int, int]]:
 
 @given(st.lists(rectangles, max_size=8))
 def test_patches_cover_each_rectangle_once_and_are_disjoint(covered: list[Rectangle]) -> None:
-    found = patches(covered)
+    found = merge_overlapping(covered)
     assert sorted(i for _, members in found for i in members) == list(range(len(covered)))
     for patch, members in found:
         assert all(pixels(covered[i]) <= pixels(patch) for i in members)
@@ -31,5 +31,5 @@ def test_patches_cover_each_rectangle_once_and_are_disjoint(covered: list[Rectan
 
 def test_distant_rectangles_stay_separate_until_a_third_joins_them() -> None:
     left, right = (0, 0, 10, 10), (50, 0, 60, 10)
-    assert patches([left, right]) == [(left, frozenset([0])), (right, frozenset([1]))]
-    assert patches([left, right, (5, 5, 55, 8)]) == [((0, 0, 60, 10), frozenset([0, 1, 2]))]
+    assert merge_overlapping([left, right]) == [(left, frozenset([0])), (right, frozenset([1]))]
+    assert merge_overlapping([left, right, (5, 5, 55, 8)]) == [((0, 0, 60, 10), frozenset([0, 1, 2]))]

@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 from chaserdock_models.camera import Camera
 from chaserdock_models.native.build import X86_64
-from chaserdock_world.rendering import background as sky
-from chaserdock_world.rendering import effects
-from chaserdock_world.rendering import supersampling as samples
-from chaserdock_world.rendering.effects import CameraEffects, Effects, blurred
+from chaserdock_protocol.scenario.camera import Effects
+from chaserdock_world.rendering import background, effects
+from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.native import LIBRARY
-from chaserdock_world.rendering.supersampling import spread, take_means
+from chaserdock_world.rendering.rasterizer import upsample
 from numpy.typing import NDArray
 
 Pixels = NDArray[np.uint8]
@@ -25,7 +24,7 @@ def instruction_set(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     if LIBRARY.level == 0 or request.param > LIBRARY.level:
         pytest.skip(f"this processor has no copy {request.param}")
     own = LIBRARY.function
-    for module in (effects, samples, sky):
+    for module in (effects, background):
         monkeypatch.setattr(module, "function", lambda name, result=None: own(name, result, request.param))
 
 
@@ -40,19 +39,12 @@ def images(size: tuple[int, int]) -> list[Pixels]:
     return [noise, space, white, np.where(noise > 127, white, np.uint8(0))]
 
 
-@pytest.mark.parametrize("sigma_px", [0.05, 0.34, 0.6, 0.9, 1.4, 2.0, 5.0, 10.6, 10.7])
-def test_a_blur_is_opencvs(sigma_px: float) -> None:
-    width = 2 * int(np.ceil(3.0 * sigma_px)) + 1
-    for size in SIZES:
-        for image in images(size):
-            expected = cv2.GaussianBlur(image, (width, width), sigma_px, borderType=cv2.BORDER_REPLICATE)
-            np.testing.assert_array_equal(blurred(image, sigma_px), expected, f"{size}")
-
-
 @pytest.mark.parametrize("size", [(480, 640), (33, 97)])
 @pytest.mark.parametrize(("read", "shot"), [(1.5, 0.025), (0.0, 0.5), (60.0, 2.0), (3000.0, 0.0)])
 def test_noise_kernel_equals_numpy(size: tuple[int, int], read: float, shot: float) -> None:
-    camera = CameraEffects(size[1], size[0], Effects(1.0, 0.0, read, shot), seed=3)
+    camera = CameraEffects(
+        size[1], size[0], Effects(point_spread_px=0.0, read_noise=read, shot_noise=shot), seed=3
+    )
     assert camera._bank is not None
     for number, image in enumerate(images(size)):
         seeds = np.random.SeedSequence([3, 1, 2, number]).generate_state(3)
@@ -65,44 +57,26 @@ def test_noise_kernel_equals_numpy(size: tuple[int, int], read: float, shot: flo
 
 
 @pytest.mark.parametrize("number", [2, 4])
-def test_samples_and_their_means_are_as_opencv_resizes(number: int) -> None:
+def test_upsampling_equals_nearest_neighbour_interpolation(number: int) -> None:
     rng = np.random.default_rng(number)
     for rows, columns in SIZES:
-        canvas = rng.integers(0, 256, (rows + 5, columns + 7), dtype=np.uint8)
-        before, size = canvas.copy(), (number * columns, number * rows)
-        view = canvas[2 : 2 + rows, 3 : 3 + columns]
-        fine = spread(view, number)
-        np.testing.assert_array_equal(fine, cv2.resize(view, size, interpolation=cv2.INTER_NEAREST))
-        take_means(fine, number, view)
-        np.testing.assert_array_equal(canvas, before)  # what is not painted on stays what it was
-        fine = rng.integers(0, 256, fine.shape, dtype=np.uint8)
-        take_means(fine, number, view)
-        expected = cv2.resize(fine, (columns, rows), interpolation=cv2.INTER_AREA)
-        before[2 : 2 + rows, 3 : 3 + columns] = expected
-        np.testing.assert_array_equal(canvas, before)
-
-
-def test_samples_that_do_not_fit_are_refused() -> None:
-    view = np.zeros((4, 6), dtype=np.uint8)
-    with pytest.raises(ValueError, match="3 samples"):
-        spread(view, 3)
-    with pytest.raises(ValueError, match="strides"):
-        spread(view[:, ::2], 2)
-    with pytest.raises(ValueError, match="not 2 samples"):
-        take_means(np.zeros((8, 10), dtype=np.uint8), 2, view)
+        view = rng.integers(0, 256, (rows + 5, columns + 7), dtype=np.uint8)[2 : 2 + rows, 3 : 3 + columns]
+        size = (number * columns, number * rows)
+        expected = cv2.resize(view, size, interpolation=cv2.INTER_NEAREST)
+        np.testing.assert_array_equal(upsample(view, number), expected)
 
 
 def test_stars_are_drawn_at_their_projection() -> None:
     rng = np.random.default_rng(4)
     for camera in (Camera.from_hfov(640, 480, 1.0), Camera.from_hfov(64, 64, 2.6)):
         origin, size = np.array([-9.0, -7.0]), (camera.width_px + 11, camera.height_px + 8)
-        seen = sky.Sky(camera, origin, size)
+        seen = background.Background(camera, origin, size)
         for q in rng.normal(size=(20, 4)):
             q = q / np.linalg.norm(q)
-            expected = np.full(size[::-1], sky.SPACE_LEVEL, dtype=np.uint8)
-            stars = seen._stars @ sky.rotations.to_matrix(q)
+            expected = np.full(size[::-1], background.SPACE_LEVEL, dtype=np.uint8)
+            stars = seen._stars @ background.rotations.to_matrix(q)
             for star, level in zip(stars, seen._star_levels, strict=True):
                 column, row = np.rint(camera.project_ideal(star) - origin)
                 if star[2] > 0.1 and 0 <= column < size[0] and 0 <= row < size[1]:
                     expected[int(row), int(column)] = level
-            np.testing.assert_array_equal(seen.background(q), expected)
+            np.testing.assert_array_equal(seen.draw(q), expected)

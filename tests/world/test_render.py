@@ -6,10 +6,11 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import Box, TargetModel, target_model
+from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
-from chaserdock_world.rendering.effects import NO_EFFECTS, CameraEffects, Effects
+from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
-from chaserdock_world.rendering.scene_geometry import SeenBox, hides, paint_order
+from chaserdock_world.rendering.scene_geometry import VisibleBox, paint_order
 from chaserdock_world.rendering.textures import finest_texture, marker_cells
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from hypothesis import given, settings
@@ -201,7 +202,7 @@ def test_paint_order_agrees_with_ray_casting(seed):
 
 def placed(*boxes):
     """Boxes (centre, half edges), as seen from the origin, whose images overlap."""
-    out = np.zeros(len(boxes), dtype=SeenBox)
+    out = np.zeros(len(boxes), dtype=VisibleBox)
     for row, (centre, half) in zip(out, boxes, strict=True):
         row["centre"], row["half"], row["rotation"], row["high_px"] = centre, half, np.eye(3), 1.0
     return out
@@ -211,15 +212,17 @@ def test_wide_near_box_occludes_though_its_centre_is_farther():
     wide, small = ([3.0, 0.0, 1.0], [4.0, 0.5, 0.1]), ([-0.5, 0.0, 1.3], [0.1, 0.1, 0.1])
     assert np.linalg.norm(wide[0]) > np.linalg.norm(small[0])
     boxes = placed(wide, small)
-    assert (hides(boxes, 0, 1), hides(boxes, 1, 0)) == (1, -1)
     assert paint_order(boxes) == [1, 0]
-    # Two boxes apart in the image wait for nothing: the farther one first.
+    assert paint_order(placed(small, wide)) == [0, 1]
+    # Boxes that are disjoint in the image are ordered by distance, the farther one first.
     boxes["low_px"][1], boxes["high_px"][1] = 5.0, 6.0
     assert paint_order(boxes) == [0, 1]
 
 
 def test_boxes_on_opposite_sides_of_the_camera_do_not_occlude():
-    assert hides(placed(*(([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in (2.0, -2.0))), 0, 1) == 0
+    # At equal distance the order is that of the boxes; an occlusion would reverse one of the two.
+    for ends in ((2.0, -2.0), (-2.0, 2.0)):
+        assert paint_order(placed(*(([0.0, 0.0, z], [0.5, 0.5, 0.5]) for z in ends))) == [0, 1]
 
 
 @pytest.mark.parametrize("camera", [CAMERA, LENS], ids=["pinhole", "lens"])
@@ -293,7 +296,7 @@ def test_sunlit_faces_are_brighter_than_shaded_ones():
     dark = renderer.render(EYE, AHEAD, [0.0, 0.0, 1.0], rotations.IDENTITY, (), Light((0.0, 0.0, 1.0)))
     assert lit[240, 320] == round(235 * 0.5)
     assert dark[240, 320] == round(235 * 0.5 * 0.35)
-    with pytest.raises(ValueError, match="light"):
+    with pytest.raises(ValueError, match="direction to the sun"):
         Light((0.0, 0.0, 0.0))
 
 
@@ -354,10 +357,17 @@ def test_noise_repeats_for_equal_chaser_and_image_and_differs_otherwise():
 @pytest.mark.parametrize("level", [40, 100, 220])
 def test_noise_has_the_stated_variance(level):
     image = np.full((480, 640), level, dtype=np.uint8)
-    noisy = CameraEffects(640, 480, Effects(1.0, 0.0, 2.0, 0.05), 1).apply(image, 0, 0).astype(float)
+    noisy = (
+        CameraEffects(640, 480, Effects(point_spread_px=0.0, read_noise=2.0, shot_noise=0.05), 1)
+        .apply(image, 0, 0)
+        .astype(float)
+    )
     assert noisy.mean() == pytest.approx(level, abs=0.05)
     # A twelfth is added by rounding to whole grey levels.
     assert noisy.var() == pytest.approx(4.0 + 0.05 * level + 1.0 / 12.0, rel=0.03)
+
+
+NO_EFFECTS = Effects(gain=1.0, point_spread_px=0.0, read_noise=0.0, shot_noise=0.0)
 
 
 def test_disabled_effects_do_not_change_the_image():

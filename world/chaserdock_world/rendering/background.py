@@ -1,4 +1,4 @@
-"""What is behind the target: space, stars and, if it is there, the Earth; and the light of the sun."""
+"""Background of an image: space, stars and the Earth; and the illumination of the scene."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from numpy.typing import NDArray
 from .native import function
 
 AMBIENT = 0.35
-"""Share of the light that comes from everywhere; the rest is the sun's, by Lambert's cosine law."""
+"""Default share of ambient light; the rest is the sun's, by Lambert's cosine law."""
 
 WHITE_LEVEL = 235.0
 """Grey level of reflectance 1 in full sun: below 255, so that noise does not clip on white."""
 
 SPACE_LEVEL = 4
 _STARS = 400
-# The Earth is soft: it is computed on every such pixel, and between them interpolated.
+# The Earth has no fine detail: it is computed on a grid of this step and interpolated.
 _EARTH_STEP_PX = 4
-# Reflectance of sea, and of the thickest clouds above that.
+# Reflectance of the sea, and the additional reflectance of the thickest clouds.
 _SEA, _CLOUDS = 0.12, 0.6
 _MAP_ROWS, _MAP_COLUMNS = 256, 512
 
 
 @dataclass(frozen=True)
 class Light:
-    """What lights the scene. ``to_sun_w``: direction (3,) in WRF, any length. ``sun`` and ``ambient``: shares
-    of full light that come from there and from everywhere. ``lamp``: grey level of a white surface that faces
-    the camera's own lamp at 1 m (inverse square, Lambert).
+    """Illumination of the scene.
+
+    ``to_sun_w``: direction (3,) in WRF, any length. ``sun`` and ``ambient``: shares of full light from the sun and from all
+    directions. ``lamp``: grey level of a white surface facing the camera's lamp at 1 m (inverse square, Lambert).
 
     Raises ValueError for a zero direction.
     """
@@ -48,18 +49,21 @@ class Light:
     def __post_init__(self) -> None:
         length = float(np.linalg.norm(self.to_sun_w))
         if not (np.isfinite(length) and length > 0.0):
-            raise ValueError("the light needs a direction other than zero")
+            raise ValueError("the direction to the sun must not be zero")
 
     @cached_property
     def direction_w(self) -> Array:
-        """Unit vector (3,) in WRF, to the sun; read-only."""
+        """Unit vector (3,) to the sun in WRF; read-only."""
         direction = np.array(self.to_sun_w) / np.linalg.norm(self.to_sun_w)
         direction.setflags(write=False)
         return direction
 
     def level(self, cosine: float, to_camera: Array, normal: Array) -> float:
-        """Grey level of a white face with the sun at ``cosine`` from its normal; ``to_camera`` (3,), metres,
-        from the face to the lamp beside the lens, in the axes of ``normal`` (3,)."""
+        """Return the grey level of a white face.
+
+        ``cosine``: of the angle between the sun and the face's normal; ``to_camera`` (3,): from the face to the lamp beside
+        the lens, metres, in the axes of ``normal`` (3,).
+        """
         level = WHITE_LEVEL * (self.ambient + self.sun * max(0.0, cosine))
         if self.lamp > 0.0:
             distance = float(np.linalg.norm(to_camera))
@@ -69,14 +73,14 @@ class Light:
 
 @dataclass(frozen=True)
 class Earth:
-    """The Earth's disc: ``direction_w`` to its centre (WRF) and its angular radius."""
+    """The Earth's disc: direction to its centre (WRF) and angular radius."""
 
     direction_w: tuple[float, float, float]
     radius_rad: float
 
 
-class Sky:
-    """Draws the background of images that start at ``origin_px`` and have ``size_px`` (width, height)."""
+class Background:
+    """Draws the background of ideal images that start at ``origin_px`` and have ``size_px`` (width, height)."""
 
     def __init__(
         self, camera: Camera, origin_px: Array, size_px: tuple[int, int], earth: Earth | None = None
@@ -86,15 +90,15 @@ class Sky:
         stars = generator.standard_normal((_STARS, 3))
         self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)
         self._star_levels = (30.0 + 150.0 * generator.random(_STARS) ** 3).astype(np.uint8)
-        # As Camera.project_ideal: focal lengths, centre, and the canvas' first pixel.
+        # As in Camera.project_ideal: focal lengths, centre, and the first pixel of the canvas.
         lens = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *origin_px.tolist())
         self._lens = np.array(lens)
         if earth is not None:
             self._albedo = _albedo_map(generator)
             self._rays = _rays(camera, origin_px, size_px, _EARTH_STEP_PX)
 
-    def background(self, q_w_irf_wxyz: Array, light: Light | None = None) -> NDArray[np.uint8]:
-        """Ideal image (h, w), uint8, of all that is far away; ``light`` (for the Earth's day side)."""
+    def draw(self, q_w_irf_wxyz: Array, light: Light | None = None) -> NDArray[np.uint8]:
+        """Return the ideal image (h, w), uint8, of stars and Earth; ``light`` illuminates the Earth."""
         width, height = self._size
         canvas = np.full((height, width), SPACE_LEVEL, dtype=np.uint8)
         turn = rotations.to_matrix(q_w_irf_wxyz)
@@ -108,17 +112,17 @@ class Sky:
         return canvas
 
     def _draw_earth(self, canvas: NDArray[np.uint8], turn: Array, earth: Earth, light: Light) -> None:
-        """Lambert's law on a sphere seen from outside, with clouds fixed to it."""
+        """Draw a Lambertian sphere with clouds fixed to it."""
         centre = np.array(earth.direction_w) / np.linalg.norm(earth.direction_w)
         rays = self._rays @ turn.T  # in WRF, unit
         cosine = rays @ centre
         if float(cosine.max()) < np.cos(earth.radius_rad) - 0.05:
             return
         # A sphere of radius sin(radius) at distance 1.
-        size = np.sin(earth.radius_rad)
-        inside = cosine**2 - (1.0 - size**2)
-        reach = cosine - np.sqrt(np.maximum(inside, 0.0))
-        normals = (reach[..., None] * rays - centre) / size
+        radius = np.sin(earth.radius_rad)
+        inside = cosine**2 - (1.0 - radius**2)
+        distance = cosine - np.sqrt(np.maximum(inside, 0.0))
+        normals = (distance[..., None] * rays - centre) / radius
         longitude = np.arctan2(normals[..., 1], normals[..., 0]) / (2.0 * np.pi) + 0.5
         latitude = np.arccos(np.clip(normals[..., 2], -1.0, 1.0)) / np.pi
         albedo = cv2.remap(
@@ -128,10 +132,10 @@ class Sky:
             cv2.INTER_LINEAR,
             borderMode=cv2.BORDER_WRAP,
         )
-        # A sunlit Earth fills the sky with the ambient share; in the target's eclipse it shows its night.
+        # In the target's eclipse the Earth's night side is visible.
         day = np.maximum(normals @ light.direction_w, 0.0) * light.sun / (1.0 - AMBIENT)
         level = SPACE_LEVEL + WHITE_LEVEL * albedo * day
-        # The limb falls within a step; its edge is where the ray just touches.
+        # The limb is narrower than a grid step; ``inside`` is zero where a ray is tangent.
         edge = np.clip(inside / 2e-3, 0.0, 1.0) * (cosine > 0.0)
         height, width = canvas.shape
         size_px = (width, height)
@@ -142,7 +146,7 @@ class Sky:
 
 
 def _rays(camera: Camera, origin_px: Array, size_px: tuple[int, int], step_px: int) -> Array:
-    """Unit rays (rows, columns, 3) in IRF through the middles of blocks of ``step_px`` ideal pixels."""
+    """Return unit rays (rows, columns, 3) in IRF through the centres of blocks of ``step_px`` ideal pixels."""
     columns, rows = -(-size_px[0] // step_px), -(-size_px[1] // step_px)
     u = (np.arange(columns) + 0.5) * size_px[0] / columns - 0.5 + origin_px[0]
     v = (np.arange(rows) + 0.5) * size_px[1] / rows - 0.5 + origin_px[1]
@@ -152,7 +156,7 @@ def _rays(camera: Camera, origin_px: Array, size_px: tuple[int, int], step_px: i
 
 
 def _albedo_map(generator: np.random.Generator) -> NDArray[np.float32]:
-    """Reflectance by latitude and longitude: sea with clouds, from noise at several scales."""
+    """Return reflectance by latitude and longitude: sea with clouds, from noise at several scales."""
     clouds = np.zeros((_MAP_ROWS, _MAP_COLUMNS), dtype=np.float32)
     for octave in range(5):
         size = (8 << octave, 4 << octave)

@@ -1,4 +1,4 @@
-"""The chasers' cameras: exact image, blur of motion, glare, effects, compression."""
+"""The chasers' cameras: rendering, motion blur, glare, sensor effects, compression."""
 
 from __future__ import annotations
 
@@ -21,73 +21,72 @@ from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.sensors.errors import true_camera
 
 from .background import Earth, Light
-from .effects import CameraEffects, Effects
-from .glare import Glare, is_hidden
+from .effects import CameraEffects
+from .glare import Glare, is_occluded
 from .rasterizer import Renderer, chaser_boxes
 from .scene_geometry import Obstacle
 from .tinyrenderer import TinyRenderer
 
-# Moments of an exposure: one for every so many pixels of motion, and at most so many.
-_BLUR_STEP_PX, _BLUR_MOMENTS = 0.5, 16
+# Motion blur: one sample of the exposure per this many pixels of motion, and at most so many.
+_BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 States = dict[str, BodyState]
 
 
 class Cameras:
-    """Takes the images of all chasers of a scenario; an image depends on its arguments alone."""
+    """Makes the images of all chasers of a scenario; an image depends on its arguments only."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, section = scenario, scenario.camera
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
         self._target = scenario.target_model()
-        e, earth = section.effects, section.earth
-        self._exposure_s = e.exposure_s
-        far = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))
+        effects, earth = section.effects, section.earth
+        self._exposure_s = effects.exposure_s
+        background = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))
 
         @cache
         def renderer(camera: Camera) -> Renderer | TinyRenderer:
             try:
                 kind = Renderer if section.renderer == "exact" else TinyRenderer
-                return kind(camera, self._target, far)
+                return kind(camera, self._target, background)
             except ValueError as error:
                 raise ScenarioError(f"camera: {error}") from None
 
         self._renderers = [renderer(camera) for camera in self._cameras]
-        glares = {c: Glare(c, e.glare) for c in self._cameras} if e.glare > 0.0 else {}
+        glares = {c: Glare(c, effects.glare) for c in self._cameras} if effects.glare > 0.0 else {}
         self._glares = [glares.get(c) for c in self._cameras]
-        told = self._cameras[0]
-        strengths = Effects(e.gain, e.point_spread_px, e.read_noise, e.shot_noise)
-        self._effects = CameraEffects(told.width_px, told.height_px, strengths, scenario.seed)
-        self._jpeg_quality = e.jpeg_quality
+        first = self._cameras[0]
+        self._effects = CameraEffects(first.width_px, first.height_px, effects, scenario.seed)
+        self._jpeg_quality = effects.jpeg_quality
         self._day = Light(section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp)
         night = section.ambient * section.eclipse_ambient
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
         body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
-        # A chaser's own body lies behind its lens; its probe does not.
+        # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
-        # PyBullet's renderer is one for all; what is drawn here has nothing to share.
-        self._beside = ThreadPoolExecutor(1, "images") if section.renderer == "exact" else None
+        # PyBullet's renderer is shared by all cameras and not thread-safe.
+        self._second_thread = ThreadPoolExecutor(1, "images") if section.renderer == "exact" else None
 
     def images(
         self, chasers: Sequence[int], number: int, tick: int, time_ns: int, states: States
     ) -> list[Image]:
-        """``image`` of several chasers, of one moment, in their order: drawn on two threads."""
-        if self._beside is None:
+        """Return ``image`` of several chasers at one time, in their order, rendered on two threads."""
+        if self._second_thread is None:
             return [self.image(i, number, tick, time_ns, states) for i in chasers]
         exposure = (number, tick, time_ns, states)
-        beside = {i: self._beside.submit(self.image, i, *exposure) for i in chasers[1::2]}
-        here = {i: self.image(i, *exposure) for i in chasers[::2]}
-        return [here[i] if i in here else beside[i].result() for i in chasers]
+        futures = {i: self._second_thread.submit(self.image, i, *exposure) for i in chasers[1::2]}
+        images = {i: self.image(i, *exposure) for i in chasers[::2]}
+        return [images[i] if i in images else futures[i].result() for i in chasers]
 
     def image(self, chaser: int, number: int, tick: int, time_ns: int, states: States) -> Image:
-        """Image ``number`` of chaser ``chaser`` of the bodies ``states``, exposed about ``time_ns``."""
+        """Return image ``number`` of a chaser of the bodies ``states``; the exposure is centred on ``time_ns``."""
         camera = self._cameras[chaser]
-        taken = self.taken(chaser, number, time_ns, states)
+        pixels = self.render(chaser, number, time_ns, states)
         if self._jpeg_quality:
-            data = cv2.imencode(".jpg", taken, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])[1].tobytes()
+            data = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, self._jpeg_quality])[1].tobytes()
         else:
-            data = taken.tobytes()
+            data = pixels.tobytes()
         return Image(
             tick=tick,
             sim_time_ns=time_ns,
@@ -98,34 +97,33 @@ class Cameras:
             data=data,
         )
 
-    def taken(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:
-        """The image (h, w), uint8, before it is compressed."""
+    def render(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:
+        """Return the image (h, w), uint8, before compression."""
         eclipses = self._scenario.camera.eclipses
         dark = any(e.from_s <= time_ns * 1e-9 < e.to_s for e in eclipses)
         light = self._night if dark else self._day
-        moments = self._moments(chaser, states)
-        images = [self._exact(chaser, s, light) for s in moments]
-        exact = images[0]
-        if len(images) > 1:
-            total = np.sum(images, axis=0, dtype=np.uint16)
-            exact = np.asarray((total + len(images) // 2) // len(images), dtype=np.uint8)
+        samples = [self._render_sharp(chaser, s, light) for s in self._sample_exposure(chaser, states)]
+        image = samples[0]
+        if len(samples) > 1:
+            total = np.sum(samples, axis=0, dtype=np.uint16)
+            image = np.asarray((total + len(samples) // 2) // len(samples), dtype=np.uint8)
         glare = self._glares[chaser]
         if glare is not None and not dark:
-            position, attitude = self._eye(chaser, states)
+            position, attitude = self._camera_pose(chaser, states)
             target = (self._target.boxes, states[TARGET].position_m, states[TARGET].q_wxyz)
-            if not is_hidden(position, light.direction_w, [target, *self._bodies(chaser, states)]):
-                exact = glare.add(exact, rotations.rotate_inverse(attitude, light.direction_w))
-        return self._effects.apply(exact, chaser, number)
+            if not is_occluded(position, light.direction_w, [target, *self._bodies(chaser, states)]):
+                image = glare.add(image, rotations.rotate_inverse(attitude, light.direction_w))
+        return self._effects.apply(image, chaser, number)
 
-    def _exact(self, chaser: int, states: States, light: Light) -> NDArray[np.uint8]:
-        position, attitude = self._eye(chaser, states)
+    def _render_sharp(self, chaser: int, states: States, light: Light) -> NDArray[np.uint8]:
+        position, attitude = self._camera_pose(chaser, states)
         target = states[TARGET]
         bodies = self._bodies(chaser, states)
         return self._renderers[chaser].render(
             position, attitude, target.position_m, target.q_wxyz, bodies, light
         )
 
-    def _eye(self, chaser: int, states: States) -> tuple[Array, Array]:
+    def _camera_pose(self, chaser: int, states: States) -> tuple[Array, Array]:
         own = states[f"chaser/{chaser}"]
         return self._cameras[chaser].irf_pose_in_world(own.position_m, own.q_wxyz)
 
@@ -137,28 +135,28 @@ class Cameras:
             if name != TARGET
         ]
 
-    def _moments(self, chaser: int, states: States) -> list[States]:
-        """The bodies at moments spread over the exposure, as many as their motion in the image asks for."""
+    def _sample_exposure(self, chaser: int, states: States) -> list[States]:
+        """Return the bodies at times spread over the exposure, as many as the motion of the target in the image needs."""
         if self._exposure_s == 0.0:
             return [states]
-        ends = [self._corners(chaser, _moved(states, s * self._exposure_s)) for s in (-0.5, 0.5)]
+        ends = [self._corners(chaser, _propagate(states, s * self._exposure_s)) for s in (-0.5, 0.5)]
         motion = np.abs(ends[1] - ends[0])
         motion_px = float(motion[np.isfinite(motion)].max(initial=0.0))
-        n = min(math.ceil(motion_px / _BLUR_STEP_PX), _BLUR_MOMENTS)
+        n = min(math.ceil(motion_px / _BLUR_STEP_PX), _BLUR_SAMPLES_MAX)
         if n < 2:
             return [states]
-        return [_moved(states, ((k + 0.5) / n - 0.5) * self._exposure_s) for k in range(n)]
+        return [_propagate(states, ((k + 0.5) / n - 0.5) * self._exposure_s) for k in range(n)]
 
     def _corners(self, chaser: int, states: States) -> Array:
-        """Pixels (8, 2) of the corners of a cuboid about the target."""
-        position, attitude = self._eye(chaser, states)
+        """Return the pixels (8, 2) of the corners of a cuboid around the target."""
+        position, attitude = self._camera_pose(chaser, states)
         target = states[TARGET]
         at_w = rotations.rotate(target.q_wxyz, _CUBE * self._target.size_m) + target.position_m
         return self._cameras[chaser].project_ideal(rotations.rotate_inverse(attitude, at_w - position))
 
 
-def _moved(states: States, time_s: float) -> States:
-    """The bodies ``time_s`` later at their present rates."""
+def _propagate(states: States, time_s: float) -> States:
+    """Return the bodies ``time_s`` later at constant rates."""
     return {
         name: BodyState(
             s.position_m + s.velocity_m_s * time_s,

@@ -1,4 +1,4 @@
-"""Which parts of an image have to be painted: rectangles of pixels that do not overlap."""
+"""Merge overlapping rectangles of pixels into disjoint patches to be painted."""
 
 from __future__ import annotations
 
@@ -8,23 +8,23 @@ Rectangle = tuple[int, int, int, int]
 """x0, y0, x1, y1: pixels x0 <= x < x1 and y0 <= y < y1."""
 
 
-def patches(covered: Sequence[Rectangle]) -> list[tuple[Rectangle, frozenset[int]]]:
-    """Rectangles, none overlapping another, that hold the ``covered`` ones, and which of these each holds.
+def merge_overlapping(rectangles: Sequence[Rectangle]) -> list[tuple[Rectangle, frozenset[int]]]:
+    """Return disjoint rectangles that cover ``rectangles``, each with the indices of those that it covers.
 
-    Bodies far apart in the image are thus painted each on its own: one rectangle around all of them would be mostly
-    sky, and leave fewer samples to a pixel.
+    Bodies that are far apart in the image are painted separately: a common rectangle would be mostly background and allow
+    fewer samples per pixel.
     """
-    found: list[tuple[Rectangle, frozenset[int]]] = []
-    for index, rectangle in enumerate(covered):
+    merged: list[tuple[Rectangle, frozenset[int]]] = []
+    for index, rectangle in enumerate(rectangles):
         members = frozenset([index])
-        # What it joins makes it larger, so that it may reach others.
-        while touched := [known for known in found if _overlap(known[0], rectangle)]:
-            found = [known for known in found if known not in touched]
-            members = members.union(*(others for _, others in touched))
-            x0, y0, x1, y1 = zip(rectangle, *(other for other, _ in touched), strict=True)
+        # A union is larger than its parts and may overlap further rectangles.
+        while overlapping := [known for known in merged if _overlap(known[0], rectangle)]:
+            merged = [known for known in merged if known not in overlapping]
+            members = members.union(*(others for _, others in overlapping))
+            x0, y0, x1, y1 = zip(rectangle, *(other for other, _ in overlapping), strict=True)
             rectangle = (min(x0), min(y0), max(x1), max(y1))
-        found.append((rectangle, members))
-    return found
+        merged.append((rectangle, members))
+    return merged
 
 
 def _overlap(a: Rectangle, b: Rectangle) -> bool:

@@ -1,4 +1,4 @@
-"""The sun in, or near, the image: its disc, and the light that a lens scatters from it."""
+"""Glare of the sun in or near the image: its disc, and stray light in the lens."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ _STEP_PX = 4
 
 
 class Glare:
-    """Stray light that falls with the square of the angle from the sun (W. S. Stiles, J. Holladay, 1929):
-    ``level_at_1_deg`` grey levels at one degree."""
+    """Adds the sun's disc, and stray light inversely proportional to the squared angle from the sun.
+
+    ``level_at_1_deg``: grey levels at one degree (W. S. Stiles, J. Holladay, 1929).
+    """
 
     def __init__(self, camera: Camera, level_at_1_deg: float):
         self._camera, self._level = camera, level_at_1_deg
@@ -33,30 +35,33 @@ class Glare:
         self._rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
     def add(self, image: NDArray[np.uint8], to_sun_irf: Array) -> NDArray[np.uint8]:
-        """The image (h, w) with the sun in direction ``to_sun_irf`` (3,), unit: the same one with no sun ahead."""
+        """Return the image (h, w) with the sun in direction ``to_sun_irf`` (3,), a unit vector.
+
+        Returns ``image`` itself if the sun is behind the camera.
+        """
         if to_sun_irf[2] <= 0.0:
             return image
-        # 1 - cos is small and exact enough: the angle squared is twice that, to 1 % up to 20 degrees.
+        # The squared angle is 2 (1 - cos), to 1 % up to 20 degrees.
         angle2 = np.maximum(2.0 * (1.0 - self._rays @ to_sun_irf), SUN_RADIUS_RAD**2)
         stray = np.minimum(self._level * np.deg2rad(1.0) ** 2 / angle2, 255.0).astype(np.float32)
         size = (image.shape[1], image.shape[0])
-        whole = np.rint(cv2.resize(stray, size, interpolation=cv2.INTER_LINEAR)).astype(np.uint8)
-        out = np.asarray(cv2.add(image, whole), dtype=np.uint8)
+        scattered = np.rint(cv2.resize(stray, size, interpolation=cv2.INTER_LINEAR)).astype(np.uint8)
+        out = np.asarray(cv2.add(image, scattered), dtype=np.uint8)
         px = self._camera.project(to_sun_irf)
-        reach = self._camera.fx_px * SUN_RADIUS_RAD
+        radius_px = self._camera.fx_px * SUN_RADIUS_RAD
         if np.all(np.abs(px) < 1e4):
             centre = np.rint(px * 16.0).astype(int).tolist()
-            cv2.circle(out, (centre[0], centre[1]), round(16.0 * reach), 255, -1, cv2.LINE_8, 4)
+            cv2.circle(out, (centre[0], centre[1]), round(16.0 * radius_px), 255, -1, cv2.LINE_8, 4)
         return out
 
 
-def is_hidden(eye_w_m: Array, direction_w: Array, bodies: Sequence[Obstacle]) -> bool:
-    """Whether a ray from ``eye_w_m`` (3,) along ``direction_w`` (3,) meets one of the bodies' boxes (slabs method)."""
+def is_occluded(origin_w_m: Array, direction_w: Array, bodies: Sequence[Obstacle]) -> bool:
+    """Return whether a ray from ``origin_w_m`` (3,) along ``direction_w`` (3,) hits a box of the bodies (slab method)."""
     for boxes, p_w, q_w in bodies:
         for box in boxes:
             q = rotations.multiply(q_w, box.q_wxyz)
             centre = np.asarray(p_w) + rotations.rotate(q_w, box.position_m)
-            start = rotations.rotate_inverse(q, eye_w_m - centre)
+            start = rotations.rotate_inverse(q, origin_w_m - centre)
             along = rotations.rotate_inverse(q, direction_w)
             along = np.where(np.abs(along) < 1e-12, 1e-12, along)
             half = np.array(box.size_m) / 2.0

@@ -1,4 +1,4 @@
-"""The ideal image behind a lens: how large it must be, and how the lens distorts it."""
+"""Lens distortion: the extent of the ideal image that a distorted image needs, and the mapping between them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 
 
 class Lens:
-    """What lies between the ideal image, which renderers draw, and the image that ``camera`` takes.
+    """Maps the ideal image, which renderers draw, to the distorted image of ``camera``.
 
-    ``origin_px`` (2,): ideal pixel of the ideal image's first one; ``size_px``: its width and height, which
-    reach beyond the frame where the lens shows more. Raises ValueError when the camera's distortion cannot be
-    inverted everywhere in the image.
+    ``origin_px`` (2,): ideal pixel coordinates of the ideal image's first pixel; ``size_px``: its width and height, larger
+    than the frame where the lens covers more. Raises ValueError if the distortion is not invertible everywhere in the
+    image.
     """
 
     def __init__(self, camera: Camera):
@@ -22,15 +22,15 @@ class Lens:
         self.size_px = (camera.width_px, camera.height_px)
         self._maps: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
         if any(camera.distortion):
-            self._prepare()
+            self._make_maps()
 
-    def _prepare(self) -> None:
+    def _make_maps(self) -> None:
         width, height = self.size_px
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1).astype(float)
-        # As Camera.undistort, which is slow for a million points.
+        # Camera.undistort is too slow for a million points.
         matrix = self.camera.matrix()
         criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 50, 1e-10)
-        found = cv2.undistortPoints(
+        undistorted = cv2.undistortPoints(
             grid.reshape(-1, 1, 2),
             matrix,
             np.array(self.camera.distortion),
@@ -39,7 +39,7 @@ class Lens:
             matrix,
             criteria=criteria,
         )
-        ideal = np.asarray(found, dtype=float).reshape(grid.shape)
+        ideal = np.asarray(undistorted, dtype=float).reshape(grid.shape)
         if not np.all(np.abs(self.camera.distort(ideal) - grid) < 1e-3):
             raise ValueError("the lens distortion cannot be inverted everywhere in the image")
         low = np.floor(ideal.min(axis=(0, 1))) - 1.0
@@ -51,8 +51,8 @@ class Lens:
         maps = (ideal - low).astype(np.float32)
         self._maps = (np.ascontiguousarray(maps[..., 0]), np.ascontiguousarray(maps[..., 1]))
 
-    def distorted(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The image (h, w) that the camera takes of an ideal image of ``size_px``; itself without distortion."""
+    def distort(self, ideal: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Return the distorted image (h, w) of an ideal image of ``size_px``; without distortion the image itself."""
         if self._maps is None:
             return ideal
         return np.asarray(cv2.remap(ideal, *self._maps, cv2.INTER_LINEAR), dtype=np.uint8)

@@ -1,6 +1,6 @@
-"""Which faces of which boxes a camera sees, where in its image, and in which order they are painted.
+"""Scene geometry: visible faces of boxes, their outlines in the image, and their painting order.
 
-The arithmetic is a kernel (native/scene.c): an image shows a dozen faces, too few for as many calls into NumPy.
+The arithmetic is in C (native/scene.c): an image shows about a dozen faces, too few to vectorize with NumPy.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from .native import function
 from .textures import FINEST_TEXEL_M
 
 NEAR_M = 0.01
-"""Nothing nearer to the camera's plane than this is drawn."""
+"""Near plane: geometry nearer to the camera's plane is not drawn."""
 
 Obstacle = tuple[Sequence[Box], ArrayLike, ArrayLike]
-"""Boxes in the axes of a body, its position (3,) in WRF and its attitude (4,), body -> WRF."""
+"""A body: its boxes in body axes, position (3,) in WRF and attitude (4,), body to WRF."""
 
 Shape = np.dtype(
     [
@@ -36,15 +36,15 @@ Shape = np.dtype(
         ("radius", float),
     ]
 )
-"""native/scene.c: a box by itself, in its body's axes, metres; ``half`` edges, ``radius`` of the bounding sphere."""
+"""native/scene.c: a box in its body's axes, metres; ``half`` edges, ``radius`` of the bounding sphere."""
 
-SeenBox = np.dtype(
+VisibleBox = np.dtype(
     [
         ("shape", float), ("centre", float, 3), ("rotation", float, (3, 3)), ("half", float, 3),
         ("low_px", float, 2), ("high_px", float, 2),
     ]
 )  # fmt: skip
-"""native/scene.c: a box of which something is seen: which shape, in IRF, and the pixels that bound its outline."""
+"""native/scene.c: a visible box: number of its shape, pose in IRF, and the pixels that bound its outline."""
 
 Face = np.dtype(
     [
@@ -53,8 +53,8 @@ Face = np.dtype(
         ("count", float), ("outline_px", float, (10, 2)),
     ]
 )  # fmt: skip
-"""native/scene.c: a visible face in IRF: of which seen box, which ``side`` of it, whether all of it lies ``in_front``, and
-its clipped outline, ``count`` points in pixels of the canvas."""
+"""native/scene.c: a visible face in IRF: index of its visible box, ``side`` of it, whether all of it is ``in_front`` of the
+camera, and its clipped outline, ``count`` points in pixels of the canvas."""
 
 _FACE_AXES = np.array([rotations.to_matrix(face_rotation(face)) for face in range(6)])
 
@@ -70,11 +70,11 @@ class _Frustum(Structure):
 
 
 class Frustum:
-    """What of space a canvas shows: the image of ``camera`` from pixel ``origin_px`` (2,), ``size_px`` wide and high."""
+    """View frustum of a canvas: the image of ``camera`` from pixel ``origin_px`` (2,), ``size_px`` wide and high."""
 
     def __init__(self, camera: Camera, origin_px: Array, size_px: Sequence[int]):
-        # Planes n x + d >= 0 (n_x, n_y, n_z, d) within which a point is in front and on the canvas, with a
-        # pixel to spare; and, of the canvas' borders, unit normals into it.
+        # Planes n x + d >= 0 (n_x, n_y, n_z, d) of points in front and on the canvas, with a margin of one pixel, and
+        # inward unit normals of the canvas' borders.
         left, top = (origin_px - 1.0 - (camera.cx_px, camera.cy_px)).tolist()
         right, bottom = left + size_px[0] + 1.0, top + size_px[1] + 1.0
         planes = np.array(
@@ -97,8 +97,8 @@ class Frustum:
 
 @dataclass(frozen=True)
 class Shapes:
-    """The boxes of several bodies: ``table`` (n,) of Shape, and of each the number of its body, its own number in
-    that, and its reflectance."""
+    """The boxes of several bodies: ``table`` (n,) of Shape, and for each box the number of its body, its number within that
+    body, and its reflectance."""
 
     table: NDArray[np.void]
     bodies: list[int]
@@ -107,8 +107,8 @@ class Shapes:
 
 
 @lru_cache(maxsize=256)
-def shapes_of(bodies: tuple[tuple[Box, ...], ...]) -> Shapes:
-    """The table of these bodies' boxes, in their order."""
+def shape_table(bodies: tuple[tuple[Box, ...], ...]) -> Shapes:
+    """Return the boxes of these bodies, in their order."""
     boxes = [(body, number, box) for body, own in enumerate(bodies) for number, box in enumerate(own)]
     table = np.zeros(len(boxes), dtype=Shape)
     for row, (body, _, box) in zip(table, boxes, strict=True):
@@ -125,58 +125,51 @@ def shapes_of(bodies: tuple[tuple[Box, ...], ...]) -> Shapes:
     )
 
 
-def see_faces(
-    frustum: Frustum, shapes: Shapes, eye: Array, poses: Array
+def visible_faces(
+    frustum: Frustum, shapes: Shapes, camera_pose: Array, poses: Array
 ) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Boxes of which something is seen (b,) and their faces that are seen (f,), in the order of ``shapes`` and sides.
+    """Return the visible boxes (b,) and their visible faces (f,), in the order of ``shapes`` and sides.
 
-    ``eye`` (7,): position in WRF and attitude IRF -> WRF of the camera; ``poses`` (bodies, 7): theirs, body -> WRF.
+    ``camera_pose`` (7,): position in WRF and attitude IRF to WRF; ``poses`` (bodies, 7): of the bodies, body to WRF.
     """
     n = len(shapes.table)
-    seen, faces, counts = np.empty(n, SeenBox), np.empty(6 * n, Face), np.zeros(2, np.int64)
-    function("see_faces")(
-        byref(frustum.native), address(eye), address(poses), c_int64(n), address(shapes.table),
-        address(_FACE_AXES), address(seen), address(faces), address(counts),
+    boxes, faces, counts = np.empty(n, VisibleBox), np.empty(6 * n, Face), np.zeros(2, np.int64)
+    function("visible_faces")(
+        byref(frustum.native), address(camera_pose), address(poses), c_int64(n), address(shapes.table),
+        address(_FACE_AXES), address(boxes), address(faces), address(counts),
     )  # fmt: skip
-    return seen[: counts[0]], faces[: counts[1]]
+    return boxes[: counts[0]], faces[: counts[1]]
 
 
 def paint_order(boxes: NDArray[np.void]) -> list[int]:
-    """Indices of ``boxes`` (n,) of SeenBox in the order in which to paint them: nothing before what it hides.
+    """Return the indices of ``boxes`` (n,) of VisibleBox in painting order: every box after those that it occludes.
 
-    Boxes that hide one another in a circle (long thin ones can) leave no such order; of those the farthest
-    is painted first.
+    Boxes that occlude one another cyclically (long thin ones can) have no such order; the farthest is painted first.
     """
     n = len(boxes)
-    hidden, order = np.empty(n * n, np.uint8), np.empty(n, np.int64)
-    function("paint_order")(c_int64(n), address(boxes), address(hidden), address(order))
+    occluded, order = np.empty(n * n, np.uint8), np.empty(n, np.int64)
+    function("paint_order")(c_int64(n), address(boxes), address(occluded), address(order))
     return order.tolist()
 
 
-def hides(boxes: NDArray[np.void], a: int, b: int) -> int:
-    """1 when box ``a`` of ``boxes`` (n,) of SeenBox is in front of ``b`` as seen from the origin, -1 when behind, 0
-    when neither can hide the other."""
-    return int(function("hides", c_int64)(address(boxes[a : a + 1]), address(boxes[b : b + 1])))
-
-
-def texture_place(
+def place_texture(
     frustum: Frustum,
     face: NDArray[np.void],
     at: tuple[int, int, int],
     patch: tuple[int, ...],
     finest: tuple[int, ...],
 ) -> tuple[list[int], list[int], Array] | None:
-    """Where the texture of ``face`` (1,) goes on a patch (rows, columns) of the canvas that has ``at[0]`` samples a
-    pixel from pixel ``at[1:]`` on; None where that is nowhere.
+    """Place the texture of ``face`` (1,) on a patch (rows, columns) of the canvas; None if they do not overlap.
 
-    The region of the patch (left, top, right, bottom); how often the texture's width and height, ``finest`` (rows,
-    columns) at textures.FINEST_TEXEL_M, are halved so that a texel is about a sample in the middle of the outline; and
-    the matrix (3, 3) from the region's samples to texels.
+    ``at``: samples per pixel of the patch, and its first pixel (x, y); ``finest`` (rows, columns): size of the texture at
+    textures.FINEST_TEXEL_M. Returns the region of the patch (left, top, right, bottom); how often the texture's width and
+    height are halved so that a texel is about a sample at the centre of the outline; and the homography (3, 3) from the
+    region's samples to texels.
     """
     sizes = np.array([patch[1], patch[0], finest[1], finest[0]], dtype=np.int64)
     out, matrix = np.empty(6, dtype=np.int64), np.empty((3, 3))
-    there = function("place_texture", c_int64)(
+    overlaps = function("place_texture", c_int64)(
         byref(frustum.native), address(face), *map(c_double, at), address(sizes[:2]), address(sizes[2:]),
         c_double(FINEST_TEXEL_M), address(out[:4]), address(out[4:]), address(matrix),
     )  # fmt: skip
-    return (out[:4].tolist(), out[4:].tolist(), matrix) if there else None
+    return (out[:4].tolist(), out[4:].tolist(), matrix) if overlaps else None

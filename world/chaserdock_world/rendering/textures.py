@@ -1,7 +1,7 @@
-"""What is printed on the faces of a target: markers as exactly area-averaged textures.
+"""Textures of a target's faces: markers, exactly averaged over the area of each texel.
 
-A texel's value is the mean over its area, at whatever size: an edge stays where it is at every
-resolution, so rendering from a coarser texture blurs a marker but does not shift it.
+A texel's value is the mean over its area at every resolution, so that rendering from a coarser texture blurs a marker but
+does not shift its edges.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from numpy.typing import NDArray
 
 FINEST_TEXEL_M = 0.00025
-# Reflectance of the printed white and black: neither paint is perfect.
+# Reflectance of the printed white and black.
 WHITE, BLACK = 0.95, 0.05
 
 
 def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
-    """Cells (n, n) of an ArUco marker with its black border, row 0 on top: 1 white, 0 black.
+    """Return the cells (n, n) of an ArUco marker with its black border, row 0 on top: 1 white, 0 black.
 
     Raises ValueError for a dictionary that OpenCV does not have or an id that is not in it.
     """
@@ -36,10 +36,10 @@ def marker_cells(dictionary: str, marker_id: int) -> NDArray[np.uint8]:
 
 
 def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marker, Array, int]]:
-    """Markers on one face of a box: each with its centre (2,) in the face's axes (x right, y up; metres)
-    and the number of quarter turns, counter-clockwise, of its image.
+    """Return the markers on one face of a box, each with its centre (2,) in the face's axes (x right, y up; metres)
+    and the number of counter-clockwise quarter turns of its image.
 
-    Raises ValueError for a marker in the face's plane that is turned by other than quarter turns.
+    Raises ValueError for a marker in the face's plane whose rotation is not a multiple of a quarter turn.
     """
     found = []
     q_box_face = face_rotation(face)
@@ -61,10 +61,10 @@ def markers_on_face(model: TargetModel, box: Box, face: int) -> list[tuple[Marke
 
 @lru_cache(maxsize=64)
 def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.uint8] | None:
-    """Reflectance times 255 (rows, columns), at FINEST_TEXEL_M, of one face; None for a face without markers.
+    """Return reflectance times 255 (rows, columns) of one face at FINEST_TEXEL_M; None for a face without markers.
 
     Column 0 is at the left and row 0 on top, as seen from outside with the face's up direction upwards.
-    Read-only, and shared by all who ask for the same face.
+    The array is read-only and shared between callers.
     """
     box = model.boxes[box_index]
     markers = markers_on_face(model, box, face)
@@ -74,7 +74,7 @@ def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.
     shape = (max(2, round(height / FINEST_TEXEL_M)), max(2, round(width / FINEST_TEXEL_M)))
     texture = np.full(shape, box.shade, dtype=np.float32)
     white = np.full((1, 1), WHITE)
-    for marker, centre, _ in markers:  # all white borders first: they may reach under other markers
+    for marker, centre, _ in markers:  # all white borders first: they may overlap other markers
         half = marker.side_m / 2.0 + model.white_margin_m
         _print(texture, white, centre, half, width, height)
     for marker, centre, quarters in markers:
@@ -85,8 +85,8 @@ def finest_texture(model: TargetModel, box_index: int, face: int) -> NDArray[np.
     return finished
 
 
-def label(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
-    """Reflectance times 255 (n, n) of one marker with its white border, as a label stuck to a surface."""
+def label_texture(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
+    """Return reflectance times 255 (n, n) of one marker with its white border, as a label on a surface."""
     side = marker.side_m + 2.0 * model.white_margin_m
     texture = np.full((max(2, round(side / FINEST_TEXEL_M)),) * 2, WHITE, dtype=np.float32)
     cells = np.where(marker_cells(model.dictionary, marker.id) > 0, WHITE, BLACK)
@@ -97,7 +97,7 @@ def label(model: TargetModel, marker: Marker) -> NDArray[np.uint8]:
 def _print(
     texture: NDArray[np.float32], cells: Array, centre: Array, half_m: float, width_m: float, height_m: float
 ) -> None:
-    """Prints a square of cells, in place, by the share of each texel that each cell covers."""
+    """Print a square of cells, in place, weighted by the share of each texel that a cell covers."""
     rows, columns = texture.shape
     n = len(cells)
     # Cell edges in texels from the left and from the top; the face's y axis points up.
@@ -114,7 +114,7 @@ def _print(
 
 
 def _coverage(edges: Array, first: int, last: int) -> Array:
-    """Share (cells, texels) of each texel first..last - 1 that lies between consecutive ``edges``."""
+    """Return the share (cells, texels) of each texel first..last - 1 between consecutive ``edges``."""
     texels = np.arange(first, last, dtype=float)
     low = np.maximum(edges[:-1, None], texels[None, :])
     high = np.minimum(edges[1:, None], texels[None, :] + 1.0)

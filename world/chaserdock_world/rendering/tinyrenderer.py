@@ -1,8 +1,8 @@
-"""PyBullet's own software renderer, for targets of any shape: the adapter to its images.
+"""Adapter to PyBullet's software renderer TinyRenderer, for targets of any shape.
 
-It draws a scene of its own, apart from the physics, with the camera at its origin (x right, y up, looking
-along -z). TinyRenderer samples half a pixel off, which is undone here, and not at all between pixels, so the
-image is drawn ``supersampled`` times as wide and high and averaged.
+Renders a scene of its own, separate from the physics, with the camera at the origin (x right, y up, looking along -z).
+TinyRenderer samples half a pixel off, which is compensated here, and does not supersample, so the image is rendered
+``supersampled`` times as wide and high and averaged.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike, NDArray
 from chaserdock_world.physics.bullet import connect, pybullet
 
 from . import textures
-from .background import WHITE_LEVEL, Earth, Light, Sky
+from .background import WHITE_LEVEL, Background, Earth, Light
 from .lens import Lens
 from .rasterizer import DAYLIGHT
 from .scene_geometry import NEAR_M, Obstacle
@@ -31,15 +31,15 @@ _FAR_M = 50.0
 _BEHIND = (0.0, 0.0, 1000.0)
 # IRF (x right, y down, z forward) -> the axes of Bullet's camera.
 _Q_GL_IRF = np.array([0.0, 1.0, 0.0, 0.0])
-# Markers on a mesh are drawn this far above the plane they lie in, so that the mesh does not swallow them.
+# Markers on a mesh are drawn this far above their plane, so that the mesh does not hide them.
 _LIFT_M = 2e-4
 
 
 class TinyRenderer:
-    """Draws what ``camera`` sees, as `render.Renderer` does, with PyBullet's TinyRenderer.
+    """Renders what ``camera`` sees with TinyRenderer; the interface is that of `rasterizer.Renderer`.
 
-    ``model.mesh``, where there is one, is drawn in the place of the target's boxes. ``supersampled``: samples a
-    pixel along each axis. Raises ValueError for a mesh that PyBullet cannot read, and as `Lens` does.
+    ``model.mesh``, if given, replaces the target's boxes. ``supersampled``: samples per pixel along each axis. Raises
+    ValueError for a mesh that PyBullet cannot read, and as `Lens` does.
     """
 
     def __init__(
@@ -47,17 +47,17 @@ class TinyRenderer:
     ) -> None:
         self.camera, self.model, self._samples = camera, model, supersampled
         self._lens = Lens(camera)
-        self._sky = Sky(camera, self._lens.origin_px, self._lens.size_px, earth)
+        self._background = Background(camera, self._lens.origin_px, self._lens.size_px, earth)
         self._bullet = connect()
-        self._others: dict[tuple[Box, ...], list[int]] = {}
+        self._obstacles: dict[tuple[Box, ...], list[int]] = {}
         with tempfile.TemporaryDirectory(prefix="chaserdock-") as folder:
             self._folder = Path(folder)
-            # Each with its place (position, attitude) in TRF.
+            # Bodies with their position and attitude in TRF.
             self._target = self._mesh_parts() if model.mesh else self._box_parts()
         width, height = self._lens.size_px
         left, top = (self._lens.origin_px - (camera.cx_px, camera.cy_px)).tolist()
-        # Borders of the image at the near plane. TinyRenderer takes its samples at the upper left corners of
-        # its pixels, counted from the bottom: half a sample to the left and half a sample up.
+        # Borders of the image at the near plane. TinyRenderer samples at the upper left corners of its pixels,
+        # counted from the bottom: half a sample to the left and half a sample up.
         left, top = left - 0.5 + 0.5 / supersampled, top - 0.5 - 0.5 / supersampled
         bounds = (
             left / camera.fx_px,
@@ -77,9 +77,9 @@ class TinyRenderer:
         obstacles: Sequence[Obstacle] = (),
         light: Light = DAYLIGHT,
     ) -> NDArray[np.uint8]:
-        """Image (h, w), uint8; arguments as for `render.Renderer.render`.
+        """Return the image (h, w), uint8; arguments as for `rasterizer.Renderer.render`.
 
-        The camera's lamp, if there is one, shines on all alike from the lens: TinyRenderer has one sun only.
+        TinyRenderer has a single light: in the dark the camera's lamp replaces the sun, without inverse-square falloff.
         """
         q_w_irf = np.asarray(camera_q_w_irf_wxyz, dtype=float)
         eye = np.asarray(camera_position_w_m, dtype=float)
@@ -98,19 +98,19 @@ class TinyRenderer:
         for boxes, p_w, q_w in obstacles:
             kind = tuple(boxes)
             k = used[kind] = used.get(kind, -1) + 1
-            place(self._other(kind, k), p_w, q_w)
-        for kind, bodies in self._others.items():
+            place(self._obstacle(kind, k), p_w, q_w)
+        for kind, bodies in self._obstacles.items():
             for body in bodies[(used.get(kind, -1) + 1) * len(kind) :]:
                 self._bullet.resetBasePositionAndOrientation(body, _BEHIND, [0.0, 0.0, 0.0, 1.0])
-        return self._lens.distorted(self._drawn(self._sky.background(q_w_irf, light), q_gl_w, light))
+        return self._lens.distort(self._draw(self._background.draw(q_w_irf, light), q_gl_w, light))
 
-    def _drawn(self, background: NDArray[np.uint8], q_gl_w: Array, light: Light) -> NDArray[np.uint8]:
+    def _draw(self, background: NDArray[np.uint8], q_gl_w: Array, light: Light) -> NDArray[np.uint8]:
         height, width = background.shape
         n = self._samples
         full = WHITE_LEVEL / 255.0
         lamp = light.lamp / WHITE_LEVEL
         to_light = rotations.rotate(q_gl_w, light.direction_w)
-        if light.sun == 0.0 and lamp > 0.0:  # in the dark the lamp takes the sun's place
+        if light.sun == 0.0 and lamp > 0.0:
             to_light = np.array([0.0, 0.0, 1.0])
         _, _, rgba, _, segments = self._bullet.getCameraImage(
             n * width,
@@ -133,9 +133,9 @@ class TinyRenderer:
             return grey
         return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
-    def _other(self, kind: tuple[Box, ...], k: int) -> list[tuple[int, Array, Array]]:
-        """The k-th body made of the boxes ``kind``."""
-        bodies = self._others.setdefault(kind, [])
+    def _obstacle(self, kind: tuple[Box, ...], k: int) -> list[tuple[int, Array, Array]]:
+        """Return the parts of the k-th body made of the boxes ``kind``."""
+        bodies = self._obstacles.setdefault(kind, [])
         while len(bodies) < (k + 1) * len(kind):
             bodies += [self._box(box) for box in kind]
         mine = bodies[k * len(kind) : (k + 1) * len(kind)]
@@ -153,7 +153,7 @@ class TinyRenderer:
             visual = self._bullet.createVisualShape(specularColor=[0.0, 0.0, 0.0], **shape)
             return self._bullet.createMultiBody(baseMass=0.0, baseVisualShapeIndex=visual)
         except pybullet.error as error:
-            raise ValueError(f"PyBullet cannot draw it: {error}") from None
+            raise ValueError(f"PyBullet cannot create the visual shape: {error}") from None
 
     def _box_parts(self) -> list[tuple[int, Array, Array]]:
         parts = []
@@ -171,7 +171,7 @@ class TinyRenderer:
     def _mesh_parts(self) -> list[tuple[int, Array, Array]]:
         mesh, shade = self.model.mesh, self.model.boxes[0].shade
         if not Path(mesh).is_file():
-            raise ValueError(f"the target's mesh {mesh} is no file")
+            raise ValueError(f"the target's mesh {mesh} is not a file")
         body = self._body(
             shapeType=pybullet.GEOM_MESH,
             fileName=mesh,
@@ -183,11 +183,11 @@ class TinyRenderer:
             q = np.array(marker.q_trf_marker_wxyz)
             side = marker.side_m + 2.0 * self.model.white_margin_m
             at = np.array(marker.position_trf_m) + rotations.rotate(q, [0.0, 0.0, _LIFT_M])
-            parts.append((self._quad(side, side, textures.label(self.model, marker)), at, q))
+            parts.append((self._quad(side, side, textures.label_texture(self.model, marker)), at, q))
         return parts
 
     def _quad(self, width_m: float, height_m: float, texture: NDArray[np.uint8]) -> int:
-        """A textured rectangle (x right, y up, seen from +z) about its middle."""
+        """Return a textured rectangle (x right, y up, seen from +z) about its centre."""
         x, y = width_m / 2.0, height_m / 2.0
         body = self._body(
             shapeType=pybullet.GEOM_MESH,
@@ -203,5 +203,5 @@ class TinyRenderer:
         return body
 
     def close(self) -> None:
-        """Frees the PyBullet scene."""
+        """Disconnect the PyBullet client."""
         self._bullet.disconnect()

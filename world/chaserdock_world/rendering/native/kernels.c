@@ -3,5 +3,3 @@
 #include "elementary.h"
 #include "scene.c"
 #include "noise.c"
-#include "blur.c"
-#include "samples.c"

@@ -1,25 +1,25 @@
-/* What a camera sees of boxes: their faces, the order in which to paint them, and where a texture goes. */
+/* Scene geometry: visible faces of boxes, their painting order, and the placement of textures. */
 #include "base.h"
 
 #define OUTLINE_MOST 10
 
-/* What of space a canvas shows (chaserdock_world.rendering.scene_geometry.Frustum): planes n x + d >= 0 within which a point is in front and on
- * the canvas, unit normals of its borders, the lens, the canvas' first pixel. */
+/* View frustum of a canvas (chaserdock_world.rendering.scene_geometry.Frustum): planes n x + d >= 0 of points in front and on
+ * the canvas, inward unit normals of its borders, the lens, the canvas' first pixel. */
 typedef struct {
     double planes[5][4], borders[4][3], fx, fy, cx, cy, origin[2], near_m;
 } Frustum;
 
-/* A box by itself: in its body's axes, metres. */
+/* A box in its body's axes, metres. */
 typedef struct {
     double body, position[3], rotation[9], half[3], radius;
 } Shape;
 
-/* A box of which something is seen: which one, in IRF, and the pixels of the canvas that bound its outline. */
+/* A visible box: number of its shape, pose in IRF, and the pixels of the canvas that bound its outline. */
 typedef struct {
     double shape, centre[3], rotation[9], half[3], low[2], high[2];
-} SeenBox;
+} VisibleBox;
 
-/* A visible face, in IRF: which seen box and which side of it, whether all of it lies in front, its clipped outline. */
+/* A visible face in IRF: index of its visible box and side of it, whether all of it is in front, its clipped outline. */
 typedef struct {
     double box, side, in_front, width, height, centre[3], right[3], up[3], normal[3], count, outline[OUTLINE_MOST][2];
 } Face;
@@ -37,8 +37,8 @@ static void matrix_of(const double *q, double *m) {
     copy(rows, m, 9);
 }
 
-/* Clips ``polygon`` at one plane (I. E. Sutherland, G. W. Hodgman, 1974); the number of points left. */
-static int clipped(double polygon[][3], int n, const double *plane) {
+/* Clip ``polygon`` at one plane (I. E. Sutherland, G. W. Hodgman, 1974); return the number of points left. */
+static int clip(double polygon[][3], int n, const double *plane) {
     double out[OUTLINE_MOST][3];
     int kept = 0;
     for (int i = 0; i < n; i++) {
@@ -54,7 +54,7 @@ static int clipped(double polygon[][3], int n, const double *plane) {
     return kept;
 }
 
-/* The face's outline on the canvas; 0 where nothing of it is there. ``corners`` (4). */
+/* Compute a face's outline on the canvas from its ``corners`` (4); return 0 if it is empty. */
 static int outline_of(const Frustum *f, double corners[][3], Face *face) {
     double polygon[OUTLINE_MOST][3];
     int n = 4, cut[5] = {0};
@@ -67,7 +67,7 @@ static int outline_of(const Frustum *f, double corners[][3], Face *face) {
     for (int p = 0; p < 5; p++)
         if (cut[p] == 4) return 0;
     for (int p = 0; p < 5 && n >= 3; p++)
-        if (cut[p]) n = clipped(polygon, n, f->planes[p]);
+        if (cut[p]) n = clip(polygon, n, f->planes[p]);
     if (n < 3) return 0;
     face->count = n;
     for (int i = 0; i < n; i++) {
@@ -83,22 +83,22 @@ static int reaches(const Frustum *f, const double *centre, double radius) {
     return centre[2] + radius >= f->near_m;
 }
 
-/* Faces, in the order of boxes and sides, and boxes seen; ``counts`` gets how many of each. ``eye`` (7): the camera's place
- * and attitude IRF -> WRF; ``poses`` (bodies, 7): theirs, body -> WRF; ``sides`` (6, 3, 3): right, up and normal of a box's
- * sides as columns. There is room for six faces a shape. */
-EXPORT void NAME(see_faces)(const Frustum *f, const double *eye, const double *poses, int64_t shapes, const Shape *shape,
-                           const double *sides, SeenBox *seen, Face *faces, int64_t *counts) {
-    double inverse[4] = {eye[3], -eye[4], -eye[5], -eye[6]}, to_irf[9];
-    int64_t found = 0, drawn = 0;
+/* Find the visible boxes and faces, in the order of boxes and sides; ``counts``: number of boxes and of faces. ``camera``
+ * (7): position and attitude IRF to WRF; ``poses`` (bodies, 7): of the bodies, body to WRF; ``sides`` (6, 3, 3): right, up and
+ * normal of a box's sides as columns. ``faces`` holds six faces per shape. */
+EXPORT void NAME(visible_faces)(const Frustum *f, const double *camera, const double *poses, int64_t shapes, const Shape *shape,
+                           const double *sides, VisibleBox *boxes, Face *faces, int64_t *counts) {
+    double inverse[4] = {camera[3], -camera[4], -camera[5], -camera[6]}, to_irf[9];
+    int64_t count = 0, visible = 0;
     matrix_of(inverse, to_irf);
     for (int64_t i = 0; i < shapes; i++) {
         const Shape *s = shape + i;
         const double *pose = poses + 7 * (int64_t)s->body;
         double turn[9], body[9], from[3], at[3], place[3];
-        SeenBox *box = seen + drawn;
+        VisibleBox *box = boxes + visible;
         matrix_of(pose + 3, turn);
         product9(to_irf, turn, body);
-        minus3(pose, eye, from);
+        minus3(pose, camera, from);
         times3(to_irf, from, at);
         times3(body, s->position, place);
         for (int k = 0; k < 3; k++) box->centre[k] = at[k] + place[k];
@@ -108,7 +108,7 @@ EXPORT void NAME(see_faces)(const Frustum *f, const double *eye, const double *p
         box->shape = (double)i;
         int any = 0;
         for (int side = 0; side < 6; side++) {
-            Face *face = faces + found;
+            Face *face = faces + count;
             double axes[9], corners[4][3], size[2];
             product9(box->rotation, sides + 9 * side, axes);
             for (int k = 0; k < 3; k++) {
@@ -116,7 +116,7 @@ EXPORT void NAME(see_faces)(const Frustum *f, const double *eye, const double *p
                 face->centre[k] = box->centre[k] + s->half[side / 2] * face->normal[k];
             }
             if (!(dot3(face->normal, face->centre) < 0.0)) continue;
-            /* Width and height, as chaserdock_models.targets.face_extent. */
+            /* Width and height, as in chaserdock_models.targets.face_extent. */
             size[0] = 2.0 * s->half[side < 2 ? 1 : 0], size[1] = 2.0 * s->half[side < 4 ? 2 : 1];
             for (int c = 0; c < 4; c++) {
                 double u = (c == 1 || c == 2 ? 0.5 : -0.5) * size[0], v = (c < 2 ? 0.5 : -0.5) * size[1];
@@ -124,7 +124,7 @@ EXPORT void NAME(see_faces)(const Frustum *f, const double *eye, const double *p
             }
             if (!outline_of(f, corners, face)) continue;
             face->width = size[0], face->height = size[1];
-            face->box = (double)drawn, face->side = side;
+            face->box = (double)visible, face->side = side;
             for (int k = 0; k < 2; k++) {
                 if (!any) box->low[k] = box->high[k] = face->outline[0][k];
                 for (int n = 0; n < (int)face->count; n++) {
@@ -133,20 +133,20 @@ EXPORT void NAME(see_faces)(const Frustum *f, const double *eye, const double *p
                 }
             }
             any = 1;
-            found++;
+            count++;
         }
-        drawn += any;
+        visible += any;
     }
-    counts[0] = drawn;
-    counts[1] = found;
+    counts[0] = visible;
+    counts[1] = count;
 }
 
-/* 1 when box a is in front of b as seen from the origin, -1 when behind, 0 when neither can hide the other.
+/* Return 1 if box a can occlude b as seen from the origin, -1 if b can occlude a, 0 if neither can.
  *
- * Of the 15 axes that can separate two boxes (S. Gottschalk, M. C. Lin, D. Manocha, "OBBTree", 1996), those with a gap are
- * looked at: a plane that has the origin and a on one side and b on the other proves that b cannot hide a. For boxes that
- * touch or overlap a little, the axis of largest gap decides. */
-static int hides(const SeenBox *a, const SeenBox *b) {
+ * Uses those of the 15 axes that can separate two boxes (S. Gottschalk, M. C. Lin, D. Manocha, "OBBTree", 1996) that have a
+ * gap: a plane with the origin and a on one side and b on the other proves that b cannot occlude a. For boxes that touch or
+ * overlap slightly, the axis of largest gap decides. */
+static int occludes(const VisibleBox *a, const VisibleBox *b) {
     double axes[15][3], end[15], start[15], gap[15], widest = -1e300;
     int n = 0;
     for (int i = 0; i < 3; i++)
@@ -166,14 +166,14 @@ static int hides(const SeenBox *a, const SeenBox *b) {
             reach_a += size_of(dot3(axes[i], axes[j])) * a->half[j];
             reach_b += size_of(dot3(axes[i], axes[3 + j])) * b->half[j];
         }
-        double sign = at_a > at_b ? -1.0 : 1.0; /* turns every axis so that it points from a to b */
+        double sign = at_a > at_b ? -1.0 : 1.0; /* orients every axis from a to b */
         end[i] = sign * at_a + reach_a;
         start[i] = sign * at_b - reach_b;
         gap[i] = start[i] - end[i];
         widest = most(widest, gap[i]);
     }
-    /* The origin projects to 0 on every axis, and any plane from the end of a to the start of b separates the boxes: one of
-     * them has the origin on b's side when a ends before 0, and one on a's side when b starts after 0. */
+    /* The origin projects to 0 on every axis, and every plane between the end of a and the start of b separates the boxes:
+     * one of them has the origin on b's side if a ends before 0, and one on a's side if b starts after 0. */
     int a_may = 1, b_may = 1;
     for (int i = 0; i < n; i++) {
         if (!(widest > 0.0 ? gap[i] > 0.0 : gap[i] >= widest)) continue;
@@ -184,26 +184,24 @@ static int hides(const SeenBox *a, const SeenBox *b) {
     return a_may ? 1 : (b_may ? -1 : 0);
 }
 
-EXPORT int64_t NAME(hides)(const SeenBox *a, const SeenBox *b) { return hides(a, b); }
-
-static int apart(const SeenBox *a, const SeenBox *b) {
+static int apart(const VisibleBox *a, const VisibleBox *b) {
     for (int k = 0; k < 2; k++)
         if (a->low[k] > b->high[k] + 1.0 || b->low[k] > a->high[k] + 1.0) return 1;
     return 0;
 }
 
-/* The order in which to paint boxes: nothing before what it hides. Boxes that hide one another in a circle (long thin ones
- * can) leave no such order; of those the farthest is painted first. ``hidden`` (n, n) is working memory. */
-EXPORT void NAME(paint_order)(int64_t n, const SeenBox *boxes, uint8_t *hidden, int64_t *order) {
-    for (int64_t i = 0; i < n * n; i++) hidden[i] = 0;
+/* Determine the painting order: every box after those that it occludes. Boxes that occlude one another cyclically (long thin
+ * ones can) have no such order; the farthest is painted first. ``occluded`` (n, n) is working memory. */
+EXPORT void NAME(paint_order)(int64_t n, const VisibleBox *boxes, uint8_t *occluded, int64_t *order) {
+    for (int64_t i = 0; i < n * n; i++) occluded[i] = 0;
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = i + 1; j < n; j++) {
             if (apart(boxes + i, boxes + j)) continue;
-            int found = hides(boxes + i, boxes + j);
-            if (found > 0) hidden[i * n + j] = 1; /* i waits for j */
-            else if (found < 0) hidden[j * n + i] = 1;
+            int order_of_pair = occludes(boxes + i, boxes + j);
+            if (order_of_pair > 0) occluded[i * n + j] = 1; /* i waits for j */
+            else if (order_of_pair < 0) occluded[j * n + i] = 1;
         }
-    /* Farthest first, equal ones in their order. */
+    /* Farthest first, stable. */
     for (int64_t i = 0; i < n; i++) {
         double distance = dot3(boxes[i].centre, boxes[i].centre);
         int64_t k = i;
@@ -214,7 +212,7 @@ EXPORT void NAME(paint_order)(int64_t n, const SeenBox *boxes, uint8_t *hidden, 
         int64_t next = done;
         for (int64_t k = done; k < n; k++) {
             int waits = 0;
-            for (int64_t j = done; j < n; j++) waits |= hidden[order[k] * n + order[j]];
+            for (int64_t j = done; j < n; j++) waits |= occluded[order[k] * n + order[j]];
             if (!waits) {
                 next = k;
                 break;
@@ -226,10 +224,10 @@ EXPORT void NAME(paint_order)(int64_t n, const SeenBox *boxes, uint8_t *hidden, 
     }
 }
 
-/* Where a face's texture goes on a patch of the canvas with ``samples`` a pixel from pixel ``x0``, ``y0`` on. Out: the
- * region of the patch (low x, y, high x, y), how often the texture's width and height are halved, so that a texel is
- * about a sample where the middle of the outline is, and the matrix from a sample of the region to texels, (3, 3); 0 where
- * the region is empty. ``patch``: width, height; ``finest``: columns and rows of the finest texture, ``texel_m`` wide. */
+/* Place a face's texture on a patch of the canvas with ``samples`` per pixel from pixel ``x0``, ``y0`` on; return 0 if the
+ * region is empty. Output: the region of the patch (low x, y, high x, y), how often the texture's width and height are halved,
+ * so that a texel is about a sample at the centre of the outline, and the homography (3, 3) from a sample of the region to
+ * texels. ``patch``: width, height; ``finest``: columns and rows of the finest texture, ``texel_m`` wide. */
 EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double samples, double x0, double y0,
                                   const int64_t *patch, const int64_t *finest, double texel_m, int64_t *region,
                                   int64_t *halved, double *matrix) {
@@ -252,14 +250,14 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
         region[k] = (int64_t)low[k];
         region[2 + k] = (int64_t)high[k];
     }
-    /* The ray through the middle of the outline, cut with the face's plane. */
+    /* Intersect the ray through the centre of the outline with the face's plane. */
     double ray[3] = {(middle[0] - lens[2]) / lens[0], (middle[1] - lens[3]) / lens[1], 1.0}, normal[3], at[3];
     cross3(face->right, face->up, normal);
     double depth = dot3(normal, face->centre) / dot3(normal, ray);
     for (int k = 0; k < 3; k++) at[k] = ray[k] * depth;
     int64_t texels[2];
     for (int axis = 0; axis < 2; axis++) {
-        /* Derivative of the sample's coordinates by a metre along the axis. */
+        /* Derivative of the sample's coordinates with respect to metres along the axis. */
         const double *along = axis ? face->up : face->right;
         double by[2];
         for (int k = 0; k < 2; k++) by[k] = lens[k] * (along[k] - at[k] / at[2] * along[2]) / at[2];
@@ -276,7 +274,7 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
         m[3 + k] = -v;
         m[6 + k] = (face->centre[k] + u * (0.5 - columns / 2.0)) + v * (rows / 2.0 - 0.5);
     }
-    /* Columns of texel -> IRF, then to samples of the region. */
+    /* Columns of the matrix from texels to IRF, then to samples of the region. */
     for (int c = 0; c < 3; c++) {
         double *p = m + 3 * c;
         p[0] = lens[0] * p[0] + (lens[2] - low[0]) * p[2];
@@ -296,15 +294,15 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
     return 1;
 }
 
-/* Stars in directions (count, 3) of IRF, each a pixel of its level, on a canvas (height, width); none nearer to the camera's
- * plane than a tenth. ``lens``: fx, fy, cx, cy, the canvas' first pixel. */
+/* Draw stars in ``directions`` (count, 3) of IRF, each one pixel of its level, on a canvas (height, width), except those
+ * within 0.1 of the camera's plane. ``lens``: fx, fy, cx, cy, the canvas' first pixel. */
 EXPORT void NAME(draw_stars)(const double *directions, const uint8_t *levels, int64_t count, const double *lens, int64_t width,
                             int64_t height, uint8_t *canvas) {
     for (int64_t i = 0; i < count; i++) {
         const double *d = directions + 3 * i;
         if (!(d[2] > 0.1)) continue;
         double x = d[0] / d[2] * lens[0] + lens[2] - lens[4], y = d[1] / d[2] * lens[1] + lens[3] - lens[5];
-        /* Added and taken away again, 1.5 * 2^52 rounds to the nearest whole number, halves to even. */
+        /* Adding and subtracting 1.5 * 2^52 rounds to the nearest integer, ties to even. */
         if (!(x > -1.0 && y > -1.0 && x < (double)width && y < (double)height)) continue;
         int64_t column = (int64_t)((x + 6755399441055744.0) - 6755399441055744.0);
         int64_t row = (int64_t)((y + 6755399441055744.0) - 6755399441055744.0);

@@ -25,7 +25,7 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.messages import JoinReply, JoinRequest
 from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
 from chaserdock_protocol.scenario import load_scenario
-from chaserdock_protocol.scenario.overrides import ScenarioError
+from chaserdock_protocol.scenario.errors import ScenarioError
 from mutations import garbage_in, mutate, value_mutator
 from results import options_of, write_json
 

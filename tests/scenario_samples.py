@@ -1,4 +1,4 @@
-"""A small scenario that is good, for tests to spoil."""
+"""A small valid scenario for tests to change."""
 
 from __future__ import annotations
 

@@ -16,11 +16,10 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario.errors import ScenarioError, explain
 from chaserdock_protocol.scenario.fields import Name, Number, Positive, Section
-from chaserdock_protocol.scenario.overrides import ScenarioError, explain
+from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
 from pydantic import Field, ValidationError, model_validator
-
-from chaserdock.launch.scenario_files import find_scenario
 
 MAX_RUNS = 100_000
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
@@ -100,13 +99,12 @@ def load_campaign(path: Path) -> Campaign:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     except ValidationError as error:
-        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error))) from None
+        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error, CampaignFile))) from None
     local = path.parent / file.scenario
-    scenario = local if local.is_file() else find_scenario(file.scenario)
-    if scenario is None:
-        raise ScenarioError(
-            f"{path}: scenario: {file.scenario}: no such file and no shipped scenario of that name"
-        )
+    try:
+        scenario = local if local.is_file() else find_scenario(file.scenario)
+    except ScenarioNotFound as error:
+        raise ScenarioError(f"{path}: scenario: {error}") from None
     return Campaign(file.name, tuple(file.vary), _runs(file, scenario, path))
 
 

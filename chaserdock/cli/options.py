@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.shipped_scenarios import shipped_names
 
 from chaserdock.exit_codes import BAD_INPUT
-from chaserdock.launch.scenario_files import shipped_names
 
 if TYPE_CHECKING:
     from chaserdock.launch.progress import Show

@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from chaserdock_protocol.errors import ChaserdockError
-
-from chaserdock.launch.scenario_files import find_scenario, shipped_names
+from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from .options import (
     ConfigOpt,
@@ -55,20 +53,6 @@ def start_process(name: str, options) -> None:
     sys.exit(process(options))
 
 
-def _found(scenario: str) -> Path:
-    path = find_scenario(scenario)
-    if path is None:
-        raise ScenarioNotFound(
-            f"{scenario}: no such scenario file, and none of that name is shipped; "
-            f"there are {', '.join(shipped_names())}"
-        )
-    return path
-
-
-class ScenarioNotFound(ChaserdockError):
-    """No file of that name, and none shipped."""
-
-
 def run(
     scenario: ScenarioArg,
     out: OutOpt = None,
@@ -93,7 +77,7 @@ def run(
 
     show = show_of(quiet, as_json)
     with errors_as_lines(as_json):
-        path = _found(scenario)
+        path = find_scenario(scenario)
         folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
         changes = tuple(overrides or ())
         raise typer.Exit(run_mission(path, folder, mode.value, seed, changes, show, view, keys))
@@ -125,7 +109,7 @@ def world(
         listen = [DEFAULT_ENDPOINT]
     options = ProcessOptions(
         link=link_of(namespace, connect or [], listen, net_mode, config, lease_ms, keys, "world"),
-        scenario=_found(scenario),
+        scenario=find_scenario(scenario),
         overrides=tuple(overrides or ()),
         seed=seed,
         mode=mode.value,

@@ -63,12 +63,12 @@ def arguments_of(arguments: list[str], sets: str) -> list[str]:
 def chasers_of(scenario: str, sets: str) -> int:
     """How many chasers a scenario has. Raises ScenarioError."""
     from chaserdock_protocol.scenario import ScenarioError, load_scenario
+    from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
 
-    from .scenario_files import find_scenario
-
-    path = find_scenario(scenario)
-    if path is None:
-        raise ScenarioError(f"SCENARIO={scenario}: no such scenario file, and none of that name is shipped")
+    try:
+        path = find_scenario(scenario)
+    except ScenarioNotFound as error:
+        raise ScenarioError(f"SCENARIO={error}") from None
     return len(load_scenario(path, tuple(shlex.split(sets))).chasers)
 
 

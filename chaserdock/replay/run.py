@@ -11,7 +11,6 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError, LogSource, read_log, read_scenario
 from chaserdock_protocol.replay_node import Stage, order_by_tick
 from chaserdock_protocol.scenario import parse_scenario
-from chaserdock_protocol.scenario.overrides import override
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
 
@@ -55,10 +54,7 @@ def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolera
     """
     stage = stage_of(through)
     text, run = read_scenario(log)
-    values = json.loads(text)
-    for change in overrides:
-        override(values, change, lambda: parse_scenario(values, "the log's scenario").model_dump(mode="json"))
-    scenario = parse_scenario(values, "the log's scenario")
+    scenario = parse_scenario(json.loads(text), "the log's scenario", overrides)
     keys = [
         topic.key_of(place)
         for topic in (*stage.inputs, *stage.outputs)

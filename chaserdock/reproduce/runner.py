@@ -16,13 +16,13 @@ from typing import Any
 
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
 from chaserdock_protocol.study import StudyCase, StudyResult, line_of, read_lines
 
 from chaserdock.campaign.plan import Campaign, Run, make_run
 from chaserdock.campaign.scheduler import Progress
 from chaserdock.campaign.table import rows_of, write_table
 from chaserdock.campaign.worker import CampaignError, Result, fly_campaign, read_result, result_path
-from chaserdock.launch.scenario_files import find_scenario
 
 from .plan import SCENARIO, Mission, Plan
 
@@ -66,10 +66,10 @@ def code_digest() -> str:
 
 def scenario_path(name: str) -> Path:
     """Return the path of a shipped scenario. Raise CampaignError if there is none of that name."""
-    path = find_scenario(name)
-    if path is None:
-        raise CampaignError(f"no shipped scenario is named {name}")
-    return path
+    try:
+        return find_scenario(name)
+    except ScenarioNotFound as error:
+        raise CampaignError(str(error)) from None
 
 
 def mission_run(mission: Mission, index: int = 0) -> tuple[Run, Scenario]:

@@ -14,13 +14,13 @@ from typing import Any
 import msgspec
 import pytest
 from chaserdock_protocol.process import SINGLE_THREADED
+from chaserdock_protocol.shipped_scenarios import shipped_names
 from harness import ROOT, SHORT, chaserdock, finished, sets
 from typer.main import get_command
 
 from chaserdock.cli.main import app, main
 from chaserdock.cli.plain import PlainGroup
 from chaserdock.launch.json_events import Commanded, Failed, Line, Progress, Result, Start, Told
-from chaserdock.launch.scenario_files import shipped_names
 
 
 def verbs(group: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

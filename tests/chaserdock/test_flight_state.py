@@ -11,13 +11,13 @@ import msgspec
 import pytest
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.shipped_scenarios import SHIPPED
 from rich.console import Console
 
 from chaserdock.launch import progress
 from chaserdock.launch.flight_state import FlightState
 from chaserdock.launch.json_events import Commanded, Line, Progress, Start, Told
 from chaserdock.launch.progress import ProgressReporter, Show, head_of, words_of
-from chaserdock.launch.scenario_files import SHIPPED
 
 SCENARIO = load_scenario(SHIPPED[0] / "two-chaser-tracking.toml")
 NOWHERE: dict[str, Any] = {"velocity_m_s": (0.0, 0.0, 0.0), "omega_rad_s": (0.0, 0.0, 0.0)}

@@ -7,8 +7,8 @@ from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.targets import face_rotation
 from chaserdock_protocol.scenario import load_scenario, scenario_from_json
+from chaserdock_protocol.scenario.errors import ScenarioError
 from chaserdock_protocol.scenario.files import find_target
-from chaserdock_protocol.scenario.overrides import ScenarioError
 from chaserdock_world.rendering.background import Light
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer

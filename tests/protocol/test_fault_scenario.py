@@ -1,4 +1,4 @@
-"""``[[fault]]`` tables: what is taken, and what each wrong one is told."""
+"""``[[fault]]`` tables: valid ones load, each invalid one is a single line with its path."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 from chaserdock_protocol.scenario import load_scenario
-from chaserdock_protocol.scenario.overrides import ScenarioError
+from chaserdock_protocol.scenario.errors import ScenarioError
 
 ROOT = Path(__file__).resolve().parents[2]
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
@@ -33,7 +33,10 @@ BAD = [
     ('kind = "kill", process = "moon"', "'moon' is no process"),
     ('kind = "kill", process = "chaser/7"', "there is no chaser/7; this mission has chaser/0 to chaser/3"),
     ('kind = "cut", process = "chaser/0", peer = "chaser/9", duration_s = 1', "there is no chaser/9"),
-    ('kind = "cut", process = "chaser/0", peer = "chaser/0", duration_s = 1', "nothing that counts comes to"),
+    (
+        'kind = "cut", process = "chaser/0", peer = "chaser/0", duration_s = 1',
+        "receives no message that can be faulty from",
+    ),
     ('kind = "freeze", process = "chaser/0"', "freeze needs duration_s"),
     ('kind = "drop", process = "chaser/0", duration_s = 1', "drop needs topic"),
     ('kind = "drop", process = "chaser/0", topic = "tick", duration_s = 1', "fault.0.topic"),
@@ -54,23 +57,26 @@ BAD = [
     ('kind = "lying_sensor", process = "chaser/0", duration_s = 1', "needs offset_m or rotation_deg"),
     (
         'kind = "drop", process = "controller", topic = "thrusters", duration_s = 1',
-        "there are thrusters only with",
+        "thrusters exist only with",
     ),
-    ('kind = "drop", process = "chaser/0", topic = "docking", duration_s = 1', "a docking sensor only with"),
+    (
+        'kind = "drop", process = "chaser/0", topic = "docking", duration_s = 1',
+        "docking sensors exist only with",
+    ),
     ('kind = "camera_off", process = "chaser/0", duration_s = -1', "fault.0.duration_s"),
     ('kind = "camera_off", process = "chaser/0", duration_s = 1, colour = "red"', "fault.0.colour"),
 ]
 
 
 @pytest.mark.parametrize("fault", GOOD)
-def test_good_ones_load_and_travel(fault: str) -> None:
+def test_valid_faults_survive_serialization(fault: str) -> None:
     scenario = load_scenario(DRILL, (f"fault=[{{{fault}, at_s = 1.0}}]",))
     assert type(scenario).model_validate_json(scenario.model_dump_json()) == scenario
     assert scenario.fault[0].text().startswith(str(scenario.fault[0].kind))
 
 
 @pytest.mark.parametrize(("fault", "words"), BAD)
-def test_wrong_ones_are_told(fault: str, words: str) -> None:
+def test_invalid_faults_are_one_line_with_their_path(fault: str, words: str) -> None:
     with pytest.raises(ScenarioError) as caught:
         load_scenario(DRILL, (f"fault=[{{{fault}, at_s = 1.0}}]",))
     assert words in str(caught.value)
@@ -78,12 +84,12 @@ def test_wrong_ones_are_told(fault: str, words: str) -> None:
     assert len(str(caught.value).splitlines()) == 1
 
 
-def test_not_before_the_first_tick() -> None:
+def test_faults_begin_after_time_zero() -> None:
     with pytest.raises(ScenarioError, match=r"fault\.0\.at_s"):
         load_scenario(DRILL, ('fault=[{kind = "kill", process = "controller", at_s = 0.0}]',))
 
 
-def test_written_as_tables(tmp_path: Path) -> None:
+def test_faults_can_be_written_as_tables(tmp_path: Path) -> None:
     text = DRILL.read_text() + '\n[[fault]]\nkind = "kill"\nat_s = 3.0\nprocess = "chaser/2"\n'
     path = tmp_path / "drill.toml"
     path.write_text(text)

@@ -1,4 +1,4 @@
-"""Scenario files: what is shipped can be flown, and whatever is wrong is told in one line with its path."""
+"""The scenario schema: shipped scenarios are valid, and every error is one line with its path."""
 
 from __future__ import annotations
 
@@ -14,18 +14,17 @@ from chaserdock_models.targets import target_model
 from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario, scenario_from_json
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from chaserdock_protocol.scenario.fields import unit
+from chaserdock_protocol.shipped_scenarios import SHIPPED, find_scenario
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scenario_samples import good
-
-from chaserdock.launch.scenario_files import SHIPPED, find_scenario
 
 FOLDER = Path(__file__).resolve().parents[2] / "scenarios"
 FILES = sorted(FOLDER.glob("*.toml"))
 
 
 def changed(path: str, value: Any) -> dict[str, Any]:
-    """The good scenario with the value at a dotted path set, or taken out for None."""
+    """Return the sample scenario with the value at a dotted path set, or removed for None."""
     values = good()
     place: Any = values
     *way, last = [int(k) if k.isdigit() else k for k in path.split(".")]
@@ -38,7 +37,7 @@ def changed(path: str, value: Any) -> dict[str, Any]:
     return values
 
 
-def complaint(values: dict[str, Any]) -> list[str]:
+def errors_of(values: dict[str, Any]) -> list[str]:
     with pytest.raises(ScenarioError) as caught:
         parse_scenario(values, "x.toml")
     return str(caught.value).splitlines()
@@ -47,7 +46,7 @@ def complaint(values: dict[str, Any]) -> list[str]:
 # -- what is shipped --------------------------------------------------------------------------------------
 
 
-def test_the_named_scenarios_are_shipped() -> None:
+def test_scenarios_of_the_documentation_are_shipped() -> None:
     assert {"single", "two-chaser-tracking", "four-chaser-docking"} <= {f.stem for f in FILES}
     assert FOLDER in SHIPPED
 
@@ -56,7 +55,7 @@ def test_the_named_scenarios_are_shipped() -> None:
 def test_shipped_scenarios_load(path: Path) -> None:
     scenario = load_scenario(path)
     assert scenario.name == path.stem
-    assert find_scenario(path.stem) is not None
+    assert find_scenario(path.stem) == path
     assert scenario.ticks == round(scenario.duration_s * scenario.time.rate_hz)
     assert scenario.settling_s < (scenario.steady_until_s or scenario.duration_s) <= scenario.duration_s
     assert all(entry.at_s < scenario.duration_s for entry in scenario.timeline)
@@ -119,7 +118,7 @@ def test_inertia_defaults_to_the_cuboids() -> None:
 
 
 @given(st.tuples(*[st.floats(-1.0, 1.0)] * 4).filter(lambda q: math.hypot(*q) > 1e-3), st.floats(-9e-4, 9e-4))
-def test_a_unit_quaternion_stays_the_same_when_told_again(
+def test_normalizing_a_quaternion_is_idempotent_to_the_bit(
     q: tuple[float, float, float, float], error: float
 ) -> None:
     w, x, y, z = (part / math.hypot(*q) * (1.0 + error) for part in q)
@@ -135,7 +134,9 @@ def test_a_unit_quaternion_stays_the_same_when_told_again(
         (0.5392993294557796, -0.19975267097334765, -0.13347041596982093, -0.8071197965525293),
     ],
 )
-def test_a_quaternion_whose_last_bit_does_not_settle_at_once(q: tuple[float, float, float, float]) -> None:
+def test_a_quaternion_whose_last_bit_changes_under_repeated_division_is_stable(
+    q: tuple[float, float, float, float],
+) -> None:
     assert unit(unit(q)) == unit(q)
     assert np.abs(np.array(unit(q)) - rotations.normalize(np.array(q))).max() < 3e-16
 
@@ -155,7 +156,7 @@ def test_scenarios_cannot_be_changed() -> None:
 # -- faults -----------------------------------------------------------------------------------------------
 
 FAULTS: list[tuple[str, Any, str, str]] = [
-    # path, value (None: taken out), where the complaint is to be, and what it is to say
+    # path, value (None: key removed), expected path, expected text
     ("name", None, "name", "is missing"),
     ("duration_s", None, "duration_s", "is missing"),
     ("chasers", None, "chasers", "is missing"),
@@ -169,15 +170,15 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("target.motion", "wobble", "target.motion", "constant_rates"),
     ("chasers.0.q_wxyz", [1.0, 1.0, 0.0, 0.0], "chasers.0.q_wxyz", "unit length"),
     ("chasers.0.q_wxyz", [0.0, 0.0, 0.0, 0.0], "chasers.0.q_wxyz", "unit length"),
-    ("chasers.0.q_wxyz", [1.0, 0.0, 0.0], "chasers.0.q_wxyz.3", "is missing"),
+    ("chasers.0.q_wxyz", [1.0, 0.0, 0.0], "chasers.0.q_wxyz", "must be an array of 4 numbers"),
     ("target.q_wxyz", [2.0, 0.0, 0.0, 0.0], "target.q_wxyz", "unit length"),
     ("chasers.1.position_m", [-1.0, 0.0, 0.0], "chasers.1", "inside one another"),
     ("chasers.1.start_offset_m", [-1.9, 0.0, 0.0], "chasers.1", "inside one another"),
     ("chasers.1.position_m", [0.0, 0.0, 0.0], "chasers.1", "origin"),
-    ("name", "a/b", "name", "pattern"),
-    ("name", "", "name", "pattern"),
-    ("name", "two\nlines", "name", "pattern"),
-    ("name", "x" * 65, "name", "pattern"),
+    ("name", "a/b", "name", "must begin with a letter or digit"),
+    ("name", "", "name", "must begin with a letter or digit"),
+    ("name", "two\nlines", "name", "must begin with a letter or digit"),
+    ("name", "x" * 65, "name", "must begin with a letter or digit"),
     ("duration_s", math.nan, "duration_s", "finite"),
     ("duration_s", math.inf, "duration_s", "finite"),
     ("chaser.mass_kg", math.inf, "chaser.mass_kg", "finite"),
@@ -188,45 +189,50 @@ FAULTS: list[tuple[str, Any, str, str]] = [
     ("time.latency_s", math.nan, "time.latency_s", "finite"),
     ("camera.hfov_deg", math.inf, "camera.hfov_deg", "finite"),
     ("camera.hfov_deg", 150.0, "camera.hfov_deg", "less than 150"),
-    ("camera.effects.jpeg_quality", 101, "camera.effects.jpeg_quality", "less than or equal to 100"),
-    ("typo", 1, "typo", "not a key that is known"),
-    ("target.typo", 1, "target.typo", "not a key that is known"),
-    ("chasers.0.typo", 1, "chasers.0.typo", "not a key that is known"),
+    (
+        "camera.effects.jpeg_quality",
+        101,
+        "camera.effects.jpeg_quality",
+        "must be a whole number from 0 to 100 (got 101)",
+    ),
+    ("typo", 1, "unknown key typo", "known keys: format, extends, name"),
+    ("target.typo", 1, "unknown key target.typo", "known keys: attitude_deg, model"),
+    ("chasers.0.typo", 1, "unknown key chasers.0.typo", "look_at"),
     ("chaser.inertia_kg_m2", [1.0, 1.0, 2.1], "chaser", "inertia_kg_m2"),
     ("target.inertia_kg_m2", [1.0, 5.0, 1.0], "target", "inertia_kg_m2"),
     ("chaser.inertia_kg_m2", [1.0, 0.0, 1.0], "chaser.inertia_kg_m2.1", "greater than 0"),
     ("time.rate_hz", 16, "time", "multiple of image_hz (16, 15)"),
     ("time.rate_hz", 45, "time", "multiple of rate_hz (960, 45)"),
     ("time.image_hz", 2, "time", "multiple of image_hz (15, 2)"),
-    ("time.rate_hz", 0, "time.rate_hz", "greater than or equal to 1"),
+    ("time.rate_hz", 0, "time.rate_hz", "a whole number from 1 to 240 (got 0)"),
     ("time.rate_hz", 7.5, "time.rate_hz", "whole number"),
     ("timeline.0.chasers", [0, 2], "timeline.0.chasers", "there is no chaser 2"),
-    ("timeline.0.chasers", [-1], "timeline.0.chasers.0", "greater than or equal to 0"),
-    ("timeline.0.chasers", [], "timeline.0.chasers", "at least 1 item"),
-    ("timeline.0.command", "ram", "timeline.0.command", "'approach'"),
+    ("timeline.0.chasers", [-1], "timeline.0.chasers.0", "at least 0"),
+    ("timeline.0.chasers", [], "timeline.0.chasers", "an array of at least 1"),
+    ("timeline.0.command", "ram", "timeline.0.command", "one of approach, hold"),
     ("timeline.0.command", "goto", "timeline.0", "goto needs it"),
     ("timeline.0.offset_m", [1.0, 0.0, 0.0], "timeline.0", "goes with the command goto"),
-    ("timeline.0.at_s", -1.0, "timeline.0.at_s", "greater than or equal to 0"),
+    ("timeline.0.at_s", -1.0, "timeline.0.at_s", "at least 0"),
     ("success.docked", [2], "success.docked", "there is no chaser 2"),
-    ("success.docked", [-1], "success.docked.0", "greater than or equal to 0"),
+    ("success.docked", [-1], "success.docked.0", "at least 0"),
     ("controller.horizon_s", 0.04, "controller", "shorter than one step"),
     ("controller.dt_s", 0.001, "controller", "3000 stages; at most 500"),
     ("controller.dt_s", 0.0, "controller.dt_s", "greater than 0"),
-    ("controller.falloff", 1.5, "controller.falloff", "less than or equal to 1"),
+    ("controller.falloff", 1.5, "controller.falloff", "a number from 0 to 1 (got 1.5)"),
     ("controller.weight_force", 0.0, "controller.weight_force", "greater than 0"),
     ("approach.max_speed_m_s", 0.0, "approach.max_speed_m_s", "greater than 0"),
-    ("chasers", [], "chasers", "at least 1 item"),
-    ("chasers", 4, "chasers", "must be an array (got 4)"),
+    ("chasers", [], "chasers", "an array of 1 to 16 tables (got [])"),
+    ("chasers", 4, "chasers", "must be an array of 1 to 16 tables (got 4)"),
     ("target", "paper", "target", "must be a table"),
-    ("seed", -1, "seed", "greater than or equal to 0"),
+    ("seed", -1, "seed", "at least 0"),
     ("seed", 2**32, "seed", "less than 4294967296"),
     ("seed", 1.5, "seed", "whole number"),
     ("duration_s", "long", "duration_s", "number"),
-    # What could be taken for a value of the right kind is none.
-    ("duration_s", "30", "duration_s", "must be a number (got '30')"),
-    ("duration_s", True, "duration_s", "must be a number (got true)"),
+    # Types are strict.
+    ("duration_s", "30", "duration_s", "must be a number greater than 0 and at most 7776000 (got '30')"),
+    ("duration_s", True, "duration_s", "must be a number greater than 0 and at most 7776000 (got true)"),
     ("seed", "3", "seed", "must be a whole number"),
-    ("seed", 3.0, "seed", "must be a whole number (got 3.0)"),
+    ("seed", 3.0, "seed", "must be a whole number at least 0 and less than 4294967296 (got 3.0)"),
     ("controller.feed_forward", 1, "controller.feed_forward", "must be true or false (got 1)"),
     ("controller.feed_forward", "yes", "controller.feed_forward", "must be true or false"),
     ("chasers.1.position_m", ["1", 0, 0], "chasers.1.position_m.0", "must be a number"),
@@ -238,10 +244,10 @@ FAULTS: list[tuple[str, Any, str, str]] = [
 @pytest.mark.parametrize(
     ("path", "value", "where", "what"), FAULTS, ids=[f"{f[0]}={f[1]!r:.30}" for f in FAULTS]
 )
-def test_a_fault_is_one_line_with_its_path(path: str, value: Any, where: str, what: str) -> None:
-    lines = complaint(changed(path, value))
+def test_an_error_is_one_line_with_its_path(path: str, value: Any, where: str, what: str) -> None:
+    lines = errors_of(changed(path, value))
     assert len(lines) == 1, lines
-    # Faults between sections are told on behalf of the whole scenario and name the places themselves.
+    # Errors across sections are those of the whole scenario; their texts name the path.
     assert re.match(rf"x\.toml: (\(scenario\): .*)?{re.escape(where)}\b", lines[0]), lines
     assert what in lines[0], lines
     assert "Value error" not in lines[0]
@@ -256,14 +262,14 @@ def test_whole_numbers_stand_for_any_number() -> None:
     )
 
 
-def test_every_fault_gets_its_line() -> None:
+def test_every_error_has_its_own_line() -> None:
     values = changed("chaser.mass_kg", -3.0) | {"typo": 1, "seed": -1}
     del values["name"]
-    assert len(complaint(values)) == 4
+    assert len(errors_of(values)) == 4
 
 
 def test_known_targets_are_named() -> None:
-    assert "paper" in complaint(changed("target.model", "death-star"))[0]
+    assert "paper" in errors_of(changed("target.model", "death-star"))[0]
     for name in ("paper", "servicer"):
         assert parse_scenario(changed("target.model", name), "x").target.model == name
         assert target_model(name).markers

@@ -1,4 +1,4 @@
-"""Thrusters in scenario files: what is shipped can fly, and what cannot is told in one line."""
+"""Thrusters in scenario files: shipped layouts give full control, and invalid ones are an error."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ import pytest
 from chaserdock_models.wrench_set import WrenchSet, wrench_matrix, wrench_set
 from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario, scenario_from_json
 from chaserdock_protocol.scenario.thrusters import thrusts_max
+from chaserdock_protocol.shipped_scenarios import find_scenario
 from thruster_cases import box, mission
-
-from chaserdock.launch.scenario_files import find_scenario
 
 THRUSTER = {"position_m": [0.1, 0.0, 0.0], "direction": [0.0, 1.0, 0.0], "thrust_N": 1.0}
 
@@ -30,9 +29,7 @@ def pairs() -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize("name", ["single-thrusters", "thruster-failure", "four-chaser-docking-thrusters"])
 def test_shipped_scenarios_fly_with_thrusters(name: str) -> None:
-    path = find_scenario(name)
-    assert path is not None
-    s = load_scenario(path)
+    s = load_scenario(find_scenario(name))
     assert s.name == name
     assert s.chaser.actuation == "thrusters"
     assert scenario_from_json(s.model_dump_json(), "the same") == s
@@ -59,7 +56,7 @@ def test_opposed_pairs_do_not_survive_one() -> None:
 
 
 def test_the_scale_of_the_box_is_the_largest_that_fits() -> None:
-    """Held against the set's own points: no corner of the scaled box is outside, some are just outside beyond."""
+    """Every corner of the scaled box is attainable; slightly beyond, some are not."""
     from chaserdock_agents.chaser.thrusters.allocation import Allocator
 
     s = mission()
@@ -70,7 +67,7 @@ def test_the_scale_of_the_box_is_the_largest_that_fits() -> None:
     assert not all(allocator.allocate(c * scale * 1.001, full).exact for c in corners)
 
 
-def test_a_body_of_ones_own_overrides_what_is_shipped() -> None:
+def test_keys_override_the_predefined_body() -> None:
     s = mission(chaser={"mass_kg": 20.0})
     assert s.chaser.mass_kg == 20.0
     assert len(s.chaser.thrusters) == 12
@@ -108,7 +105,7 @@ def test_a_body_of_ones_own_overrides_what_is_shipped() -> None:
         ({"timeline": [{"at_s": 1, "command": "hold", "chasers": [0], "thruster": 1}]}, "thruster goes with"),
     ],
 )  # fmt: skip
-def test_what_cannot_fly_is_told(changes: dict[str, Any], words: str) -> None:
+def test_invalid_thrusters_are_an_error(changes: dict[str, Any], words: str) -> None:
     with pytest.raises(ScenarioError) as error:
         mission(**changes)
     assert words in str(error.value)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import load_scenario
-from chaserdock_protocol.scenario.overrides import ScenarioError
+from chaserdock_protocol.scenario.errors import ScenarioError
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics, prescribed_state
 from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.sensors.errors import OdometrySensor, true_camera

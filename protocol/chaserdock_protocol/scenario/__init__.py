@@ -1,15 +1,8 @@
-"""The scenario file: schema, overrides, and loading."""
+"""The scenario file: schema, loading, variants and overrides."""
 
-from .overrides import ScenarioError
-from .schema import (
-    ESTIMATORS,
-    PERCEPTIONS,
-    SOLVERS,
-    Scenario,
-    load_scenario,
-    parse_scenario,
-    scenario_from_json,
-)
+from .errors import ScenarioError
+from .loading import load_scenario, parse_scenario, scenario_from_json
+from .schema import ESTIMATORS, PERCEPTIONS, SOLVERS, Scenario
 
 __all__ = [
     "ESTIMATORS",

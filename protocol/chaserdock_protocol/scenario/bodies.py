@@ -1,96 +1,132 @@
-"""The scenario's sections of bodies: the target and the chasers' body."""
+"""Scenario sections ``[target]`` and ``[chaser]``."""
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from chaserdock_models.targets import TargetModel, target_model, target_names
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
-from .fields import Name, NotNegative, Positive, PositiveVector, Section, UnitQuaternion, Vector
+from .fields import Name, NotNegative, Oriented, Positive, PositiveVector, Section, UnitQuaternion, Vector
 from .target import Geometry
 from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
 
-class Target(Section):
-    """The target's model (geometry and markers), initial state, and how it moves.
+class Target(Oriented):
+    """The target: shape, initial state, and motion."""
 
-    ``model`` is a known name or, in a file, the path of a target file; with ``geometry`` it is just a name.
-
-    ``constant_rates`` and ``static`` prescribe the motion, as the paper does; ``torque_free`` is a rigid
-    body's (then ``inertia_kg_m2``, principal, and ``mass_kg`` count).
-    """
-
-    model: Name = "paper"
-    geometry: Geometry | None = None
-    motion: Literal["constant_rates", "static", "torque_free"] = "constant_rates"
-    position_m: Vector = (0.0, 0.0, 0.0)
-    q_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
-    velocity_m_s: Vector = (0.015, 0.0075, 0.03)
-    omega_rad_s: Vector = (0.015, 0.045, 0.03)
-    mass_kg: Positive = 1.25
-    inertia_kg_m2: PositiveVector | None = None
+    model: Name = Field(
+        default="paper",
+        description="Name of a known target (`paper`, `servicer`), or, in a file, the path of a target file (`….toml`) "
+        "relative to it. With `geometry`: the name of that geometry.",
+    )
+    geometry: Geometry | None = Field(
+        default=None, description="Shape and markers, in place of those of a known `model`."
+    )
+    motion: Literal["constant_rates", "static", "torque_free"] = Field(
+        default="constant_rates",
+        description="`constant_rates`: prescribed constant velocity and angular velocity, as in the paper. `static`: "
+        "prescribed, at rest. `torque_free`: a rigid body, which contact forces can move.",
+    )
+    position_m: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="Initial position of its centre (WRF), m."
+    )
+    q_wxyz: UnitQuaternion = Field(
+        default=(1.0, 0.0, 0.0, 0.0),
+        description="Initial attitude, TRF to WRF: unit quaternion, scalar first.",
+    )
+    velocity_m_s: Vector = Field(
+        default=(0.015, 0.0075, 0.03), description="Initial velocity (WRF), m/s. Ignored by `static`."
+    )
+    omega_rad_s: Vector = Field(
+        default=(0.015, 0.045, 0.03),
+        description="Initial angular velocity (TRF), rad/s. Ignored by `static`.",
+    )
+    mass_kg: Positive = Field(default=1.25, description="Mass, kg. Used by `torque_free` only.")
+    inertia_kg_m2: PositiveVector | None = Field(
+        default=None,
+        description="Principal moments of inertia about the axes of TRF, kg m². Used by `torque_free` only. Without it: "
+        "those of a homogeneous cuboid of the model's size.",
+    )
 
     @model_validator(mode="after")
     def _known(self) -> Target:
         if self.geometry is None:
             target_model(self.model)
         elif self.model in target_names():
-            raise ValueError(f"model: {self.model!r} is a known target; give this geometry a name of its own")
+            raise ValueError(
+                f"model: {self.model!r} is the name of a known target; choose another one for this geometry"
+            )
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
         return self
 
     def shape(self) -> TargetModel:
-        """Geometry and markers."""
+        """Return geometry and markers."""
         return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
 
 
 def _check_inertia(i: tuple[float, float, float]) -> None:
     if 2 * max(i) > sum(i) * (1 + 1e-9):
-        raise ValueError(
-            f"inertia_kg_m2 {i}: no moment may exceed the sum of the other two (no body is like that)"
-        )
+        raise ValueError(f"inertia_kg_m2 {i}: no principal moment may exceed the sum of the other two")
 
 
 def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Principal moments (kg m^2) of a homogeneous cuboid about its axes."""
+    """Return the principal moments (kg m^2) of a homogeneous cuboid."""
     x, y, z = (s * s for s in size_m)
     return (mass_kg * (y + z) / 12, mass_kg * (x + z) / 12, mass_kg * (x + y) / 12)
 
 
 class Body(Section):
-    """A chaser's body; ``inertia_kg_m2`` (principal) defaults to the homogeneous cuboid's.
+    """The body and actuators of every chaser."""
 
-    ``body`` names one that is shipped with thrusters, whose figures are then the defaults. ``actuation``: the commanded
-    wrench itself (``ideal``), or pulses of the thrusters. ``thruster_test_s``: a thruster of which its chaser has not seen for so long
-    that it works is tested where that may be; 0: never. ``thruster_faults_by_command``: operators may make thrusters fail in
-    flight, for tests.
-    """
-
-    body: Literal["slider", "tetra12"] | None = None
-    mass_kg: Positive = 30.0
-    size_m: PositiveVector = (0.25, 0.25, 0.05)
-    inertia_kg_m2: PositiveVector | None = None
-    force_max_N: Positive = 2.0
-    torque_max_N_m: Positive = 0.05
-    probe_reach_m: Positive = 0.35
-    actuation: Literal["ideal", "thrusters"] = "ideal"
-    thrusters: Annotated[tuple[Thruster, ...], Field(max_length=MAX_THRUSTERS)] = ()
+    body: Literal["slider", "tetra12"] | None = Field(
+        default=None,
+        description="A predefined body with thrusters: `slider` (the paper's, 16 thrusters) or `tetra12` (12 thrusters). "
+        "Its values replace the defaults below.",
+    )
+    mass_kg: Positive = Field(default=30.0, description="Mass, kg.")
+    size_m: PositiveVector = Field(
+        default=(0.25, 0.25, 0.05), description="Edges of the body's cuboid (CRF), m."
+    )
+    inertia_kg_m2: PositiveVector | None = Field(
+        default=None,
+        description="Principal moments of inertia about the axes of CRF, kg m². Without it: those of a homogeneous cuboid.",
+    )
+    force_max_N: Positive = Field(default=2.0, description="Largest force per body axis, N.")
+    torque_max_N_m: Positive = Field(default=0.05, description="Largest torque per body axis, N m.")
+    probe_reach_m: Positive = Field(
+        default=0.35,
+        description="Distance of the docking probe's tip from the body's centre along +X (CRF), m.",
+    )
+    actuation: Literal["ideal", "thrusters"] = Field(
+        default="ideal",
+        description="`ideal`: the commanded force and torque act on the body. `thrusters`: pulses of `thrusters` do.",
+    )
+    thrusters: tuple[Thruster, ...] = Field(
+        default=(), max_length=MAX_THRUSTERS, description="Position, direction and thrust of every thruster."
+    )
     modulation: Modulation = Modulation()
-    thruster_test_s: NotNegative = 10.0
-    thruster_faults_by_command: bool = False
+    thruster_test_s: NotNegative = Field(
+        default=10.0,
+        description="A thruster whose function has not been confirmed for this long is tested when it is safe to do so, "
+        "s. 0: no tests.",
+    )
+    thruster_faults_by_command: bool = Field(
+        default=False,
+        description="Whether operators may inject thruster faults (`chaserdock thruster-fault`).",
+    )
 
     @model_validator(mode="before")
     @classmethod
-    def _shipped(cls, values: Any) -> Any:
+    def _apply_predefined_body(cls, values: Any) -> Any:
         if isinstance(values, dict) and isinstance(name := values.get("body"), str) and name in BODIES:
             return BODIES[name] | values
         return values
 
     @model_validator(mode="after")
-    def _possible(self) -> Body:
+    def _check_consistent(self) -> Body:
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
         if self.actuation == "thrusters":

@@ -1,4 +1,4 @@
-"""The scenario's section of the chasers' camera, and of the light it works in."""
+"""Scenario section ``[camera]``: the chasers' cameras and the light."""
 
 from __future__ import annotations
 
@@ -7,56 +7,79 @@ from typing import Annotated, Literal
 
 from chaserdock_models import rotations
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from .fields import NotNegative, Number, Positive, Section, Vector, finite
+from .fields import Fraction, NotNegative, Number, Positive, Section, Vector
 
-Share = Annotated[float, AfterValidator(finite), Field(ge=0, le=1)]
+Pixels = Annotated[int, Field(ge=64, le=4096)]
 
 
 class Effects(Section):
-    """What the camera does to the exact image: a gain of 1 and 0 elsewhere switch an effect off.
+    """Image effects. A gain of 1, and 0 elsewhere, switch an effect off."""
 
-    Noise in grey levels (``read_noise``) and squared grey levels per grey level (``shot_noise``). ``exposure_s``:
-    motion blur of a shutter that is open so long, about the image's time; the image's level is ``gain``'s.
-    ``glare``: grey levels of stray light at one degree from the sun (it falls with the angle); the sun's disc
-    itself is drawn when that is above 0.
-    """
-
-    gain: Positive = 1.0
-    point_spread_px: NotNegative = 0.6
-    read_noise: NotNegative = 1.5
-    shot_noise: NotNegative = 0.025
-    exposure_s: Annotated[float, AfterValidator(finite), Field(ge=0, le=0.5)] = 0.0
-    glare: NotNegative = 0.0
-    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = 85
+    gain: Positive = Field(default=1.0, description="Exposure: factor on the grey levels.")
+    point_spread_px: NotNegative = Field(
+        default=0.6, description="Standard deviation of a Gaussian blur, pixels."
+    )
+    read_noise: NotNegative = Field(
+        default=1.5, description="Standard deviation of the read noise, grey levels."
+    )
+    shot_noise: NotNegative = Field(
+        default=0.025, description="Variance of the shot noise, squared grey levels per grey level."
+    )
+    exposure_s: float = Field(
+        default=0.0,
+        ge=0,
+        le=0.5,
+        allow_inf_nan=False,
+        description="Time for which the shutter is open, centred on the image's time, s. It blurs moving edges; the "
+        "brightness depends on `gain` alone.",
+    )
+    glare: NotNegative = Field(
+        default=0.0,
+        description="Stray light at one degree from the sun, grey levels; it falls with the angle. Above 0, the sun's "
+        "disc is drawn, too.",
+    )
+    jpeg_quality: int = Field(
+        default=85,
+        ge=0,
+        le=100,
+        description="JPEG quality of the images that chasers receive. 0: uncompressed.",
+    )
 
 
 class Intrinsics(Section):
-    """The camera matrix and lens of a calibration; ``distortion``: k1, k2, p1, p2[, k3], or none."""
+    """Camera matrix and lens distortion of a calibration."""
 
-    width_px: Annotated[int, Field(ge=64, le=4096)]
-    height_px: Annotated[int, Field(ge=64, le=4096)]
-    fx_px: Positive
-    fy_px: Positive
-    cx_px: Number
-    cy_px: Number
-    distortion: tuple[Number, ...] = ()
+    width_px: Pixels = Field(description="Image width, pixels.")
+    height_px: Pixels = Field(description="Image height, pixels.")
+    fx_px: Positive = Field(description="Focal length along x, pixels.")
+    fy_px: Positive = Field(description="Focal length along y, pixels.")
+    cx_px: Number = Field(description="Principal point, x, pixels.")
+    cy_px: Number = Field(description="Principal point, y, pixels.")
+    distortion: tuple[Number, ...] = Field(
+        default=(), description="OpenCV's coefficients k1, k2, p1, p2[, k3]. Empty: no distortion."
+    )
 
     @model_validator(mode="after")
-    def _coefficients(self) -> Intrinsics:
+    def _check_coefficients(self) -> Intrinsics:
         if len(self.distortion) not in (0, 4, 5):
             raise ValueError(f"distortion takes k1, k2, p1, p2[, k3], not {len(self.distortion)} numbers")
         return self
 
 
 class CalibrationError(Section):
-    """One sigma of how far the cameras are from what those who fly are told, drawn for each from the seed."""
+    """Difference between each true camera and the calibration that flight software uses, one standard deviation, drawn
+    per camera from the seed."""
 
-    focal_length_share: NotNegative = 0.0
-    centre_px: NotNegative = 0.0
-    mounting_deg: NotNegative = 0.0
-    mounting_m: NotNegative = 0.0
+    focal_length_share: NotNegative = Field(default=0.0, description="Relative error of the focal length.")
+    centre_px: NotNegative = Field(default=0.0, description="Error of the principal point per axis, pixels.")
+    mounting_deg: NotNegative = Field(
+        default=0.0, description="Error of the mounting rotation per axis, degrees."
+    )
+    mounting_m: NotNegative = Field(
+        default=0.0, description="Error of the mounting position per axis (CRF), m."
+    )
 
     @property
     def any(self) -> bool:
@@ -64,62 +87,92 @@ class CalibrationError(Section):
 
 
 class Eclipse(Section):
-    """The target passes through the Earth's shadow: no sun from ``from_s`` to ``to_s``."""
+    """An interval in which the target is in the Earth's shadow and the sun gives no light."""
 
-    from_s: NotNegative
-    to_s: Positive
+    from_s: NotNegative = Field(description="Begin, s of mission time.")
+    to_s: Positive = Field(description="End, s of mission time; after `from_s`.")
 
     @model_validator(mode="after")
-    def _ordered(self) -> Eclipse:
+    def _check_order(self) -> Eclipse:
         if self.to_s <= self.from_s:
             raise ValueError(f"to_s ({self.to_s}) must be after from_s ({self.from_s})")
         return self
 
 
 class EarthSection(Section):
-    """The Earth in the background: direction to its centre (WRF) and angular radius (66 deg from 500 km up)."""
+    """The Earth in the background."""
 
-    direction: Vector
-    radius_deg: Annotated[float, AfterValidator(finite), Field(gt=1, lt=85)] = 66.0
+    direction: Vector = Field(description="Direction to the Earth's centre (WRF), any length but 0.")
+    radius_deg: float = Field(
+        default=66.0,
+        gt=1,
+        lt=85,
+        allow_inf_nan=False,
+        description="Angular radius of the Earth's disc, degrees: 66 from 500 km altitude.",
+    )
 
     @model_validator(mode="after")
-    def _somewhere(self) -> EarthSection:
+    def _check_direction(self) -> EarthSection:
         if not any(self.direction):
             raise ValueError("direction must not be zero")
         return self
 
 
 class CameraSection(Section):
-    """The chasers' camera, looking along the body's +X, its top towards +Z, turned by ``mounting_rotation_deg``
-    (rotation vector, CRF). ``intrinsics`` (or ``calibration``: a file with them) take the place of size and field
-    of view. ``sun_direction`` (WRF): to the sun; ``ambient``: the share of light from everywhere, of which
-    ``eclipse_ambient`` is left in an eclipse; ``lamp``: grey level that the camera's own lamp gives to white at 1 m.
-    """
+    """The camera of every chaser, and the light. The camera looks along +X of CRF, its top towards +Z."""
 
-    renderer: Literal["exact", "pybullet"] = "exact"
-    width_px: Annotated[int, Field(ge=64, le=4096)] = 1280
-    height_px: Annotated[int, Field(ge=64, le=4096)] = 720
-    hfov_deg: Annotated[float, AfterValidator(finite), Field(gt=5, lt=150)] = 60.0
-    intrinsics: Intrinsics | None = None
-    position_m: Vector = (0.07, 0.0, 0.075)
-    mounting_rotation_deg: Vector = (0.0, 0.0, 0.0)
+    renderer: Literal["exact", "pybullet"] = Field(
+        default="exact",
+        description="`exact`: analytic edges, for cuboids and markers. `pybullet`: PyBullet's renderer, which also draws "
+        "meshes.",
+    )
+    width_px: Pixels = Field(default=1280, description="Image width, pixels.")
+    height_px: Pixels = Field(default=720, description="Image height, pixels.")
+    hfov_deg: float = Field(
+        default=60.0, gt=5, lt=150, allow_inf_nan=False, description="Horizontal field of view, degrees."
+    )
+    intrinsics: Intrinsics | None = Field(
+        default=None, description="Calibrated camera, in place of `width_px`, `height_px` and `hfov_deg`."
+    )
+    calibration: str | None = Field(
+        default=None,
+        exclude=True,
+        description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, JSON or XML) to read "
+        "`intrinsics` from.",
+    )
+    position_m: Vector = Field(
+        default=(0.07, 0.0, 0.075), description="Position of the optical centre (CRF), m."
+    )
+    mounting_rotation_deg: Vector = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Rotation from looking along +X to the camera's mounting: rotation vector (CRF), degrees.",
+    )
     calibration_error: CalibrationError = CalibrationError()
-    sun_direction: Vector = (-0.4, -0.5, 0.77)
-    ambient: Share = 0.35
-    eclipse_ambient: Share = 0.05
-    lamp: NotNegative = 0.0
+    sun_direction: Vector = Field(
+        default=(-0.4, -0.5, 0.77), description="Direction to the sun (WRF), any length but 0."
+    )
+    ambient: Fraction = Field(default=0.35, description="Share of the light that comes from all directions.")
+    eclipse_ambient: Fraction = Field(
+        default=0.05, description="Share of `ambient` that remains in an eclipse."
+    )
+    lamp: NotNegative = Field(
+        default=0.0,
+        description="Light of the camera's own lamp: grey level of a white surface at 1 m distance.",
+    )
     eclipses: tuple[Eclipse, ...] = ()
     earth: EarthSection | None = None
     effects: Effects = Effects()
 
     @model_validator(mode="after")
-    def _lit(self) -> CameraSection:
+    def _check_section(self) -> CameraSection:
         if not any(self.sun_direction):
             raise ValueError("sun_direction must not be zero")
+        if self.calibration is not None:
+            raise ValueError("calibration is resolved in scenario files only; give intrinsics")
         return self
 
     def model(self) -> Camera:
-        """The camera as those who fly are told it is."""
+        """Return the camera as calibrated, without ``calibration_error``."""
         i = self.intrinsics
         q = Q_CRF_IRF_FORWARD_WXYZ
         if any(self.mounting_rotation_deg):
@@ -129,14 +182,7 @@ class CameraSection(Section):
         if i is None:
             c = Camera.from_hfov(self.width_px, self.height_px, math.radians(self.hfov_deg), self.position_m)
             return Camera(c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px, (), self.position_m, q)
+        distortion = i.distortion if any(i.distortion) else ()
         return Camera(
-            i.width_px,
-            i.height_px,
-            i.fx_px,
-            i.fy_px,
-            i.cx_px,
-            i.cy_px,
-            i.distortion if any(i.distortion) else (),
-            self.position_m,
-            q,
+            i.width_px, i.height_px, i.fx_px, i.fy_px, i.cx_px, i.cy_px, distortion, self.position_m, q
         )

@@ -1,46 +1,140 @@
-"""What a scenario's chasers may not be asked: checks over several of its sections."""
+"""Checks across several sections of a scenario. Each raises ValueError with the path of what is wrong."""
 
 from __future__ import annotations
 
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
+from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
+
+from .faults import check_faults
+from .thrusters import check_pulses
+
 if TYPE_CHECKING:
     from . import Scenario
 
 
-def check_apart(scenario: Scenario) -> None:
-    """Raises ValueError where two chasers start inside one another."""
+def check_consistent(scenario: Scenario) -> None:
+    """Run all checks."""
+    _check_start_positions(scenario)
+    _check_references(scenario)
+    _check_mesh(scenario)
+    _check_chaser_numbers(scenario)
+    _check_reached(scenario)
+    if scenario.chaser.actuation == "thrusters":
+        check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
+    _check_thruster_failures(scenario)
+    _check_latched(scenario)
+    if scenario.docking.kind == "capture":
+        _check_capture(scenario)
+    check_faults(scenario.fault, scenario)
+
+
+def _check_start_positions(scenario: Scenario) -> None:
     starts = [scenario.start_pose(i)[0] for i in range(len(scenario.chasers))]
     width = math.hypot(*scenario.chaser.size_m)
     for i, a in enumerate(starts):
         for j in range(i):
-            apart = math.dist(a, starts[j])
-            if apart < width:
+            distance = math.dist(a, starts[j])
+            if distance < width:
                 raise ValueError(
-                    f"chasers.{j} and chasers.{i} start {apart:.3f} m apart, inside one another; "
+                    f"chasers.{j} and chasers.{i} start {distance:.3f} m apart, inside one another; "
                     f"their bodies need {width:.3f} m"
                 )
 
 
-def check_references(scenario: Scenario) -> None:
-    """Raises ValueError where a chaser is to be where the controller may not take it."""
+def _check_references(scenario: Scenario) -> None:
     limits = scenario.limits
     for i, c in enumerate(scenario.chasers):
-        far = math.hypot(*c.position_m)
-        for word, wrong, name in (
-            ("nearer", far < limits.min_distance_target_m, "min_distance_target_m"),
-            ("farther", far > limits.max_reference_distance_m, "max_reference_distance_m"),
+        distance = math.hypot(*c.position_m)
+        for comparison, wrong, name in (
+            ("nearer", distance < limits.min_distance_target_m, "min_distance_target_m"),
+            ("farther", distance > limits.max_reference_distance_m, "max_reference_distance_m"),
         ):
             if wrong:
                 raise ValueError(
-                    f"chasers.{i}.position_m: {far:.3g} m from the target, {word} than limits.{name} "
+                    f"chasers.{i}.position_m: {distance:.3g} m from the target, {comparison} than limits.{name} "
                     f"({getattr(limits, name):g} m) allows"
                 )
         for j, other in enumerate(scenario.chasers[:i]):
-            apart = math.dist(c.position_m, other.position_m)
-            if apart < limits.min_distance_chasers_m:
+            distance = math.dist(c.position_m, other.position_m)
+            if distance < limits.min_distance_chasers_m:
                 raise ValueError(
-                    f"chasers.{j} and chasers.{i} are to be {apart:.3g} m apart, nearer than "
+                    f"the positions of chasers.{j} and chasers.{i} are {distance:.3g} m apart, nearer than "
                     f"limits.min_distance_chasers_m ({limits.min_distance_chasers_m:g} m) allows"
                 )
+
+
+def _check_mesh(scenario: Scenario) -> None:
+    geometry = scenario.target.geometry
+    if geometry is not None and geometry.mesh and scenario.camera.renderer != "pybullet":
+        raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
+
+
+def _check_chaser_numbers(scenario: Scenario) -> None:
+    last = len(scenario.chasers) - 1
+    named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(scenario.timeline)]
+    named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(scenario.docking.ports)]
+    named += [(f"success.{key}", getattr(scenario.success, key)) for key in ("docked", "latched", "reached")]
+    for path, chasers in named:
+        if max(chasers, default=0) > last:
+            raise ValueError(f"{path}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
+
+
+def _check_reached(scenario: Scenario) -> None:
+    for i in scenario.success.reached:
+        if scenario.goal_of(i) is None:
+            raise ValueError(f"success.reached: no goto of the timeline names chaser {i}")
+
+
+def _check_thruster_failures(scenario: Scenario) -> None:
+    chasers, thrusters = len(scenario.chasers), len(scenario.chaser.thrusters)
+    if scenario.thruster_failure and scenario.chaser.actuation != "thrusters":
+        raise ValueError('thruster_failure: thrusters fail only with chaser.actuation = "thrusters"')
+    failed: set[tuple[int, int]] = set()
+    for k, failure in enumerate(scenario.thruster_failure):
+        path = f"thruster_failure.{k}"
+        if failure.chaser >= chasers:
+            raise ValueError(
+                f"{path}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
+            )
+        if failure.thruster >= thrusters:
+            raise ValueError(
+                f"{path}.thruster: there is no thruster {failure.thruster}; the body has 0 to {thrusters - 1}"
+            )
+        if (failure.chaser, failure.thruster) in failed:
+            raise ValueError(f"{path}: thruster {failure.thruster} of chaser {failure.chaser} fails twice")
+        failed.add((failure.chaser, failure.thruster))
+
+
+def _check_latched(scenario: Scenario) -> None:
+    for i in scenario.success.latched:
+        if scenario.docking.port_of(i) is None:
+            raise ValueError(
+                f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]"
+            )
+
+
+def _check_capture(scenario: Scenario) -> None:
+    if scenario.target.motion != "torque_free":
+        raise ValueError(
+            f"target.motion: docking by capture needs torque_free, which contact forces can move, "
+            f"not {scenario.target.motion}"
+        )
+    if scenario.chaser.probe_reach_m <= scenario.chaser.size_m[0] / 2:
+        raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
+    nearest_m = scenario.limits.min_distance_target_m
+    for k, port in enumerate(scenario.docking.ports):
+        entry_m = math.hypot(*centre_offset(port, scenario.chaser.probe_reach_m, scenario.docking.entry_m))
+        if entry_m <= nearest_m:
+            raise ValueError(
+                f"docking.ports.{k}: its corridor begins {entry_m:.3g} m from the target's centre, inside "
+                f"limits.min_distance_target_m ({nearest_m:g} m); make docking.entry_m longer"
+            )
+        off_deg = axis_error_deg(port, np.asarray(scenario.chasers[port.chaser].q_wxyz))
+        if off_deg > 0.1:
+            raise ValueError(
+                f"docking.ports.{k}.axis: the +X axis of chaser {port.chaser} is {off_deg:.3g} degrees off the "
+                "axis into the port; change the attitude of the chaser or the axis"
+            )

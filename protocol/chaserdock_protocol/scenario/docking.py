@@ -1,103 +1,109 @@
-"""The scenario's section of docking: what counts as docked, the ports, the corridors and their limits."""
+"""Scenario section ``[docking]``: ports, approach corridors, and when a chaser counts as docked."""
 
 from __future__ import annotations
 
-import math
-from typing import Annotated, Literal
+from typing import Literal
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from .fields import NotNegative, Positive, Section, Vector
-
-
-def _direction(value: tuple[float, float, float]) -> tuple[float, float, float]:
-    length = math.hypot(*value)
-    if abs(length - 1.0) > 1e-3:
-        raise ValueError(f"must be a unit vector; this one has length {length:.6g}")
-    x, y, z = (v / length for v in value)
-    return (x, y, z)
+from .fields import Index, NotNegative, Positive, Section, UnitVector, Vector
 
 
 class Port(Section):
-    """Where one chaser docks: its probe's tip comes to ``position_m`` (TRF) against ``axis`` (TRF, unit, outwards)."""
+    """The docking port of one chaser on the target."""
 
-    chaser: Annotated[int, Field(ge=0)]
-    position_m: Vector
-    axis: Annotated[Vector, AfterValidator(_direction)]
-
-
-class PoseLimits(Section):
-    """Most that a probe may be off its port's axis: sideways, in attitude, and sideways in speed."""
-
-    lateral_m: Positive
-    angle_deg: Positive
-    lateral_speed_m_s: Positive
+    chaser: Index = Field(description="Number of the chaser, from 0. At most one port per chaser.")
+    position_m: Vector = Field(description="Where the probe's tip latches (TRF), m.")
+    axis: UnitVector = Field(description="Outward axis of the port (TRF), unit vector.")
 
 
-class Tolerances(PoseLimits):
-    """Within which the latch closes when the tip touches; ``closing_m_s`` is the speed at the touch."""
+class Corridor(Section):
+    """Limits relative to the port's axis at the end of the alignment and during the approach, before `final`."""
 
-    lateral_m: Positive = 0.01
-    angle_deg: Positive = 3.0
-    lateral_speed_m_s: Positive = 0.01
-    closing_m_s: Positive = 0.02
-
-
-class Final(PoseLimits):
-    """Limits over the last ``Docking.final_m``; of the closing speed once the slowing down is over."""
-
-    lateral_m: Positive = 0.008
-    angle_deg: Positive = 2.0
-    lateral_speed_m_s: Positive = 0.008
-    closing_m_s: Positive = 0.016
+    lateral_m: Positive = Field(default=0.03, description="Lateral offset of the probe's tip, m.")
+    angle_deg: Positive = Field(default=4.0, description="Attitude error, degrees.")
+    lateral_speed_m_s: Positive = Field(default=0.02, description="Lateral speed of the probe's tip, m/s.")
+    closing_m_s: Positive = Field(default=0.04, description="Closing speed, m/s.")
 
 
-class Corridor(PoseLimits):
-    """Limits of align (at its end) and of the approach, before ``final``."""
+class Final(Corridor):
+    """Limits over the last `final_m`. The closing speed is checked once the chaser has slowed down."""
 
-    lateral_m: Positive = 0.03
-    angle_deg: Positive = 4.0
-    lateral_speed_m_s: Positive = 0.02
-    closing_m_s: Positive = 0.04
+    lateral_m: Positive = Field(default=0.008, description="Lateral offset of the probe's tip, m.")
+    angle_deg: Positive = Field(default=2.0, description="Attitude error, degrees.")
+    lateral_speed_m_s: Positive = Field(default=0.008, description="Lateral speed of the probe's tip, m/s.")
+    closing_m_s: Positive = Field(default=0.016, description="Closing speed, m/s.")
+
+
+class Tolerances(Corridor):
+    """Errors at contact up to which the latch closes."""
+
+    lateral_m: Positive = Field(default=0.01, description="Lateral offset of the probe's tip, m.")
+    angle_deg: Positive = Field(default=3.0, description="Attitude error, degrees.")
+    lateral_speed_m_s: Positive = Field(default=0.01, description="Lateral speed of the probe's tip, m/s.")
+    closing_m_s: Positive = Field(default=0.02, description="Closing speed at contact, m/s.")
 
 
 class Docking(Section):
-    """How docking ends: ``held`` at a distance (``approach``'s tolerances, as in the paper), or by ``capture``.
+    """How docking ends. Distances are between the probe's tip and the port, along the port's axis."""
 
-    Distances are between the probe's tip and the port along the port's axis: a corridor begins ``entry_m`` out, its
-    last ``final_m`` are flown at ``contact_speed_m_s``, what is before at ``approach_speed_m_s``. The reference goes
-    on to ``overdrive_m`` behind the port. ``pull_N`` for ``pull_s``, and as long a push back, must not move a latched
-    chaser by more than ``verify_*``. A chaser whose way in comes within ``clearance_m`` of another's, centre to
-    centre, waits, as does one more than ``at_once``. A chaser on its way in or out, by capture or not, is planned inside
-    a cone about its axis, of half angle ``corridor_angle_deg``, in place of the distance that the others keep.
-    """
-
-    kind: Literal["held", "capture"] = "held"
+    kind: Literal["held", "capture"] = Field(
+        default="held",
+        description="`held`: the chaser holds at a distance, within the tolerances of `[approach]`, as in the paper. "
+        "`capture`: it flies into its port and is latched.",
+    )
     ports: tuple[Port, ...] = ()
-    entry_m: Positive = 0.35
-    final_m: Positive = 0.10
-    overdrive_m: Positive = 0.03
-    approach_speed_m_s: Positive = 0.025
-    contact_speed_m_s: Positive = 0.01
+    entry_m: Positive = Field(
+        default=0.35, description="Distance at which a corridor begins, m. Longer than `final_m`."
+    )
+    final_m: Positive = Field(
+        default=0.10, description="Length of the last part, flown at `contact_speed_m_s`, m."
+    )
+    overdrive_m: Positive = Field(
+        default=0.03, description="How far the reference continues behind the port, m."
+    )
+    approach_speed_m_s: Positive = Field(
+        default=0.025, description="Speed of the reference before the last part, m/s."
+    )
+    contact_speed_m_s: Positive = Field(
+        default=0.01,
+        description="Speed of the reference in the last part, m/s. At most `approach_speed_m_s`.",
+    )
     corridor: Corridor = Corridor()
-    corridor_angle_deg: Annotated[float, Field(gt=0.0, lt=90.0)] = 20.0
+    corridor_angle_deg: float = Field(
+        default=20.0,
+        gt=0.0,
+        lt=90.0,
+        allow_inf_nan=False,
+        description="Half angle of the cone about the corridor's axis in which a chaser on its way in or out is planned, "
+        "degrees. It replaces `limits.min_distance_target_m` for that chaser.",
+    )
     final: Final = Final()
     tolerances: Tolerances = Tolerances()
-    clearance_m: NotNegative = 0.45
-    at_once: Annotated[int, Field(ge=1)] = 2
-    attempts: Annotated[int, Field(ge=1, le=100)] = 3
-    align_timeout_s: Positive = 60.0
-    approach_timeout_s: Positive = 60.0
-    final_timeout_s: Positive = 30.0
-    contact_timeout_s: Positive = 5.0
-    settle_s: Positive = 2.0
-    pull_N: Positive = 0.5
-    pull_s: Positive = 1.0
-    verify_position_m: Positive = 0.005
-    verify_angle_deg: Positive = 0.5
+    clearance_m: NotNegative = Field(
+        default=0.45,
+        description="A chaser waits if its corridor comes this near to one in use, between body centres, m.",
+    )
+    at_once: int = Field(
+        default=2, ge=1, description="Most chasers on their way in at the same time; others wait."
+    )
+    attempts: int = Field(default=3, ge=1, le=100, description="Attempts before a chaser gives up.")
+    align_timeout_s: Positive = Field(default=60.0, description="Longest alignment before the corridor, s.")
+    approach_timeout_s: Positive = Field(default=60.0, description="Longest approach to the last part, s.")
+    final_timeout_s: Positive = Field(default=30.0, description="Longest last part, s.")
+    contact_timeout_s: Positive = Field(default=5.0, description="Longest contact without a latch, s.")
+    settle_s: Positive = Field(default=2.0, description="Wait between the latch and the pull test, s.")
+    pull_N: Positive = Field(default=0.5, description="Force of the pull test, N.")
+    pull_s: Positive = Field(
+        default=1.0, description="Duration of the pull, and of the push that follows it, s."
+    )
+    verify_position_m: Positive = Field(
+        default=0.005, description="Largest displacement in the pull test, m."
+    )
+    verify_angle_deg: Positive = Field(default=0.5, description="Largest rotation in the pull test, degrees.")
 
     @model_validator(mode="after")
-    def _consistent(self) -> Docking:
+    def _check_consistent(self) -> Docking:
         if self.kind == "capture" and not self.ports:
             raise ValueError("kind capture needs at least one of [[docking.ports]]")
         chasers = [port.chaser for port in self.ports]
@@ -114,7 +120,7 @@ class Docking(Section):
         return self
 
     def port_of(self, chaser: int) -> Port | None:
-        """The port where a chaser is to be captured, or None."""
+        """Return the port where a chaser is to be captured, or None."""
         if self.kind != "capture":
             return None
         return next((port for port in self.ports if port.chaser == chaser), None)

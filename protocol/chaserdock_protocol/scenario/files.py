@@ -1,5 +1,7 @@
-"""Files that a scenario names: the target's and the camera's. What is in them becomes part of the scenario, which
-the world sends to processes that have no such file."""
+"""Read scenario files, and the target and calibration files that they name.
+
+Their content becomes part of the scenario, because the world sends it to processes that do not have these files.
+"""
 
 from __future__ import annotations
 
@@ -11,12 +13,12 @@ import numpy as np
 from chaserdock_models.targets import TargetModel, target_model
 from pydantic import ValidationError
 
-from .overrides import ScenarioError, explain
+from .errors import ScenarioError, explain
 from .target import Geometry
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The tables of a TOML file; raises ScenarioError, which names it, for one that cannot be read."""
+    """Return the tables of a TOML file. Raises ScenarioError."""
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
@@ -26,12 +28,14 @@ def read_toml(path: Path) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     except RecursionError:
-        raise ScenarioError(f"{path}: not TOML of ours: nested too deeply") from None
+        raise ScenarioError(f"{path}: nested too deeply") from None
 
 
 def resolve_files(values: dict[str, Any], folder: Path) -> None:
-    """Puts the contents of the files that a scenario names into its tables, in place; paths are relative to
-    ``folder``. Raises ScenarioError for files that cannot be read or do not hold what they should."""
+    """Replace the files that a scenario names by their content, in place; paths are relative to ``folder``.
+
+    Raises ScenarioError for files that cannot be read or are not valid.
+    """
     target, camera = values.get("target"), values.get("camera")
     if isinstance(target, dict):
         model = target.get("model")
@@ -50,7 +54,7 @@ def _geometry_values(path: Path) -> dict[str, Any]:
     try:
         Geometry.model_validate(values)
     except ValidationError as error:
-        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error))) from None
+        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error, Geometry))) from None
     _absolute_mesh(values, path.parent)
     return values
 
@@ -65,7 +69,7 @@ def _absolute_mesh(geometry: dict[str, Any], folder: Path) -> None:
 
 
 def find_target(name: str) -> TargetModel:
-    """The target of a file (``….toml``) or of a known name; raises ScenarioError."""
+    """Return the target of a file (``….toml``) or of a known name. Raises ScenarioError."""
     if name.endswith(".toml"):
         return Geometry.model_validate(_geometry_values(Path(name))).model(Path(name).stem)
     try:
@@ -75,9 +79,12 @@ def find_target(name: str) -> TargetModel:
 
 
 def read_calibration(path: Path) -> dict[str, Any]:
-    """The scenario's ``camera.intrinsics`` from a calibration file as OpenCV writes them (YAML, JSON or XML, with
-    ``image_width``, ``image_height``, ``camera_matrix`` and ``distortion_coefficients``). Raises ScenarioError."""
-    import cv2  # heavy, and needed for such files alone
+    """Return ``camera.intrinsics`` from an OpenCV calibration file. Raises ScenarioError.
+
+    The file is YAML, JSON or XML with ``image_width``, ``image_height``, ``camera_matrix`` and
+    ``distortion_coefficients``.
+    """
+    import cv2  # slow to import, and needed for such files only
 
     if not path.is_file():
         raise ScenarioError(f"{path}: no such calibration file")
@@ -95,7 +102,7 @@ def read_calibration(path: Path) -> dict[str, Any]:
     if matrix is None or matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
         raise ScenarioError(f"{path}: camera_matrix must be a 3 x 3 matrix")
     if width < 1 or height < 1:
-        raise ScenarioError(f"{path}: image_width and image_height must be there, and positive")
+        raise ScenarioError(f"{path}: image_width and image_height must be positive")
     coefficients = [] if lens is None else np.ravel(lens).astype(float).tolist()
     while len(coefficients) > 5 and coefficients[-1] == 0.0:
         coefficients.pop()

@@ -1,4 +1,4 @@
-"""Migrate scenarios of older formats: those stored in logs are converted, files get an error that names the new key."""
+"""Older scenario formats: scenarios stored in logs are migrated, files get an error that names the new key."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 FORMAT = 2
-"""Present format of scenario files. 1 called thrusters jets and images pictures."""
+"""Present format of scenario files. Format 1 called thrusters jets, and images pictures."""
 
 _RENAMED_KEYS: dict[tuple[str, ...], str] = {
     ("time", "picture_hz"): "image_hz",
@@ -18,7 +18,7 @@ _RENAMED_KEYS: dict[tuple[str, ...], str] = {
     ("jet_failure", "*", "told"): "reported",
     ("jet_failure",): "thruster_failure",
 }
-"""Path of a key in format 1 (``*``: every element of an array) -> its present name. Parents stand last."""
+"""Path of a key in format 1 (``*``: every element of an array) -> its present name. Parents follow their children."""
 
 
 def _holders(
@@ -36,16 +36,30 @@ def _holders(
 
 
 def old_keys(values: dict[str, Any]) -> list[str]:
-    """Return one line per key of an older format, naming its present name."""
-    return [
-        f"{path}: is now called {new}"
-        for old, new in _RENAMED_KEYS.items()
-        for _, path in _holders(values, old)
-    ]
+    """Return one line per key, or value, of an older format, naming its present name."""
+    lines = []
+    for old, new in _RENAMED_KEYS.items():
+        for _, path in _holders(values, old):
+            lines.append(f"{path}: is now called {path.rpartition('.')[0]}.{new}".replace(" .", " "))
+    for table, path in _holders(values, ("fault", "*", "topic")):
+        if table["topic"] == "jets":
+            lines.append(f"{path}: 'jets' is now called 'thrusters'")
+    return lines
+
+
+def old_format(values: dict[str, Any]) -> list[str]:
+    """Return an error line for values that state another format than the present one."""
+    stated = values.get("format", FORMAT)
+    if stated == FORMAT:
+        return []
+    if stated == 1:
+        changes = "; ".join(old_keys(values)) or "no key of this file has another name"
+        return [f"format: 1 is not supported any more; set format = {FORMAT} and change: {changes}"]
+    return [f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"]
 
 
 def migrated(text: str) -> str:
-    """Return a resolved scenario (JSON) in the present format; text of the present format, or no JSON, stays as it is."""
+    """Return a resolved scenario (JSON) in the present format. Text that is not JSON is returned unchanged."""
     try:
         values = json.loads(text)
     except (json.JSONDecodeError, RecursionError):
@@ -55,8 +69,7 @@ def migrated(text: str) -> str:
     for old, new in _RENAMED_KEYS.items():
         for table, _ in _holders(values, old):
             table[new] = table.pop(old[-1])
-    faults = values.get("fault", ())
-    for fault in faults if isinstance(faults, list) else ():
-        if isinstance(fault, dict) and fault.get("topic") == "jets":
+    for fault, _ in _holders(values, ("fault", "*", "topic")):
+        if fault["topic"] == "jets":
             fault["topic"] = "thrusters"
     return json.dumps({"format": FORMAT, **values})

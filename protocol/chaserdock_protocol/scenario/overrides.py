@@ -1,98 +1,106 @@
-"""Scenarios as people write them: overriding a value by its path, and telling what is wrong and where."""
+"""Change the values of a scenario: variants (``extends``) and overrides (``--set``)."""
 
 from __future__ import annotations
 
+import copy
 import tomllib
 from collections.abc import Callable
 from typing import Any
 
-from pydantic import ValidationError
+from chaserdock_models.targets import target_names
 
-from chaserdock_protocol.errors import ChaserdockError
+from .errors import ScenarioError, value_text
+from .fields import ATTITUDE_KEYS
 
-
-class ScenarioError(ChaserdockError):
-    """A scenario that cannot be flown; the text has one line a fault."""
-
-
-_KINDS = {
-    "float_type": "must be a number",
-    "int_type": "must be a whole number",
-    "bool_type": "must be true or false",
-    "string_type": "must be text",
-    "tuple_type": "must be an array",
-    "model_type": "must be a table",
-}
-"""What a value of another kind should have been, by pydantic's name of the fault."""
+Values = dict[str, Any]
 
 
-def _toml(value: object) -> str:
-    return str(value).lower() if isinstance(value, bool) else repr(value)
+def merge(base: Values, variant: Values) -> Values:
+    """Return ``base`` with the values of ``variant``: tables are merged, everything else, arrays too, is replaced."""
+    out = dict(base)
+    for key, value in variant.items():
+        _drop_alternatives(out, key, value)
+        old = out.get(key)
+        out[key] = merge(old, value) if isinstance(old, dict) and isinstance(value, dict) else value
+    return out
 
 
-def explain(error: ValidationError) -> list[str]:
-    """One line a fault: path, what would be right, what was given."""
-    lines = []
-    places = [fault["loc"] for fault in error.errors()]
-    for fault in error.errors():
-        # A faulty item also makes its array too short; the item says it all.
-        loc = fault["loc"]
-        if fault["type"] == "too_short" and any(len(p) > len(loc) and p[: len(loc)] == loc for p in places):
-            continue
-        path = ".".join(str(p) for p in fault["loc"]) or "(scenario)"
-        message = _KINDS.get(fault["type"]) or fault["msg"].removeprefix("Value error, ")
-        value = fault.get("input")
-        value = list(value) if isinstance(value, tuple) else value
-        shown = f" (got {_toml(value)})" if isinstance(value, int | float | str | list) else ""
-        if fault["type"] == "missing":
-            message, shown = "is missing", ""
-        elif fault["type"] == "extra_forbidden":
-            message, shown = "is not a key that is known here", ""
-        lines.append(f"{path}: {message}{shown}")
-    return lines
+def _drop_alternatives(table: Values, key: str, value: Any) -> None:
+    """Remove from a table what a new value of ``key`` replaces: other forms of an attitude, a target's own geometry."""
+    if key in ATTITUDE_KEYS:
+        for other in ATTITUDE_KEYS:
+            if other != key:
+                table.pop(other, None)
+    elif key == "model" and value in target_names():
+        table.pop("geometry", None)
 
 
-def override(values: dict[str, Any], text: str, resolved: Callable[[], dict[str, Any]]) -> None:
-    """Sets ``key.path=value`` in nested tables and arrays, the value in TOML's notation; raises ScenarioError.
+def with_override(values: Values, text: str, resolve: Callable[[Values], Values]) -> Values:
+    """Return a copy of nested tables and arrays with ``key.path=value`` set, the value in TOML's notation.
 
-    ``resolved`` gives the same tables with all defaults: one element of an array that is not in ``values`` can only be
-    set together with its neighbours.
+    ``resolve`` returns the same tables with all defaults; an element of an array that is not in ``values`` is set in a
+    copy of the default. Raises ScenarioError.
     """
+    values = copy.deepcopy(values)
     path, equals, value = text.partition("=")
     if not equals or not path.strip():
-        raise ScenarioError(f"--set {text}: must be key.path=value")
-    try:
-        parsed = tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        parsed = value.strip()
-    except RecursionError:
-        raise ScenarioError(f"--set {path.strip()}: nested too deeply") from None
-    place: Any = values
+        raise ScenarioError(f"--set {text}: must be KEY=VALUE, such as camera.width_px=640")
     keys = path.strip().split(".")
+    table: Any = values
     for depth, key in enumerate(keys[:-1]):
-        if isinstance(place, dict) and key not in place and _is_index(keys[depth + 1]):
-            place[key] = _default(resolved(), keys[: depth + 1])
-        place = _item(place, key, text) if isinstance(place, list) else place.setdefault(key, {})
-        if not isinstance(place, dict | list):
-            raise ScenarioError(f"--set {text}: {key} is a value, not a table")
-    if isinstance(place, list):
-        _item(place, keys[-1], text)
-        place[int(keys[-1])] = parsed
-    else:
-        place[keys[-1]] = parsed
-
-
-def _is_index(key: str) -> bool:
-    return key.isascii() and key.isdigit()
-
-
-def _default(values: Any, keys: list[str]) -> Any:
-    for key in keys:
-        values = values.get(key, {}) if isinstance(values, dict) else {}
+        if isinstance(table, dict) and key not in table and _is_index(keys[depth + 1]):
+            table[key] = _value_at(resolve(values), keys[: depth + 1])
+        table = _child(table, key, text)
+    _assign(table, keys[-1], _parsed(value, path), text)
     return values
 
 
-def _item(place: list[Any], key: str, text: str) -> Any:
-    if not _is_index(key) or int(key) >= len(place):
-        raise ScenarioError(f"--set {text}: {key} must be a number from 0 to {len(place) - 1}")
-    return place[int(key)]
+def _parsed(value: str, path: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return value.strip()
+    except RecursionError:
+        raise ScenarioError(f"--set {path.strip()}: nested too deeply") from None
+
+
+def _child(table: Any, key: str, text: str) -> Any:
+    if isinstance(table, list):
+        child = _element(table, key, text)
+    else:
+        _drop_alternatives(table, key, None)
+        child = table.setdefault(key, {})
+    if not isinstance(child, dict | list):
+        raise ScenarioError(f"--set {text}: {key} is a value ({value_text(child)}), not a table")
+    return child
+
+
+def _assign(table: Any, key: str, value: Any, text: str) -> None:
+    if isinstance(table, list):
+        _element(table, key, text)
+        table[int(key)] = value
+    else:
+        _drop_alternatives(table, key, value)
+        table[key] = value
+
+
+def _element(array: list[Any], key: str, text: str) -> Any:
+    if not _is_index(key) or int(key) >= len(array):
+        valid = (
+            f"must be a number from 0 to {len(array) - 1}" if array else "is no element: the array is empty"
+        )
+        raise ScenarioError(f"--set {text}: {key} {valid}")
+    return array[int(key)]
+
+
+def _is_index(key: str) -> bool:
+    return key.isascii() and key.isdigit() and len(key) < 10
+
+
+def _value_at(values: Any, keys: list[str]) -> Any:
+    for key in keys:
+        if isinstance(values, list):
+            values = values[int(key)] if _is_index(key) and int(key) < len(values) else {}
+        else:
+            values = values.get(key, {}) if isinstance(values, dict) else {}
+    return copy.deepcopy(values)

@@ -1,48 +1,68 @@
-"""The scenario file: TOML, every value checked, every error with its path and what would be right.
+"""Schema of a scenario: every key with type, default, range and description.
 
-Names are snake_case with their unit at the end; frames as everywhere: WRF world, CRF chaser, TRF target.
+Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF target, IRF image (docs/frames.md).
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Literal
 
-import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_models.clock import Timing
-from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.targets import TargetModel
-from pydantic import AfterValidator, Field, ValidationError, model_validator
-
-from chaserdock_protocol import plugins
+from pydantic import Field, model_validator
 
 from .bodies import Body, Target
 from .camera import CameraSection
-from .checks import check_apart, check_references
+from .checks import check_consistent
 from .docking import Docking
-from .faults import Fault, check_faults
-from .fields import Name, NotNegative, Positive, Section, UnitQuaternion, Vector, finite
-from .files import read_toml, resolve_files
-from .migrations import FORMAT, old_keys
+from .faults import Fault
+from .fields import (
+    Fraction,
+    Index,
+    LookAt,
+    Name,
+    NotNegative,
+    Oriented,
+    Positive,
+    Section,
+    UnitQuaternion,
+    Vector,
+)
+from .migrations import FORMAT
 from .odometry import OdometrySection
-from .overrides import ScenarioError, explain, override
-from .thrusters import ThrusterFailure, check_pulses
+from .thrusters import ThrusterFailure
+
+PERCEPTIONS = ("default", "paper")
+ESTIMATORS = ("mekf", "paper")
+SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
+"""Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""
+
+MAX_STAGES = 500
+"""Longest prediction: more stages could not be solved in time, and messages bound their size."""
+
+MAX_DURATION_S = 90 * 86_400.0
+"""Longest mission: messages count simulated time in nanoseconds up to 2**53 (see ``message_fields``)."""
 
 
 class Time(Section):
-    """Rates and latencies of simulated time."""
+    """Rates and latency of simulated time."""
 
-    rate_hz: Annotated[int, Field(ge=1, le=240)] = 15
-    image_hz: Annotated[int, Field(ge=1, le=240)] = 15
-    physics_hz: Annotated[int, Field(ge=60, le=20000)] = 960
-    latency_s: NotNegative = 1.0 / 30.0
+    rate_hz: int = Field(
+        default=15, ge=1, le=240, description="Ticks of control per second, Hz. It must divide `physics_hz`."
+    )
+    image_hz: int = Field(
+        default=15, ge=1, le=240, description="Images per second, Hz. It must divide `rate_hz`."
+    )
+    physics_hz: int = Field(default=960, ge=60, le=20000, description="Physics steps per second, Hz.")
+    latency_s: NotNegative = Field(
+        default=1.0 / 30.0,
+        description="Time from a tick to the effect of the commands computed from it, s, rounded to physics steps.",
+    )
 
     @model_validator(mode="after")
-    def _divide(self) -> Time:
+    def _check_divisors(self) -> Time:
         if self.physics_hz % self.rate_hz:
             raise ValueError(f"physics_hz must be a multiple of rate_hz ({self.physics_hz}, {self.rate_hz})")
         if self.rate_hz % self.image_hz:
@@ -51,146 +71,193 @@ class Time(Section):
 
 
 class EstimatorSection(Section):
-    """How sightings become the target's odometry; the numbers are ``mekf``'s.
+    """Fusion of all chasers' sightings into the target's state."""
 
-    ``camera_bias_*``: one sigma of each camera's own calibration error (place of the lens, mounting, focal length),
-    which is then estimated. 0: the cameras are as calibrated, which is so in the world's images.
-    """
-
-    name: Name = "mekf"
-    camera_bias_position_m: NotNegative = 0.0
-    camera_bias_attitude_deg: NotNegative = 0.0
-    camera_bias_focal_share: NotNegative = 0.0
+    name: Name = Field(
+        default="mekf",
+        description="`mekf`: multiplicative extended Kalman filter. `paper`: the paper's average. Or an installed plugin.",
+    )
+    camera_bias_position_m: NotNegative = Field(
+        default=0.0,
+        description="Prior standard deviation of each camera's mounting position, m. Above 0, `mekf` estimates it.",
+    )
+    camera_bias_attitude_deg: NotNegative = Field(
+        default=0.0,
+        description="Prior standard deviation of each camera's mounting attitude, degrees. Above 0, `mekf` estimates it.",
+    )
+    camera_bias_focal_share: NotNegative = Field(
+        default=0.0,
+        description="Prior standard deviation of each camera's relative focal length. Above 0, `mekf` estimates it.",
+    )
 
     @property
     def estimates_cameras(self) -> bool:
-        """Whether the cameras' calibration errors are estimated."""
-        told = (self.camera_bias_position_m, self.camera_bias_attitude_deg, self.camera_bias_focal_share)
-        return self.name == "mekf" and any(told)
+        """Whether calibration errors of the cameras are estimated."""
+        biases = (self.camera_bias_position_m, self.camera_bias_attitude_deg, self.camera_bias_focal_share)
+        return self.name == "mekf" and any(biases)
 
 
 class PerceptionSection(Section):
-    """How an image becomes a pose."""
+    """Pose estimation from one image."""
 
-    name: Name = "default"
-
-
-PERCEPTIONS = ("default", "paper")
-ESTIMATORS = ("mekf", "paper")
-SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
-"""Chaserdock's own parts, by the name that a scenario chooses them with; others may be installed (see ``plugins``)."""
-
-MAX_STAGES = 500
-"""Most prediction steps of a plan; more could not be solved in time, and messages bound their size."""
-
-
-MAX_DURATION_S = 90 * 86_400.0
-"""Longest mission: messages count simulated time in nanoseconds up to 2**53 (see ``message_fields``)."""
+    name: Name = Field(
+        default="default", description="`default`, `paper` (the paper's method), or an installed plugin."
+    )
 
 
 class Controller(Section):
-    """The NMPC: solver, horizon, weights (the paper's names in docs/controller.md).
+    """The NMPC: solver, horizon and weights ([controller.md](controller.md) relates them to the paper's symbols)."""
 
-    ``max_iterations`` bounds a solve, in iterations as the solver counts them, so that it flies the same anywhere.
-    ``solve_budget_s``, wall time, bounds it in real time alone, by as many iterations as have been found to fit.
-    ``standby``: a second controller flies along, ready to take over (docs/redundancy.md).
-    """
-
-    standby: bool = False
-    solver: Name = "rti"
-    max_iterations: Annotated[int, Field(ge=0)] | None = None
-    solve_budget_s: Positive | None = None
-    horizon_s: Positive = 3.0
-    dt_s: Positive = 0.1
-    falloff: Annotated[float, AfterValidator(finite), Field(ge=0, le=1)] = 0.0
-    weight_position: NotNegative = 65.0
-    weight_orientation: NotNegative = 35.0
-    weight_force: Positive = 3.5
-    weight_torque: Positive = 40.0
-    weight_final_position: NotNegative = 3250.0
-    weight_final_orientation: NotNegative = 1750.0
-    integrator: Literal["rk4", "euler"] = "rk4"
-    feed_forward: bool = True
-    command_lifetime_s: Positive = 0.5
+    standby: bool = Field(
+        default=False,
+        description="Start a second controller as hot standby ([redundancy.md](redundancy.md)).",
+    )
+    solver: Name = Field(
+        default="rti",
+        description=f"One of {', '.join(f'`{name}`' for name in SOLVERS)}, or an installed plugin.",
+    )
+    max_iterations: int | None = Field(
+        default=None,
+        ge=0,
+        description="Most iterations per solve, as the solver counts them. Without it: the solver's default.",
+    )
+    solve_budget_s: Positive | None = Field(
+        default=None,
+        description="Wall time per solve, s: in real time, limits the iterations to what fits. Only with the solver `rti`.",
+    )
+    horizon_s: Positive = Field(
+        default=3.0, description=f"Prediction horizon, s: at least one and at most {MAX_STAGES} steps `dt_s`."
+    )
+    dt_s: Positive = Field(default=0.1, description="Step of the prediction, s.")
+    falloff: Fraction = Field(
+        default=0.0,
+        description="Linear decrease of the stage weights along the horizon: 0 is constant, 1 ends at zero.",
+    )
+    weight_position: NotNegative = Field(default=65.0, description="Weight of the position error, 1/m².")
+    weight_orientation: NotNegative = Field(
+        default=35.0,
+        description="Weight of the attitude error (squared vector part of the error quaternion).",
+    )
+    weight_force: Positive = Field(default=3.5, description="Weight of the force, 1/N².")
+    weight_torque: Positive = Field(default=40.0, description="Weight of the torque, 1/(N m)².")
+    weight_final_position: NotNegative = Field(
+        default=3250.0, description="Additional weight of the position error at the end of the horizon, 1/m²."
+    )
+    weight_final_orientation: NotNegative = Field(
+        default=1750.0, description="Additional weight of the attitude error at the end of the horizon."
+    )
+    integrator: Literal["rk4", "euler"] = Field(default="rk4", description="Integrator of the prediction.")
+    feed_forward: bool = Field(
+        default=True,
+        description="Count the input cost from the force and torque that the reference motion needs. Otherwise from zero, "
+        "as in the paper.",
+    )
+    command_lifetime_s: Positive = Field(
+        default=0.5, description="Age at which a chaser rejects a command and uses its fallback, s."
+    )
 
     @model_validator(mode="after")
-    def _budget(self) -> Controller:
+    def _check_consistent(self) -> Controller:
         if self.solve_budget_s is not None and self.solver in SOLVERS[1:]:
-            raise ValueError(
-                f"solve_budget_s goes with the solver rti; {self.solver} cannot be held to a time"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _stages(self) -> Controller:
-        if round(self.horizon_s / self.dt_s) < 1:
+            raise ValueError(f"solve_budget_s goes with the solver rti; {self.solver} has no time limit")
+        stages = self.horizon_s / self.dt_s
+        if round(min(stages, MAX_STAGES)) < 1:
             raise ValueError(f"horizon_s ({self.horizon_s}) is shorter than one step dt_s ({self.dt_s})")
-        if self.horizon_s / self.dt_s > MAX_STAGES:
-            raise ValueError(
-                f"horizon_s / dt_s is {self.horizon_s / self.dt_s:.0f} stages; at most {MAX_STAGES}"
-            )
+        if stages > MAX_STAGES:
+            raise ValueError(f"horizon_s / dt_s is {stages:.0f} stages; at most {MAX_STAGES}")
         return self
 
 
 class Limits(Section):
-    """Distances that the controller keeps, centre to centre.
+    """Distances between body centres that the controller keeps."""
 
-    ``estimate_margin_sigmas``: how many standard deviations of the target's estimated position are added to the
-    distance from it, at most 0.1 m. 0: the estimate is taken as it is.
-    """
-
-    min_distance_target_m: NotNegative = 0.35
-    estimate_margin_sigmas: NotNegative = 0.0
-    min_distance_chasers_m: NotNegative = 0.35
-    max_reference_distance_m: Positive = 25.0
+    min_distance_target_m: NotNegative = Field(
+        default=0.35, description="Smallest distance from the target, m."
+    )
+    estimate_margin_sigmas: NotNegative = Field(
+        default=0.0,
+        description="Standard deviations of the target's estimated position that are added to "
+        "`min_distance_target_m`, at most 0.1 m in all.",
+    )
+    min_distance_chasers_m: NotNegative = Field(
+        default=0.35, description="Smallest distance between chasers, m."
+    )
+    max_reference_distance_m: Positive = Field(
+        default=25.0, description="Largest distance of a reference position from the target, m."
+    )
 
 
 class Approach(Section):
-    """How an approach is flown, and when a chaser counts as docked.
+    """Approach to a distance, and when a chaser counts as docked with `docking.kind = "held"`."""
 
-    ``face_target``: the reference attitude turns with the offset, so that a chaser sent elsewhere goes on facing the
-    target; otherwise it keeps its attitude in TRF.
-    """
+    dock_distance_m: Positive = Field(default=0.40, description="Distance from the target's centre, m.")
+    max_speed_m_s: Positive = Field(
+        default=0.03,
+        description="Speed of the reference relative to the target, m/s. `goto` flies at twice this speed.",
+    )
+    docked_position_m: Positive = Field(
+        default=0.01, description="Largest position error of a docked chaser, m."
+    )
+    docked_angle_deg: Positive = Field(
+        default=1.0, description="Largest attitude error of a docked chaser, degrees."
+    )
+    docked_time_s: Positive = Field(
+        default=5.0, description="Time within both errors before it counts as docked, s."
+    )
+    face_target: bool = Field(
+        default=False,
+        description="Turn the reference attitude with the position, so that a chaser faces the target after a `goto`. "
+        "Otherwise it keeps its attitude in TRF.",
+    )
 
-    dock_distance_m: Positive = 0.40
-    max_speed_m_s: Positive = 0.03
-    docked_position_m: Positive = 0.01
-    docked_angle_deg: Positive = 1.0
-    docked_time_s: Positive = 5.0
-    face_target: bool = False
 
+class Chaser(Oriented):
+    """One chaser: its reference pose, and its initial state relative to that. It starts without rotation in WRF."""
 
-class Chaser(Section):
-    """One chaser: its reference pose in TRF and where it starts, relative to that pose.
-
-    The start is ``start_offset_m`` (TRF) away from the reference position, turned by ``start_rotation_rad`` (rotation
-    vector, CRF) from the reference attitude, with ``start_velocity_m_s`` (WRF), not rotating.
-    """
-
-    position_m: Vector
-    q_wxyz: UnitQuaternion
-    start_offset_m: Vector = (0.0, 0.0, 0.0)
-    start_rotation_rad: Vector = (0.0, 0.0, 0.0)
-    start_velocity_m_s: Vector = (0.0, 0.0, 0.0)
+    position_m: Vector = Field(description="Reference position (TRF), m. Not the origin.")
+    q_wxyz: UnitQuaternion = Field(
+        description="Reference attitude, CRF to TRF: unit quaternion, scalar first. Or give `attitude_deg` or `look_at`."
+    )
+    look_at: LookAt | None = Field(
+        default=None,
+        exclude=True,
+        description="Alternative to `q_wxyz`: point +X, and so the camera, at the target's centre, without roll.",
+    )
+    start_offset_m: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="Initial position relative to the reference position (TRF), m."
+    )
+    start_rotation_rad: Vector = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Initial attitude relative to the reference attitude: rotation vector (CRF), rad.",
+    )
+    start_velocity_m_s: Vector = Field(default=(0.0, 0.0, 0.0), description="Initial velocity (WRF), m/s.")
 
     @model_validator(mode="after")
-    def _outside(self) -> Chaser:
+    def _check_position(self) -> Chaser:
         if not any(self.position_m):
-            raise ValueError("position_m must not be the target's own origin: the approach line begins there")
+            raise ValueError("position_m must not be the target's origin: the approach line begins there")
         return self
 
 
 class TimelineEntry(Section):
-    """A command at a time of the mission."""
+    """An operator command at a given time."""
 
-    at_s: NotNegative
-    command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"]
-    chasers: Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)]
-    offset_m: Vector | None = None
-    thruster: Annotated[int, Field(ge=0, le=254)] | None = None
+    at_s: NotNegative = Field(description="Mission time, s.")
+    command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"] = (
+        Field(
+            description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to the reference position. "
+            "`abort`: the same, twice as fast. `goto`: fly to `offset_m`. `calibrate`: manoeuvre to calibrate the camera. "
+            "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
+        )
+    )
+    chasers: tuple[Index, ...] = Field(min_length=1, description="Numbers of the chasers, from 0.")
+    offset_m: Vector | None = Field(default=None, description="Destination of `goto` (TRF), m.")
+    thruster: int | None = Field(
+        default=None, ge=0, le=254, description="Number of the thruster, from 0, for `isolate` and `restore`."
+    )
 
     @model_validator(mode="after")
-    def _goto(self) -> TimelineEntry:
+    def _check_arguments(self) -> TimelineEntry:
         if (self.command == "goto") != (self.offset_m is not None):
             raise ValueError("offset_m goes with the command goto, and goto needs it")
         if (self.command in ("isolate", "restore")) != (self.thruster is not None):
@@ -199,35 +266,66 @@ class TimelineEntry(Section):
 
 
 class Success(Section):
-    """What makes a run a success, judged on ground truth; what is left out is not asked.
+    """Criteria of a successful mission, evaluated on ground truth. Omitted criteria are not evaluated."""
 
-    ``reached``: chasers that at the end are where their last ``goto`` of the time line sent them, to
-    ``reached_position_m``, and have been since ``reached_within_s`` after that command at the latest.
-    """
-
-    docked: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    reached: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    reached_position_m: Positive = 0.02
-    reached_within_s: Positive | None = None
-    latched: tuple[Annotated[int, Field(ge=0)], ...] = ()
-    max_collisions: Annotated[int, Field(ge=0)] = 0
-    keep_distances: bool = True
-    steady_position_rms_m: Positive | None = None
-    steady_orientation_rms_deg: Positive | None = None
-    max_estimate_position_m: Positive | None = None
-    max_estimate_orientation_deg: Positive | None = None
+    docked: tuple[Index, ...] = Field(default=(), description="Chasers that must be docked at the end.")
+    reached: tuple[Index, ...] = Field(
+        default=(), description="Chasers that must be at the destination of their last `goto` at the end."
+    )
+    reached_position_m: Positive = Field(default=0.02, description="Tolerance of `reached`, m.")
+    reached_within_s: Positive | None = Field(
+        default=None, description="Longest time from that `goto` until a chaser is there to stay, s."
+    )
+    latched: tuple[Index, ...] = Field(default=(), description="Chasers that must be latched at the end.")
+    max_collisions: int = Field(default=0, ge=0, description="Largest number of collisions.")
+    keep_distances: bool = Field(
+        default=True, description="Whether the distances of `[limits]` must be kept."
+    )
+    steady_position_rms_m: Positive | None = Field(
+        default=None, description="Largest RMS of each chaser's position error in the steady interval, m."
+    )
+    steady_orientation_rms_deg: Positive | None = Field(
+        default=None,
+        description="Largest RMS of each chaser's attitude error in the steady interval, degrees.",
+    )
+    max_estimate_position_m: Positive | None = Field(
+        default=None, description="Largest error of the target's estimated position after `settling_s`, m."
+    )
+    max_estimate_orientation_deg: Positive | None = Field(
+        default=None,
+        description="Largest error of the target's estimated attitude after `settling_s`, degrees.",
+    )
 
 
 class Scenario(Section):
-    """A whole mission, resolved: what every process gets from the world."""
+    """A mission. Every process receives it from the world in resolved form."""
 
-    format: Literal[2] = FORMAT
-    name: Name
-    description: str = ""
-    duration_s: Annotated[Positive, Field(le=MAX_DURATION_S)]
-    settling_s: NotNegative = 20.0
-    steady_until_s: Positive | None = None
-    seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
+    format: Literal[2] = Field(
+        default=FORMAT,
+        description=f"Version of the format of this file. Without it: {FORMAT}, the present one.",
+    )
+    extends: str | None = Field(
+        default=None,
+        exclude=True,
+        description="Scenario that this one is a variant of: the name of a shipped scenario, or the path of a file "
+        "relative to this one.",
+    )
+    name: Name = Field(description="Name of the scenario; the names of run folders begin with it.")
+    description: str = Field(default="", description="One sentence for lists and reports.")
+    duration_s: float = Field(
+        gt=0,
+        le=MAX_DURATION_S,
+        allow_inf_nan=False,
+        description="Length of the mission, s of simulated time.",
+    )
+    settling_s: NotNegative = Field(
+        default=20.0, description="Begin of the steady interval, s of mission time."
+    )
+    steady_until_s: Positive | None = Field(
+        default=None,
+        description="End of the steady interval, s of mission time. Without it: the end of the mission.",
+    )
+    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of everything random.")
     time: Time = Time()
     target: Target = Target()
     chaser: Body = Body()
@@ -239,45 +337,25 @@ class Scenario(Section):
     limits: Limits = Limits()
     approach: Approach = Approach()
     docking: Docking = Docking()
-    chasers: Annotated[tuple[Chaser, ...], Field(min_length=1, max_length=16)]
+    chasers: tuple[Chaser, ...] = Field(min_length=1, max_length=16)
     timeline: tuple[TimelineEntry, ...] = ()
     thruster_failure: tuple[ThrusterFailure, ...] = ()
-    fault: Annotated[tuple[Fault, ...], Field(max_length=100)] = ()
+    fault: tuple[Fault, ...] = Field(default=(), max_length=100)
     success: Success = Success()
 
     @model_validator(mode="after")
-    def _consistent(self) -> Scenario:
-        check_apart(self)
-        check_references(self)
-        if (
-            self.target.geometry is not None
-            and self.target.geometry.mesh
-            and self.camera.renderer != "pybullet"
-        ):
-            raise ValueError('target.geometry.mesh: is drawn by camera.renderer = "pybullet" alone')
-        named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(self.timeline)]
-        last = len(self.chasers) - 1
-        named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(self.docking.ports)]
-        judged = [
-            (f"success.{what}", getattr(self.success, what)) for what in ("docked", "latched", "reached")
-        ]
-        for where, chasers in (*named, *judged):
-            if max(chasers, default=0) > last:
-                raise ValueError(f"{where}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
-        for i in self.success.reached:
-            if self.goal_of(i) is None:
-                raise ValueError(f"success.reached: no goto of the timeline names chaser {i}")
-        if self.chaser.actuation == "thrusters":
-            check_pulses(self.chaser.thrusters, self.chaser.modulation, self.time.physics_hz)
-        _check_failures(self)
-        _check_ports(self)
-        check_faults(self.fault, self)
+    def _check_consistent(self) -> Scenario:
+        if self.extends is not None:
+            raise ValueError("extends: is resolved in scenario files only")
+        check_consistent(self)
         return self
 
     def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
-        """When (s) and whereto (TRF, m) the last ``goto`` of the time line sends a chaser, if one does."""
-        sent = [(e.at_s, e.offset_m) for e in self.timeline if chaser in e.chasers and e.offset_m is not None]
-        return max(sent, key=lambda entry: entry[0], default=None)
+        """Return time (s) and destination (TRF, m) of a chaser's last ``goto`` in the timeline, or None."""
+        goals = [
+            (e.at_s, e.offset_m) for e in self.timeline if chaser in e.chasers and e.offset_m is not None
+        ]
+        return max(goals, key=lambda goal: goal[0], default=None)
 
     @property
     def timing(self) -> Timing:
@@ -289,11 +367,11 @@ class Scenario(Section):
         )
 
     def camera_model(self) -> Camera:
-        """The chasers' camera, as perception and fusion know it."""
+        """Return the camera as calibrated, which perception and estimation use."""
         return self.camera.model()
 
     def target_model(self) -> TargetModel:
-        """Geometry and markers of the target."""
+        """Return geometry and markers of the target."""
         return self.target.shape()
 
     @property
@@ -301,111 +379,9 @@ class Scenario(Section):
         return self.timing.ticks_in(self.duration_s)
 
     def start_pose(self, chaser: int) -> tuple[rotations.Array, rotations.Array]:
-        """Position (3,) WRF and attitude (4,) CRF to WRF of a chaser at time zero."""
+        """Return position (3,) in WRF and attitude (4,), CRF to WRF, of a chaser at time zero."""
         c = self.chasers[chaser]
         offset = [a + b for a, b in zip(c.position_m, c.start_offset_m, strict=True)]
         position = self.target.position_m + rotations.rotate(self.target.q_wxyz, offset)
         attitude = rotations.multiply(self.target.q_wxyz, c.q_wxyz)
         return position, rotations.multiply(attitude, rotations.exp(c.start_rotation_rad))
-
-
-def _check_failures(scenario: Scenario) -> None:
-    """Thrusters fail in this mission only where there are some."""
-    chasers, thrusters = len(scenario.chasers), len(scenario.chaser.thrusters)
-    if scenario.thruster_failure and scenario.chaser.actuation != "thrusters":
-        raise ValueError('thruster_failure: thrusters fail only with chaser.actuation = "thrusters"')
-    for k, failure in enumerate(scenario.thruster_failure):
-        if failure.chaser >= chasers:
-            raise ValueError(
-                f"thruster_failure.{k}.chaser: there is no chaser {failure.chaser}; this mission has 0 to {chasers - 1}"
-            )
-        if failure.thruster >= thrusters:
-            raise ValueError(
-                f"thruster_failure.{k}.thruster: there is no thruster {failure.thruster}; the body has 0 to {thrusters - 1}"
-            )
-        if any(
-            (f.chaser, f.thruster) == (failure.chaser, failure.thruster)
-            for f in scenario.thruster_failure[:k]
-        ):
-            raise ValueError(
-                f"thruster_failure.{k}: thruster {failure.thruster} of chaser {failure.chaser} fails twice"
-            )
-
-
-def _check_ports(scenario: Scenario) -> None:
-    docking = scenario.docking
-    for i in scenario.success.latched:
-        if docking.port_of(i) is None:
-            raise ValueError(
-                f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]"
-            )
-    if docking.kind != "capture":
-        return
-    if scenario.target.motion != "torque_free":
-        raise ValueError(
-            f"target.motion: docking by capture needs torque_free, a target that feels it, not {scenario.target.motion}"
-        )
-    if scenario.chaser.probe_reach_m <= scenario.chaser.size_m[0] / 2:
-        raise ValueError("chaser.probe_reach_m: the probe must reach beyond the body's front")
-    for k, port in enumerate(docking.ports):
-        entry = centre_offset(port, scenario.chaser.probe_reach_m, docking.entry_m)
-        nearest_m = scenario.limits.min_distance_target_m
-        if math.hypot(*entry) <= nearest_m:
-            raise ValueError(
-                f"docking.ports.{k}: its corridor begins {math.hypot(*entry):.3g} m from the target's centre, inside "
-                f"limits.min_distance_target_m ({nearest_m:g} m); make docking.entry_m longer"
-            )
-        off_deg = axis_error_deg(port, np.asarray(scenario.chasers[port.chaser].q_wxyz))
-        if off_deg > 0.1:
-            raise ValueError(
-                f"docking.ports.{k}.axis: chaser {port.chaser} looks along its +X {off_deg:.3g} degrees off the "
-                "axis into the port; turn chasers.q_wxyz or the axis"
-            )
-
-
-def _checked(validate: Callable[[Any], Scenario], values: Any, source: str) -> Scenario:
-    try:
-        return validate(values)
-    except ValidationError as error:
-        raise ScenarioError("\n".join(f"{source}: {line}" for line in explain(error))) from None
-
-
-def parse_scenario(values: dict[str, Any], source: str) -> Scenario:
-    """Scenario from nested tables; raises ScenarioError with one line a fault, each with its path."""
-    if old := old_keys(values):
-        raise ScenarioError("\n".join(f"{source}: {line}" for line in old))
-    return _checked(Scenario.model_validate, values, source)
-
-
-def scenario_from_json(text: str, source: str) -> Scenario:
-    """Scenario as the world sends it; raises ScenarioError."""
-    return _checked(Scenario.model_validate_json, text, source)
-
-
-def _require_parts(scenario: Scenario, source: str) -> None:
-    parts: tuple[tuple[plugins.Kind, str, str, tuple[str, ...]], ...] = (
-        ("perception", "perception.name", scenario.perception.name, PERCEPTIONS),
-        ("estimator", "estimator.name", scenario.estimator.name, ESTIMATORS),
-        ("solver", "controller.solver", scenario.controller.solver, SOLVERS),
-    )
-    for kind, path, name, own in parts:
-        try:
-            plugins.require(kind, name, own)
-        except plugins.PluginError as error:
-            raise ScenarioError(f"{source}: {path}: {error}") from None
-
-
-def load_scenario(path: Path, overrides: tuple[str, ...] = ()) -> Scenario:
-    """Scenario file with ``key.path=value`` overrides (values in TOML's notation); raises ScenarioError.
-
-    Files it names lie relative to it; those that an override names, to the working directory. The parts that it names
-    have to be installed here; a scenario from the world or a log may name what is not.
-    """
-    values = read_toml(path)
-    resolve_files(values, path.parent)
-    for text in overrides:
-        override(values, text, lambda: parse_scenario(values, str(path)).model_dump(mode="json"))
-    resolve_files(values, Path())
-    scenario = parse_scenario(values, str(path))
-    _require_parts(scenario, str(path))
-    return scenario

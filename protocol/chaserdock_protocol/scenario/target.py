@@ -1,4 +1,4 @@
-"""A target of one's own: cuboids, a mesh, and the markers on them. In a scenario or in a file (docs/cameras.md)."""
+"""Custom targets: cuboids, an optional mesh, and markers, in a scenario or in a target file (docs/cameras.md)."""
 
 from __future__ import annotations
 
@@ -11,7 +11,18 @@ from chaserdock_models import rotations
 from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from pydantic import AfterValidator, Field, model_validator
 
-from .fields import NotNegative, Number, Positive, PositiveVector, Section, UnitQuaternion, Vector
+from .fields import (
+    Fraction,
+    Index,
+    NotNegative,
+    Number,
+    Oriented,
+    Positive,
+    PositiveVector,
+    Section,
+    UnitQuaternion,
+    Vector,
+)
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _FAMILIES = {
@@ -21,12 +32,12 @@ _FAMILIES = {
     "DICT_APRILTAG_36h10": 2320,
     "DICT_APRILTAG_36h11": 587,
 }
-# A marker lies in a face when it is no further from it than this.
+# Largest distance of a marker from the face that it lies on.
 _FLAT_M = 1e-6
 
 
 def dictionary_size(name: str) -> int:
-    """Number of markers in OpenCV's ArUco dictionary of that name; raises ValueError for an unknown one."""
+    """Return the number of markers in an ArUco dictionary of OpenCV. Raises ValueError for an unknown name."""
     plain = re.fullmatch(r"DICT_[4567]X[4567]_(50|100|250|1000)", name)
     if plain is not None and name[5] == name[7]:
         return int(plain[1])
@@ -37,34 +48,43 @@ def dictionary_size(name: str) -> int:
     )
 
 
-def _known(name: str) -> str:
+def _check_dictionary(name: str) -> str:
     dictionary_size(name)
     return name
 
 
-class Cuboid(Section):
-    """A cuboid of the target: edges, centre and attitude in TRF; ``shade``: reflectance, 0 black to 1 white."""
+class Cuboid(Oriented):
+    """A cuboid of the target."""
 
-    size_m: PositiveVector
-    position_m: Vector = (0.0, 0.0, 0.0)
-    q_wxyz: UnitQuaternion = (1.0, 0.0, 0.0, 0.0)
-    shade: Annotated[float, Field(ge=0, le=1)] = 0.6
+    size_m: PositiveVector = Field(description="Edges, m.")
+    position_m: Vector = Field(default=(0.0, 0.0, 0.0), description="Centre (TRF), m.")
+    q_wxyz: UnitQuaternion = Field(
+        default=(1.0, 0.0, 0.0, 0.0), description="Attitude, cuboid to TRF: unit quaternion, scalar first."
+    )
+    shade: Fraction = Field(default=0.6, description="Reflectance: 0 is black, 1 is white.")
 
     def box(self) -> Box:
         return Box(self.size_m, self.position_m, self.q_wxyz, self.shade)
 
 
-class MarkerSection(Section):
-    """A marker: either on a ``face`` of a ``cuboid`` (by number), ``at_m`` right of and above its middle, or with
-    its pose in TRF: ``position_m`` and ``q_wxyz`` (x to its right, y up, z out of it)."""
+class MarkerSection(Oriented):
+    """A fiducial marker: on a `face` of a `cuboid`, or at a pose in TRF. Its x points right, y up, z out of it."""
 
-    id: Annotated[int, Field(ge=0)]
-    side_m: Positive
-    face: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = None
-    cuboid: Annotated[int, Field(ge=0)] = 0
-    at_m: tuple[Number, Number] = (0.0, 0.0)
-    position_m: Vector | None = None
-    q_wxyz: UnitQuaternion | None = None
+    id: Index = Field(description="Number of the marker in its dictionary.")
+    side_m: Positive = Field(description="Edge of the black square, m.")
+    face: Literal["+x", "-x", "+y", "-y", "+z", "-z"] | None = Field(
+        default=None, description="Face of the cuboid that the marker lies on."
+    )
+    cuboid: Index = Field(default=0, description="Number of the cuboid that has the face, from 0.")
+    at_m: tuple[Number, Number] = Field(
+        default=(0.0, 0.0), description="Position on the face: right of its middle and above it, m."
+    )
+    position_m: Vector | None = Field(
+        default=None, description="Centre (TRF), m, in place of `face`; with an attitude."
+    )
+    q_wxyz: UnitQuaternion | None = Field(
+        default=None, description="Attitude, marker to TRF: unit quaternion, scalar first. With `position_m`."
+    )
 
     @model_validator(mode="after")
     def _one_way(self) -> MarkerSection:
@@ -86,41 +106,48 @@ class MarkerSection(Section):
 
 
 class Geometry(Section):
-    """What the target looks like: ``cuboids`` (also what is collided with), ``markers`` of one ``dictionary`` with a
-    white border ``white_margin_m`` wide, and optionally a ``mesh`` file, drawn in the place of the cuboids by the
-    renderer ``pybullet`` alone."""
+    """Shape and markers of a custom target; also the content of a target file."""
 
-    dictionary: Annotated[str, AfterValidator(_known)]
-    white_margin_m: NotNegative = 0.005
-    cuboids: Annotated[tuple[Cuboid, ...], Field(min_length=1, max_length=64)]
-    markers: Annotated[tuple[MarkerSection, ...], Field(min_length=1, max_length=1000)]
-    mesh: str = ""
-    mesh_scale: Positive = 1.0
+    dictionary: Annotated[str, AfterValidator(_check_dictionary)] = Field(
+        description="OpenCV's name of the ArUco dictionary, such as `DICT_4X4_50`."
+    )
+    white_margin_m: NotNegative = Field(
+        default=0.005, description="Width of the white border around each marker, m."
+    )
+    cuboids: tuple[Cuboid, ...] = Field(
+        min_length=1, max_length=64, description="Body of the target; also used for collisions."
+    )
+    markers: tuple[MarkerSection, ...] = Field(
+        min_length=1, max_length=1000, description="Markers, which may not overlap."
+    )
+    mesh: str = Field(
+        default="",
+        description="Path of a mesh file, relative to the file that names it. The renderer `pybullet` draws it in place of "
+        "the cuboids.",
+    )
+    mesh_scale: Positive = Field(default=1.0, description="Factor from the mesh's unit of length to m.")
 
     @model_validator(mode="after")
-    def _possible(self) -> Geometry:
-        size = dictionary_size(self.dictionary)
-        seen: dict[int, int] = {}
+    def _check_markers(self) -> Geometry:
+        size, last = dictionary_size(self.dictionary), len(self.cuboids) - 1
+        first_use: dict[int, int] = {}
         for k, m in enumerate(self.markers):
             if m.id >= size:
                 raise ValueError(f"markers.{k}.id: {self.dictionary} has markers 0 to {size - 1}, not {m.id}")
-            if m.id in seen:
+            if m.id in first_use:
+                raise ValueError(f"markers.{k}.id: {m.id} is already used by markers.{first_use[m.id]}")
+            first_use[m.id] = k
+            if m.cuboid > last:
                 raise ValueError(
-                    f"markers.{k}.id: {m.id} is also that of markers.{seen[m.id]}; each must be one of its own"
+                    f"markers.{k}.cuboid: there is no cuboid {m.cuboid}; this target has 0 to {last}"
                 )
-            seen[m.id] = k
-            if m.cuboid >= len(self.cuboids):
-                raise ValueError(
-                    f"markers.{k}.cuboid: there is no cuboid {m.cuboid}; this target has 0 to {len(self.cuboids) - 1}"
-                )
-        if not self.mesh:
-            for k, m in enumerate(self.markers):
+            if not self.mesh:
                 _check_on_a_face(k, m.marker(self.cuboids), self.cuboids)
         _check_apart(tuple(m.marker(self.cuboids) for m in self.markers))
         return self
 
     def model(self, name: str) -> TargetModel:
-        """The target; ``size_m`` is that of the smallest cuboid about the origin of TRF that holds it."""
+        """Return the target model; its ``size_m`` is that of the smallest cuboid centred in TRF that contains it."""
         boxes = tuple(c.box() for c in self.cuboids)
         markers = tuple(m.marker(self.cuboids) for m in self.markers)
         reach = np.max(
@@ -133,12 +160,12 @@ class Geometry(Section):
 
 
 def _reach(box: Box) -> rotations.Array:
-    """Largest absolute coordinates (3,) in TRF of a box."""
+    """Return the largest absolute coordinates (3,) of a box in TRF."""
     return np.abs(box.position_m) + np.abs(rotations.to_matrix(box.q_wxyz)) @ np.array(box.size_m) / 2.0
 
 
 def _check_on_a_face(number: int, marker: Marker, cuboids: tuple[Cuboid, ...]) -> None:
-    """Raises ValueError unless the marker lies within a face, its edges along the face's."""
+    """Raise ValueError unless the marker lies within a face, its edges parallel to those of the face."""
     corners = marker.corners_trf_m()
     for cuboid in cuboids:
         local = rotations.rotate_inverse(cuboid.q_wxyz, corners - np.array(cuboid.position_m))
@@ -153,13 +180,11 @@ def _check_on_a_face(number: int, marker: Marker, cuboids: tuple[Cuboid, ...]) -
             if np.any(np.abs(local) > half + _FLAT_M):
                 raise ValueError(f"markers.{number}: reaches beyond its face")
             return
-    raise ValueError(
-        f"markers.{number}: must lie on a face of a cuboid (without a mesh, there alone it is seen)"
-    )
+    raise ValueError(f"markers.{number}: must lie on a face of a cuboid, unless the target has a mesh")
 
 
 def _check_apart(markers: tuple[Marker, ...]) -> None:
-    """Raises ValueError when two markers that face the same way in one plane overlap."""
+    """Raise ValueError when two markers in one plane that face the same way overlap."""
     for i, a in enumerate(markers):
         for k in range(i):
             b = markers[k]

@@ -1,69 +1,85 @@
-"""The scenario's sections of thrusters: where they sit, what they give, how they are pulsed, how they fail."""
+"""Scenario tables about thrusters: layout, pulse modulation, and failures."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from chaserdock_models.rotations import Array
 from chaserdock_models.thruster_model import FailureKind
 from chaserdock_models.wrench_set import wrench_matrix, wrench_set
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import Field, model_validator
 
-from .fields import NotNegative, Positive, Section, Vector
+from .fields import Index, NotNegative, Positive, Section, UnitVector, Vector
 
 MAX_THRUSTERS = 24
-"""Facets of the set of wrenches grow with the fifth power of the number of thrusters."""
-
-
-def _unit(v: tuple[float, float, float]) -> tuple[float, float, float]:
-    length = math.hypot(*v)
-    if abs(length - 1.0) > 1e-3:
-        raise ValueError(f"must be of unit length; this one has length {length:.6g}")
-    return (v[0] / length, v[1] / length, v[2] / length)
+"""The number of facets of the attainable wrench set grows with the fifth power of the number of thrusters."""
 
 
 class Thruster(Section):
-    """A thruster that is open or shut: where it sits (CRF), the direction of its force on the body (CRF, unit).
+    """One on-off thruster."""
 
-    Its thrust rises linearly within ``rise_s`` of the valve's opening and falls linearly within ``fall_s`` of its
-    closing. A pulse shorter than ``min_on_s`` does not open the valve.
-    """
-
-    position_m: Vector
-    direction: Annotated[Vector, AfterValidator(_unit)]
-    thrust_N: Positive
-    min_on_s: Positive = 0.010
-    rise_s: NotNegative = 0.002
-    fall_s: NotNegative = 0.002
-    isp_s: Positive = 70.0
+    position_m: Vector = Field(description="Position of the nozzle (CRF), m.")
+    direction: UnitVector = Field(description="Direction of its force on the body (CRF), unit vector.")
+    thrust_N: Positive = Field(description="Full thrust, N.")
+    min_on_s: Positive = Field(
+        default=0.010, description="Minimum on-time, s: a shorter pulse does not open the valve."
+    )
+    rise_s: NotNegative = Field(
+        default=0.002,
+        description="Time of the linear rise of the thrust after the valve opens, s. At most `min_on_s`.",
+    )
+    fall_s: NotNegative = Field(
+        default=0.002, description="Time of the linear fall of the thrust after the valve closes, s."
+    )
+    isp_s: Positive = Field(
+        default=70.0, description="Specific impulse, s. It gives the propellant consumption."
+    )
 
     @model_validator(mode="after")
-    def _rises_in_time(self) -> Thruster:
+    def _check_rise(self) -> Thruster:
         if self.min_on_s < self.rise_s:
             raise ValueError(f"min_on_s ({self.min_on_s}) must be at least rise_s ({self.rise_s})")
         return self
 
 
 class Modulation(Section):
-    """How thrusts become pulses: once a carrier period and thruster (docs/thrusters.md).
+    """Conversion of commanded thrust to pulses ([thrusters.md](thrusters.md))."""
 
-    ``resolution_s``: pulse widths are whole multiples of it. ``carry_over``: impulse that was asked for and not
-    given, as under the minimum on-time, is asked for again in the next period. ``schmitt``: open for whole periods,
-    from ``schmitt_on`` of the thruster's thrust on until less than ``schmitt_off`` of it is asked for.
-    """
-
-    modulator: Literal["pwm", "schmitt"] = "pwm"
-    carrier_hz: Annotated[int, Field(ge=1, le=240)] = 10
-    resolution_s: Positive = 0.001
-    carry_over: bool = True
-    schmitt_on: Annotated[float, Field(gt=0, le=1)] = 0.75
-    schmitt_off: Annotated[float, Field(ge=0, lt=1)] = 0.25
+    modulator: Literal["pwm", "schmitt"] = Field(
+        default="pwm",
+        description="`pwm`: one pulse per carrier period, its width proportional to the thrust. `schmitt`: open for whole "
+        "periods, with hysteresis.",
+    )
+    carrier_hz: int = Field(
+        default=10, ge=1, le=240, description="Carrier frequency, Hz. It must divide `time.physics_hz`."
+    )
+    resolution_s: Positive = Field(
+        default=0.001,
+        description="Pulse widths are multiples of this, s: from 1e-6 to half a carrier period.",
+    )
+    carry_over: bool = Field(
+        default=True,
+        description="Add impulse that a period could not give, as below the minimum on-time, to the next one.",
+    )
+    schmitt_on: float = Field(
+        default=0.75,
+        gt=0,
+        le=1,
+        allow_inf_nan=False,
+        description="Share of full thrust at which `schmitt` opens.",
+    )
+    schmitt_off: float = Field(
+        default=0.25,
+        ge=0,
+        lt=1,
+        allow_inf_nan=False,
+        description="Share of full thrust below which `schmitt` closes. Less than `schmitt_on`.",
+    )
 
     @model_validator(mode="after")
-    def _possible(self) -> Modulation:
+    def _check_consistent(self) -> Modulation:
         if self.resolution_s < 1e-6:
             raise ValueError(f"resolution_s ({self.resolution_s}) must be at least a microsecond")
         if self.resolution_s > 0.5 / self.carrier_hz:
@@ -74,34 +90,42 @@ class Modulation(Section):
 
 
 class ThrusterFailure(Section):
-    """From ``at_s`` on a thruster of a chaser does not open, does not close, or gives ``factor`` of its thrust.
+    """A permanent failure of one thruster."""
 
-    ``reported``: the chaser is told at once; otherwise it has to find out.
-    """
-
-    chaser: Annotated[int, Field(ge=0)]
-    thruster: Annotated[int, Field(ge=0)]
-    at_s: NotNegative
-    kind: FailureKind
-    factor: Annotated[float, Field(ge=0, le=1)] | None = None
-    reported: bool = False
+    chaser: Index = Field(description="Number of the chaser, from 0.")
+    thruster: Index = Field(description="Number of the thruster, from 0.")
+    at_s: NotNegative = Field(description="Begin, s of mission time.")
+    kind: FailureKind = Field(
+        description="`stuck_off`: it never opens. `stuck_on`: it never closes. `weak`: it gives `factor` of its thrust."
+    )
+    factor: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        allow_inf_nan=False,
+        description="Remaining share of the thrust, for `weak` only.",
+    )
+    reported: bool = Field(
+        default=False,
+        description="Whether the chaser is informed at once. Otherwise it has to detect the failure.",
+    )
 
     @model_validator(mode="after")
-    def _factor(self) -> ThrusterFailure:
+    def _check_factor(self) -> ThrusterFailure:
         if (self.kind == "weak") != (self.factor is not None):
             raise ValueError("factor goes with the kind weak, and weak needs it")
         return self
 
 
 def thrusts_max(thrusters: Sequence[Thruster]) -> Array:
-    """Full thrust (n,) of all thrusters, N."""
+    """Return the full thrust (n,) of all thrusters, N."""
     return np.array([t.thrust_N for t in thrusters])
 
 
 def check_layout(thrusters: Sequence[Thruster], force_max_N: float, torque_max_N_m: float) -> None:
-    """Raises ValueError unless the thrusters can give every wrench within the limits, all axes at once."""
+    """Raise ValueError unless the thrusters can give every wrench within the limits, on all axes at once."""
     if not thrusters:
-        raise ValueError("actuation thrusters needs thrusters, or a body that has some: slider, tetra12")
+        raise ValueError("actuation thrusters needs thrusters, or a body with thrusters: slider, tetra12")
     box = np.array([force_max_N] * 3 + [torque_max_N_m] * 3)
     scale = wrench_set(wrench_matrix(thrusters)).box_scale(thrusts_max(thrusters), box)
     if scale <= 1e-6:
@@ -114,7 +138,7 @@ def check_layout(thrusters: Sequence[Thruster], force_max_N: float, torque_max_N
 
 
 def check_pulses(thrusters: Sequence[Thruster], modulation: Modulation, physics_hz: int) -> None:
-    """Raises ValueError unless pulses fit into carrier periods, and these into whole physics steps."""
+    """Raise ValueError unless pulses fit into carrier periods, and carrier periods into whole physics steps."""
     carrier = modulation.carrier_hz
     if physics_hz % carrier:
         raise ValueError(
@@ -124,5 +148,5 @@ def check_pulses(thrusters: Sequence[Thruster], modulation: Modulation, physics_
     if longest > 1.0 / carrier:
         raise ValueError(
             f"chaser.modulation.carrier_hz: a period of {1.0 / carrier:g} s is shorter than the shortest pulse "
-            f"with its fall, {longest:g} s"
+            f"including its fall, {longest:g} s"
         )

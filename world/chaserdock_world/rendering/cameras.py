@@ -14,7 +14,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.overrides import ScenarioError
+from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
 from chaserdock_world.physics.simulation import TARGET, BodyState

@@ -1,0 +1,172 @@
+"""The scenario's JSON schema: for editors, for the reference page, and for the texts of validation errors."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator, Sequence
+from functools import cache
+from typing import Any
+
+from pydantic import BaseModel
+
+from .fields import LARGEST
+from .migrations import FORMAT
+
+Node = dict[str, Any]
+
+
+@cache
+def schema_of(model: type[BaseModel]) -> Node:
+    """Return the JSON schema of a model, as pydantic derives it."""
+    return model.model_json_schema()
+
+
+def resolved(node: Node, root: Node) -> Node:
+    """Return the node that a reference, or an optional value, stands for."""
+    while True:
+        if "$ref" in node:
+            node = root["$defs"][node["$ref"].rpartition("/")[2]]
+            continue
+        options = [option for option in node.get("anyOf", ()) if option.get("type") != "null"]
+        if len(options) != 1:
+            return node
+        node = options[0]
+
+
+def item_of(node: Node, index: int = 0) -> Node | None:
+    """Return the schema of an array's element."""
+    fixed = node.get("prefixItems")
+    if fixed:
+        return fixed[index] if index < len(fixed) else None
+    return node.get("items")
+
+
+def node_at(root: Node, path: Sequence[str | int]) -> Node | None:
+    """Return the schema of the value at a path, or None for an unknown key."""
+    node: Node | None = root
+    for part in path:
+        node = resolved(node, root)
+        node = item_of(node, part) if isinstance(part, int) else node.get("properties", {}).get(part)
+        if node is None:
+            return None
+    return resolved(node, root)
+
+
+def description_of(node: Node, root: Node) -> str:
+    """Return the description of a key, or of the table that is its value."""
+    if "description" in node:
+        return node["description"]
+    inner = resolved(node, root)
+    if "description" not in inner and (item := item_of(inner)) is not None:
+        inner = resolved(item, root)
+    return " ".join(inner.get("description", "").split())
+
+
+def number_text(value: float) -> str:
+    """Return a number without a needless exponent or fraction."""
+    return str(int(value)) if float(value).is_integer() and abs(value) < 1e10 else f"{value:g}"
+
+
+def range_text(node: Node, every: bool = False) -> str:
+    """Return the range of a number in words. ``every``: include the bound that all numbers have."""
+    bounds = {k: node[k] for k in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum") if k in node}
+    if not every:
+        bounds = {k: v for k, v in bounds.items() if abs(v) < LARGEST}
+    text = {k: number_text(v) for k, v in bounds.items()}
+    if bounds.keys() == {"minimum", "maximum"}:
+        return f"from {text['minimum']} to {text['maximum']}"
+    words = {
+        "minimum": "at least",
+        "exclusiveMinimum": "greater than",
+        "maximum": "at most",
+        "exclusiveMaximum": "less than",
+    }
+    return " and ".join(f"{words[k]} {v}" for k, v in text.items())
+
+
+def _count_text(node: Node) -> str:
+    low, high = node.get("minItems", 0), node.get("maxItems")
+    if high is None:
+        return f"at least {low} " if low else ""
+    return f"{low} " if low == high else f"{low} to {high} " if low else f"at most {high} "
+
+
+def expected_text(node: Node, root: Node, every: bool = False) -> str:
+    """Return in words what a value must be, such as "a number greater than 0"; empty if the schema does not say."""
+    if "enum" in node:
+        return f"one of {', '.join(map(str, node['enum']))}"
+    if "const" in node:
+        return str(node["const"])
+    kind = node.get("type")
+    if kind in ("number", "integer"):
+        name = "a number" if kind == "number" else "a whole number"
+        return f"{name} {range_text(node, every)}".strip()
+    if kind == "array":
+        item = item_of(node)
+        inner = resolved(item, root).get("type") if item else None
+        names = {"number": "numbers", "integer": "whole numbers", "object": "tables", "string": "texts"}
+        return f"an array of {_count_text(node)}{names.get(str(inner), 'values')}"
+    return {"boolean": "true or false", "string": "text", "object": "a table"}.get(str(kind), "")
+
+
+def key_paths(root: Node) -> Iterator[str]:
+    """Yield the dotted path of every key; ``N`` stands for the number of an array's element."""
+
+    def walk(node: Node, path: str) -> Iterator[str]:
+        node = resolved(node, root)
+        if (item := item_of(node)) is not None:
+            yield from walk(item, f"{path}.N")
+        for key, inner in node.get("properties", {}).items():
+            below = f"{path}.{key}".removeprefix(".")
+            yield below
+            yield from walk(inner, below)
+
+    return walk(root, "")
+
+
+def editor_schema(model: type[BaseModel]) -> Node:
+    """Return the schema of scenario files for editors (draft 7, which taplo and VS Code's Even Better TOML support).
+
+    It describes files as written: with ``extends`` no other key is required, and ``model`` may be a path.
+    """
+    schema = _simplified(copy.deepcopy(schema_of(model)))
+    definitions = schema.pop("$defs")
+    required = schema.pop("required")
+    definitions["Target"]["properties"]["model"].pop("pattern")
+    chaser = definitions["Chaser"]
+    chaser["required"].remove("q_wxyz")
+    chaser["oneOf"] = [{"required": [key]} for key in ("q_wxyz", "attitude_deg", "look_at")]
+    schema["properties"]["format"] = {**schema["properties"]["format"], "enum": [FORMAT]}
+    return {
+        "$schema": "http://json-schema.org/draft-07/schema#",
+        "$id": f"urn:chaserdock:scenario:{FORMAT}",
+        "title": "chaserdock scenario",
+        **schema,
+        "anyOf": [{"required": ["extends"]}, {"required": required}],
+        "definitions": definitions,
+    }
+
+
+def _simplified(node: Any) -> Any:
+    """Remove titles and nulls, and express what draft 7 does not know by what it knows."""
+    if isinstance(node, list):
+        return [_simplified(item) for item in node]
+    if not isinstance(node, dict):
+        return node
+    options = node.pop("anyOf", None)
+    if options is not None:
+        node |= next(option for option in options if option.get("type") != "null")
+    if "prefixItems" in node:
+        node["items"] = node.pop("prefixItems")[0]
+    if isinstance(node.get("title"), str):
+        del node["title"]
+    if "default" in node and node["default"] is None:
+        del node["default"]
+    out = {k: _simplified(v) for k, v in node.items()}
+    if isinstance(out.get("description"), str):
+        out["description"] = " ".join(out["description"].replace("``", "`").split())
+    if isinstance(reference := out.get("$ref"), str):
+        out["$ref"] = reference.replace("#/$defs/", "#/definitions/")
+        if len(out) > 1:  # draft 7 ignores everything beside a reference
+            out = {**{k: v for k, v in out.items() if k != "$ref"}, "allOf": [{"$ref": out["$ref"]}]}
+    return out

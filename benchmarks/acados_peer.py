@@ -21,9 +21,7 @@ from chaserdock_controller.nmpc.problem import dynamics, multiply
 from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
 from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
 from chaserdock_controller.nmpc.warm_start import Frame, Task, status_of
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from chaserdock_models.arrays import Array
 
 KINDS = ("coupled", "decoupled")
 # How far a first guess leaves the straight way to its right, m: in exactly head-on pairs no linearization has a way out.

@@ -12,7 +12,7 @@ from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_controller.core import ControllerCore, TickInputs
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, PoseSolution, Sighting, ThrusterReport
 from chaserdock_protocol.scenario import Scenario

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from chaserdock_controller.guidance.composite_body import target_body
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand, ProbeTouch
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.physics.simulation import TARGET

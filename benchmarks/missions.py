@@ -29,8 +29,8 @@ import numpy as np
 from chaserdock_controller.evaluation.closed_loop import Trace, fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.physics.simulation import TARGET
 from offline import CameraPose, Offline, seeing_eye, statistical_eye

@@ -40,12 +40,10 @@ from chaserdock_controller.nmpc import (
     native,
 )
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.native.build import compile_kernels
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
-from numpy.typing import NDArray
 from results import options_of, write_json
-
-Array = NDArray[np.float64]
 
 TICK_S = 0.1
 D_MIN_M = 0.35

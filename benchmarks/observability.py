@@ -16,8 +16,8 @@ from chaserdock_controller.estimation.motion_models import constant_rates
 from chaserdock_controller.estimation.types import CameraPose
 from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
-from chaserdock_models.rotations import Array
 from results import options_of, write_json
 
 TUMBLE, STILL = np.array([0.015, 0.045, 0.03]), np.zeros(3)

@@ -18,7 +18,7 @@ from chaserdock_agents.chaser.sighting import look, prediction_from
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, OperatorCommand, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario

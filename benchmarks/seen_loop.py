@@ -17,7 +17,7 @@ from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
 from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Image, OperatorCommand, Sighting
 from chaserdock_protocol.messages import TargetEstimate as Estimate
 from chaserdock_protocol.scenario import Scenario

@@ -19,7 +19,7 @@ import numpy as np
 from chaserdock_agents.chaser.thrusters.allocation import allocator_of
 from chaserdock_agents.chaser.thrusters.modulation import Modulator
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_protocol.scenario.thrusters import thrusts_max

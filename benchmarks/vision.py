@@ -16,8 +16,8 @@ import cv2
 import numpy as np
 from chaserdock_agents.chaser.perception import Method, Perception, Sighting
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_models.targets import face_rotation, target_model
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import PortView
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
 

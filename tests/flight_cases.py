@@ -9,7 +9,7 @@ import numpy as np
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.trajectories import Motion
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from hypothesis import settings

@@ -15,9 +15,7 @@ from chaserdock_controller.guidance.reference import (
 )
 from chaserdock_controller.nmpc import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver, kernels, make_solver
 from chaserdock_models import rotations
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from chaserdock_models.arrays import Array
 
 # The paper's chaser and tumble (paper/reference.toml).
 MASS_KG = 30.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, WrenchCommand
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from flight_cases import odometry

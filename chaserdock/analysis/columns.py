@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from typing import IO
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError
 from numpy.typing import NDArray
 

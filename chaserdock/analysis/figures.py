@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure

@@ -10,7 +10,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
 from chaserdock_protocol.messages import (

@@ -8,7 +8,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.recording.log import LogError
 from numpy.typing import NDArray
 

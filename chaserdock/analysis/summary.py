@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 

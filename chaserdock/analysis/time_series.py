@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import Literal, get_args
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import BodyTruth
 from chaserdock_protocol.recording.log import LogSource, Record, read_log

@@ -14,7 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_agents.chaser.perception.detect import dictionary_of
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 LEAST_IMAGES = 6

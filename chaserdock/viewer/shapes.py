@@ -6,8 +6,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import centre_offset
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 

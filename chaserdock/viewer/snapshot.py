@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,

@@ -8,9 +8,9 @@ from typing import Literal, cast
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.braking import brake_wrench
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     CommandReply,

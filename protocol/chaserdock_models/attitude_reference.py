@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import Array
 from .rotations import multiply, normalize
-
-Array = NDArray[np.float64]
 
 
 def facing_attitudes(nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike) -> Array:

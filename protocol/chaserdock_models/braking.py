@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rotations
-from .rotations import Array
+from .arrays import Array
 
 BRAKE_TIME_S = 3.0
 """Time constant with which velocity and rate decay while the limits allow."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rotations
-from .rotations import Array
+from .arrays import Array
 
 Q_CRF_IRF_FORWARD_WXYZ: tuple[float, float, float, float] = (0.5, -0.5, 0.5, -0.5)
 """Rotation IRF -> CRF of a camera that looks along +X with +Z up (z -> x, x -> -y, y -> -z)."""

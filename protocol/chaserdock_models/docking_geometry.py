@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from . import rotations
-from .rotations import Array
+from .arrays import Array
+from .rigid_body import BodyState
 
 
 class Port(Protocol):
@@ -31,16 +32,6 @@ class PoseLimits(Protocol):
     def angle_deg(self) -> float: ...
     @property
     def lateral_speed_m_s(self) -> float: ...
-
-
-@dataclass(frozen=True)
-class BodyState:
-    """State of a rigid body: position (3,) and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) in body axes."""
-
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
 
 
 @dataclass(frozen=True)

@@ -11,9 +11,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from .arrays import Array
+from .scalar_rotations import cross_components, matrix_components, product_components, rotated_components
 
 IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
 _CONJUGATED: Array = np.array([1.0, -1.0, -1.0, -1.0])
@@ -42,8 +43,8 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
     """Hamilton product (..., 4): the rotation ``b`` followed by ``a`` (Sola eq. 12)."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:  # Python floats: several times faster than NumPy on so few numbers
-        return np.array(_product(*a.tolist(), *b.tolist()))
-    return _joined(_product(*(a[..., i] for i in range(4)), *(b[..., i] for i in range(4))))
+        return np.array(product_components(*a.tolist(), *b.tolist()))
+    return _joined(product_components(*(a[..., i] for i in range(4)), *(b[..., i] for i in range(4))))
 
 
 def _joined(parts: list[Array]) -> Array:
@@ -54,43 +55,20 @@ def _joined(parts: list[Array]) -> Array:
     return whole
 
 
-def _product(aw, ax, ay, az, bw, bx, by, bz) -> list:
-    return [
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    ]
-
-
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     """Vector ``v`` (..., 3) in body axes, given in world axes (..., 3)."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     if q.ndim == v.ndim == 1:
-        return np.array(_rotated(*q.tolist(), *v.tolist()))
-    return _joined(_rotated(*(q[..., i] for i in range(4)), *(v[..., i] for i in range(3))))
-
-
-def _rotated(w, x, y, z, vx, vy, vz) -> list:
-    # v + 2 w (u x v) + 2 u x (u x v), with t = 2 (u x v)
-    tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
-    return [
-        vx + w * tx + (y * tz - z * ty),
-        vy + w * ty + (z * tx - x * tz),
-        vz + w * tz + (x * ty - y * tx),
-    ]
+        return np.array(rotated_components(*q.tolist(), *v.tolist()))
+    return _joined(rotated_components(*(q[..., i] for i in range(4)), *(v[..., i] for i in range(3))))
 
 
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
     """Cross product (..., 3); as np.cross, but quick on single vectors."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
-        return np.array(_crossed(*a.tolist(), *b.tolist()))
-    return _joined(_crossed(*(a[..., i] for i in range(3)), *(b[..., i] for i in range(3))))
-
-
-def _crossed(ax, ay, az, bx, by, bz) -> list:
-    return [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
+        return np.array(cross_components(*a.tolist(), *b.tolist()))
+    return _joined(cross_components(*(a[..., i] for i in range(3)), *(b[..., i] for i in range(3))))
 
 
 def rotate_inverse(q: ArrayLike, v: ArrayLike) -> Array:
@@ -150,17 +128,9 @@ def to_matrix(q: ArrayLike) -> Array:
     """Rotation matrix (..., 3, 3), body to world, of unit quaternion ``q`` (..., 4)."""
     q = np.asarray(q, dtype=float)
     if q.ndim == 1:
-        return np.array(_matrix_rows(*q.tolist()))
-    rows = _matrix_rows(*(q[..., i] for i in range(4)))
+        return np.array(matrix_components(*q.tolist()))
+    rows = matrix_components(*(q[..., i] for i in range(4)))
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _matrix_rows(w, x, y, z) -> list[list]:
-    return [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
 
 
 def from_matrix(r: ArrayLike) -> Array:

@@ -11,10 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from . import rotations
-from .rotations import Array
-
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+from .arrays import Array, Quaternion, Vector3
 
 # The six faces of a box in the order of the marker ids: outward normal, and "up" of what is printed on it.
 FACES: tuple[tuple[Vector3, Vector3], ...] = (

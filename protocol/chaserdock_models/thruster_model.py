@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from .rotations import Array
+from .arrays import Array
 
 FailureKind = Literal["stuck_off", "stuck_on", "weak"]
 """How a thruster fails: never opens, never closes, or gives a fraction of its thrust."""

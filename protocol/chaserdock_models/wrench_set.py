@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from .rotations import Array
+from .arrays import Array
 
 
 class Thruster(Protocol):

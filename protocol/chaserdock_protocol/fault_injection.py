@@ -22,6 +22,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.clock import Timing
 
 from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, ON_PUBLISHING, ON_RECEIPT, Fault
@@ -235,7 +236,7 @@ def create_fault_layer(scenario: Scenario, name: str, lockstep: bool) -> FaultLa
     return FaultLayer(scenario.fault, name, scenario.timing, scenario.seed, lockstep)
 
 
-def _rotation(fault: Fault) -> rotations.Array:
+def _rotation(fault: Fault) -> Array:
     return rotations.exp(np.radians(fault.rotation_deg or (0.0, 0.0, 0.0)))
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.thrusters.allocation import allocator_of
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -21,7 +21,7 @@ from chaserdock_agents.chaser.fallback import (
 )
 from chaserdock_agents.chaser.process import Chaser
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate, Tick, WrenchCommand

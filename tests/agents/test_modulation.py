@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.thrusters.modulation import Modulator
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_protocol.messages import ThrusterPulse
 from chaserdock_protocol.scenario.thrusters import thrusts_max

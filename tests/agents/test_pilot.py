@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.command_gate import brake, passed_on, refusal
-from chaserdock_controller.output.latency_compensation import integrate
 from chaserdock_models import rotations
+from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.messages import Odometry, WrenchCommand
 from chaserdock_protocol.scenario.bodies import Body
 from flight_cases import odometry, start
@@ -91,7 +91,7 @@ def test_braking_brings_a_chaser_to_rest_within_its_limits(seed: int) -> None:
         )
         assert max(map(abs, command.force_N)) <= BODY.force_max_N
         assert max(map(abs, command.torque_N_m)) <= BODY.torque_max_N_m
-        x = integrate(x, np.array([*command.force_N, *command.torque_N_m]), BODY, 1 / 15)
+        x = propagate(x, np.array([*command.force_N, *command.torque_N_m]), BODY, 1 / 15)
         speeds.append((np.linalg.norm(x[3:6]), np.linalg.norm(x[10:13])))
     assert speeds[-1][0] < 1e-3
     assert speeds[-1][1] < 1e-4

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.thrusters.fault_detection import Flags, ThrusterFaultDetector, Verdict
 from chaserdock_agents.chaser.thrusters.impulse_residual import Noise, covariance, noise_of, observed_impulse
-from chaserdock_controller.output.latency_compensation import integrate
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import propagate
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
@@ -54,7 +54,7 @@ class Case:
         )
 
     def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> Verdict | None:
-        self.state = integrate(self.state, self.matrix @ given_N_s / TICK_S, self.body, TICK_S)
+        self.state = propagate(self.state, self.matrix @ given_N_s / TICK_S, self.body, TICK_S)
         self.tick += 1
         now = self._odometry()
         residual = observed_impulse(self.last, now, self.body) - self.matrix @ asked_N_s

@@ -11,7 +11,7 @@ from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.allocation import allocator_of
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.self_test import ThrusterSelfTest
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from closed_loop import fly
 from thruster_cases import at_rest, mission, wrench

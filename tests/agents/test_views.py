@@ -10,9 +10,9 @@ from chaserdock_agents.chaser.perception import detect, pnp, views
 from chaserdock_agents.chaser.perception.native import LIBRARY
 from chaserdock_agents.chaser.perception.refine import Pose
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native.build import X86_64
-from chaserdock_models.rotations import Array
 from chaserdock_models.targets import target_model
 
 CAMERA = Camera.from_hfov(640, 480, 1.0)

@@ -21,8 +21,8 @@ from chaserdock_controller.ingest.lost_chasers import (
     with_lost_chasers,
 )
 from chaserdock_controller.nmpc import NmpcInput
-from chaserdock_controller.output.latency_compensation import integrate
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
@@ -156,7 +156,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
         assert [r.accepted for r in out.replies] == [True] * len(commands)
         told += [e.what for e in out.events]
         wrench = np.array([*out.wrenches[0].force_N, *out.wrenches[0].torque_N_m])
-        x = integrate(x, wrench, scenario.chaser, 1.0 / rate_hz)
+        x = propagate(x, wrench, scenario.chaser, 1.0 / rate_hz)
         near_m = min(near_m, float(np.linalg.norm(x[:3] - lost)))
     return near_m, told
 

@@ -11,7 +11,7 @@ from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
 from chaserdock_controller.evaluation.closed_loop import fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.guidance.phases import Phase
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import DockingStatus
 from chaserdock_protocol.scenario import Scenario, load_scenario, parse_scenario
 from docking_cases import scenario as capture_scenario

@@ -18,7 +18,7 @@ from chaserdock_controller.guidance.phases import (
     permitted_commands,
 )
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.messages import Phase as PhaseName
 from flight_cases import at, drain, odometry, points, quick, scenario

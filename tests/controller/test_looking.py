@@ -19,9 +19,9 @@ from chaserdock_controller.guidance.pointing import (
     search_angles,
     search_wrench,
 )
-from chaserdock_controller.output.latency_compensation import integrate
 from chaserdock_models import rotations
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
+from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from flight_cases import odometry, scenario
@@ -84,7 +84,7 @@ def test_a_chaser_follows_the_search_within_its_torque() -> None:
         assert np.abs(u[3:]).max() <= body.torque_max_N_m
         yaw, pitch = search_angles(t, WIDTH, HEIGHT)
         worst = max(worst, float(rotations.angle_between(x[6:10], rotations.exp([0.0, pitch, yaw]))))
-        x = integrate(x, u, body, 1 / 15)
+        x = propagate(x, u, body, 1 / 15)
     assert worst < math.radians(12.0), math.degrees(worst)
     assert np.linalg.norm(x[3:6]) < 1e-3  # it has come to rest meanwhile
 

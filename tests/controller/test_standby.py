@@ -15,7 +15,7 @@ from chaserdock_controller.process import Controller
 from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
 from chaserdock_controller.redundancy.serialization import decode, encode
 from chaserdock_controller.redundancy.standby import HotStandby
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
 from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick

@@ -7,11 +7,11 @@ import pytest
 from chaserdock_controller.estimation import motion_models as motion
 from chaserdock_controller.estimation.hypothesis import Branch, predict
 from chaserdock_controller.estimation.parameters import MekfParameters
-from chaserdock_controller.estimation.rigid_target import TargetBody, joined, tumble
-from chaserdock_controller.estimation.so3 import qexp, qinv_mul, qlog, qmul
+from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies, predict_path
 from chaserdock_controller.guidance.composite_body import target_body
 from chaserdock_controller.guidance.reference import feed_forward
 from chaserdock_models import rotations
+from chaserdock_models import scalar_rotations as so3
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
 from docking_cases import CHASER_INERTIA, CHASER_KG, scenario, world
 
@@ -22,7 +22,7 @@ def composite(physics: Physics) -> TargetBody:
     a, b = physics.state(TARGET), physics.state("chaser/0")
     centre = rotations.rotate_inverse(a.q_wxyz, b.position_m - a.position_m)
     q = rotations.multiply(rotations.conjugate(a.q_wxyz), b.q_wxyz)
-    return joined(target_body(scenario()), [(CHASER_KG, np.array(CHASER_INERTIA), centre, q)])
+    return attach_bodies(target_body(scenario()), [(CHASER_KG, np.array(CHASER_INERTIA), centre, q)])
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def branch(s: BodyState) -> Branch:
 def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
     """3 s ahead, at three times the paper's rates: 0.2 mm and 0.02 degrees; uniform motion is off by more than 1 cm."""
     begin, body = captured.state(TARGET), composite(captured)
-    path = tumble(body, begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s, 0.05, 60)
+    path = predict_path(body, begin.position_m, begin.velocity_m_s, begin.q_wxyz, begin.omega_rad_s, 0.05, 60)
     estimated = predict(branch(begin), 3_000_000_000, parameters(body))
     captured.advance(3 * HZ, {})
     end = captured.state(TARGET)
@@ -82,7 +82,7 @@ def test_the_path_knows_its_own_accelerations() -> None:
         50.0, np.array([[1.0, 0.1, 0], [0.1, 2.0, 0], [0, 0, 2.5]]), np.array([-0.2, 0.05, 0.1])
     )
     h = 1e-3
-    path = tumble(body, (0, 0, 0), (0.01, 0, 0), (1, 0, 0, 0), (0.05, 0.1, -0.1), h, 40)
+    path = predict_path(body, (0, 0, 0), (0.01, 0, 0), (1, 0, 0, 0), (0.05, 0.1, -0.1), h, 40)
     second = (path.positions_m[2:] - 2 * path.positions_m[1:-1] + path.positions_m[:-2]) / h**2
     np.testing.assert_allclose(
         rotations.rotate_inverse(path.q_wxyz[1:-1], second), path.acceleration_m_s2[1:-1], atol=1e-7
@@ -95,7 +95,7 @@ def test_feed_forward_holds_a_place_on_a_body_with_its_centre_elsewhere() -> Non
     """The force is that of the second derivative of the place's own path."""
     body = TargetBody(50.0, np.diag([1.0, 2.0, 2.5]), np.array([-0.2, 0.05, 0.1]))
     h, offset = 1e-3, np.array([0.0, 1.0, 0.2])
-    path = tumble(body, (0, 0, 0), (0.01, 0, 0), (1, 0, 0, 0), (0.05, 0.1, -0.1), h, 2)
+    path = predict_path(body, (0, 0, 0), (0.01, 0, 0), (1, 0, 0, 0), (0.05, 0.1, -0.1), h, 2)
     places = path.positions_m + rotations.rotate(path.q_wxyz, np.tile(offset, (3, 1)))
     wanted = 17.8 * rotations.rotate_inverse(path.q_wxyz[1], (places[2] - 2 * places[1] + places[0]) / h**2)
     inertia = np.diag([0.3, 0.4, 0.5])
@@ -116,7 +116,7 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
         BodyState(
             np.zeros(3),
             np.array([0.01, 0.02, 0.0]),
-            qexp(np.array([0.3, -0.2, 0.5])),
+            so3.exp(np.array([0.3, -0.2, 0.5])),
             np.array([0.1, 0.2, -0.1]),
         )
     )
@@ -128,7 +128,7 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
                 0,
                 start.position_m + d[:3],
                 start.velocity_m_s + d[3:6],
-                qmul(start.q_wxyz, qexp(d[6:9])),
+                so3.multiply(start.q_wxyz, so3.exp(d[6:9])),
                 start.omega_rad_s + d[9:12],
                 (),
                 start.bias,
@@ -141,7 +141,7 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
         )
 
     def apart(a: Branch, b: Branch) -> np.ndarray:
-        turned = qlog(qinv_mul(b.q_wxyz, a.q_wxyz))
+        turned = so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))
         return np.concatenate(
             [
                 a.position_m - b.position_m,

@@ -5,12 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
 
 quick = settings(derandomize=True, deadline=None, max_examples=60)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import G0_M_S2, Valves, joined, without
 from chaserdock_protocol.scenario.thrusters import Thruster
 from hypothesis import given, settings

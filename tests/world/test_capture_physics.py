@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import TARGET, Physics
 from docking_cases import CHASER_INERTIA, CHASER_KG, TARGET_INERTIA, TARGET_KG, scenario, world

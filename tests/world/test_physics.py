@@ -10,7 +10,7 @@ import pytest
 from chaserdock_controller.nmpc import NmpcParameters
 from chaserdock_controller.nmpc.problem import dynamics
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics, prescribed_state
 from world_cases import HZ, STEP_S, scenario
 

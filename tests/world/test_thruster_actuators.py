@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Literal
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, Tick, WrenchCommand
 from chaserdock_protocol.scenario.bodies import Body

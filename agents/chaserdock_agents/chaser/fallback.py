@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.docking_geometry import centre_offset
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.bodies import Body

@@ -17,8 +17,8 @@ from dataclasses import dataclass, fields
 from itertools import groupby
 
 import numpy as np
+from chaserdock_models import scalar_rotations as so3
 
-from .so3 import qinv_mul, qlog
 from .types import (
     Array,
     EstimatorEvent,
@@ -233,10 +233,10 @@ class PaperEstimator:
         )
         if self._mean is not None:
             dt = (time_ns - self._mean[0]) * 1e-9
-            omega = qlog(qinv_mul(self._mean[2], mean[2])) / dt
+            omega = so3.log(so3.inverse_multiply(self._mean[2], mean[2])) / dt
             self._rates.append(((mean[1] - self._mean[1]) / dt, omega))
         self._mean = mean
 
 
 def _angle(a: Array, b: Array) -> float:
-    return float(np.linalg.norm(qlog(qinv_mul(a, b))))
+    return float(np.linalg.norm(so3.log(so3.inverse_multiply(a, b))))

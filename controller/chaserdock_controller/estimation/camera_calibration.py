@@ -13,9 +13,9 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from chaserdock_models import scalar_rotations as so3
 
 from .parameters import MekfParameters
-from .so3 import qexp, qinv_mul, qmatrix, qmul, right_jacobian, skew
 from .types import Array, CameraPose
 
 ERRORS = 7
@@ -36,19 +36,19 @@ class Seen(NamedTuple):
 
 def seen_by(eye: CameraPose, position_m: Array, q_wxyz: Array, errors: Array) -> Seen:
     """What a camera with ``errors`` (7,) measures of a target at ``position_m`` (3,), ``q_wxyz`` (4,), WRF."""
-    axes = qmatrix(eye.q_wxyz)
+    axes = so3.to_matrix(eye.q_wxyz)
     turn, longer = errors[:3], 1.0 + float(errors[6])
-    back = qmatrix(qexp(-turn))
+    back = so3.to_matrix(so3.exp(-turn))
     told = axes * [1.0, 1.0, 1.0 / longer]  # E S^-1
     line = axes.T @ (position_m - eye.position_m) - errors[3:6]
     turned = back @ line
-    jr = right_jacobian(-turn)
+    jr = so3.right_jacobian(-turn)
     jacobian = np.zeros((6, ERRORS))
-    jacobian[:3, :3] = told @ back @ skew(line) @ jr
+    jacobian[:3, :3] = told @ back @ so3.skew(line) @ jr
     jacobian[:3, 3:6] = -told @ back
     jacobian[:3, 6] = axes[:, 2] * (-float(turned[2]) / longer**2)
-    jacobian[3:, :3] = -qmatrix(q_wxyz).T @ axes @ jr
-    q = qmul(qmul(eye.q_wxyz, qexp(-turn)), qinv_mul(eye.q_wxyz, q_wxyz))
+    jacobian[3:, :3] = -so3.to_matrix(q_wxyz).T @ axes @ jr
+    q = so3.multiply(so3.multiply(eye.q_wxyz, so3.exp(-turn)), so3.inverse_multiply(eye.q_wxyz, q_wxyz))
     return Seen(eye.position_m + told @ turned, q, told @ back @ axes.T, jacobian)
 
 

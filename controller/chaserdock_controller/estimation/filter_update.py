@@ -10,10 +10,10 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from chaserdock_models import scalar_rotations as so3
 
 from .hypothesis import Branch, absorb, agree, pose_sigmas, predict, start
 from .parameters import MekfParameters
-from .so3 import qexp, qinv_mul, qlog, qmul
 from .types import Array, EstimatorEvent, Measurement, PoseHypothesis, Shock
 
 
@@ -131,7 +131,7 @@ def mixture_covariance(branches: tuple[Branch, ...]) -> Array:
             [
                 b.position_m - first.position_m,
                 b.velocity_m_s - first.velocity_m_s,
-                qlog(qinv_mul(first.q_wxyz, b.q_wxyz)),
+                so3.log(so3.inverse_multiply(first.q_wxyz, b.q_wxyz)),
                 b.omega_rad_s - first.omega_rad_s,
             ]
         )
@@ -189,7 +189,9 @@ def _opinions(now: FilterState) -> list[Measurement]:
     for m in now.recent:
         dt = (now.time_ns - m.time_ns) * 1e-9
         moved = tuple(
-            PoseHypothesis(h.position_m + velocity * dt, qmul(h.q_wxyz, qexp(omega * dt)), h.covariance)
+            PoseHypothesis(
+                h.position_m + velocity * dt, so3.multiply(h.q_wxyz, so3.exp(omega * dt)), h.covariance
+            )
             for h in m.hypotheses
         )
         opinions.append(replace(m, hypotheses=moved))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 from chaserdock_models import rotations as rot
+from chaserdock_models import scalar_rotations as so3
 from numpy.typing import ArrayLike
 
-from .so3 import qmatrix, skew
 from .types import Array, PoseHypothesis
 
 
@@ -51,8 +51,8 @@ def to_world(
     q_i = rot.normalize(_array(q_irf_trf_wxyz, (4,), "q_irf_trf_wxyz"))
     covariance = _array(covariance_irf, (6, 6), "covariance_irf")
 
-    c = qmatrix(q_c)
-    camera = qmatrix(mount_q)
+    c = so3.to_matrix(q_c)
+    camera = so3.to_matrix(mount_q)
     lever = mount_p + camera @ p_i
     q_ct = rot.multiply(mount_q, q_i)
 
@@ -62,7 +62,7 @@ def to_world(
     if odometry_covariance is not None:
         odometry = _array(odometry_covariance, (6, 6), "odometry_covariance")
         j = np.eye(6)
-        j[:3, 3:] = -c @ skew(lever)
-        j[3:, 3:] = qmatrix(q_ct).T
+        j[:3, 3:] = -c @ so3.skew(lever)
+        j[3:, 3:] = so3.to_matrix(q_ct).T
         total = total + j @ odometry @ j.T
     return PoseHypothesis(p_c + c @ lever, rot.normalize(rot.multiply(q_c, q_ct)), 0.5 * (total + total.T))

@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from chaserdock_models import scalar_rotations as so3
 
 from . import motion_models as motion
 from .camera_calibration import ERRORS, NO_ERROR, pose_prior, prior, seen_by
 from .parameters import MekfParameters, chi_square_6
-from .so3 import qexp, qinv_mul, qlog, qmul, qnormalize, right_jacobian
 from .types import Array, CameraPose, Measurement, PoseHypothesis
 
 POSE = np.array([0, 1, 2, 6, 7, 8])
@@ -139,11 +139,11 @@ def innovate(
         jacobian[:3, :3] = expected.by_position
         jacobian[:, column : column + ERRORS] = expected.by_errors
         residual[:3] = h.position_m - expected.position_m
-        residual[3:] = qlog(qinv_mul(expected.q_wxyz, h.q_wxyz))
+        residual[3:] = so3.log(so3.inverse_multiply(expected.q_wxyz, h.q_wxyz))
     else:
         jacobian[:3, :3] = _EYE3
         residual[:3] = h.position_m - branch.position_m
-        residual[3:] = qlog(qinv_mul(branch.q_wxyz, h.q_wxyz))
+        residual[3:] = so3.log(so3.inverse_multiply(branch.q_wxyz, h.q_wxyz))
     noise = measurement_noise(h, p)
     s = jacobian @ branch.covariance @ jacobian.T + noise
     factor = np.linalg.cholesky(s)
@@ -162,14 +162,14 @@ def correct(branch: Branch, i: Innovation) -> Branch:
     d = gain @ i.residual
     dtheta = d[6:9]
     # The new dtheta is counted from the corrected attitude: Sola eq. 287, with the exact Jr.
-    reset = right_jacobian(dtheta)
+    reset = so3.right_jacobian(dtheta)
     covariance[6:9] = reset @ covariance[6:9]
     covariance[:, 6:9] = covariance[:, 6:9] @ reset.T
     return replace(
         branch,
         position_m=branch.position_m + d[:3],
         velocity_m_s=branch.velocity_m_s + d[3:6],
-        q_wxyz=qnormalize(qmul(branch.q_wxyz, qexp(dtheta))),
+        q_wxyz=so3.normalize(so3.multiply(branch.q_wxyz, so3.exp(dtheta))),
         omega_rad_s=branch.omega_rad_s + d[9:12],
         bias=branch.bias + d[12:].reshape(-1, ERRORS),
         covariance=_symmetric(covariance),
@@ -236,7 +236,7 @@ def agree(
     a: PoseHypothesis, eye_a: CameraPose, b: PoseHypothesis, eye_b: CameraPose, p: MekfParameters
 ) -> bool:
     """Whether two measured poses of the same time differ by no more than their errors explain."""
-    d = np.concatenate([a.position_m - b.position_m, qlog(qinv_mul(b.q_wxyz, a.q_wxyz))])
+    d = np.concatenate([a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))])
     s = _spread(a, eye_a, p) + _spread(b, eye_b, p)
     return float(d @ np.linalg.solve(s, d)) <= chi_square_6(p.gate_probability)
 
@@ -261,7 +261,7 @@ def start(
     covariance[np.ix_(r, r)] = rate_covariance
     covariance[_POSE_GRID] = measurement_noise(h, p) * scale
     branch = Branch(
-        time_ns, h.position_m, velocity, qnormalize(h.q_wxyz), omega, (), np.zeros((0, ERRORS)), covariance,
+        time_ns, h.position_m, velocity, so3.normalize(h.q_wxyz), omega, (), np.zeros((0, ERRORS)), covariance,
         0.0, {},
     )  # fmt: skip
     if not p.has_bias:

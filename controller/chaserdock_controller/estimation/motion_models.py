@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.rigid_body import rk4_step
 
-from .so3 import qexp, qmatrix, qmul, qnormalize, right_jacobian, skew
 from .types import Array
 
 MODELS = ("constant_rates", "torque_free")
@@ -21,12 +22,12 @@ def constant_rates(q_wxyz: Array, omega_rad_s: Array, dt_s: float) -> tuple[Arra
     """Attitude (4,), body rate (3,) and the (6, 6) transition of (dtheta, domega) after ``dt_s`` at a
     constant body rate; exact. Source: Sola 2017, section 5.4 (right Jacobian for the rate column)."""
     phi = omega_rad_s * dt_s
-    step = qexp(phi)
+    step = so3.exp(phi)
     transition = np.zeros((6, 6))
-    transition[:3, :3] = qmatrix(step).T
-    transition[:3, 3:] = right_jacobian(phi) * dt_s
+    transition[:3, :3] = so3.to_matrix(step).T
+    transition[:3, 3:] = so3.right_jacobian(phi) * dt_s
     transition[3:, 3:] = _EYE3
-    return qnormalize(qmul(q_wxyz, step)), omega_rad_s, transition
+    return so3.normalize(so3.multiply(q_wxyz, step)), omega_rad_s, transition
 
 
 def torque_free(
@@ -38,28 +39,25 @@ def torque_free(
     equations are integrated together by RK4, in steps of at most 0.5 s and 0.1 rad.
     """
     n = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
-    h = dt_s / n
-    q, w, transition = q_wxyz, omega_rad_s, np.eye(6)
 
-    def slope(q: Array, w: Array, t: Array) -> tuple[Array, Array, Array]:
+    def derivative(y: Array) -> Array:
+        q, w, transition = y[:4], y[4:7], y[7:].reshape(6, 6)
         momentum = inertia @ w
-        cross = skew(w)
+        omega_skew = so3.skew(w)
         jacobian = np.zeros((6, 6))
-        jacobian[:3, :3] = -cross
+        jacobian[:3, :3] = -omega_skew
         jacobian[:3, 3:] = _EYE3
-        jacobian[3:, 3:] = inertia_inverse @ (skew(momentum) - cross @ inertia)
-        rate = np.array([0.0, *w.tolist()])
-        return 0.5 * qmul(q, rate), -(inertia_inverse @ (cross @ momentum)), jacobian @ t
+        jacobian[3:, 3:] = inertia_inverse @ (so3.skew(momentum) - omega_skew @ inertia)
+        q_rate = 0.5 * so3.multiply(q, np.array([0.0, *w.tolist()]))
+        return np.concatenate(
+            [q_rate, -(inertia_inverse @ (omega_skew @ momentum)), (jacobian @ transition).ravel()]
+        )
 
+    y = np.concatenate([q_wxyz, omega_rad_s, np.eye(6).ravel()])
     for _ in range(n):
-        q1, w1, t1 = slope(q, w, transition)
-        q2, w2, t2 = slope(q + 0.5 * h * q1, w + 0.5 * h * w1, transition + 0.5 * h * t1)
-        q3, w3, t3 = slope(q + 0.5 * h * q2, w + 0.5 * h * w2, transition + 0.5 * h * t2)
-        q4, w4, t4 = slope(q + h * q3, w + h * w3, transition + h * t3)
-        q = qnormalize(q + h / 6.0 * (q1 + 2.0 * q2 + 2.0 * q3 + q4))
-        w = w + h / 6.0 * (w1 + 2.0 * w2 + 2.0 * w3 + w4)
-        transition = transition + h / 6.0 * (t1 + 2.0 * t2 + 2.0 * t3 + t4)
-    return q, w, transition
+        y = rk4_step(derivative, y, dt_s / n)
+        y[:4] = so3.normalize(y[:4])
+    return y[:4], y[4:7], y[7:].reshape(6, 6)
 
 
 def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
@@ -67,11 +65,11 @@ def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
 
     The point is at p + R c and moves at v + R (omega x c); dtheta and omega stay.
     """
-    rotation, turning = qmatrix(q_wxyz), np.cross(omega_rad_s, centre_trf_m)
+    rotation, turning = so3.to_matrix(q_wxyz), np.cross(omega_rad_s, centre_trf_m)
     m = np.eye(12)
-    m[0:3, 6:9] = -rotation @ skew(centre_trf_m)
-    m[3:6, 6:9] = -rotation @ skew(turning)
-    m[3:6, 9:12] = -rotation @ skew(centre_trf_m)
+    m[0:3, 6:9] = -rotation @ so3.skew(centre_trf_m)
+    m[3:6, 6:9] = -rotation @ so3.skew(turning)
+    m[3:6, 9:12] = -rotation @ so3.skew(centre_trf_m)
     return m
 
 
@@ -89,14 +87,14 @@ def about_centre(
     """
     position, velocity, q, omega = before
     q_after, omega_after = after
-    arm, arm_after = qmatrix(q) @ centre_trf_m, qmatrix(q_after) @ centre_trf_m
-    turning = qmatrix(q) @ np.cross(omega, centre_trf_m)
+    arm, arm_after = so3.to_matrix(q) @ centre_trf_m, so3.to_matrix(q_after) @ centre_trf_m
+    turning = so3.to_matrix(q) @ np.cross(omega, centre_trf_m)
     centre_velocity = velocity + turning
     there = position + arm + centre_velocity * dt_s
     back = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
     return (
         there - arm_after,
-        centre_velocity - qmatrix(q_after) @ np.cross(omega_after, centre_trf_m),
+        centre_velocity - so3.to_matrix(q_after) @ np.cross(omega_after, centre_trf_m),
         back @ transition @ to_centre(q, omega, centre_trf_m),
     )
 

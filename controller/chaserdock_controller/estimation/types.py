@@ -7,11 +7,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from chaserdock_models.arrays import Array, Matrix3
 from chaserdock_protocol.messages.fields import Level
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
-Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 
 
 @dataclass(frozen=True, eq=False)

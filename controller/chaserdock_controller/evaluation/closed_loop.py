@@ -12,13 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import Scenario
 
 from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
-from chaserdock_controller.output.latency_compensation import integrate
 
 from .perfect_knowledge import PerfectEstimator
 
@@ -101,7 +101,7 @@ def fly_offline(
             until_ns = min(end_ns, waiting[0][0] if waiting else end_ns)
             duration_s = (until_ns - now_ns) / 1e9
             states = np.array(
-                [integrate(x, u, scenario.chaser, duration_s) for x, u in zip(states, acting, strict=True)]
+                [propagate(x, u, scenario.chaser, duration_s) for x, u in zip(states, acting, strict=True)]
             )
             now_ns = until_ns
     errors = np.array([h[2] for h in history])

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import casadi as ca
 import numpy as np
-from chaserdock_models.rotations import Array, rotate
+from chaserdock_models.arrays import Array
+from chaserdock_models.rotations import rotate
 
 # Three-point Gauss: exact for the fourth-degree square of a parabola.
 _GAUSS = ((0.5 - np.sqrt(0.15), 5 / 18), (0.5, 8 / 18), (0.5 + np.sqrt(0.15), 5 / 18))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import StrEnum
 
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 
 from .phases import Phase
 from .trajectories import Motion

@@ -7,13 +7,14 @@ from collections.abc import Mapping
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.docking_geometry import BodyState, view_of
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
+from chaserdock_models.docking_geometry import view_of
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import DockingStatus, Odometry
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 
-from chaserdock_controller.estimation.rigid_target import TargetBody, TargetPath, joined, tumble
+from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, attach_bodies, predict_path
 from chaserdock_controller.estimation.types import Estimator, Shock, TargetState
 from chaserdock_controller.output.latency_compensation import CommandHistory
 
@@ -115,7 +116,7 @@ class Captures:
         for i in sorted(self.latched):
             centre, attitude = pose_in_target(fused, odometry[i])
             held.append((chaser.mass_kg, np.asarray(chaser.inertia), centre, attitude))
-        self.body = joined(self._alone, held)
+        self.body = attach_bodies(self._alone, held)
         rows = self.body.inertia_kg_m2.tolist()
         centre = self.body.centre_trf_m.tolist()
         self._estimator.change_body((tuple(rows[0]), tuple(rows[1]), tuple(rows[2])), tuple(centre))
@@ -125,8 +126,8 @@ class Captures:
         """The target from the estimate ``ahead`` on: at 0, step_s, ... steps * step_s, and in the middles between."""
         state = (ahead.position_m, ahead.velocity_m_s, ahead.q_wxyz, ahead.omega_rad_s)
         if self._free:
-            fine = tumble(self.body, *state, step_s / 2, 2 * steps)
-            return fine.every(0), fine.every(1)
+            fine = predict_path(self.body, *state, step_s / 2, 2 * steps)
+            return fine.every_second(0), fine.every_second(1)
         times_s = np.arange(steps + 1) * step_s
         both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
         positions, attitudes = reference.predict_target(*state, both_s)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import PortView, centre_offset, segments_apart
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.docking import Docking, Port
 

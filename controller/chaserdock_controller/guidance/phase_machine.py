@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Latch, OperatorCommand
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import ArrayLike

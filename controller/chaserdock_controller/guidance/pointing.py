@@ -8,9 +8,9 @@ import math
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
 from numpy.typing import ArrayLike

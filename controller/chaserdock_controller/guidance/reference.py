@@ -6,10 +6,9 @@ The target moves at constant velocity (WRF) and constant body rate. Pure functio
 from __future__ import annotations
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.rotations import conjugate, cross, exp, multiply, normalize, rotate, rotate_inverse
-from numpy.typing import ArrayLike, NDArray
-
-Array = NDArray[np.float64]
+from numpy.typing import ArrayLike
 
 
 def predict_target(

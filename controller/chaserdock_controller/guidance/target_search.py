@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
 

@@ -12,7 +12,7 @@ import math
 from functools import cached_property
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from msgspec import Struct
 from numpy.typing import ArrayLike
 

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.messages.fields import Level

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import msgspec
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Odometry

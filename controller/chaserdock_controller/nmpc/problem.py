@@ -12,26 +12,25 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from chaserdock_models.scalar_rotations import product_components, rotated_components
 
 from .slack import SLACK_L2
 from .types import INTEGRATORS, NmpcParameters
 
 
 def multiply(a: Any, b: Any) -> Any:
-    """Hamilton product of CasADi quaternions (4), scalar first."""
-    aw, av, bw, bv = a[0], a[1:4], b[0], b[1:4]
-    return ca.vertcat(aw * bw - ca.dot(av, bv), aw * bv + bw * av + ca.cross(av, bv))
+    """Return the Hamilton product of CasADi quaternions (4)."""
+    return ca.vertcat(*product_components(*ca.vertsplit(a), *ca.vertsplit(b)))
 
 
 def conjugate(q: Any) -> Any:
-    """Conjugate of a CasADi quaternion (4), scalar first."""
+    """Return the conjugate of a CasADi quaternion (4)."""
     return ca.vertcat(q[0], -q[1:4])
 
 
 def rotate(q: Any, v: Any) -> Any:
-    """Body vector ``v`` (3) in world axes; ``q`` (4) body to world."""
-    t = 2 * ca.cross(q[1:4], v)
-    return v + q[0] * t + ca.cross(q[1:4], t)
+    """Return the body vector ``v`` (3) in world axes; ``q`` (4) body to world."""
+    return ca.vertcat(*rotated_components(*ca.vertsplit(q), *ca.vertsplit(v)))
 
 
 def derivative(x: Any, u: Any, params: NmpcParameters) -> Any:

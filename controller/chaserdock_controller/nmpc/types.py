@@ -8,11 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-Matrix3 = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+from chaserdock_models.arrays import Array, IntArray, Matrix3
 
 INTEGRATORS = ("rk4", "euler")
 

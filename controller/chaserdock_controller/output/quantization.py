@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 
 COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
 """Resolution of commands: 15 uN and 0.24 uN m, 17 and 18 bits of the paper's actuators.

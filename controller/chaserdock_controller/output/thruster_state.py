@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
 from chaserdock_protocol.scenario import Scenario
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, TypeVar
 
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from msgspec import Struct
 
@@ -19,7 +19,7 @@ from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParam
 from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
-from chaserdock_controller.estimation.rigid_target import TargetBody
+from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.docking import DockingObservation

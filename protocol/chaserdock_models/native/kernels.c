@@ -1,3 +1,3 @@
 /* The kernels of chaserdock_models, compiled once per instruction set (LEVEL). See base.h. */
 #include "base.h"
-#include "tumble.c"
+#include "rigid_body.c"

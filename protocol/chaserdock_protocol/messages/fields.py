@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
+from chaserdock_models.arrays import Quaternion, Vector3
 from msgspec import Meta, Struct
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
 MAX_COUNT = 2**53
 """Bounds every whole number: 104 days in nanoseconds; exact as a double, too, and sums of some stay encodable."""
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Literal
 
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.clock import Timing
 from chaserdock_models.targets import TargetModel
@@ -378,7 +379,7 @@ class Scenario(Section):
     def ticks(self) -> int:
         return self.timing.ticks_in(self.duration_s)
 
-    def start_pose(self, chaser: int) -> tuple[rotations.Array, rotations.Array]:
+    def start_pose(self, chaser: int) -> tuple[Array, Array]:
         """Return position (3,) in WRF and attitude (4,), CRF to WRF, of a chaser at time zero."""
         c = self.chasers[chaser]
         offset = [a + b for a, b in zip(c.position_m, c.start_offset_m, strict=True)]

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from pydantic import AfterValidator, Field, model_validator
 
@@ -159,7 +160,7 @@ class Geometry(Section):
         )
 
 
-def _reach(box: Box) -> rotations.Array:
+def _reach(box: Box) -> Array:
     """Return the largest absolute coordinates (3,) of a box in TRF."""
     return np.abs(box.position_m) + np.abs(rotations.to_matrix(box.q_wxyz)) @ np.array(box.size_m) / 2.0
 

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import FailureKind
 from chaserdock_models.wrench_set import wrench_matrix, wrench_set
 from pydantic import Field, model_validator

@@ -7,8 +7,8 @@ Propellant consumption is computed; the body's mass stays constant.
 from __future__ import annotations
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.clock import Timing
-from chaserdock_models.rotations import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import ActuatorCommand

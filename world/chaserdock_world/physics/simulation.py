@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.docking_geometry import BodyState, view_of
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
+from chaserdock_models.docking_geometry import view_of
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario

@@ -9,9 +9,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
-from chaserdock_models.rotations import Array
 from numpy.typing import NDArray
 
 from .native import function

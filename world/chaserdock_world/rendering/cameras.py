@@ -10,8 +10,8 @@ from functools import cache
 import cv2
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.errors import ScenarioError

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from numpy.typing import NDArray
 
 from .scene_geometry import Obstacle

@@ -12,9 +12,9 @@ from functools import lru_cache
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
-from chaserdock_models.rotations import Array
 from chaserdock_models.targets import Box, face_rotation
 from numpy.typing import ArrayLike, NDArray
 

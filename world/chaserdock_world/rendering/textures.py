@@ -11,7 +11,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from numpy.typing import NDArray
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_models.targets import Box, TargetModel, face_extent, face_rotation
 from numpy.typing import ArrayLike, NDArray
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from numpy.typing import NDArray
 
 from . import pnp

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_models.targets import TargetModel
 from numpy.typing import ArrayLike, NDArray
 

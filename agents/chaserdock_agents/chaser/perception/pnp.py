@@ -16,8 +16,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.rotations import Array
 from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 

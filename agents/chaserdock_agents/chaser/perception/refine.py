@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.native import address
-from chaserdock_models.rotations import Array
 
 from .native import function
 

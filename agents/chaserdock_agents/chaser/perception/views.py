@@ -8,9 +8,9 @@ from __future__ import annotations
 from ctypes import c_double, c_int64
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
-from chaserdock_models.rotations import Array
 
 from .native import function
 from .refine import Pose

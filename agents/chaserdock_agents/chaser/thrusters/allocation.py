@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import daqp
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.scenario.bodies import Body
 from chaserdock_protocol.scenario.thrusters import Thruster, thrusts_max

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_set
 from chaserdock_protocol.codec import vector

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
 from chaserdock_protocol.scenario.odometry import OdometrySection

@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.clock import Timing
-from chaserdock_models.rotations import Array
 from chaserdock_protocol.messages import ThrusterPulse
 from chaserdock_protocol.scenario.thrusters import Modulation, Thruster, thrusts_max
 from numpy.typing import NDArray

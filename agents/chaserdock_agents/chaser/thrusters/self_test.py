@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 
 import numpy as np
-from chaserdock_models.rotations import Array
+from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 from .allocation import Allocator

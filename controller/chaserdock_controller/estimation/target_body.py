@@ -1,20 +1,18 @@
-"""How a free rigid target moves on, and what holding on to it makes of it. Pure functions; SI units, radians.
+"""The target as a free rigid body: its predicted path, and its mass properties with captured chasers attached.
 
-TRF's origin need not be the centre of mass: with a captured chaser it no longer is.
+TRF's origin need not be the centre of mass: with a captured chaser it is not.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from ctypes import c_double, c_int64
 from dataclasses import dataclass, fields
 
 import numpy as np
-from chaserdock_models.native import address, function
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import free_rotation
 from chaserdock_models.rotations import cross, normalize, rotate, to_matrix
-from numpy.typing import ArrayLike, NDArray
-
-Array = NDArray[np.float64]
+from numpy.typing import ArrayLike
 
 
 @dataclass(frozen=True)
@@ -37,19 +35,19 @@ class TargetPath:
     alpha_rad_s2: Array
     acceleration_m_s2: Array
 
-    def every(self, begin: int) -> TargetPath:
-        """Every second instant, from the one numbered ``begin`` on."""
-        return TargetPath(*(getattr(self, f.name)[begin::2] for f in fields(self)))
+    def every_second(self, first: int) -> TargetPath:
+        """Return every second instant from number ``first`` on."""
+        return TargetPath(*(getattr(self, f.name)[first::2] for f in fields(self)))
 
 
-def joined(target: TargetBody, held: Sequence[tuple[float, Array, Array, Array]]) -> TargetBody:
-    """The target with bodies fixed to it: each its mass, principal inertia (3,), centre (3,) and attitude (4,) in TRF.
+def attach_bodies(target: TargetBody, attached: Sequence[tuple[float, Array, Array, Array]]) -> TargetBody:
+    """Return the target with bodies fixed to it: each mass, principal inertia (3,), centre (3,) and attitude (4,) in TRF.
 
     Parallel axes: I = sum of R I_i R' + m_i (d'd 1 - d d'), d from the common centre of mass (Goldstein, "Classical
     Mechanics", section 5.3).
     """
     parts = [(target.mass_kg, target.inertia_kg_m2, target.centre_trf_m)]
-    for mass, inertia, centre, q in held:
+    for mass, inertia, centre, q in attached:
         rotation = to_matrix(q)
         parts.append((mass, rotation @ np.diag(inertia) @ rotation.T, centre))
     mass = sum(m for m, _, _ in parts)
@@ -61,7 +59,7 @@ def joined(target: TargetBody, held: Sequence[tuple[float, Array, Array, Array]]
     return TargetBody(mass, total, centre)
 
 
-def tumble(
+def predict_path(
     body: TargetBody,
     position_m: ArrayLike,
     velocity_m_s: ArrayLike,
@@ -70,24 +68,17 @@ def tumble(
     step_s: float,
     steps: int,
 ) -> TargetPath:
-    """The free body's motion at 0, step_s, ... steps * step_s from now.
+    """Return the free body's motion at 0, step_s, ... steps * step_s from now.
 
     position and velocity (3,) of TRF's origin in WRF, q_wxyz (4,) TRF to WRF, omega (3,) in TRF. The centre of mass
-    moves uniformly; Euler's equations I w' = (I w) x w by RK4, good to 1e-9 rad for steps of 0.05 s and rates of
-    0.2 rad/s. Raises ValueError for a zero quaternion.
+    moves at constant velocity; ``free_rotation`` integrates the attitude. Raises ValueError for a zero quaternion.
     """
-    q, omega = normalize(q_wxyz), np.array(omega_rad_s, dtype=float)
-    inertia, c = np.ascontiguousarray(body.inertia_kg_m2), body.centre_trf_m
+    q, omega, c = normalize(q_wxyz), np.array(omega_rad_s, dtype=float), body.centre_trf_m
     n = steps + 1
-    qs, omegas, alphas = np.empty((n, 4)), np.empty((n, 3)), np.empty((n, 3))
-    inverse = np.linalg.inv(inertia)
-    function("tumble")(
-        address(q), address(omega), address(inertia), address(inverse), c_double(step_s), c_int64(n), address(qs),
-        address(omegas), address(alphas),
-    )  # fmt: skip
+    qs, omegas, alphas = free_rotation(q_wxyz, omega, body.inertia_kg_m2, step_s, n)
     centre = np.asarray(position_m, dtype=float) + rotate(q, c)
     velocity = np.asarray(velocity_m_s, dtype=float) + rotate(q, cross(omega, c))
     times = step_s * np.arange(n)[:, None]
     positions = centre + times * velocity - rotate(qs, np.broadcast_to(c, (n, 3)))
-    turning = cross(alphas, c) + cross(omegas, cross(omegas, c))
-    return TargetPath(positions, qs, omegas, alphas, -turning)
+    centripetal = cross(alphas, c) + cross(omegas, cross(omegas, c))
+    return TargetPath(positions, qs, omegas, alphas, -centripetal)

@@ -1,0 +1,112 @@
+"""Rigid-body motion: the Newton-Euler equations and their integration by the classical Runge-Kutta method (RK4).
+
+Three functions cover the uses in simulator and flight software; all have the same equations. ``propagate`` integrates
+one body under a constant wrench. ``free_rotation`` tabulates the rotation of a free body at many times, several
+hundred steps a tick, so a C kernel does it (native/rigid_body.c). ``rk4_step`` is the method itself, for states with
+further components (the estimator adds the transition matrix). The NMPC has its own discretization with derivatives by
+state and input (chaserdock_controller/nmpc/native/dynamics.c), as its solver needs both in one pass.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from ctypes import c_double, c_int64
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .arrays import Array, Vector3
+from .native import address, function
+from .rotations import normalize
+
+MAX_STEP_S = 0.02
+"""Longest integration step of ``propagate``."""
+
+
+@dataclass(frozen=True)
+class BodyState:
+    """Position (3,) and velocity (3,) in WRF, attitude (4,) body to WRF, angular rate (3,) in body axes."""
+
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+
+
+class RigidBody(Protocol):
+    """Mass and principal moments of inertia of a body whose axes are its principal axes."""
+
+    @property
+    def mass_kg(self) -> float: ...
+    @property
+    def inertia(self) -> Vector3: ...
+
+
+def rk4_step(derivative: Callable[[Array], Array], y: Array, step_s: float) -> Array:
+    """Return ``y`` after one step of the classical Runge-Kutta method for y' = ``derivative`` (y)."""
+    k1 = derivative(y)
+    k2 = derivative(y + 0.5 * step_s * k1)
+    k3 = derivative(y + 0.5 * step_s * k2)
+    k4 = derivative(y + step_s * k3)
+    return y + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+
+
+def newton_euler(state: Array, wrench: list[float], mass_kg: float, inertia: Vector3) -> Array:
+    """Return the derivative (13,) of a state as in ``propagate``; ``wrench`` is force and torque in body axes."""
+    _, _, _, vx, vy, vz, w, i, j, k, a, b, c = state.tolist()
+    fx, fy, fz, tx, ty, tz = wrench
+    ia, ib, ic = inertia
+    cx, cy, cz = 2.0 * (j * fz - k * fy), 2.0 * (k * fx - i * fz), 2.0 * (i * fy - j * fx)
+    return np.array(
+        [
+            vx,
+            vy,
+            vz,
+            (fx + w * cx + (j * cz - k * cy)) / mass_kg,
+            (fy + w * cy + (k * cx - i * cz)) / mass_kg,
+            (fz + w * cz + (i * cy - j * cx)) / mass_kg,
+            0.5 * (-i * a - j * b - k * c),
+            0.5 * (w * a + j * c - k * b),
+            0.5 * (w * b + k * a - i * c),
+            0.5 * (w * c + i * b - j * a),
+            (tx - (b * ic * c - c * ib * b)) / ia,
+            (ty - (c * ia * a - a * ic * c)) / ib,
+            (tz - (a * ib * b - b * ia * a)) / ic,
+        ]
+    )
+
+
+def propagate(state: Array, wrench: Array, body: RigidBody, duration_s: float) -> Array:
+    """Return the state (13,) after ``duration_s`` under a constant wrench.
+
+    The state is position and velocity (WRF), q_wxyz (body to WRF) and angular rate (body axes); the wrench (6,) is
+    force and torque in body axes.
+    """
+    u, mass_kg, inertia = wrench.tolist(), body.mass_kg, body.inertia
+    steps = max(1, math.ceil(duration_s / MAX_STEP_S))
+    for _ in range(steps):
+        state = rk4_step(lambda y: newton_euler(y, u, mass_kg, inertia), state, duration_s / steps)
+        state[6:10] /= math.hypot(*state[6:10].tolist())
+    return state
+
+
+def free_rotation(
+    q_wxyz: ArrayLike, omega_rad_s: ArrayLike, inertia: Array, step_s: float, count: int
+) -> tuple[Array, Array, Array]:
+    """Return attitudes (K, 4), rates and angular accelerations (K, 3) of a free body at 0, step_s, ... (K = ``count``).
+
+    Euler's equations I w' = (I w) x w with the inertia tensor ``inertia`` (3, 3) in body axes. The error is below
+    1e-9 rad for steps of 0.05 s and rates of 0.2 rad/s. Raises ValueError for a zero quaternion.
+    """
+    q, omega = normalize(q_wxyz), np.array(omega_rad_s, dtype=float)
+    inertia = np.ascontiguousarray(inertia)
+    inverse = np.linalg.inv(inertia)
+    attitudes, rates, accelerations = np.empty((count, 4)), np.empty((count, 3)), np.empty((count, 3))
+    function("free_rotation")(
+        address(q), address(omega), address(inertia), address(inverse), c_double(step_s), c_int64(count),
+        address(attitudes), address(rates), address(accelerations),
+    )  # fmt: skip
+    return attitudes, rates, accelerations

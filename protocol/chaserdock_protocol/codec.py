@@ -1,4 +1,4 @@
-"""Messages to bytes and back, with everything from outside checked at this boundary."""
+"""Encoding and decoding of messages, with validation of all external data."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .messages import Message, encoding_of
 MAX_BYTES = 17_000_000
 UNIT_QUATERNION_TOLERANCE = 1e-6
 MAX_MAGNITUDE = 1e15
-"""Bounds every float (SI units): far beyond any mission, and its powers stay finite in all that is worked out."""
+"""Bound of every float (SI units): beyond any mission, and small enough that its powers remain finite."""
 
 T = TypeVar("T", bound=Struct)
 
@@ -24,7 +24,7 @@ _encoder = msgspec.msgpack.Encoder()
 
 
 class Rejected(Exception):
-    """A message that must not be used; ``reason`` is a short stable word to count it by."""
+    """An invalid message. ``reason`` is a short stable identifier for counters."""
 
     def __init__(self, reason: str, detail: str) -> None:
         super().__init__(f"{reason}: {detail}")
@@ -38,15 +38,15 @@ def _decoder(kind: type[Struct]) -> msgspec.msgpack.Decoder[Any]:
 
 
 def encode(message: Struct) -> bytes:
-    """Payload of a message: a msgpack map."""
+    """Return the payload of a message, a msgpack map."""
     return _encoder.encode(message)
 
 
 def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
-    """Message of type ``kind`` from a payload, checked.
+    """Decode and validate a message of type ``kind``.
 
-    Raises Rejected with reason ``encoding`` (another type or version than ``kind``'s), ``size``, ``format``
-    (no msgpack, wrong type or shape), ``not_finite``, ``range``, ``not_unit_quaternion`` or ``not_a_covariance``.
+    Raises Rejected with reason ``encoding`` (another type or version), ``size``, ``format`` (no msgpack, wrong type or
+    shape), ``not_finite``, ``range``, ``not_unit_quaternion`` or ``not_a_covariance``.
     """
     if encoding is not None and encoding != (expected := encoding_of(kind)):
         raise Rejected("encoding", f"got {encoding!r}, expected {expected!r}")
@@ -61,14 +61,14 @@ def decode(kind: type[T], payload: bytes, encoding: str | None = None) -> T:
 
 
 def check_numbers(message: Struct) -> None:
-    """Raises Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of unit length and
+    """Raise Rejected unless every float is finite and within ``MAX_MAGNITUDE``, every ``q_wxyz`` of unit length and
     no variance negative."""
-    if not _surely_good(message):
-        _check_one_by_one(message)
+    if not _passes_fast_check(message):
+        _check_fields(message)
 
 
-class _Plan(NamedTuple):
-    """A type's fields with floats by what there is to check of them, each as what gets the values of a message."""
+class _FieldGetters(NamedTuple):
+    """Getters of a type's fields with floats, grouped by the required check."""
 
     numbers: Callable[[Any], tuple[float, ...]] | None
     rows: Callable[[Any], tuple[tuple[float, ...], ...]] | None
@@ -77,16 +77,15 @@ class _Plan(NamedTuple):
     parts: Callable[[Any], tuple[tuple[Struct, ...], ...]] | None
 
 
-def _surely_good(message: Struct) -> bool:
-    """Whether all numbers of a message are good, as they nearly always are: all of it at the speed of C.
+def _passes_fast_check(message: Struct) -> bool:
+    """Return True only if all numbers of a message are valid, by a few calls into C.
 
-    False when it takes a closer look, which may still find nothing. NaN and infinity come through a ``hypot``, and no part
-    is greater than the length.
+    False requires the detailed check. ``hypot`` propagates NaN and infinity, and is at least as large as each component.
     """
-    plan = _plan(type(message))
-    if plan is None:
+    getters = _field_getters(type(message))
+    if getters is None:
         return False
-    numbers, rows, quaternions, covariances, parts = plan
+    numbers, rows, quaternions, covariances, parts = getters
     if numbers is not None and not hypot(*numbers(message)) <= MAX_MAGNITUDE:
         return False
     if rows is not None:
@@ -101,12 +100,12 @@ def _surely_good(message: Struct) -> bool:
         for covariance in covariances(message):
             if not covariance or min(covariance[:: isqrt(len(covariance)) + 1]) < 0.0:
                 return False
-    return parts is None or all(_surely_good(part) for several in parts(message) for part in several)
+    return parts is None or all(_passes_fast_check(part) for several in parts(message) for part in several)
 
 
 @cache
-def _plan(kind: type[Struct]) -> _Plan | None:
-    """None for a type with a field of another kind, such as one that may be None."""
+def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
+    """Return None for a type with other fields that hold floats, such as optional ones."""
     numbers: list[str] = []
     rows: list[str] = []
     quaternions: list[str] = []
@@ -128,24 +127,24 @@ def _plan(kind: type[Struct]) -> _Plan | None:
                     covariances.append(field.name)
             case other if holds_floats(other):
                 return None
-    return _Plan(*map(_values_of, (numbers, rows, quaternions, covariances, parts)))
+    return _FieldGetters(*map(_getter, (numbers, rows, quaternions, covariances, parts)))
 
 
 def _is_row(kind: inspect.TupleType | inspect.VarTupleType) -> bool:
-    """Whether it is a tuple of floats and nothing else."""
+    """Return whether it is a tuple of floats only."""
     items = kind.item_types if isinstance(kind, inspect.TupleType) else (kind.item_type,)
     return all(isinstance(item, inspect.FloatType) for item in items)
 
 
-def _values_of(names: list[str]) -> Callable[[Any], Any] | None:
-    """What gets the fields of these names, as a tuple; None without names."""
+def _getter(names: list[str]) -> Callable[[Any], Any] | None:
+    """Return a function that returns these fields as a tuple, or None without names."""
     if len(names) > 1:
         return attrgetter(*names)
     return (lambda message: (getattr(message, names[0]),)) if names else None
 
 
-def _check_one_by_one(message: Struct) -> None:
-    """Field by field, so that a refusal names the first that is bad."""
+def _check_fields(message: Struct) -> None:
+    """Check field by field, so that the error names the first invalid one."""
     for name in _fields_with_floats(type(message)):
         value = getattr(message, name)
         if isinstance(value, float):
@@ -154,9 +153,9 @@ def _check_one_by_one(message: Struct) -> None:
         elif value and isinstance(value, tuple):
             if isinstance(value[0], Struct):
                 for item in value:
-                    _check_one_by_one(item)
+                    _check_fields(item)
                 continue
-            # Long ones (a plan has hundreds) at the speed of C: NaN and infinity come through, and no part is greater.
+            # One call into C for long tuples (a plan has hundreds of floats), as in _passes_fast_check.
             length = hypot(*value)
             if not length <= MAX_MAGNITUDE:
                 for item in value:
@@ -176,8 +175,8 @@ def _fields_with_floats(kind: type[Struct]) -> tuple[str, ...]:
 
 
 def holds_floats(kind: inspect.Type) -> bool:
-    """Whether a field of this type may hold floats, in itself or in structures. Raises TypeError for one that
-    ``check_numbers`` does not go through."""
+    """Return whether a field of this type may hold floats, directly or in structures. Raises TypeError for a type that
+    ``check_numbers`` does not support."""
     match kind:
         case inspect.FloatType() | inspect.StructType():
             return True
@@ -188,7 +187,7 @@ def holds_floats(kind: inspect.Type) -> bool:
         case inspect.TupleType(item_types=items):
             held = {holds_floats(item) for item in items}
             if len(held) > 1:
-                raise TypeError(f"floats beside others in a tuple: {items}")
+                raise TypeError(f"floats and other types in one tuple: {items}")
             return held == {True}
         case inspect.DictType(value_type=value) if holds_floats(value):
             raise TypeError("floats in a dictionary")
@@ -202,23 +201,22 @@ def _bad_number(name: str, value: float) -> Rejected:
 
 
 def _check_covariance(values: tuple[float, ...]) -> None:
-    """Variances are not negative. That the whole is positive semi-definite is left to those who invert it."""
+    """Reject negative variances. Users that invert the matrix check that it is positive semi-definite."""
     step = isqrt(len(values)) + 1
     if min(values[::step]) < 0.0:
         raise Rejected("not_a_covariance", "covariance has a negative variance")
 
 
 def vector(array: Any) -> Any:
-    """Flat tuple of Python floats, as messages carry numbers (NumPy scalars do not encode).
+    """Return a flat tuple of Python floats, as messages hold them (NumPy scalars do not encode).
 
-    Typed Any, as only the caller knows the length that its field wants.
+    Typed Any, as the type checker cannot know the length.
     """
     return tuple(array.ravel().tolist())
 
 
 def without_wall_time(message: Message) -> dict[str, Any]:
-    """The message as a dictionary without its wall-clock fields, and the words that are new at each start of a process:
-    what two equal flights must agree in."""
+    """Return the fields that are equal in two equal flights: all but wall-clock times and process instances."""
     return {
         name: getattr(message, name)
         for name in message.__struct_fields__

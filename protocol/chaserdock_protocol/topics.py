@@ -1,7 +1,7 @@
-"""The one table of topics: key, type, who may write and read it, how often, and how it is sent.
+"""Table of topics: key, type, writer, readers, rate and quality of service.
 
-Keys are relative to the run's namespace and begin with their publisher's name, so that a rule can hold a
-process to its own branch. ``truth/**`` is the world's, and no process that flies may read it.
+Keys are relative to the run's namespace and begin with their publisher's name, so that an access rule can restrict a
+process to its own branch. Only the world writes ``truth/**``, and no flight process may read it.
 """
 
 from __future__ import annotations
@@ -18,19 +18,19 @@ Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysi
 Qos = Literal["bulk", "state", "command", "event"]
 
 CONTROLLERS = ("controller", "standby")
-"""Processes of the role ``controller``, in the order in which they are given the command."""
+"""Processes of the role ``controller``, in the order of succession."""
 FLYING: frozenset[Role] = frozenset({"chaser", "controller"})
 _EVERYONE: frozenset[Role] = frozenset(get_args(Role))
-_WATCHERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "viewer"})
-_KNOW_THE_TRUTH: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
+_OBSERVERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "viewer"})
+_TRUTH_READERS: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
 
 
 @dataclass(frozen=True, eq=False)
 class Topic:
-    """A key with one ``{chaser}`` or ``{process}`` place at most, and what goes over it. There is one of each.
+    """A key with at most one placeholder, ``{chaser}`` or ``{process}``, and its properties. Compared by identity.
 
-    ``rate`` is per tick (``tick``), per tick with images (``image``), once a second of simulated time
-    (``second``), of wall time (``presence``), or when something happens (``event``).
+    ``rate``: every tick (``tick``), every tick with images (``image``), every second of simulated time (``second``) or of
+    wall time (``presence``), or on an event (``event``).
     """
 
     key: str
@@ -41,7 +41,7 @@ class Topic:
     qos: Qos
 
     def key_of(self, place: int | str | None = None) -> str:
-        """The concrete key, for a chaser's number or a process' name where the key has a place."""
+        """Return the concrete key. ``place``: chaser number or process name for the placeholder, if the key has one."""
         return _key_of(self, place)
 
 
@@ -49,7 +49,7 @@ class Topic:
 def _key_of(topic: Topic, place: int | str | None) -> str:
     if "{" not in topic.key:
         if place is not None:
-            raise ValueError(f"topic {topic.key} has no place for {place!r}")
+            raise ValueError(f"topic {topic.key} has no placeholder for {place!r}")
         return topic.key
     if place is None:
         raise ValueError(f"topic {topic.key} needs a chaser or process")
@@ -57,7 +57,7 @@ def _key_of(topic: Topic, place: int | str | None) -> str:
 
 
 def _topic(key, kind, writer, readers, rate, qos) -> Topic:
-    return Topic(key, kind, writer, frozenset(readers) | _WATCHERS, rate, qos)
+    return Topic(key, kind, writer, frozenset(readers) | _OBSERVERS, rate, qos)
 
 
 TICK = _topic("world/tick", m.Tick, "world", {"chaser", "controller"}, "tick", "state")
@@ -69,8 +69,8 @@ ODOMETRY = _topic(
 DOCKING = _topic(
     "world/chaser/{chaser}/docking", m.DockingStatus, "world", {"chaser", "controller"}, "tick", "state"
 )
-TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _KNOW_THE_TRUTH, "tick", "state")
-TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _KNOW_THE_TRUTH, "tick", "state")
+TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _TRUTH_READERS, "tick", "state")
+TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _TRUTH_READERS, "tick", "state")
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
 THRUSTERS = _topic("chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state")
@@ -78,7 +78,7 @@ WRENCH = _topic(
     "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
 )
 REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "controller", set(), "tick", "state")
-# As urgent as the command, and sent before it; the network may still bring it after the command.
+# Same priority as the command, and sent before it; it may still arrive after the command.
 PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "command")
 TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "command")
 SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
@@ -118,9 +118,9 @@ TOPICS: tuple[Topic, ...] = (
 )
 
 EXPRESS = (WRENCH, ACTUATORS, ACK, STATE)
-"""Sent without waiting for more, with all of their priority that was published before them."""
+"""Sent at once (not batched), together with messages of their priority published before."""
 NEVER_DROPPED = (END, FAREWELL)
-"""Published once, at the end, and waited for even in real time."""
+"""Published once, at the end, and never dropped, not even in real time."""
 
 JOIN_KEY = "world/join"
 """Query: JoinRequest -> JoinReply."""
@@ -134,7 +134,7 @@ LIVE_KEY = "live/{process}"
 
 @lru_cache(maxsize=4096)
 def topic_of_key(key: str) -> tuple[Topic, str | None] | None:
-    """The topic a concrete key belongs to and what stands in its place, or None for a foreign key."""
+    """Return the topic of a concrete key and its placeholder value, or None for an unknown key."""
     for topic in TOPICS:
         if "{" not in topic.key:
             if key == topic.key:
@@ -144,44 +144,44 @@ def topic_of_key(key: str) -> tuple[Topic, str | None] | None:
         tail = rest.partition("}")[2]
         if key.startswith(head) and key.endswith(tail):
             place = key[len(head) : len(key) - len(tail)]
-            if place and _fits(topic, place):
+            if place and _is_valid_place(topic, place):
                 return topic, place
     return None
 
 
-def _fits(topic: Topic, place: str) -> bool:
+def _is_valid_place(topic: Topic, place: str) -> bool:
     if "{chaser}" in topic.key:
         return _is_number(place)
     return is_process_name(place)
 
 
 def _is_number(text: str) -> bool:
-    # Written in one way only: with leading zeros a chaser would have several names and keys.
+    # Without leading zeros, with which a chaser would have several names and keys.
     return text.isascii() and text.isdigit() and (text == "0" or text[0] != "0")
 
 
 def is_process_name(name: str) -> bool:
-    """Whether ``name`` is one of ours: ``world``, ``target`` (a body), ``controller``, ``recorder``, ``chaser/3`` …"""
+    """Return whether ``name`` is a process or body: ``world``, ``target`` (a body), ``controller``, ``recorder``, ``chaser/3`` …"""
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)
     members = {"world", *CONTROLLERS, "recorder", "operator", "viewer"}
-    return slash == "" and head in members | _NO_MEMBERS
+    return slash == "" and head in members | _NON_MEMBERS
 
 
-_NO_MEMBERS = {"target", "router"}
+_NON_MEMBERS = {"target", "router"}
 
 
 def is_member_name(name: str) -> bool:
-    """Whether ``name`` is one of ours that takes part in a mission: no body, nor the router."""
-    return is_process_name(name) and name not in _NO_MEMBERS
+    """Return whether ``name`` is a process that joins missions (not a body or the router)."""
+    return is_process_name(name) and name not in _NON_MEMBERS
 
 
 def may_read(role: Role, topic: Topic) -> bool:
-    """Whether a process of this role may subscribe to the topic."""
+    """Return whether a process of this role may subscribe to the topic."""
     return role in topic.readers
 
 
 def may_write(role: Role, topic: Topic) -> bool:
-    """Whether a process of this role may publish on the topic."""
+    """Return whether a process of this role may publish on the topic."""
     return topic.writer in ("any", role)

@@ -1,4 +1,4 @@
-"""What every message has."""
+"""Base class of messages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What messages are made of: kinds of fields, with their bounds, and parts that never stand alone."""
+"""Field types of messages with their bounds, and nested structures."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from chaserdock_models.arrays import Quaternion, Vector3
 from msgspec import Meta, Struct
 
 MAX_COUNT = 2**53
-"""Bounds every whole number: 104 days in nanoseconds; exact as a double, too, and sums of some stay encodable."""
+"""Bound of every integer: 104 days in ns, exact as a double, and sums of a few remain encodable."""
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
 ChaserId = Annotated[int, Meta(ge=0, le=255)]
 ChaserIds = Annotated[tuple[ChaserId, ...], Meta(max_length=256)]
@@ -19,6 +19,9 @@ Text = Annotated[str, Meta(max_length=2000)]
 ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
 Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
 Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
+OperatorCommandName = Literal[
+    "approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"
+]
 Level = Literal["info", "warning", "error"]
 Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
@@ -41,9 +44,9 @@ Phase = Literal[
     "latched",
     "verified",
 ]
-"""What a chaser is doing; from ``wait`` on, where docking ends by capture."""
+"""Phase of a chaser. Those from ``wait`` on occur only if docking ends by capture."""
 Latch = Literal["keep", "arm", "release"]
-"""What a probe's latch is told: as it is, to close at a proper touch (and stay closed), to open (and stay open)."""
+"""Command of a probe's latch: no change; close at a valid touch and stay closed; open and stay open."""
 
 
 class PoseSolution(Struct, frozen=True, kw_only=True):
@@ -60,10 +63,10 @@ class PoseSolution(Struct, frozen=True, kw_only=True):
 
 
 class CameraCalibration(Struct, frozen=True, kw_only=True):
-    """How far chaser ``chaser``'s camera is from its calibration, as estimated in flight, with one sigma of each.
+    """Calibration error of chaser ``chaser``'s camera, as estimated in flight, with standard deviations.
 
-    ``turn_rad``: rotation vector in CRF by which it is turned from its told mounting; ``shift_m``: of its lens, in CRF;
-    ``focal_share``: how much longer its focal length is.
+    ``turn_rad``: rotation vector in CRF from the nominal mounting. ``shift_m``: lens position error in CRF.
+    ``focal_share``: relative error of the focal length.
     """
 
     chaser: ChaserId
@@ -76,9 +79,9 @@ class CameraCalibration(Struct, frozen=True, kw_only=True):
 
 
 class ProbeTouch(Struct, frozen=True, kw_only=True):
-    """A probe's tip came to touch the target at ``sim_time_ns``: where and how fast, relative to its port.
+    """First contact of a probe's tip with the target at ``sim_time_ns``: position and velocity relative to its port.
 
-    ``latched`` says whether the latch closed, ``refused`` why not.
+    ``latched``: whether the latch closed. ``refused``: the reason if it did not.
     """
 
     chaser: ChaserId
@@ -92,7 +95,7 @@ class ProbeTouch(Struct, frozen=True, kw_only=True):
 
 
 class ThrusterPulse(Struct, frozen=True, kw_only=True):
-    """A thruster's valve is to be open between two times."""
+    """Commanded opening interval of a thruster's valve."""
 
     thruster: ThrusterId
     open_ns: Count

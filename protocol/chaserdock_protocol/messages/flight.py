@@ -1,17 +1,4 @@
-"""Every message that travels between processes, or lies in a log.
-
-On the wire a message is a msgpack map of the field names below; its type and version travel in the
-Zenoh encoding (see ``codec``). A new field gets a default, so that old logs stay readable; a changed
-meaning gets a new VERSION.
-
-Common fields: ``seq`` numbers the messages of one publisher on one key from 0 (set when published);
-``tick`` is the world's tick the message belongs to; ``sim_time_ns`` is simulated time: for whatever
-derives from an image, the time of its *exposure*. Nothing in these messages depends on a wall clock,
-except fields whose name begins with ``wall_``.
-
-Units SI, radians; frames in the names: WRF world, CRF chaser body, TRF target body, IRF camera.
-``q_wxyz`` is a Hamilton unit quaternion, body to world unless said otherwise; ``omega_rad_s`` is in body axes.
-"""
+"""Messages of a flight: world, chaser and controller."""
 
 from __future__ import annotations
 
@@ -32,6 +19,7 @@ from .fields import (
     Level,
     MarkerIds,
     Names,
+    OperatorCommandName,
     Phase,
     PoseSolution,
     ProbeTouch,
@@ -49,11 +37,11 @@ from .thruster_fault import ThrusterFaultCommand
 
 
 class Tick(Message, frozen=True, kw_only=True):
-    """The world opens a tick, or (``revision`` > 0) takes back whom it expects an answer from.
+    """Start of a tick, or (``revision`` > 0) a correction of the processes that the world expects replies from.
 
-    ``controller``: whether one commands. ``commander`` is that process, ``instance`` its start, ``term`` numbers the
-    times that the command was given; 0 before the first, and in logs from before there were terms. ``standing_by``:
-    controllers that would take over, with their instances, the next in line first.
+    ``controller``: whether a controller is in command: ``commander``, with its ``instance``. ``term`` counts changes of
+    command, 0 before the first and in logs without terms. ``standing_by``: standby controllers with their instances, in
+    the order of succession.
     """
 
     revision: Count = 0
@@ -67,7 +55,7 @@ class Tick(Message, frozen=True, kw_only=True):
 
 
 class MissionEnd(Message, frozen=True, kw_only=True):
-    """The world has flown its last tick, or gives up: everyone finishes what they have."""
+    """The world has finished its last tick or ends early. All processes finish their work."""
 
     reason: Text
     complete: bool
@@ -84,7 +72,7 @@ class Image(Message, frozen=True, kw_only=True):
 
 
 class Odometry(Message, frozen=True, kw_only=True):
-    """A chaser's own state as it knows it: position and velocity WRF, attitude CRF to WRF, rate in CRF."""
+    """A chaser's own navigation solution: position and velocity in WRF, attitude CRF to WRF, rate in CRF."""
 
     chaser: ChaserId
     position_m: Vector3
@@ -94,8 +82,8 @@ class Odometry(Message, frozen=True, kw_only=True):
 
 
 class DockingStatus(Message, frozen=True, kw_only=True):
-    """What a chaser's own docking sensor says: ``contact`` of the probe's tip since the last tick, ``armed``: the
-    latch closes at a touch within its tolerances, ``latched``: it has closed."""
+    """Measurement of a chaser's docking sensor. ``contact``: contact of the probe's tip since the last tick. ``armed``:
+    the latch will close at a touch within its tolerances. ``latched``: it has closed."""
 
     chaser: ChaserId
     contact: bool
@@ -106,10 +94,10 @@ class DockingStatus(Message, frozen=True, kw_only=True):
 class BodyTruth(Message, frozen=True, kw_only=True):
     """Ground truth of one body (``target`` or ``chaser/0``), for recorder, analysis and viewer alone.
 
-    ``impulse_N_s`` and ``angular_impulse_N_m_s`` are what its actuators gave it since the last tick, in
-    body axes; ``absolute_impulse_N_s`` is the time integral of the sum of the force components' magnitudes.
-    With thrusters: ``thruster_impulse_N_s`` that every thruster gave, ``thruster_open_s`` that its valves were open, and the
-    ``propellant_kg`` that took, since the last tick (the body's mass stays what it is).
+    ``impulse_N_s`` and ``angular_impulse_N_m_s``: impulses of its actuators since the last tick, in body axes.
+    ``absolute_impulse_N_s``: time integral of the sum of the force components' magnitudes. With thrusters, since the
+    last tick: ``thruster_impulse_N_s`` and valve opening time ``thruster_open_s`` of each, and ``propellant_kg`` used
+    (the body's mass is constant).
     """
 
     body: Text
@@ -126,9 +114,9 @@ class BodyTruth(Message, frozen=True, kw_only=True):
 
 
 class WorldTruth(Message, frozen=True, kw_only=True):
-    """Contacts between bodies, in this tick and the physics steps since the last, and saturated commands.
+    """Contacts between bodies in the physics steps since the last tick, and saturated commands.
 
-    A touch of a probe's tip on the target is no contact here but one of ``touches``; ``latched``: who holds on now.
+    ``touches``: contacts of probe tips with the target, not included in ``contacts``. ``latched``: chasers latched now.
     """
 
     contacts: Annotated[tuple[tuple[Text, Text], ...], Meta(max_length=1024)]
@@ -139,10 +127,10 @@ class WorldTruth(Message, frozen=True, kw_only=True):
 
 
 class Sighting(Message, frozen=True, kw_only=True):
-    """What a chaser saw of the target in one image; no ``solutions`` means "I see nothing".
+    """Target poses that a chaser measured in one image; empty ``solutions`` if it detected nothing.
 
-    The best solution comes first; a second one is there when a single small marker allows both.
-    ``corners_px`` are eight numbers a used marker: u, v of its four corners, in the image as taken.
+    The best solution comes first; a second one follows if a single small marker is ambiguous.
+    ``corners_px``: u, v of the four corners of each used marker, in the distorted image.
     """
 
     chaser: ChaserId
@@ -156,11 +144,10 @@ class Sighting(Message, frozen=True, kw_only=True):
 
 
 class TargetEstimate(Message, frozen=True, kw_only=True):
-    """The fused odometry of the target at ``sim_time_ns``; position and velocity WRF, rate in TRF.
+    """Fused odometry of the target at ``sim_time_ns``: position and velocity in WRF, rate in TRF.
 
-    ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With status
-    ``none`` nothing has been seen yet and the numbers mean nothing. ``cameras``: where the estimator finds out how far the
-    cameras are from their calibration.
+    ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With status ``none``,
+    before the first sighting, the values are meaningless. ``cameras``: estimated calibration errors, if estimated.
     """
 
     status: Literal["none", "tracking", "predicting", "lost"]
@@ -175,7 +162,7 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
 
 
 class Reference(Message, frozen=True, kw_only=True):
-    """Where a chaser is to be at ``sim_time_ns``, and what it is doing there.
+    """Reference pose of a chaser at ``sim_time_ns``, and its phase.
 
     ``offset_m`` is the reference position in TRF; ``time_s`` counts from the start of the phase.
     """
@@ -190,15 +177,14 @@ class Reference(Message, frozen=True, kw_only=True):
 
 
 class WrenchCommand(Message, frozen=True, kw_only=True):
-    """What a chaser's actuators are to give, in body axes, from ``effective_time_ns`` on.
+    """Commanded force and torque of a chaser, in body axes, from ``effective_time_ns`` to ``expires_ns``.
 
-    Valid until ``expires_ns``; ``tick`` is that of the odometry it answers. ``mode`` says where it comes from:
-    the NMPC's plan, a safe command (``brake`` stops the chaser, ``coast`` gives nothing), the ``search`` for a target
-    that nobody sees, the ``pull`` that verifies a latch, or ``none``: the controller has no command, as it does not know
-    where the chaser is.
-    ``isolated``: thrusters whose shut-off valve an operator wants closed; ``trusted``: thrusters that an operator vouches for,
-    whatever the chaser has found. ``free``: nothing holds or touches the chaser, so that its motion shows its thrusters.
-    ``term``, ``commander`` and ``instance``: as the ``Tick`` had them that gave the command to who sends this.
+    ``tick`` is that of the odometry that it is based on. ``mode`` is its origin: the NMPC's plan, a safe command
+    (``brake`` to rest, ``coast`` without force), the ``search`` for a target that no chaser sees, the ``pull`` that
+    verifies a latch, or ``none``: no command, as the chaser's state is unknown.
+    ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
+    healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
+    thruster faults. ``term``, ``commander`` and ``instance`` are those of the ``Tick`` that put the sender in command.
     """
 
     chaser: ChaserId
@@ -230,7 +216,7 @@ class Plan(Message, frozen=True, kw_only=True):
 
 
 class SolverStatus(Message, frozen=True, kw_only=True):
-    """How the controller's solve of this tick went; one entry a chaser that took part."""
+    """Result of the controller's solve in this tick, one entry per planned chaser."""
 
     solver: Text
     chasers: ChaserIds
@@ -243,12 +229,12 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 
 
 class ActuatorCommand(Message, frozen=True, kw_only=True):
-    """What a chaser tells its actuators, body axes, from ``effective_time_ns`` on.
+    """A chaser's command to its actuators, body axes, from ``effective_time_ns`` on.
 
-    ``source`` is ``command`` when it passes on the controller's, of ``term``. When it has none that it can trust it flies
-    its last ``plan`` to the end, then comes to rest (``brake``), then keeps clear of the target (``hold``).
-    With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, and ``isolated``
-    the thrusters whose shut-off valves are closed from ``effective_time_ns`` on; force and torque say what was asked for.
+    ``source``: ``command`` for the controller's command of ``term``. Without a valid command the chaser flies its last
+    ``plan`` to its end, comes to rest (``brake``) and then keeps clear of the target (``hold``).
+    With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, ``isolated`` the
+    thrusters whose shut-off valves are closed from ``effective_time_ns`` on, and force and torque the demand.
     """
 
     chaser: ChaserId
@@ -263,11 +249,11 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
 
 
 class ThrusterReport(Message, frozen=True, kw_only=True):
-    """What a chaser's thrusters can do, as it knows them, at the time of the odometry of the same tick.
+    """Capability of a chaser's thrusters, by its own estimate, at the time of the odometry of the same tick.
 
-    ``force_max_N`` and ``torque_max_N_m`` are within reach on all body axes at once. ``coming_*`` is the impulse (body
-    axes) that it will get from pulses under way, less what of them counts as the next command's; ``given_*`` is what
-    its thrusters should have given since the report before.
+    ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``: remaining impulse (body
+    axes) of commanded pulses, without the part that belongs to the next command. ``given_*``: expected impulse of the
+    thrusters since the previous report.
     """
 
     chaser: ChaserId
@@ -282,7 +268,7 @@ class ThrusterReport(Message, frozen=True, kw_only=True):
 
 
 class Event(Message, frozen=True, kw_only=True):
-    """Something worth telling, once."""
+    """A single occurrence for log and operators."""
 
     process: Text
     level: Level
@@ -291,7 +277,7 @@ class Event(Message, frozen=True, kw_only=True):
 
 
 class Health(Message, frozen=True, kw_only=True):
-    """A process counts: messages it rejected (by reason), lost (gaps in ``seq``), discarded as stale."""
+    """Message counters of a process: rejected (by reason), lost (gaps in ``seq``), discarded as stale."""
 
     process: Text
     rejected: Counts
@@ -301,21 +287,20 @@ class Health(Message, frozen=True, kw_only=True):
 
 
 class RecorderAck(Message, frozen=True, kw_only=True):
-    """The recorder holds everything up to ``tick`` from all who were expected."""
+    """The recorder has all expected messages up to ``tick``."""
 
 
 class OperatorCommand(Message, frozen=True, kw_only=True):
-    """An operator's wish, sent as a query; ``offset_m`` (TRF) goes with ``goto`` alone.
+    """An operator's command, sent as a query. ``offset_m`` (TRF): with ``goto`` only.
 
-    ``operator`` says who asks, for the log; after ``expires_ns`` the wish is stale and refused.
+    ``operator``: name for the log. A command is rejected after ``expires_ns``. The controller publishes it with the tick
+    at which it was accepted or rejected, so that the log holds all inputs.
 
-    The controller publishes it again, with the tick it was obeyed or refused at: the log must hold all inputs.
-
-    ``calibrate`` turns the chaser about while it watches the target, which shows how its camera is mounted.
-    ``isolate`` closes a thruster's shut-off valve, ``restore`` opens it and vouches for the thruster; ``thruster`` goes with these.
+    ``calibrate`` rotates the chaser while it observes the target, which makes its camera mounting observable.
+    ``isolate`` closes the shut-off valve of ``thruster``; ``restore`` opens it and declares the thruster healthy.
     """
 
-    command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"]
+    command: OperatorCommandName
     chaser: ChaserId
     offset_m: Vector3 | None = None
     thruster: ThrusterId | None = None
@@ -324,7 +309,7 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
 
 
 class CommandReply(Message, frozen=True, kw_only=True):
-    """The controller's answer to an operator command, also published for the log."""
+    """Reply of the controller to an operator command, also published for the log."""
 
     command: Text
     chaser: ChaserId
@@ -334,9 +319,9 @@ class CommandReply(Message, frozen=True, kw_only=True):
 
 
 class ControllerState(Message, frozen=True, kw_only=True):
-    """The commander's word to who stands by: this tick is worked out, with what operators asked in it (``operated``).
+    """The commanding controller's report to standbys: the tick is complete; ``operated``: its operator commands.
 
-    ``state``, now and then: all that it knows after the tick, for one that came late (``controller/state.py``); else empty.
+    ``state``, at intervals: serialized controller state after the tick, for standbys that joined late; else empty.
     """
 
     process: Text
@@ -373,11 +358,11 @@ VERSION: dict[type[Struct], int] = {
     JoinRequest: 1,
     JoinReply: 1,
 }
-"""Version of every message type that may stand alone on the wire."""
+"""Version of every top-level message type."""
 
 
 def encoding_of(kind: type[Struct]) -> str:
-    """Zenoh encoding of a message type, such as ``application/msgpack;chaserdock.Odometry.v1``."""
+    """Return the Zenoh encoding of a message type, such as ``application/msgpack;chaserdock.Odometry.v1``."""
     return _encoding(kind, VERSION[kind])
 
 
@@ -387,5 +372,5 @@ def _encoding(kind: type[Struct], number: int) -> str:
 
 
 def schema_of(kind: type[Struct]) -> bytes:
-    """JSON Schema of a message type, as the log carries it."""
+    """Return the JSON Schema of a message type, as stored in logs."""
     return msgspec.json.encode(msgspec.json.schema(kind))

@@ -1,4 +1,4 @@
-"""Messages of joining a mission and leaving it."""
+"""Messages for joining and leaving a mission."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from .fields import Counts, Names, Text
 
 
 class Presence(Message, frozen=True, kw_only=True):
-    """Who a process is, and whose presence has reached it: process name to instance (see ``presence``)."""
+    """Heartbeat of a process. ``heard``: processes whose presence it has received, name to instance."""
 
     process: Text
     instance: Text
@@ -19,21 +19,21 @@ class Presence(Message, frozen=True, kw_only=True):
 
 
 class Farewell(Message, frozen=True, kw_only=True):
-    """The last message of a process: how many messages it has published on each key."""
+    """Last message of a process: the number of messages that it has published on each key."""
 
     process: Text
     published: Counts
 
 
 class JoinRequest(Struct, frozen=True, kw_only=True):
-    """A process asks the world to take part, before it opens any topic."""
+    """Request of a process to join the mission, before it declares any topic."""
 
     process: Text
     instance: Text
 
 
 class JoinReply(Struct, frozen=True, kw_only=True):
-    """The world's answer: the resolved scenario as JSON, or why not."""
+    """The world's reply: the resolved scenario as JSON, or the reason of a rejection."""
 
     accepted: bool
     reason: Text

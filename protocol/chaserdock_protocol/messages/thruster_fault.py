@@ -1,4 +1,4 @@
-"""What an operator asks of the world's thrusters, for tests."""
+"""Operator command that injects thruster faults into the simulation."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from .fields import ChaserId, Text, ThrusterId, ThrusterState
 
 
 class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
-    """An operator makes a thruster fail, or mends it (``healthy``), in the world: for tests, where the scenario allows it.
+    """Make a simulated thruster fail or repair it (``healthy``), if the scenario allows it.
 
-    The chaser is not told. ``factor`` goes with ``weak`` alone: what is left of the thruster's thrust, 0 to 1.
+    The chaser does not receive it. ``factor``, with ``weak`` only: remaining share of the thrust, 0 to 1.
     """
 
     chaser: ChaserId

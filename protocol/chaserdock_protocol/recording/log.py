@@ -1,10 +1,9 @@
-"""The mission log: MCAP files, every message verbatim, one channel a key and encoding.
+"""The mission log: MCAP files with every message verbatim, one channel per key and encoding.
 
-``log_time`` is simulated time (the message's ``sim_time_ns``; the time of the one before where it has none), so that
-a lock-step flight has its own time line whatever the machine's speed; ``publish_time`` is the sender's wall clock.
-Payloads are the bytes that travelled (msgpack), each channel's schema is the JSON Schema of its type; the resolved
-scenario, the lock file and the versions lie inside as attachments and a metadata record. Beside this verbatim layer
-there may be a second one for viewers, under ``/viewer/``, which nothing here reads back.
+``log_time`` is simulated time (the message's ``sim_time_ns``, or that of the message before if it has none);
+``publish_time`` is the sender's wall clock. Payloads are the transmitted bytes (msgpack); the schema of a channel is the
+JSON Schema of its type. The resolved scenario, the lock file and the versions are attachments and a metadata record.
+A second layer for viewers, under ``/viewer/``, is optional and never read back.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from chaserdock_protocol.scenario.migrations import migrated
 from chaserdock_protocol.topics import Topic
 
 from . import provenance
-from .chunk_writer import LeanWriter
+from .chunk_index import create_writer
 from .scan import (
     METADATA,
     VIEWER_PREFIX,
@@ -63,7 +62,7 @@ __all__ = ["LogError", "LogSource", "LogWriter", "Record", "count_messages", "re
 
 @dataclass(frozen=True)
 class Record:
-    """One message of a log, opened. ``sent_ns`` is the sender's wall clock."""
+    """A decoded message of a log. ``sent_ns`` is the sender's wall clock."""
 
     key: str
     topic: Topic
@@ -80,15 +79,15 @@ _header = msgspec.msgpack.Decoder(_Header)
 
 
 @dataclass(slots=True)
-class _Written:
-    """A channel of the file, and how many messages of it are there."""
+class _ChannelState:
+    """A channel of the file, and its number of messages."""
 
     channel: int
     messages: int = 0
 
 
 class _Sink:
-    """The file under the MCAP writer, which hands over whole records: one that does not fit is taken back."""
+    """Output file of the MCAP writer. Truncates a record that could not be written completely."""
 
     def __init__(self, file: BinaryIO) -> None:
         self._file = file
@@ -100,7 +99,7 @@ class _Sink:
             while done < len(data):
                 done += self._file.write(memoryview(data)[done:])
         except OSError:
-            # Best effort: a cut record is found and left out by every reader, too.
+            # Best effort: readers also skip a truncated record.
             os.ftruncate(self._file.fileno(), self.size)
             raise
         self.size += len(data)
@@ -109,15 +108,15 @@ class _Sink:
         return self.size
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing: writes are unbuffered."""
 
 
 class LogWriter:
-    """Writes a log; a kill costs at most the last second, be it of ``now_s`` or of the flight.
+    """Writes a log. A kill loses at most the last second, by ``now_s`` and by simulated time.
 
-    It is flushed to the file each half second of both: a flight in lock-step may be faster than the clock, or slower.
+    Flushes every 0.5 s of both, as lock-step flights run faster or slower than the wall clock.
 
-    Raises LogError when the file cannot be created or written; what was written until then stays readable.
+    Raises LogError if the file cannot be created or written. What was written before stays readable.
     """
 
     def __init__(self, path: Path, now_s: Callable[[], float] = time.monotonic) -> None:
@@ -127,7 +126,7 @@ class LogWriter:
         self.last_time_ns = 0
         self._now_s = now_s
         self._broken = False
-        self._channels: dict[tuple[str, str], _Written] = {}
+        self._channels: dict[tuple[str, str], _ChannelState] = {}
         self._schemas: dict[str, int] = {}
         try:
             self._file = path.open("xb", buffering=0)
@@ -136,18 +135,18 @@ class LogWriter:
         except OSError as error:
             raise LogError(f"{path}: cannot be created: {error.strerror or error}") from None
         self._sink: Any = _Sink(self._file)
-        self._writer = LeanWriter(self._sink)
+        self._writer = create_writer(self._sink)
         with self._writing():
             self._writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')}")
         self._flushed_s, self._flushed_ns = now_s(), 0
 
     @property
     def size_bytes(self) -> int:
-        """Bytes in the file so far; the chunk in progress is not among them."""
+        """Return the size of the file in bytes, without the chunk in progress."""
         return self._sink.size
 
     def describe(self, scenario_json: str, run: dict[str, str]) -> None:
-        """Puts the resolved scenario, the run's data, the lock file and the package versions into the log."""
+        """Write the resolved scenario, the run's data, the lock file and the package versions."""
         now = time.time_ns()
         attached = [
             (SCENARIO_ATTACHMENT, "application/json", scenario_json.encode()),
@@ -162,22 +161,22 @@ class LogWriter:
             self._writer.add_metadata(METADATA, with_checksum({**run, **versions}))
 
     def note(self, name: str, data: dict[str, str]) -> None:
-        """Adds a metadata record of another name."""
+        """Write a metadata record."""
         with self._writing():
             self._writer.add_metadata(name, with_checksum(data))
 
     def write(
         self, key: str, encoding: str, payload: bytes, sent_ns: int, time_ns: int | None = None
     ) -> None:
-        """Appends one message, whatever it holds. ``time_ns`` is its ``sim_time_ns``, where the caller has opened it."""
+        """Append a message, valid or not. ``time_ns``: its ``sim_time_ns`` if the caller has decoded it."""
         channel = self._channels.get((key, encoding))
         if channel is None:
             with self._writing():
-                channel = self._channels[key, encoding] = _Written(self._register(key, encoding))
+                channel = self._channels[key, encoding] = _ChannelState(self._register(key, encoding))
         try:
             if time_ns is None:
                 time_ns = max(0, _header.decode(payload).sim_time_ns)
-            # Zero: a message without a time of its own (presence), which belongs where it arrived.
+            # A message without a simulated time (presence) gets the time of the message before.
             self.last_time_ns = time_ns or self.last_time_ns
         except (msgspec.DecodeError, OverflowError, RecursionError, UnicodeDecodeError):
             self.unreadable += 1
@@ -188,24 +187,24 @@ class LogWriter:
             self.flush()
 
     def write_view(self, topic: str, schema: tuple[str, str, bytes], payload: bytes, time_ns: int) -> None:
-        """Appends a message of the viewer layer, whose ``topic`` begins with ``/viewer/``.
+        """Append a message of the viewer layer; ``topic`` begins with ``/viewer/``.
 
-        ``schema``: its name, its encoding (also the message's, such as ``protobuf``) and its data.
+        ``schema``: name, encoding (also the message's, such as ``protobuf``) and data.
         """
         if not topic.startswith(VIEWER_PREFIX):
-            raise ValueError(f"{topic} is none of the viewer layer's")
+            raise ValueError(f"{topic} is not a topic of the viewer layer")
         name, encoding, data = schema
         channel = self._channels.get((topic, name))
         if channel is None:
             with self._writing():
                 if name not in self._schemas:
                     self._schemas[name] = self._writer.register_schema(name, encoding, data)
-                channel = _Written(self._writer.register_channel(topic, encoding, self._schemas[name]))
+                channel = _ChannelState(self._writer.register_channel(topic, encoding, self._schemas[name]))
             self._channels[topic, name] = channel
         self._add(channel, time_ns, payload, time_ns)
 
-    def _add(self, written: _Written, time_ns: int, payload: bytes, sent_ns: int) -> None:
-        # As ``_writing``, which would be a third of what a small message costs.
+    def _add(self, written: _ChannelState, time_ns: int, payload: bytes, sent_ns: int) -> None:
+        # Not ``with self._writing()``: it would add a third to the cost of a small message.
         if self._broken:
             raise self._not_continued()
         try:
@@ -224,14 +223,14 @@ class LogWriter:
             raise self._broken_by(error) from None
 
     def _not_continued(self) -> LogError:
-        return LogError(f"{self.path}: could not be written before, and is not continued")
+        return LogError(f"{self.path}: not continued after a failed write")
 
     def _broken_by(self, error: OSError) -> LogError:
         self._broken = True
         return LogError(f"{self.path}: cannot be written: {error.strerror or error}")
 
     def flush(self) -> None:
-        """Hands everything written so far to the operating system."""
+        """Write the chunk in progress to the file."""
         with self._writing():
             self._writer.flush()
         self._flushed_s, self._flushed_ns = self._now_s(), self.last_time_ns
@@ -249,7 +248,7 @@ class LogWriter:
         )
 
     def close(self) -> None:
-        """Writes index and footer, where the file can still be written, and closes it; raises LogError."""
+        """Write index and footer unless a write has failed, and close the file. Raises LogError."""
         try:
             if not self._broken:
                 with self._writing():
@@ -272,27 +271,27 @@ def _raw_messages(
 def read_log(
     source: LogSource, keys: Iterable[str] | None = None, rejected: Counter[str] | None = None
 ) -> Iterator[Record]:
-    """Messages of a log in file order, opened and checked, older versions upgraded.
+    """Yield the valid messages of a log in file order; messages of older versions are upgraded.
 
-    Those that do not pass are left out, and counted in ``rejected`` as ``key: reason``. Raises LogError when a file
-    cannot be read, is no log, or where it is damaged; a log cut off is read up to there.
+    Invalid messages are counted in ``rejected`` as ``key: reason``. Raises LogError if a file cannot be read, is no log,
+    or at the position where it is damaged. A truncated log is read up to its last whole record.
     """
     for channel, message in _raw_messages(source, keys):
         found = topics.topic_of_key(channel.topic)
         try:
             if found is None:
-                raise Rejected("key", "none of ours")
+                raise Rejected("key", "unknown key")
             encoding = channel.metadata.get("zenoh_encoding", "")
-            opened = decode_logged(found[0].kind, message.data, encoding)
+            decoded = decode_logged(found[0].kind, message.data, encoding)
         except Rejected as refusal:
             if rejected is not None:
                 rejected[f"{channel.topic}: {refusal.reason}"] += 1
             continue
-        yield Record(channel.topic, found[0], found[1], opened, message.publish_time)
+        yield Record(channel.topic, found[0], found[1], decoded, message.publish_time)
 
 
 def count_messages(source: LogSource) -> dict[str, int]:
-    """Messages by key, whatever they hold."""
+    """Return the number of messages by key, valid or not."""
     counts: dict[str, int] = {}
     for channel, _ in _raw_messages(source, None):
         counts[channel.topic] = counts.get(channel.topic, 0) + 1
@@ -300,9 +299,9 @@ def count_messages(source: LogSource) -> dict[str, int]:
 
 
 def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
-    """The resolved scenario (JSON, in the present format) and the run's data and versions; raises LogError if the log lacks them.
+    """Return the resolved scenario (JSON, present format) and the run's data and versions. Raises LogError without them.
 
-    All files of a rotated log must be parts of one run.
+    All files of a rotated log must belong to one run.
     """
     files = log_files(source)
     first, scenario = _scenario_of(files[0])

@@ -1,4 +1,4 @@
-"""Which software a log was recorded with: the versions of all that is installed, and the lock file where there is one."""
+"""Provenance of a log: versions of all installed packages, and the lock file."""
 
 from __future__ import annotations
 
@@ -8,25 +8,25 @@ from functools import lru_cache
 from importlib.metadata import distributions
 from pathlib import Path
 
-# In a source tree; an installed package has none.
+# Only in a source tree.
 _LOCK_FILE = Path(__file__).resolve().parents[3] / "uv.lock"
 
 
 @lru_cache
 def installed_versions() -> dict[str, str]:
-    """Version of every distribution that is installed here, by name."""
+    """Return the version of every installed distribution, by name."""
     found = {d.metadata["Name"]: d.version for d in distributions() if d.metadata["Name"]}
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
 
 
 def versions_json() -> bytes:
-    """``installed_versions`` as JSON."""
+    """Return ``installed_versions`` as JSON."""
     return json.dumps(installed_versions(), indent=1).encode()
 
 
 @lru_cache
 def lock_file_gz() -> bytes | None:
-    """The source tree's ``uv.lock``, gzipped (always the same bytes), or None outside of one."""
+    """Return the source tree's ``uv.lock``, gzipped reproducibly, or None outside a source tree."""
     try:
         return gzip.compress(_LOCK_FILE.read_bytes(), mtime=0)
     except OSError:

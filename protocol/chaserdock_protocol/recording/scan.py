@@ -1,7 +1,9 @@
-"""The records of MCAP log files, as they lie there, with every checksum held: the ground that all log readers stand on.
+"""Sequential reader of the records of MCAP log files, with integrity checks. All log readers use it.
 
-Guards: each chunk's CRC, the data section's CRC in a closed file, the attachments' CRC, and the gapless ``sequence``
-of every channel. A file whose writer was killed ends with its last whole record; what was flushed before is good.
+Checks the CRC of each chunk, of the data section of a closed file, of attachments and of our metadata, and that
+``sequence`` has no gaps. Reads a file whose writer was killed up to its last whole record. The ``mcap`` package's
+readers raise at that point, give no record positions, and check neither attachments nor sequences. Its chunk parser is
+used for chunks (2.4 us per message; a parser of our own took half of it, and was removed).
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 from mcap.records import Attachment, Channel, Chunk, Metadata, Schema
 from mcap.records import Message as McapMessage
-from mcap.stream_reader import get_chunk_data_stream
+from mcap.stream_reader import breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
 from chaserdock_protocol.errors import ChaserdockError
@@ -28,34 +30,33 @@ from chaserdock_protocol.errors import ChaserdockError
 from .schema_migrations import current_key
 
 LogSource = Path | Sequence[Path]
-"""A log file, a folder that holds a log (rotated or not), or the files of one log in their order."""
+"""A log file, a folder with a log (rotated or not), or the ordered files of one log."""
 
 LOG_NAME = "mission.mcap"
 VIEWER_PREFIX = "/viewer/"
-"""Channels for viewers, derived from the verbatim ones: never read back."""
+"""Prefix of channels for viewers, which are derived from the verbatim ones and never read back."""
 METADATA = "chaserdock"
 RECOVERED = "chaserdock.recovered"
-"""Metadata record of a repaired log: gaps are known there."""
+"""Name of the metadata record of a repaired log, which may have gaps."""
 
-# Longest record that a recorder of ours writes: a chunk closes after a megabyte, one message has 17 at most.
+# Exceeds every record that a recorder writes: chunks close after 1 MB, and a message has 17 MB at most.
 MAX_RECORD_BYTES = 1 << 27
 _HEAD = struct.Struct("<BQ")
 _CRC = struct.Struct("<I")
-_MESSAGE = struct.Struct("<HIQQ")
-# What the parsers of a damaged record raise.
+# Exceptions of the parsers for a damaged record.
 DAMAGE = (McapError, ValueError, KeyError, EOFError, struct.error, zstandard.ZstdError)
 
 
 class LogError(ChaserdockError):
-    """A log that cannot be used; the text is one clear line."""
+    """A log cannot be used. The text is one line."""
 
 
 @dataclass
 class FileState:
-    """What became known of a file while its records were read: all of it only after the last one.
+    """State of a file, complete once all its records were read.
 
-    ``closed``: its writer ended it properly, and all checksums hold. ``cut_bytes``: what follows the last whole
-    record of a file that ends without an end mark. ``place``: where the record that was read last begins.
+    ``closed``: the writer closed it, and all checksums match. ``cut_bytes``: bytes after the last whole record of a
+    file without end mark. ``place``: offset of the record read last.
     """
 
     closed: bool = False
@@ -65,12 +66,12 @@ class FileState:
 
 
 def part_name(part: int) -> str:
-    """File name of part ``part``, from 0, of a log that is rotated."""
+    """Return the file name of part ``part`` (from 0) of a rotated log."""
     return f"mission-{part:04d}.mcap"
 
 
 def log_files(source: LogSource) -> list[Path]:
-    """The files of a log in their order. Raises LogError for a folder without one, or with parts missing."""
+    """Return the files of a log in order. Raises LogError for a folder without a log or with missing parts."""
     if not isinstance(source, Path):
         return list(source)
     if not source.is_dir():
@@ -87,9 +88,9 @@ def log_files(source: LogSource) -> list[Path]:
 
 
 def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of every record up to the summary; ``state`` learns how the file ends.
+    """Yield opcode and content of every record up to the summary, and update ``state``.
 
-    Raises LogError for a file that cannot be read, is no log, or is damaged.
+    Raises LogError if a file cannot be read, is no log, or is damaged.
     """
     state = state if state is not None else FileState()
     try:
@@ -113,7 +114,7 @@ def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, b
                 content = file.read(length)
                 if opcode == Opcode.DATA_END:
                     if length != _CRC.size or _CRC.unpack(content)[0] not in (0, crc):
-                        raise LogError(f"{path}: damaged: the checksum over all data does not hold")
+                        raise LogError(f"{path}: damaged: the checksum over all data does not match")
                     state.closed = sealed
                     return
                 crc = zlib.crc32(content, zlib.crc32(head, crc))
@@ -128,7 +129,7 @@ def records(path: Path, state: FileState | None = None) -> Iterator[tuple[int, b
 
 
 def record_at(path: Path, place: int) -> bytes:
-    """Content of the record that begins at byte ``place``; raises LogError where the file has changed meanwhile."""
+    """Return the content of the record at byte ``place``. Raises LogError if the file has changed meanwhile."""
     try:
         with path.open("rb") as file:
             file.seek(place)
@@ -143,48 +144,35 @@ def record_at(path: Path, place: int) -> bytes:
 
 
 def parse_chunk(content: bytes) -> list[McapMessage | Channel | Schema]:
-    """Channels, schemas and messages of a chunk record, its checksum held; raises one of ``DAMAGE``."""
-    stream, size = get_chunk_data_stream(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True)
-    data, place = stream.read(size), 0
+    """Parse the channels, schemas and messages of a chunk record and check its CRC. Raises one of ``DAMAGE``."""
     out: list[McapMessage | Channel | Schema] = []
-    # Messages are most of a log, and the library reads them field by field.
-    while place < size:
-        opcode, length = _HEAD.unpack_from(data, place)
-        begin, place = place + _HEAD.size, place + _HEAD.size + length
-        if place > size or (opcode == Opcode.MESSAGE and length < _MESSAGE.size):
-            raise ValueError("a record runs over its end")
-        if opcode == Opcode.MESSAGE:
-            channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(data, begin)
-            payload = data[begin + _MESSAGE.size : place]
-            out.append(McapMessage(channel_id, log_time, payload, publish_time, sequence))
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(ReadDataStream(BytesIO(data[begin:place])))
-            channel.topic = current_key(channel.topic)
-            out.append(channel)
-        elif opcode == Opcode.SCHEMA:
-            out.append(Schema.read(ReadDataStream(BytesIO(data[begin:place]))))
+    for record in breakup_chunk(Chunk.read(ReadDataStream(BytesIO(content))), validate_crc=True):
+        if isinstance(record, Channel):
+            record.topic = current_key(record.topic)
+        if isinstance(record, McapMessage | Channel | Schema):
+            out.append(record)
     return out
 
 
 def parse_attachment(content: bytes) -> Attachment:
-    """An attachment record, its checksum held; raises one of ``DAMAGE``."""
+    """Parse an attachment record and check its CRC. Raises one of ``DAMAGE``."""
     attachment = Attachment.read(ReadDataStream(BytesIO(content)))
     if _CRC.unpack(content[-_CRC.size :])[0] not in (0, zlib.crc32(content[: -_CRC.size])):
-        raise ValueError(f"the checksum of {attachment.name} does not hold")
+        raise ValueError(f"the checksum of {attachment.name} does not match")
     return attachment
 
 
 def with_checksum(data: dict[str, str]) -> dict[str, str]:
-    """Metadata with a checksum among them, as MCAP has none for metadata records."""
+    """Return metadata with a checksum entry, as MCAP has none for metadata records."""
     return {**data, "crc32": f"{_metadata_crc(data):08x}"}
 
 
 def parse_metadata(content: bytes) -> Metadata:
-    """A metadata record, its checksum held where ``with_checksum`` put one; raises one of ``DAMAGE``."""
+    """Parse a metadata record and check the checksum of ``with_checksum``, if any. Raises one of ``DAMAGE``."""
     metadata = Metadata.read(ReadDataStream(BytesIO(content)))
     data = metadata.metadata
     if "crc32" in data and data["crc32"] != f"{_metadata_crc(data):08x}":
-        raise ValueError("the checksum of the metadata does not hold")
+        raise ValueError("the checksum of the metadata does not match")
     return metadata
 
 
@@ -193,7 +181,7 @@ def _metadata_crc(data: dict[str, str]) -> int:
 
 
 def stored_messages(path: Path, state: FileState | None = None) -> Iterator[tuple[Channel, McapMessage]]:
-    """Every message of a file, unopened, viewer layer included; raises LogError as ``records``, or for a gap."""
+    """Yield every message of a file, not decoded, viewer layer included. Raises LogError as ``records``, or for a gap."""
     state = state if state is not None else FileState()
     channels: dict[int, Channel] = {}
     following: dict[int, int] = {}
@@ -219,9 +207,9 @@ def stored_messages(path: Path, state: FileState | None = None) -> Iterator[tupl
 
 
 def read_head(path: Path) -> tuple[dict[str, str], dict[str, bytes]]:
-    """Our metadata and all attachments (by name) of a file; raises LogError.
+    """Return our metadata and all attachments (by name) of a file. Raises LogError.
 
-    They lie before the first chunk, where a recorder of ours puts them; with none there, the file is searched.
+    The recorder writes them before the first chunk. If they are not there, the whole file is searched.
     """
     data: dict[str, str] = {}
     attachments: dict[str, bytes] = {}

@@ -14,6 +14,8 @@ from chaserdock_models.clock import Timing
 from chaserdock_models.targets import TargetModel
 from pydantic import Field, model_validator
 
+from chaserdock_protocol.messages import OperatorCommandName
+
 from .bodies import Body, Target
 from .camera import CameraSection
 from .checks import check_consistent
@@ -244,12 +246,10 @@ class TimelineEntry(Section):
     """An operator command at a given time."""
 
     at_s: NotNegative = Field(description="Mission time, s.")
-    command: Literal["approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"] = (
-        Field(
-            description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to the reference position. "
-            "`abort`: the same, twice as fast. `goto`: fly to `offset_m`. `calibrate`: manoeuvre to calibrate the camera. "
-            "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
-        )
+    command: OperatorCommandName = Field(
+        description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to the reference position. "
+        "`abort`: the same, twice as fast. `goto`: fly to `offset_m`. `calibrate`: manoeuvre to calibrate the camera. "
+        "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
     )
     chasers: tuple[Index, ...] = Field(min_length=1, description="Numbers of the chasers, from 0.")
     offset_m: Vector | None = Field(default=None, description="Destination of `goto` (TRF), m.")

@@ -1,0 +1,181 @@
+"""Logs and scenarios of older formats open as if they had been written today."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol import messages as m
+from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.recording import schema_migrations
+from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
+from chaserdock_protocol.recording.schema_migrations import UPGRADES, current_key, decode_logged
+from chaserdock_protocol.scenario.migrations import FORMAT, migrated, old_keys
+from message_samples import BY_TYPE
+
+PRESENT: dict[str, msgspec.Struct] = {
+    **{kind.__name__: sample for kind, sample in BY_TYPE.items()},
+    "BodyTruth": msgspec.structs.replace(
+        BY_TYPE[m.BodyTruth], thruster_impulse_N_s=(0.5, 0.25), thruster_open_s=(0.125, 0.0)
+    ),
+    "Sighting": msgspec.structs.replace(BY_TYPE[m.Sighting], status="bad_image"),
+    "OperatorCommand": msgspec.structs.replace(BY_TYPE[m.OperatorCommand], command="isolate", thruster=3),
+    "ControllerState": msgspec.structs.replace(
+        BY_TYPE[m.ControllerState], operated=(m.OperatorCommand(command="restore", chaser=1, thruster=2),)
+    ),
+}
+OLD_NAMES: dict[str, dict[str, str]] = {
+    "Tick": {"images": "pictures"},
+    "BodyTruth": {"thruster_impulse_N_s": "jet_impulse_N_s", "thruster_open_s": "jet_open_s"},
+    "Sighting": {},
+    "ActuatorCommand": {},
+    "ThrusterReport": {"thrusters": "jets"},
+    "ThrusterFaultCommand": {"thruster": "jet"},
+    "OperatorCommand": {"thruster": "jet"},
+    "ControllerState": {},
+}
+OLD_TYPES = {"ThrusterReport": "JetReport", "ThrusterFaultCommand": "JetFaultCommand"}
+
+
+def version_1(message: msgspec.Struct) -> tuple[dict[str, Any], str]:
+    """Return fields and encoding of a message as version 1 wrote them."""
+    name = type(message).__name__
+    fields: dict[str, Any] = msgspec.msgpack.decode(codec.encode(message))
+    fields = {OLD_NAMES.get(name, {}).get(field, field): value for field, value in fields.items()}
+    if fields.get("status") == "bad_image":
+        fields["status"] = "bad_picture"
+    for field in ("pulses", "operated"):
+        for item in fields.get(field, ()):
+            item["jet"] = item.pop("thruster")
+    return fields, f"application/msgpack;chaserdock.{OLD_TYPES.get(name, name)}.v1"
+
+
+def kind_of(name: str) -> Any:
+    return next(kind for kind in m.VERSION if kind.__name__ == name)
+
+
+def test_every_upgrade_has_a_case_and_every_version_an_upgrade() -> None:
+    assert {name for name, _ in UPGRADES} == set(OLD_NAMES)
+    needed = {(kind.__name__, version) for kind, last in m.VERSION.items() for version in range(1, last)}
+    assert set(UPGRADES) == needed
+
+
+@pytest.mark.parametrize("name", sorted(OLD_NAMES))
+def test_message_of_version_1_decodes_to_the_present_message(name: str) -> None:
+    message = PRESENT[name]
+    fields, encoding = version_1(message)
+    assert fields != msgspec.msgpack.decode(codec.encode(message))
+    assert decode_logged(kind_of(name), msgspec.msgpack.encode(fields), encoding) == message
+    # On the wire only the present version is accepted.
+    with pytest.raises(Rejected, match="encoding"):
+        codec.decode(kind_of(name), msgspec.msgpack.encode(fields), encoding)
+
+
+def test_migrated_messages_are_validated() -> None:
+    fields, encoding = version_1(PRESENT["BodyTruth"])
+    for changed in ({"jet_open_s": [float("nan")]}, {"q_wxyz": [1.0, 1.0, 0.0, 0.0]}, {"jet_open_s": "x"}):
+        with pytest.raises(Rejected):
+            decode_logged(m.BodyTruth, msgspec.msgpack.encode(fields | changed), encoding)
+
+
+@pytest.mark.parametrize(
+    "encoding",
+    [
+        "application/msgpack;chaserdock.Tick.v3",
+        "application/msgpack;chaserdock.Tick.v0",
+        "application/msgpack;chaserdock.JetReport.v1",
+        "application/json;chaserdock.Tick.v1",
+    ],
+)
+def test_unknown_versions_and_types_are_rejected(encoding: str) -> None:
+    with pytest.raises(Rejected, match="encoding"):
+        decode_logged(m.Tick, codec.encode(PRESENT["Tick"]), encoding)
+
+
+@pytest.mark.parametrize(
+    ("key", "present"),
+    [
+        ("chaser/0/jets", "chaser/0/thrusters"),
+        ("chaser/17/jets", "chaser/17/thrusters"),
+        ("chaser/0/thrusters", "chaser/0/thrusters"),
+        ("chaser/0/jets/more", "chaser/0/jets/more"),
+        ("world/tick", "world/tick"),
+    ],
+)
+def test_renamed_keys(key: str, present: str) -> None:
+    assert current_key(key) == present
+
+
+def test_every_renamed_type_exists_today() -> None:
+    names = {kind.__name__ for kind in m.VERSION}
+    assert set(schema_migrations._RENAMED_TYPES.values()) <= names
+    assert not set(schema_migrations._RENAMED_TYPES) & names
+
+
+# -- scenarios --------------------------------------------------------------------------------------------
+
+FORMAT_1: dict[str, Any] = {
+    "name": "old",
+    "time": {"picture_hz": 15, "rate_hz": 15},
+    "chaser": {"jet_test_s": 2.0, "jet_faults_by_command": True, "mass_kg": 10.0},
+    "timeline": [{"at_s": 1.0, "command": "isolate", "jet": 3}, {"at_s": 2.0, "command": "approach"}],
+    "jet_failure": [{"jet": 1, "kind": "weak", "told": False}],
+    "fault": [{"kind": "drop", "topic": "jets"}, {"kind": "drop", "topic": "wrench"}],
+}
+FORMAT_2: dict[str, Any] = {
+    "format": FORMAT,
+    "name": "old",
+    "time": {"image_hz": 15, "rate_hz": 15},
+    "chaser": {"thruster_test_s": 2.0, "thruster_faults_by_command": True, "mass_kg": 10.0},
+    "timeline": [{"at_s": 1.0, "command": "isolate", "thruster": 3}, {"at_s": 2.0, "command": "approach"}],
+    "thruster_failure": [{"thruster": 1, "kind": "weak", "reported": False}],
+    "fault": [{"kind": "drop", "topic": "thrusters"}, {"kind": "drop", "topic": "wrench"}],
+}
+
+
+def test_scenario_of_format_1_is_migrated() -> None:
+    assert json.loads(migrated(json.dumps(FORMAT_1))) == FORMAT_2
+
+
+def test_scenario_of_the_present_format_stays_as_it_is() -> None:
+    for text in (json.dumps(FORMAT_2), "no JSON", "[1, 2]"):
+        assert migrated(text) == text
+
+
+def test_old_keys_are_named_with_their_present_names() -> None:
+    assert old_keys(FORMAT_2) == []
+    lines = old_keys(FORMAT_1)
+    for path, new in (
+        ("time.picture_hz", "image_hz"),
+        ("timeline.0.jet", "thruster"),
+        ("jet_failure", "thruster_f"),
+    ):
+        assert any(line.startswith(path) and new in line for line in lines), path
+
+
+# -- a whole log ------------------------------------------------------------------------------------------
+
+
+def test_log_of_version_1_reads_as_present_messages(tmp_path: Path) -> None:
+    path = tmp_path / "old.mcap"
+    writer = LogWriter(path)
+    writer.describe(json.dumps(FORMAT_1), {"run_id": "r1"})
+    written = []
+    for topic in topics.TOPICS:
+        message: Any = PRESENT[topic.kind.__name__]
+        place = getattr(message, "chaser", 0) if "{chaser}" in topic.key else "controller"
+        key = topic.key_of(place if "{" in topic.key else None)
+        fields, encoding = version_1(message)
+        old_key = key.replace("/thrusters", "/jets")
+        writer.write(old_key, encoding, msgspec.msgpack.encode(fields), 1)
+        written.append((key, message))
+    writer.close()
+    rejected: Counter[str] = Counter()
+    assert [(r.key, r.message) for r in read_log(path, rejected=rejected)] == written
+    assert not rejected
+    assert json.loads(read_scenario(path)[0]) == FORMAT_2

@@ -38,11 +38,11 @@ def start(fleet: Fleet, folder: Path, hours: float, network: list[str]) -> None:
     words.mkdir()
     duration = ["--set", f"duration_s={hours * 3600}"]
     fleet.start("world", ["world", str(SCENARIO), *duration, *network, "-l", "tcp/127.0.0.1:0"], words)
-    fleet.start("controller", ["controller", *network, "--patience", "120"], words)
+    fleet.start("controller", ["controller", *network, "--timeout", "120"], words)
     for i in range(CHASERS):
-        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, "--patience", "120"], words)
-    rotation = ["--rotate-s", "3600"]
-    fleet.start("recorder", ["record", "--out", str(folder), *rotation, *network, "--patience", "120"], words)
+        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, "--timeout", "120"], words)
+    rotation = ["--rotate-time", "3600"]
+    fleet.start("recorder", ["record", "--out", str(folder), *rotation, *network, "--timeout", "120"], words)
 
 
 def memory_mb(fleet: Fleet) -> dict[str, float]:
@@ -93,11 +93,9 @@ def main() -> None:
         fleet = Fleet()
         begun_s = time.monotonic()
         try:
-            start(
-                fleet, Path(folder), hours, ["-e", endpoint, "--namespace", namespace, "--lease-ms", "600000"]
-            )
+            start(fleet, Path(folder), hours, ["-e", endpoint, "--namespace", namespace, "--lease", "600"])
             samples, complete = watch(fleet, hub, Path(folder), min(SAMPLE_S, hours * 3600 / 12))
-            said = [c.last_words() for c in fleet.children if c.process.poll() != 0]
+            said = [c.last_line() for c in fleet.children if c.process.poll() != 0]
         finally:
             fleet.end()
             hub.close()

@@ -152,10 +152,10 @@ def start(fleet: Fleet, folder: Path, seconds: float, network: list[str], subjec
     sets = [part for o in (*OVERRIDES, f"duration_s={seconds}") for part in ("--set", o)]
     world = ["world", str(SCENARIO), "--mode", "realtime", *sets, *network, "-l", "tcp/127.0.0.1:0"]
     fleet.start("world", world, words)
-    fleet.start("controller", ["controller", *network, "--patience", "120"], words)
+    fleet.start("controller", ["controller", *network, "--timeout", "120"], words)
     for i in range(CHASERS):
-        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, "--patience", "120"], words)
-    fleet.start("recorder", ["record", "--out", str(folder), *network, "--patience", "120"], words)
+        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, "--timeout", "120"], words)
+    fleet.start("recorder", ["record", "--out", str(folder), *network, "--timeout", "120"], words)
     if subject == "viewer":
         port = free_port()
         fleet.start("viewer", ["view", *network, "--port", str(port)], words)
@@ -208,7 +208,7 @@ def fly(subject: str, seconds: float, rounds: int, keep: Path | None = None) -> 
             for topic in (topics.TICK, topics.IMAGE, topics.ACTUATORS):
                 hub.subscribe_raw(topic.key.format(chaser="*"), ear.take)
             total_s = SETTLE_S + rounds * len(ROUND) * (seconds + PAUSE_S) + 5.0
-            network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(LEASE_MS)]
+            network = ["-e", endpoint, "--namespace", namespace, "--lease", str(LEASE_MS / 1000)]
             start(fleet, Path(folder), total_s, network, subject)
             touched = psutil.Process(next(c.process.pid for c in fleet.children if c.name == subject))
             wait_for(ear, round(SETTLE_S * RATE_HZ), fleet, hub)
@@ -237,7 +237,7 @@ def wait_for(ear: Ear, tick: int, fleet: Fleet, hub: Node) -> None:
     """Waits until a tick's images have been sent; raises SystemExit when a process ends before."""
     while ear.last_tick < tick:
         received = hub.receive(0.05)
-        dead = [c.last_words() for c in fleet.children if c.process.poll() is not None]
+        dead = [c.last_line() for c in fleet.children if c.process.poll() is not None]
         if dead or (received is not None and isinstance(received.message, MissionEnd)):
             raise SystemExit(f"the mission ended at tick {ear.last_tick}: {'; '.join(dead)}")
 

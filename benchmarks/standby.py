@@ -32,8 +32,7 @@ from results import options_of, write_json
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summarize
-from chaserdock.launch.launcher import Fleet, free_port, run_mission
-from chaserdock.launch.progress import Show
+from chaserdock.launch.launcher import Fleet, fly_mission, free_port
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "fault-drill.toml"
@@ -148,18 +147,18 @@ def start(fleet: Fleet, folder: Path, namespace: str, port: int, wires: dict[str
     words.mkdir()
 
     def client(by: int) -> list[str]:
-        where = ["-m", "client", "-e", f"tcp/127.0.0.1:{by}", "--lease-ms", str(LEASE_MS)]
+        where = ["-m", "client", "-e", f"tcp/127.0.0.1:{by}", "--lease", str(LEASE_MS / 1000)]
         return ["--namespace", namespace, *where]
 
     world = ["world", str(SCENARIO), "--mode", "realtime", "--set", "controller.standby=true", *client(port)]
-    patient = [*client(port), "--patience", "120"]
+    patient = [*client(port), "--timeout", "120"]
     fleet.start("world", world, words)
     for i in range(CHASERS):
         fleet.start(f"chaser/{i}", ["chaser", str(i), *patient], words)
     fleet.start("recorder", ["record", "--out", str(folder), *patient], words)
     for name, wire in wires.items():
         as_what = ["--standby"] if name == "standby" else []
-        fleet.start(name, ["controller", *as_what, *client(wire.port), "--patience", "120"], words)
+        fleet.start(name, ["controller", *as_what, *client(wire.port), "--timeout", "120"], words)
 
 
 def fly(fault: Fault, at_s: float) -> Taken:
@@ -196,7 +195,7 @@ def wait(done: Callable[[], bool], fleet: Fleet, seconds: float) -> None:
         time.sleep(0.005)
         world = next(c for c in fleet.children if c.name == "world")
         if time.monotonic() > deadline or (world.process.poll() is not None and not done()):
-            raise SystemExit(f"the flight does not go on: {[c.last_words() for c in fleet.children]}")
+            raise SystemExit(f"the flight does not go on: {[c.last_line() for c in fleet.children]}")
 
 
 def account(log: Path, first_ns: int | None, struck_ns: int) -> Taken:
@@ -227,7 +226,7 @@ def identical(at_s: float) -> bool:
     for fault in ("[]", f'[{{kind="kill", at_s={at_s}, process="controller"}}]'):
         with tempfile.TemporaryDirectory() as name:
             overrides = ("controller.standby=true", f"fault={fault}")
-            run_mission(SCENARIO, Path(name), "lockstep", None, overrides, Show.nobody)
+            fly_mission(SCENARIO, Path(name), overrides=overrides)
             flight = load_flight(Path(name) / "mission.mcap")
             truths.append({body: track.position_m for body, track in flight.truth.items()})
     return all(np.array_equal(truths[0][body], truths[1][body]) for body in truths[0])

@@ -1,4 +1,4 @@
-"""``python -m chaserdock`` is the ``chaserdock`` program."""
+"""``python -m chaserdock``: the ``chaserdock`` program."""
 
 from chaserdock.cli.main import main
 

@@ -31,13 +31,17 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
     images: dict[int, Image] = {}
     sightings: dict[int, Sighting] = {}
     keys = [t.key_of(i) for i in numbers for t in (IMAGE, SIGHTING)]
+    end_s = 0.0
     for record in read_log(log, keys):
         message = record.message
+        end_s = max(end_s, message.sim_time_ns / 1e9)
         if message.sim_time_ns > at_s * 1e9:
             continue
         (images if isinstance(message, Image) else sightings)[message.chaser] = message
     if not images:
         raise LogError(f"{log}: holds no image up to {at_s:g} s")
+    if at_s > end_s + 1.0 / scenario.time.image_hz:
+        raise LogError(f"--at {at_s:g}: the last image of {log} is of {end_s:.2f} s")
     views = [view(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
     columns = math.ceil(math.sqrt(len(views)))
     blank = np.zeros_like(views[0])

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
 from .columns import nanoseconds, rows_since
 from .flight import Flight, Track, load_flight
+from .judged_criteria import judged_criteria
 from .reached import not_reached, reached_time
 
 _PART = 1 << 14  # rows that are worked on at a time
@@ -201,6 +202,7 @@ def summary_of(flight: Flight) -> dict[str, Any]:
         "wall_time_s": flight.wall_time_s,
         "success": False,
         "failures": [],
+        "not_judged": [],
         "events": _events(flight),
         "chasers": chasers,
         "min_distance_chasers_m": min(between) if between else None,
@@ -227,7 +229,8 @@ def summary_of(flight: Flight) -> dict[str, Any]:
         "rejected": flight.rejected,
         "digest": flight.digest,
     }
-    result["failures"] = failures_of(result, s)
+    judged, result["not_judged"] = judged_criteria(s)
+    result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
     return result
 
@@ -352,4 +355,5 @@ def text_of(result: dict[str, Any]) -> str:
             f"{result['late_commands']} commands late, {result['unanswered']} never came"
         )
     lines += [f"  not met: {failure}" for failure in result["failures"]]
+    lines += [f"  not judged: {reason}" for reason in result["not_judged"]]
     return "\n".join(lines)

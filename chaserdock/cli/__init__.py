@@ -1,1 +1,1 @@
-"""The verbs of the ``chaserdock`` program, a module a group; ``cli`` puts them together."""
+"""The commands of the ``chaserdock`` program, one module per topic; ``main`` assembles them."""

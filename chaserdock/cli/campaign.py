@@ -1,4 +1,4 @@
-"""The verb for many runs."""
+"""The command that flies a Monte Carlo campaign."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .options import fail
 
 
 class KeepLogs(StrEnum):
-    """Whose logs stay."""
+    """Runs whose logs are kept."""
 
     failures = "failures"
     all = "all"
@@ -25,19 +25,17 @@ def campaign(
         Path | None, typer.Option(help="folder for table and report; campaigns/NAME by default")
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option(min=1, help="runs at a time on this machine; its cores by default")
+        int | None, typer.Option(min=1, help="concurrent runs on this machine; its CPU cores by default")
     ] = None,
     cluster: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, such as tcp://host:8786")
+        str | None, typer.Option(metavar="ADDRESS", help="Dask scheduler, e.g. tcp://host:8786")
     ] = None,
-    keep_logs: Annotated[KeepLogs, typer.Option(help="whose logs stay")] = KeepLogs.failures,
-    only: Annotated[
-        int | None, typer.Option(help="fly run number ONLY, say how it went, and nothing else")
-    ] = None,
+    keep_logs: Annotated[KeepLogs, typer.Option(help="runs whose logs are kept")] = KeepLogs.failures,
+    only: Annotated[int | None, typer.Option(min=0, help="fly this run only, and print its result")] = None,
 ) -> None:
-    """Fly many runs of a scenario; resumes where it was stopped. Status 0 when all were flown, whatever their outcome."""
+    """Fly many runs of a scenario; a stopped campaign resumes. Status 0 when all runs have finished."""
     from chaserdock.campaign.scheduler import direct
 
     if only is not None and (cluster is not None or jobs is not None):
-        raise fail("--only flies one run here: it goes without --cluster and --jobs")
+        raise fail("--only flies one run on this machine; it excludes --cluster and --jobs")
     raise typer.Exit(direct(file, out, jobs, cluster, keep_logs.value, only))

@@ -1,17 +1,33 @@
-"""Verbs of an operator: commands to a running mission."""
+"""Operator commands to a running mission, and its status."""
 
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from .options import ConfigOpt, ConnectOpt, JsonOpt, KeysOpt, NamespaceOpt, NetModeOpt, link_of
+from .options import (
+    ChaserArg,
+    ConfigOpt,
+    ConnectOpt,
+    JsonOpt,
+    KeysOpt,
+    NamespaceOpt,
+    NetMode,
+    NetModeOpt,
+    OperatorOpt,
+    ReplyTimeoutOpt,
+    link_of,
+    print_result,
+)
+
+if TYPE_CHECKING:
+    from chaserdock_protocol.messages import CommandReply
 
 
 class Command(StrEnum):
-    """What an operator may ask for."""
+    """Operator commands to a chaser."""
 
     approach = "approach"
     hold = "hold"
@@ -24,43 +40,39 @@ class Command(StrEnum):
 
 
 def command(
-    what: Annotated[Command, typer.Argument(help="what the chaser is to do")],
-    number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
+    what: Annotated[Command, typer.Argument(help="command")],
+    number: ChaserArg,
     offset: Annotated[
-        tuple[float, float, float] | None, typer.Option(help="goto: where, in the target's frame, metres")
+        tuple[float, float, float] | None,
+        typer.Option(metavar="X Y Z", help="goto: position in the target's frame, metres"),
     ] = None,
     thruster: Annotated[
-        int | None, typer.Option(min=0, max=254, help="isolate, restore: which thruster, from 0")
+        int | None, typer.Option(min=0, max=254, help="isolate, restore: thruster number, from 0")
     ] = None,
-    operator: Annotated[str, typer.Option(help="who asks, for the log")] = "",
+    operator: OperatorOpt = "",
     before: Annotated[
-        float | None, typer.Option(min=0, help="simulated seconds of the mission after which it is too late")
+        float | None,
+        typer.Option(
+            min=0, max=7_776_000, help="simulated time, seconds, after which the command is refused"
+        ),
     ] = None,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    timeout: Annotated[float, typer.Option(help="seconds to wait for the answer")] = 5.0,
+    timeout: ReplyTimeoutOpt = 5.0,
     as_json: JsonOpt = False,
 ) -> None:
-    """Tell a chaser of a running mission what to do; status 1 when refused, 2 when nobody answers."""
-    import json
-
+    """Send a command to a chaser of a running mission. Status 1 when refused, 2 when there is no reply."""
     from chaserdock.launch.operator import send_command
 
-    link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
-    reply = send_command(link, what.value, number, offset, timeout, thruster, operator, before)
-    if as_json:
-        answer = {"accepted": reply.accepted, "reason": reply.reason, "sim_time_s": reply.sim_time_ns / 1e9}
-        print(json.dumps(answer, indent=2))
-    else:
-        print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
-    raise typer.Exit(0 if reply.accepted else 1)
+    link = link_of(namespace, connect, None, net_mode, config, keys=keys)
+    _print_reply(send_command(link, what.value, number, offset, timeout, thruster, operator, before), as_json)
 
 
-class Kind(StrEnum):
-    """How a thruster fails, or that it works again."""
+class FaultKind(StrEnum):
+    """Thruster failures, and the end of one."""
 
     stuck_on = "stuck_on"
     stuck_off = "stuck_off"
@@ -69,27 +81,54 @@ class Kind(StrEnum):
 
 
 def thruster_fault(
-    number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
-    thruster: Annotated[int, typer.Argument(min=0, max=254, help="which thruster, from 0")],
-    kind: Annotated[Kind, typer.Argument(help="how it fails; healthy mends it")],
+    number: ChaserArg,
+    thruster: Annotated[int, typer.Argument(min=0, max=254, help="thruster number, from 0")],
+    kind: Annotated[FaultKind, typer.Argument(help="failure; healthy ends it")],
     factor: Annotated[
-        float | None, typer.Option(min=0.0, max=1.0, help="weak: what is left of its thrust")
+        float | None, typer.Option(min=0.0, max=1.0, help="weak: fraction of the nominal thrust")
     ] = None,
-    operator: Annotated[str, typer.Option(help="who asks, for the log")] = "",
+    operator: OperatorOpt = "",
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    timeout: Annotated[float, typer.Option(help="seconds to wait for the answer")] = 5.0,
+    timeout: ReplyTimeoutOpt = 5.0,
+    as_json: JsonOpt = False,
 ) -> None:
-    """Make a thruster of a running mission fail, for a test; status 1 when refused, 2 when nobody answers.
+    """Inject a thruster failure into a running mission. Status 1 when refused, 2 when there is no reply.
 
-    Only where the scenario allows it: chaser.thruster_faults_by_command. The chaser is not told.
+    The scenario must allow it with chaser.thruster_faults_by_command. The chaser is not informed.
     """
     from chaserdock.launch.operator import send_thruster_fault
 
-    link = link_of(namespace, connect, None, net_mode, config, 60_000, keys)
-    reply = send_thruster_fault(link, number, thruster, kind.value, factor, timeout, operator)
-    print(f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}")
+    link = link_of(namespace, connect, None, net_mode, config, keys=keys)
+    _print_reply(send_thruster_fault(link, number, thruster, kind.value, factor, timeout, operator), as_json)
+
+
+def _print_reply(reply: CommandReply, as_json: bool) -> None:
+    """Print a reply and exit with status 0 or 1."""
+    value = {"accepted": reply.accepted, "reason": reply.reason, "sim_time_s": reply.sim_time_ns / 1e9}
+    print_result(as_json, value, [f"{'accepted' if reply.accepted else 'refused'}: {reply.reason}"])
     raise typer.Exit(0 if reply.accepted else 1)
+
+
+def status(
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    net_mode: NetModeOpt = NetMode.peer,
+    config: ConfigOpt = None,
+    keys: KeysOpt = None,
+    duration: Annotated[float, typer.Option(min=0.1, max=3600.0, help="seconds to listen")] = 3.0,
+    as_json: JsonOpt = False,
+) -> None:
+    """Show the processes on a mission's network, the tick, and each chaser's phase. Status 2 without any process."""
+    from rich.console import Console
+
+    from chaserdock.launch.status import observe, table_of
+
+    observed = observe(link_of(namespace, connect, None, net_mode, config, keys=keys), duration)
+    if as_json:
+        print_result(True, observed.as_dict(), ())
+    else:
+        Console().print(table_of(observed))

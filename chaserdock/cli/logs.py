@@ -1,8 +1,8 @@
-"""Verbs about recorded logs: ``chaserdock log …``."""
+"""Commands for recorded logs: ``chaserdock log …``."""
 
 from __future__ import annotations
 
-import json
+import math
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -11,25 +11,37 @@ import typer
 
 from chaserdock.exit_codes import DONE, STOPPED
 
-from .options import ConfigOpt, ConnectOpt, JsonOpt, ListenOpt, NamespaceOpt, NetModeOpt, link_of
-from .plain import PlainGroup
+from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .options import (
+    ConfigOpt,
+    ConnectOpt,
+    JsonOpt,
+    ListenOpt,
+    NamespaceOpt,
+    NetMode,
+    NetModeOpt,
+    print_result,
+    server_link,
+)
 
 app = typer.Typer(
-    cls=PlainGroup,
+    name="log",
+    cls=GroupedHelp,
+    context_settings=HELP_OPTIONS,
     rich_markup_mode=None,
-    help="Look into a log, repair it, export it, send it again.",
+    help="Inspect, repair, export and play a log.",
     no_args_is_help=True,
 )
 
-LogArg = Annotated[
+LogFilesArg = Annotated[
     list[Path],
-    typer.Argument(metavar="LOG", help="a mission.mcap, the folder of a run, or the files of a rotated log"),
+    typer.Argument(metavar="LOG", help="folder of a run, its mission.mcap, or the files of a rotated log"),
 ]
 FolderOpt = Annotated[Path, typer.Option("--out", help="folder to write into")]
 
 
 class Format(StrEnum):
-    """Kinds of table files."""
+    """File formats of tables."""
 
     parquet = "parquet"
     csv = "csv"
@@ -39,93 +51,97 @@ def _source(log: list[Path]) -> Path | list[Path]:
     return log[0] if len(log) == 1 else log
 
 
-@app.command()
-def info(log: LogArg, as_json: JsonOpt = False) -> None:
-    """Say what a log holds and check all of it; status 1 when it is not whole (cut off, messages missing or refused)."""
+def info(log: LogFilesArg, as_json: JsonOpt = False) -> None:
+    """Check all of a log and print what it holds. Status 1 when it is incomplete (cut off, messages lost or rejected)."""
     import msgspec
 
     from chaserdock.logs.info import info_lines, info_of
 
-    found = info_of(_source(log))
-    if as_json:
-        print(json.dumps({"whole": found.whole, **msgspec.to_builtins(found)}, indent=2))
-    else:
-        print("\n".join(info_lines(found)))
-    raise typer.Exit(0 if found.whole else 1)
+    result = info_of(_source(log))
+    print_result(as_json, {"whole": result.whole, **msgspec.to_builtins(result)}, info_lines(result))
+    raise typer.Exit(0 if result.whole else 1)
 
 
-@app.command()
 def recover(
-    log: Annotated[Path, typer.Argument(help="a log that was cut off or damaged")],
-    out: Annotated[Path, typer.Option(help="file to write what can be saved into")],
+    log: Annotated[Path, typer.Argument(help="log that is cut off or damaged")],
+    out: Annotated[Path, typer.Option(help="file to write the readable messages to")],
+    as_json: JsonOpt = False,
 ) -> None:
-    """Save what is whole of a log that was cut off or damaged; status 1 when something in its middle was lost."""
-    from chaserdock.logs.recover import recover as save
+    """Copy the readable messages of a damaged log to a new one. Status 1 when messages in its middle are lost."""
+    import msgspec
 
-    found = save(log, out)
-    print(f"{out}: {found.messages} messages in {found.chunks} chunks saved")
-    if found.skipped_bytes:
-        print(f"{found.skipped_bytes} bytes could not be read")
-    if found.broken_records or found.messages_without_channel:
-        print(
-            f"lost: {found.broken_records} damaged records, {found.messages_without_channel} messages whose "
-            "channel was declared in one of them"
+    from chaserdock.logs.recover import recover as recover_log
+
+    result = recover_log(log, out)
+    lines = [f"{out}: {result.messages} messages in {result.chunks} chunks recovered"]
+    if result.skipped_bytes:
+        lines.append(f"{result.skipped_bytes} bytes are not readable")
+    lost = result.broken_records or result.messages_without_channel
+    if lost:
+        lines.append(
+            f"lost: {result.broken_records} damaged records, {result.messages_without_channel} messages whose "
+            "channel is declared in one of them"
         )
-        raise typer.Exit(1)
+    print_result(as_json, msgspec.to_builtins(result), lines)
+    raise typer.Exit(1 if lost else 0)
 
 
-@app.command()
 def export(
-    log: LogArg,
+    log: LogFilesArg,
     out: FolderOpt,
     format: Annotated[
-        Format, typer.Option(help="parquet keeps types and units; csv opens anywhere")
+        Format, typer.Option(help="parquet keeps types and units; csv is readable everywhere")
     ] = Format.parquet,
-    images: Annotated[bool, typer.Option("--images", help="with the images' bytes")] = False,
+    images: Annotated[bool, typer.Option("--images", help="include the bytes of the images")] = False,
 ) -> None:
-    """Write one table a topic, all chasers together."""
+    """Write one table per topic, all chasers together."""
     from chaserdock.logs.export import export as write
 
     for name, rows in write(_source(log), out, format.value, images).items():
         print(f"{out / name}: {rows} rows")
 
 
-@app.command()
 def tracks(
-    log: LogArg,
+    log: LogFilesArg,
     out: FolderOpt,
-    from_s: Annotated[float, typer.Option(help="simulated time of the first point, s")] = 0.0,
-    to_s: Annotated[float, typer.Option(help="simulated time of the last point, s")] = float("inf"),
+    from_s: Annotated[
+        float, typer.Option("--from", min=0.0, help="simulated time of the first point, seconds")
+    ] = 0.0,
+    to_s: Annotated[
+        float | None,
+        typer.Option("--to", min=0.0, help="simulated time of the last point, seconds; the end by default"),
+    ] = None,
 ) -> None:
-    """Write trajectories as TUM files: truth of all bodies, the target's estimate, odometries, references."""
+    """Write trajectories as TUM files: truth of all bodies, target estimate, odometry, references."""
     from chaserdock.logs.tracks import write_tracks
 
-    for name, points in write_tracks(_source(log), out, from_s, to_s).items():
+    end_s = math.inf if to_s is None else to_s
+    for name, points in write_tracks(_source(log), out, from_s, end_s).items():
         print(f"{out / name}: {points} points")
 
 
-@app.command()
 def play(
-    log: LogArg,
+    log: LogFilesArg,
     speed: Annotated[
-        float | None, typer.Option(min=0.01, help="simulated over wall time; as fast as it goes by default")
+        float | None, typer.Option(min=0.01, help="simulated over wall time; as fast as possible by default")
     ] = None,
-    patience: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a recorder")] = 60.0,
+    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a recorder")] = 60.0,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
 ) -> None:
-    """Send a log's messages again, as they were, once `chaserdock record` listens; in the place of a world."""
+    """Publish a log's messages again, unchanged, in place of a world, once `chaserdock record` has joined."""
     from chaserdock_protocol.process import StopSignal
-    from chaserdock_protocol.transport import DEFAULT_ENDPOINT
 
-    from chaserdock.logs.player import play as send
+    from chaserdock.logs.player import play as publish
 
-    if listen is None and connect is None and net_mode == "peer":
-        listen = [DEFAULT_ENDPOINT]
-    link = link_of(namespace, connect or [], listen, net_mode, config, 60_000)
+    link = server_link(namespace, connect, listen, net_mode, config)
     stop = StopSignal(watch_parent=False)
-    print(f"{send(_source(log), link, speed, patience, stopped=stop)} messages sent")
+    print(f"{publish(_source(log), link, speed, timeout, stopped=stop)} messages sent")
     raise typer.Exit(STOPPED if stop() else DONE)
+
+
+for member in (info, recover, export, tracks, play):
+    app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)(member)

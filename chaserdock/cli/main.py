@@ -1,105 +1,120 @@
-"""The ``chaserdock`` program.
-
-Exit statuses: ``statuses``.
-"""
+"""The ``chaserdock`` program: all commands by group. Exit statuses: ``chaserdock.exit_codes``."""
 
 from __future__ import annotations
 
 import os
 import sys
 from importlib import metadata
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from chaserdock_protocol.errors import ChaserdockError
+from typer.exceptions import TyperException
 
 from chaserdock.exit_codes import FAILED
 
-from . import logs
+from . import keys, logs
+from .analysis import figures, report, snapshot, summary, video
 from .calibration import calibrate, markers
 from .campaign import campaign
-from .command import command, thruster_fault
+from .command import command, status, thruster_fault
 from .conformance import check
-from .network import judge, keys, router, status
+from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
 from .options import fail
-from .plain import PlainGroup
-from .processes import chaser, controller, record, run, world
-from .publish import figures, report, video
+from .processes import chaser, controller, record, router, world
 from .replay import compare, replay
 from .reproduce import reproduce, study
-from .run import snapshot, summary
+from .run import judge, run
 from .view import view
 
+GROUPS: dict[str, tuple[Any, ...]] = {
+    "Fly": (run, campaign),
+    "Processes": (world, chaser, controller, record, router),
+    "Operate": (command, thruster_fault, status, view, judge),
+    "Look at a flight": (summary, report, figures, video, snapshot),
+    "Logs": (logs.app,),
+    "Reproduce and compare": (replay, compare, reproduce, study, check),
+    "Setup": (markers, calibrate, keys.app),
+}
+"""Commands (functions) and groups of commands (apps) by the section of the help that lists them."""
 
-def _version(asked: bool) -> None:
-    if asked:
+
+def _print_version(requested: bool) -> None:
+    if requested:
         typer.echo(f"chaserdock {metadata.version('chaserdock')}")
         raise typer.Exit
+
+
+class ProgramHelp(GroupedHelp):
+    """Help of the program, in the order of ``GROUPS``."""
+
+    panel_order = tuple(GROUPS)
 
 
 app = typer.Typer(
     name="chaserdock",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    cls=PlainGroup,
-    rich_markup_mode=None,  # rich takes longer to load than help to read
+    cls=ProgramHelp,
+    context_settings=HELP_OPTIONS,
+    rich_markup_mode=None,  # importing rich takes longer than all of the help
 )
-for verb in (
-    run,
-    world,
-    chaser,
-    controller,
-    record,
-    command,
-    thruster_fault,
-    summary,
-    snapshot,
-    campaign,
-    figures,
-    report,
-    video,
-    replay,
-    compare,
-    router,
-    status,
-    judge,
-    reproduce,
-    study,
-    markers,
-    calibrate,
-    check,
-    view,
-):
-    app.command()(verb)
+for panel, members in GROUPS.items():
+    for member in members:
+        if isinstance(member, typer.Typer):
+            app.add_typer(member, rich_help_panel=panel)
+        else:
+            app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS, rich_help_panel=panel)(member)
 
 
 @app.callback()
 def program(
     version: Annotated[
-        bool, typer.Option("--version", is_eager=True, callback=_version, help="Say the version and leave.")
+        bool,
+        typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit."),
     ] = False,
 ) -> None:
     """Vision-based docking of several satellites with a tumbling target."""
 
 
-app.add_typer(logs.app, name="log")
-app.add_typer(keys, name="keys")
-
-
 def main() -> None:
-    """Entry point; a closed pipe (``| head``) is no error."""
+    """Run the program; report an error as one line, and a closed pipe (``| head``) not at all."""
     try:
-        app()
+        sys.exit(app(prog_name="chaserdock", standalone_mode=False) or 0)
     except ChaserdockError as error:
         sys.exit(fail(str(error)).exit_code)
+    except TyperException as error:
+        sys.exit(_report_usage_error(error))
     except BrokenPipeError:
         sys.exit(FAILED)
     finally:
-        _let_go()
+        _flush_output()
 
 
-def _let_go() -> None:
-    """Writes what is still to be written; where nobody reads any more it goes nowhere, or Python would complain."""
+_PLAIN_TEXTS = {
+    "Value error, ": "",
+    "Input should be a valid integer, unable to parse string as an integer": "must be a whole number",
+    "Input should be a valid integer, got a number with a fractional part": "must be a whole number",
+    "Input should be a valid number, unable to parse string as a number": "must be a number",
+    "Input should be": "must be",
+}
+
+
+def _report_usage_error(error: Any) -> int:
+    """Print typer's error as one line, or the help where that is the error; return the exit status."""
+    if type(error).__name__ == "NoArgsIsHelpError":
+        error.show()
+        return error.exit_code
+    path = error.ctx.command_path if error.ctx is not None else "chaserdock"
+    name = path.removeprefix("chaserdock").strip()
+    text = " ".join(error.format_message().split())
+    for pydantic_text, plain_text in _PLAIN_TEXTS.items():
+        text = text.replace(pydantic_text, plain_text)
+    return fail(f"{name}: {text.rstrip('.')}; see `chaserdock {name} --help`" if name else text).exit_code
+
+
+def _flush_output() -> None:
+    """Flush standard output; discard it when the reader has closed the pipe."""
     assert sys.__stdout__ is not None  # sys.stdout may be click's wrapper by now
     try:
         sys.__stdout__.flush()

@@ -1,4 +1,4 @@
-"""Verbs that fly: a whole mission, or one process of it."""
+"""Commands that run one process of a mission, for missions on several hosts or in containers."""
 
 from __future__ import annotations
 
@@ -6,81 +6,57 @@ import sys
 from datetime import datetime
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from .options import (
+    DEFAULT_LEASE_S,
+    ChaserArg,
     ConfigOpt,
     ConnectOpt,
+    JoinTimeoutOpt,
     KeysOpt,
     LeaseOpt,
-    LinesOpt,
     ListenOpt,
     Mode,
     ModeOpt,
     NamespaceOpt,
+    NetMode,
     NetModeOpt,
     OutOpt,
-    PatienceOpt,
-    QuietOpt,
     ScenarioArg,
     SeedOpt,
     SetOpt,
     WatchOpt,
-    errors_as_lines,
+    check_config,
+    check_endpoints,
     fail,
     link_of,
-    show_of,
+    server_link,
+    tls_of,
 )
 
+if TYPE_CHECKING:
+    from chaserdock_protocol.process import ProcessOptions
 
-def start_process(name: str, options) -> None:
-    """Runs a process by its entry point (group ``chaserdock.processes``) and exits with its status."""
-    found = [e for e in entry_points(group="chaserdock.processes") if e.name == name]
-    if not found:
+
+def start_process(name: str, options: ProcessOptions) -> None:
+    """Run a process by its entry point (group ``chaserdock.processes``) and exit with its status."""
+    installed = [e for e in entry_points(group="chaserdock.processes") if e.name == name]
+    if not installed:
         raise fail(f"no process {name!r} is installed")
     try:
-        process = found[0].load()
+        process = installed[0].load()
     except ImportError as error:
         if "pybullet" in str(error):
+            python = f"{sys.version_info.major}.{sys.version_info.minor}"
             raise fail(
-                f"the world needs PyBullet, whose wheels end at Python 3.11; this is Python {sys.version_info.major}."
-                f"{sys.version_info.minor}. With uv: uv run --python 3.11 chaserdock world …"
+                f"the world needs PyBullet, which has no wheels for Python {python}; use Python 3.11, "
+                "e.g. uv run --python 3.11 chaserdock world …"
             ) from None
         raise
     sys.exit(process(options))
-
-
-def run(
-    scenario: ScenarioArg,
-    out: OutOpt = None,
-    mode: ModeOpt = Mode.lockstep,
-    seed: SeedOpt = None,
-    overrides: SetOpt = None,
-    quiet: QuietOpt = False,
-    as_json: LinesOpt = False,
-    view: Annotated[bool, typer.Option("--view", help="show it in a web browser, too (see `view`)")] = False,
-    keys: Annotated[
-        Path | None,
-        typer.Option(
-            "--keys",
-            envvar="CHASERDOCK_KEYS",
-            metavar="DIR",
-            help="a mission's keys (see `keys init`): through a router, over TLS, each process held to its rights",
-        ),
-    ] = None,
-) -> None:
-    """Fly a scenario on this machine: start every process, record, judge; status 0 only if it was a success."""
-    from chaserdock.launch.launcher import run_mission
-
-    show = show_of(quiet, as_json)
-    with errors_as_lines(as_json):
-        path = find_scenario(scenario)
-        folder = out or Path("runs") / f"{path.stem}-{datetime.now():%Y%m%d-%H%M%S}"
-        changes = tuple(overrides or ())
-        raise typer.Exit(run_mission(path, folder, mode.value, seed, changes, show, view, keys))
 
 
 def world(
@@ -92,114 +68,138 @@ def world(
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    lease_ms: LeaseOpt = 60_000,
-    rejoin: Annotated[
-        float, typer.Option("--rejoin-s", help="lock-step: seconds to wait when everybody is lost")
+    lease: LeaseOpt = DEFAULT_LEASE_S,
+    rejoin_timeout: Annotated[
+        float, typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost")
     ] = 0.0,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """The simulated world: physics, cameras, time. Listens on tcp/127.0.0.1:7447 unless told otherwise."""
+    """Simulate the world: physics, cameras, time. Listens on tcp/127.0.0.1:7447 by default."""
     from chaserdock_protocol.process import ProcessOptions
-    from chaserdock_protocol.transport import DEFAULT_ENDPOINT
+    from chaserdock_protocol.shipped_scenarios import find_scenario
 
-    if listen is None and connect is None and net_mode == "peer" and keys is None:
-        listen = [DEFAULT_ENDPOINT]
     options = ProcessOptions(
-        link=link_of(namespace, connect or [], listen, net_mode, config, lease_ms, keys, "world"),
+        link=server_link(namespace, connect, listen, net_mode, config, lease, keys),
         scenario=find_scenario(scenario),
         overrides=tuple(overrides or ()),
         seed=seed,
         mode=mode.value,
         recorder_expected=recorder,
-        rejoin_s=rejoin,
+        rejoin_s=rejoin_timeout,
         watch_parent=watch_parent,
     )
     start_process("world", options)
 
 
 def chaser(
-    number: Annotated[int, typer.Argument(min=0, max=255, help="which chaser, from 0")],
+    number: ChaserArg,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    lease_ms: LeaseOpt = 60_000,
-    patience: PatienceOpt = None,
+    lease: LeaseOpt = DEFAULT_LEASE_S,
+    timeout: JoinTimeoutOpt = None,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """One chaser: sees the target, drives its actuators."""
+    """Run one chaser: measures the target's pose in its images, drives its actuators."""
     from chaserdock_protocol.process import ProcessOptions
 
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, f"chaser/{number}")
+    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, f"chaser/{number}")
     start_process(
-        "chaser", ProcessOptions(link=link, chaser=number, patience_s=patience, watch_parent=watch_parent)
+        "chaser", ProcessOptions(link=link, chaser=number, patience_s=timeout, watch_parent=watch_parent)
     )
 
 
 def controller(
     standby: Annotated[
-        bool,
-        typer.Option("--standby", help="as the second one: follow, and take over when the first is lost"),
+        bool, typer.Option("--standby", help="run as the hot standby of another controller")
     ] = False,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    lease_ms: LeaseOpt = 60_000,
-    patience: PatienceOpt = None,
+    lease: LeaseOpt = DEFAULT_LEASE_S,
+    timeout: JoinTimeoutOpt = None,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """The central controller: fuses what all chasers see, plans for all of them."""
+    """Run the central controller: fuses all chasers' measurements, plans for all chasers."""
     from chaserdock_protocol.process import ProcessOptions
 
     name = "standby" if standby else "controller"
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, name)
-    options = ProcessOptions(link=link, patience_s=patience, watch_parent=watch_parent, standby=standby)
+    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, name)
+    options = ProcessOptions(link=link, patience_s=timeout, watch_parent=watch_parent, standby=standby)
     start_process("controller", options)
 
 
 def record(
     out: OutOpt = None,
-    by_run: Annotated[bool, typer.Option(help="make a folder for this run in OUT")] = False,
+    by_run: Annotated[bool, typer.Option(help="write into a folder of this run inside OUT")] = False,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    lease_ms: LeaseOpt = 60_000,
-    patience: PatienceOpt = None,
-    rotate_size_mb: Annotated[
+    lease: LeaseOpt = DEFAULT_LEASE_S,
+    timeout: JoinTimeoutOpt = None,
+    rotate_size: Annotated[
         float | None,
-        typer.Option(min=1, help="begin a new file (mission-0000.mcap …) after so many megabytes"),
+        typer.Option(min=1, max=1e9, help="start a new file (mission-0000.mcap …) after this many megabytes"),
     ] = None,
-    rotate_s: Annotated[
-        float | None, typer.Option(min=1, help="begin a new file after so many simulated seconds")
+    rotate_time: Annotated[
+        float | None, typer.Option(min=1, help="start a new file after this many simulated seconds")
     ] = None,
-    viewer: Annotated[bool, typer.Option(help="write the layer that rerun and Foxglove show, too")] = True,
+    viewer: Annotated[bool, typer.Option(help="write the layer that rerun and Foxglove read, too")] = True,
     watch_parent: WatchOpt = False,
 ) -> None:
-    """The recorder: every message into OUT/mission.mcap."""
+    """Record every message into OUT/mission.mcap."""
     from chaserdock_protocol.process import ProcessOptions, Rotation
 
     folder = (
         (out or Path("runs")) if by_run else out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
     )
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, "recorder")
+    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, "recorder")
     options = ProcessOptions(
         link=link,
         out=folder,
         by_run=by_run,
-        rotation=Rotation(None if rotate_size_mb is None else round(rotate_size_mb * 1e6), rotate_s),
+        rotation=Rotation(None if rotate_size is None else round(rotate_size * 1e6), rotate_time),
         viewer_layer=viewer,
-        patience_s=patience,
+        patience_s=timeout,
         watch_parent=watch_parent,
     )
     start_process("record", options)
+
+
+def router(
+    listen: ListenOpt = None,
+    keys: KeysOpt = None,
+    namespace: NamespaceOpt = "chaserdock",
+    config: ConfigOpt = None,
+    lease: LeaseOpt = 10.0,
+    until: Annotated[
+        str | None, typer.Option(metavar="PROCESS", help="exit when this process has joined and left")
+    ] = None,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """Run the router that a mission's processes connect to; with --keys it enforces each process' access rights."""
+    from chaserdock_protocol.process import ProcessOptions
+    from chaserdock_protocol.topics import is_process_name
+    from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
+
+    if until is not None and not is_process_name(until):
+        raise fail(f"--until {until}: must be a process, e.g. operator or chaser/0")
+    check_config(config)
+    check_endpoints("--listen", listen or [], tls=keys is not None)
+    scheme = "tls/" if keys is not None else "tcp/"
+    endpoints = tuple(listen or [DEFAULT_ENDPOINT.replace("tcp/", scheme)])
+    tls = tls_of(keys, "router") if keys is not None else None
+    link = Link(namespace, (), endpoints, "router", config, round(lease * 1000), tls)
+    start_process("router", ProcessOptions(link=link, until=until, watch_parent=watch_parent))

@@ -1,4 +1,4 @@
-"""Verbs that lay our figures beside the paper's."""
+"""Commands that reproduce the paper's results."""
 
 from __future__ import annotations
 
@@ -16,28 +16,31 @@ def reproduce(
     quick: Annotated[
         bool, typer.Option("--quick", help="shorter runs, one seed: minutes, not hours")
     ] = False,
-    out: Annotated[
-        Path, typer.Option(help="folder of runs and of the page; a second call goes on there")
-    ] = Path("runs/reproduce"),
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="missions at a time")] = 2,
+    out: Annotated[Path, typer.Option(help="folder for runs and page; a second call resumes there")] = Path(
+        "runs/reproduce"
+    ),
+    jobs: Annotated[int, typer.Option(min=1, max=64, help="concurrent missions")] = 2,
     keep_logs: Annotated[
         bool, typer.Option("--keep-logs", help="keep every mission.mcap (gigabytes)")
     ] = False,
 ) -> None:
-    """Fly the paper's table and missions, and write them beside the paper's figures: OUT/reproduction.md and .html."""
-    from chaserdock.reproduce.main import reproduce as work
+    """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and .html."""
+    from chaserdock.reproduce.main import reproduce as fly_all
 
-    raise typer.Exit(work(quick, out, jobs, keep_logs))
+    raise typer.Exit(fly_all(quick, out, jobs, keep_logs))
 
 
 def study(
     cases: Annotated[
-        Path, typer.Argument(help="StudyCases (chaserdock_protocol/study.py), one a line, as JSON")
+        Path,
+        typer.Argument(help="cases, one JSON object per line (StudyCase in chaserdock_protocol/study.py)"),
     ],
-    out: Annotated[Path, typer.Option(help="results are appended here")],
+    out: Annotated[Path, typer.Option(help="results are appended to this file")],
 ) -> None:
-    """Fly the controller by itself on perfect knowledge, without images: a file of cases."""
-    found = [e for e in entry_points(group="chaserdock.studies") if e.name == "controller"]
-    if not found:
+    """Fly the controller alone, on perfect knowledge and without images: a file of cases."""
+    installed = [e for e in entry_points(group="chaserdock.studies") if e.name == "controller"]
+    if not installed:
         raise fail("no study of the controller is installed")
-    sys.exit(found[0].load()(cases, out))
+    if not cases.is_file():
+        raise fail(f"{cases}: no such file")
+    sys.exit(installed[0].load()(cases, out))

@@ -1,38 +1,113 @@
-"""Verbs that look at a recorded flight."""
+"""Commands that fly a whole mission on this machine, or judge one that other machines fly."""
 
 from __future__ import annotations
 
+import signal
+import sys
+import threading
+from collections.abc import Generator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Annotated
 
 import typer
 
-from .options import fail
+from .options import (
+    DEFAULT_LEASE_S,
+    ConfigOpt,
+    ConnectOpt,
+    JsonLinesOpt,
+    KeysOpt,
+    LeaseOpt,
+    Mode,
+    ModeOpt,
+    NamespaceOpt,
+    NetMode,
+    NetModeOpt,
+    OutOpt,
+    QuietOpt,
+    ScenarioArg,
+    SeedOpt,
+    SetOpt,
+    errors_as_json,
+    link_of,
+    show_of,
+)
 
 
-def summary(log: Annotated[Path, typer.Argument(help="a mission.mcap")]) -> None:
-    """Judge a recorded flight again and print its summary as JSON; status 0 only if it was a success."""
-    import json
-
-    from chaserdock.analysis.summary import summarize
-
-    result = summarize(log)
-    print(json.dumps(result, indent=2))
-    raise typer.Exit(0 if result["success"] else 1)
-
-
-def snapshot(
-    log: Annotated[Path, typer.Argument(help="a mission.mcap")],
-    at: Annotated[float, typer.Option(help="simulated time, seconds")],
-    out: Annotated[Path, typer.Option(help="image to write: .png or .jpg")],
-    width: Annotated[int, typer.Option(min=64, max=4096, help="width of one camera's image, pixels")] = 640,
+def run(
+    scenario: ScenarioArg,
+    out: OutOpt = None,
+    mode: ModeOpt = Mode.lockstep,
+    seed: SeedOpt = None,
+    overrides: SetOpt = None,
+    quiet: QuietOpt = False,
+    as_json: JsonLinesOpt = False,
+    view: Annotated[bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")] = False,
+    keys: KeysOpt = None,
 ) -> None:
-    """Draw what every camera saw at a moment of a recorded flight, detections included."""
-    import cv2
+    """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
+    import chaserdock
+    from chaserdock.launch.launcher import print_outcome
+    from chaserdock.viewer.address import DEFAULT_HOST, free_port, url_of
 
-    from chaserdock.analysis.snapshot import snapshot as draw
+    show = show_of(quiet, as_json)
+    with errors_as_json(as_json), stop_on_signals() as stop:
+        port = None
+        if view:
+            port = free_port(DEFAULT_HOST, None)
+            print(f"the viewer is at {url_of(DEFAULT_HOST, port)}", file=sys.stderr, flush=True)
+        outcome = chaserdock.api.fly(
+            scenario,
+            out=out,
+            mode=mode.value,
+            seed=seed,
+            sets=tuple(overrides or ()),
+            keys=keys,
+            show=show,
+            viewer_port=port,
+            stop_requested=stop.is_set,
+        )
+    print_outcome(outcome, show)
+    raise typer.Exit(outcome.status)
 
-    if out.suffix.lower() not in (".png", ".jpg", ".jpeg"):
-        raise fail(f"--out {out}: must end in .png or .jpg")
-    if not cv2.imwrite(str(out), draw(log, at, width)):
-        raise fail(f"--out {out}: cannot be written")
+
+@contextmanager
+def stop_on_signals() -> Generator[threading.Event]:
+    """Set an event on SIGINT or SIGTERM; repeated signals change nothing until all processes have exited."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def judge(
+    out: Annotated[Path, typer.Argument(help="folder that the recorder writes to with --by-run")],
+    namespace: NamespaceOpt = "chaserdock",
+    connect: ConnectOpt = None,
+    net_mode: NetModeOpt = NetMode.peer,
+    config: ConfigOpt = None,
+    keys: KeysOpt = None,
+    lease: LeaseOpt = DEFAULT_LEASE_S,
+    timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a mission")] = 120.0,
+    world_timeout: Annotated[
+        float, typer.Option(min=0.1, help="seconds after which an absent world counts as lost")
+    ] = 60.0,
+    quiet: QuietOpt = False,
+    as_json: JsonLinesOpt = False,
+) -> None:
+    """Watch a mission that other machines fly, wait for its log and judge it. Status 0 only if it is a success."""
+    from chaserdock.launch.judge import judge_mission
+
+    show = show_of(quiet, as_json)
+    link = link_of(namespace, connect, None, net_mode, config, lease, keys)
+    with errors_as_json(as_json):
+        raise typer.Exit(judge_mission(out, link, timeout, world_timeout, show))

@@ -1,4 +1,4 @@
-"""The web viewer's verb."""
+"""The command that serves the web viewer."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from typing import Annotated
 import typer
 
 from .options import (
+    DEFAULT_LEASE_S,
     ConfigOpt,
     ConnectOpt,
     KeysOpt,
     LeaseOpt,
     ListenOpt,
     NamespaceOpt,
+    NetMode,
     NetModeOpt,
     WatchOpt,
     fail,
@@ -26,27 +28,27 @@ def view(
         list[Path] | None,
         typer.Argument(
             metavar="[LOG]",
-            help="a mission.mcap, a run's folder or the files of a rotated log; without, the running mission",
+            help="folder of a run, its mission.mcap, or the files of a rotated log; the running mission by default",
         ),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="address to serve the page on; whoever reaches it can command the mission")
+        str, typer.Option(help="address to serve the page on; every client can command the mission")
     ] = "127.0.0.1",
     port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="the first free one from 8080 on by default")
+        int | None, typer.Option(min=1, max=65535, help="port; the first free one from 8080 by default")
     ] = None,
-    dark: Annotated[bool, typer.Option("--dark", help="begin in dark colours")] = False,
-    truth: Annotated[bool, typer.Option(help="show ground truth, too, where it may be read")] = True,
+    dark: Annotated[bool, typer.Option("--dark", help="start with dark colours")] = False,
+    truth: Annotated[bool, typer.Option(help="show ground truth where it is readable")] = True,
     at: Annotated[
-        float | None, typer.Option(min=0, help="a log: stand still at this simulated second")
+        float | None, typer.Option(min=0, help="log: pause at this simulated time, seconds")
     ] = None,
     namespace: NamespaceOpt = "chaserdock",
     connect: ConnectOpt = None,
     listen: ListenOpt = None,
-    net_mode: NetModeOpt = "peer",
+    net_mode: NetModeOpt = NetMode.peer,
     config: ConfigOpt = None,
     keys: KeysOpt = None,
-    lease_ms: LeaseOpt = 60_000,
+    lease: LeaseOpt = DEFAULT_LEASE_S,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Show a running mission, or a log, in a web browser: scene, images, plots, phases, commands."""
@@ -58,6 +60,6 @@ def view(
 
         raise typer.Exit(view_log(log[0] if len(log) == 1 else log, options, at, watch_parent))
     if at is not None:
-        raise fail("--at: goes with a log")
-    link = link_of(namespace, connect, listen, net_mode, config, lease_ms, keys, "viewer")
+        raise fail("--at: needs a log")
+    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, "viewer")
     raise typer.Exit(view_live(link, options, watch_parent))

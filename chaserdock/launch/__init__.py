@@ -1,0 +1,1 @@
+"""Start, watch and judge missions; operator commands, status, keys."""

@@ -1,4 +1,4 @@
-"""A mission as an operator hears it: what is worth telling at once, and how it stands. No I/O; wall time is given."""
+"""State of a running mission, from its messages: notices for the operator, and progress. No I/O; wall time is passed in."""
 
 from __future__ import annotations
 
@@ -21,42 +21,42 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.scenario import Scenario
 
-from .json_events import ChaserLine, Commanded, Progress, Told
+from .json_events import ChaserProgress, CommandNotice, EventNotice, Progress
 
-_NOW_S = 5.0
-"""Wall time over which the present speed is taken."""
+_SPEED_WINDOW_S = 5.0
+"""Wall time over which the present speed is measured."""
 _KEPT_TICKS = 50
 _SOLVED = ("solved", "iteration_limit")
 
 
 @dataclass
 class FlightState:
-    """Takes messages in the order they come and says how the mission stands."""
+    """Track a mission from its messages, in order of arrival."""
 
     scenario: Scenario
     flying: bool = False
     tick: int = -1
     time_ns: int = 0
     target: TargetEstimate | None = None
-    references: dict[int, Reference] = field(default_factory=dict)
-    present: set[str] = field(default_factory=set)
-    _odometry: dict[tuple[int, int], Odometry] = field(default_factory=dict)
-    _begun_s: float = 0.0
-    _heard: deque[tuple[float, int]] = field(default_factory=deque)
-    _refused: dict[str, int] = field(default_factory=dict)
-    _lost: dict[str, int] = field(default_factory=dict)
-    _unsolved: set[int] = field(default_factory=set)
+    references: dict[int, Reference] = field(default_factory=dict[int, Reference])
+    present: set[str] = field(default_factory=set[str])
+    _odometry: dict[tuple[int, int], Odometry] = field(default_factory=dict[tuple[int, int], Odometry])
+    _first_tick_s: float = 0.0
+    _tick_times: deque[tuple[float, int]] = field(default_factory=deque[tuple[float, int]])
+    _rejected: dict[str, int] = field(default_factory=dict[str, int])
+    _missing: dict[str, int] = field(default_factory=dict[str, int])
+    _unsolved: set[int] = field(default_factory=set[int])
 
-    def take(self, message: object, now_s: float) -> list[Told | Commanded]:
-        """Notes a message that came at ``now_s`` (wall time); what it says that people should know."""
+    def update(self, message: object, now_s: float) -> list[EventNotice | CommandNotice]:
+        """Apply a message received at ``now_s`` (wall time); return notices for the operator."""
         match message:
             case Tick():
                 if not self.flying:
-                    self.flying, self._begun_s = True, now_s
+                    self.flying, self._first_tick_s = True, now_s
                 self.tick, self.time_ns = message.tick, message.sim_time_ns
-                self._heard.append((now_s, message.sim_time_ns))
-                while now_s - self._heard[0][0] > _NOW_S and len(self._heard) > 2:
-                    self._heard.popleft()
+                self._tick_times.append((now_s, message.sim_time_ns))
+                while now_s - self._tick_times[0][0] > _SPEED_WINDOW_S and len(self._tick_times) > 2:
+                    self._tick_times.popleft()
             case Odometry():
                 self._odometry[message.chaser, message.tick] = message
                 self._odometry.pop((message.chaser, message.tick - _KEPT_TICKS), None)
@@ -68,7 +68,7 @@ class FlightState:
                 self.present.add(message.process)
             case Event():
                 return [
-                    Told(
+                    EventNotice(
                         sim_time_s=message.sim_time_ns / 1e9,
                         process=message.process,
                         level=message.level,
@@ -78,7 +78,7 @@ class FlightState:
                 ]
             case CommandReply():
                 return [
-                    Commanded(
+                    CommandNotice(
                         sim_time_s=message.sim_time_ns / 1e9,
                         command=message.command,
                         chaser=message.chaser,
@@ -91,10 +91,12 @@ class FlightState:
                 return self._health(message)
             case SolverStatus():
                 return self._solver(message)
+            case _:
+                pass
         return []
 
     def waiting_for(self) -> list[str]:
-        """Processes of the scenario whose presence has not been heard."""
+        """Return the processes of the scenario that have not published their presence."""
         names = [
             "world",
             "controller",
@@ -105,17 +107,17 @@ class FlightState:
         return [name for name in names if name not in self.present]
 
     def errors(self, chaser: int) -> tuple[float, float] | None:
-        """Position (m) and orientation (rad) error of a chaser from its reference, as the controller sees it."""
-        there = self.references.get(chaser)
-        here = self._odometry.get((chaser, there.tick)) if there is not None else None
-        if here is None or there is None:
+        """Return position (m) and orientation (rad) error of a chaser relative to its reference, from its odometry."""
+        reference = self.references.get(chaser)
+        odometry = self._odometry.get((chaser, reference.tick)) if reference is not None else None
+        if odometry is None or reference is None:
             return None
-        position = float(np.linalg.norm(np.subtract(here.position_m, there.position_m)))
-        return position, float(rotations.angle_between(there.q_wxyz, here.q_wxyz))
+        position = float(np.linalg.norm(np.subtract(odometry.position_m, reference.position_m)))
+        return position, float(rotations.angle_between(reference.q_wxyz, odometry.q_wxyz))
 
     def progress(self, now_s: float) -> Progress:
-        """How the mission stands at ``now_s`` (wall time)."""
-        wall_s = max(1e-9, now_s - self._begun_s) if self.flying else 0.0
+        """Return the progress at ``now_s`` (wall time)."""
+        wall_s = max(1e-9, now_s - self._first_tick_s) if self.flying else 0.0
         speed = self.time_ns / 1e9 / wall_s if self.flying else 0.0
         return Progress(
             sim_time_s=self.time_ns / 1e9,
@@ -127,21 +129,21 @@ class FlightState:
             chasers=tuple(self._chaser(i) for i in sorted(self.references) if self.errors(i) is not None),
         )
 
-    def left_s(self, progress: Progress) -> float | None:
-        """Wall time to the end at the present speed; None when nobody can say."""
-        left_s = self.scenario.duration_s - progress.sim_time_s
-        return left_s / progress.speed_now if self.flying and progress.speed_now > 1e-6 else None
+    def remaining_s(self, progress: Progress) -> float | None:
+        """Return the wall time to the end at the present speed, or None when it is unknown."""
+        simulated_s = self.scenario.duration_s - progress.sim_time_s
+        return simulated_s / progress.speed_now if self.flying and progress.speed_now > 1e-6 else None
 
     def _speed_now(self, now_s: float, speed: float) -> float:
-        if not self._heard or now_s - self._heard[0][0] < 1.0:
+        if not self._tick_times or now_s - self._tick_times[0][0] < 1.0:
             return speed
-        first_s, first_ns = self._heard[0]
+        first_s, first_ns = self._tick_times[0]
         return (self.time_ns - first_ns) / 1e9 / (now_s - first_s)
 
-    def _chaser(self, number: int) -> ChaserLine:
+    def _chaser(self, number: int) -> ChaserProgress:
         reference, errors = self.references[number], self.errors(number)
         assert errors is not None
-        return ChaserLine(
+        return ChaserProgress(
             chaser=number,
             phase=reference.phase,
             phase_time_s=reference.phase_time_s,
@@ -150,29 +152,31 @@ class FlightState:
             reference_distance_m=math.hypot(*reference.offset_m),
         )
 
-    def _warning(self, process: str, what: str, detail: str) -> Told:
-        return Told(sim_time_s=self.time_ns / 1e9, process=process, level="warning", what=what, detail=detail)
+    def _warning(self, process: str, what: str, detail: str) -> EventNotice:
+        return EventNotice(
+            sim_time_s=self.time_ns / 1e9, process=process, level="warning", what=what, detail=detail
+        )
 
-    def _health(self, health: Health) -> list[Told | Commanded]:
-        """Messages that a process has refused or missed, told when there are more than were told before."""
-        told: list[Told | Commanded] = []
-        refused = sum(health.rejected.values())
-        if refused > self._refused.get(health.process, 0):
+    def _health(self, health: Health) -> list[EventNotice | CommandNotice]:
+        """Report messages that a process rejected or missed, when the count grows."""
+        notices: list[EventNotice | CommandNotice] = []
+        rejected = sum(health.rejected.values())
+        if rejected > self._rejected.get(health.process, 0):
             reasons = ", ".join(f"{reason}: {count}" for reason, count in sorted(health.rejected.items()))
-            told.append(self._warning(health.process, f"{refused} messages refused", reasons))
-        if health.lost > self._lost.get(health.process, 0):
-            told.append(self._warning(health.process, f"{health.lost} messages missing", "gaps in seq"))
-        # A process that was started again counts from zero.
-        self._refused[health.process], self._lost[health.process] = refused, health.lost
-        return told
+            notices.append(self._warning(health.process, f"{rejected} messages rejected", reasons))
+        if health.lost > self._missing.get(health.process, 0):
+            notices.append(self._warning(health.process, f"{health.lost} messages missing", "gaps in seq"))
+        # A restarted process counts from zero.
+        self._rejected[health.process], self._missing[health.process] = rejected, health.lost
+        return notices
 
-    def _solver(self, status: SolverStatus) -> list[Told | Commanded]:
-        """Chasers whose plan is none, or enters a keep-out zone: told when it begins."""
-        bad = {c: s for c, s in zip(status.chasers, status.status, strict=False) if s not in _SOLVED}
-        told: list[Told | Commanded] = [
+    def _solver(self, status: SolverStatus) -> list[EventNotice | CommandNotice]:
+        """Report chasers without a plan, or whose plan enters a keep-out zone, when that begins."""
+        failed = {c: s for c, s in zip(status.chasers, status.status, strict=False) if s not in _SOLVED}
+        notices: list[EventNotice | CommandNotice] = [
             self._warning("controller", f"chaser {c}: plan {s}", status.solver)
-            for c, s in sorted(bad.items())
+            for c, s in sorted(failed.items())
             if c not in self._unsolved
         ]
-        self._unsolved = set(bad)
-        return told
+        self._unsolved = set(failed)
+        return notices

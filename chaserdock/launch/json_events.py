@@ -1,6 +1,6 @@
-"""What ``--json`` prints while a mission flies: one of these objects a line, told apart by ``type``.
+"""JSON lines that ``--json`` prints while a mission flies: one object per line, distinguished by ``type``.
 
-SI units and radians. docs/cli.md is made from these types (``docs/make_cli.py``).
+SI units and radians. docs/cli.md is generated from these types (``docs/make_cli.py``).
 """
 
 from __future__ import annotations
@@ -11,8 +11,8 @@ import msgspec
 from msgspec import Struct
 
 
-class ChaserLine(Struct, frozen=True, kw_only=True):
-    """A chaser as the controller sees it: errors are from its reference on the *estimated* target."""
+class ChaserProgress(Struct, frozen=True, kw_only=True):
+    """State of a chaser as the controller estimates it: errors are relative to its reference on the *estimated* target."""
 
     chaser: int
     phase: str
@@ -23,7 +23,7 @@ class ChaserLine(Struct, frozen=True, kw_only=True):
 
 
 class Start(Struct, frozen=True, kw_only=True, tag_field="type", tag="start"):
-    """First line: what will be flown, and where its files go. ``duration_s`` is simulated time."""
+    """First line: the mission and the folder of its files. ``duration_s`` is simulated time."""
 
     scenario: str
     seed: int
@@ -34,10 +34,10 @@ class Start(Struct, frozen=True, kw_only=True, tag_field="type", tag="start"):
 
 
 class Progress(Struct, frozen=True, kw_only=True, tag_field="type", tag="progress"):
-    """Each second of wall time, from the first tick on, and at the end.
+    """Progress, every second of wall time from the first tick on, and at the end.
 
     ``speed`` is simulated over wall time since the first tick, ``speed_now`` over the last seconds. ``target`` is the
-    estimate's status. ``chasers`` lists those that have a reference.
+    status of the target estimate. ``chasers`` lists the chasers that have a reference.
     """
 
     sim_time_s: float
@@ -46,12 +46,12 @@ class Progress(Struct, frozen=True, kw_only=True, tag_field="type", tag="progres
     speed: float
     speed_now: float
     target: str
-    chasers: tuple[ChaserLine, ...]
+    chasers: tuple[ChaserProgress, ...]
 
 
-class Told(Struct, frozen=True, kw_only=True, tag_field="type", tag="event"):
-    """Something worth telling, once: what a process told, or what was noticed about it (messages refused or lost, no
-    plan from the solver, a process that ended)."""
+class EventNotice(Struct, frozen=True, kw_only=True, tag_field="type", tag="event"):
+    """An event that a process published, or that was detected: messages rejected or lost, no plan from the solver, a
+    process that exited."""
 
     sim_time_s: float
     process: str
@@ -60,8 +60,8 @@ class Told(Struct, frozen=True, kw_only=True, tag_field="type", tag="event"):
     detail: str = ""
 
 
-class Commanded(Struct, frozen=True, kw_only=True, tag_field="type", tag="command"):
-    """An operator's or the time line's command, and the controller's answer."""
+class CommandNotice(Struct, frozen=True, kw_only=True, tag_field="type", tag="command"):
+    """A command of an operator or of the timeline, and the controller's reply."""
 
     sim_time_s: float
     command: str
@@ -72,7 +72,7 @@ class Commanded(Struct, frozen=True, kw_only=True, tag_field="type", tag="comman
 
 
 class Result(Struct, frozen=True, kw_only=True, tag_field="type", tag="result"):
-    """Last line of a mission that was flown: the exit status, and ``summary`` as summary.json has it (docs/summary.md)."""
+    """Last line of a finished mission: the exit status, and ``summary`` as in summary.json (docs/summary.md)."""
 
     status: int
     folder: str
@@ -80,15 +80,15 @@ class Result(Struct, frozen=True, kw_only=True, tag_field="type", tag="result"):
 
 
 class Failed(Struct, frozen=True, kw_only=True, tag_field="type", tag="error"):
-    """Last line when there is no result: bad input (``status`` 2), or a mission without a log that can be judged."""
+    """Last line without a result: invalid input (``status`` 2), or a mission without a readable log."""
 
     status: int
     text: str
 
 
-Line = Start | Progress | Told | Commanded | Result | Failed
+JsonLine = Start | Progress | EventNotice | CommandNotice | Result | Failed
 
 
-def line_of(line: Line) -> str:
-    """The line as it is printed."""
+def encode_line(line: JsonLine) -> str:
+    """Return the line as JSON text."""
     return msgspec.json.encode(line).decode()

@@ -1,4 +1,4 @@
-"""Watches a mission that others fly (containers, hosts), waits for its log and judges it, as ``run`` does for its own."""
+"""Watch a mission that other machines or containers fly, wait for its log, and judge it."""
 
 from __future__ import annotations
 
@@ -18,70 +18,61 @@ from chaserdock_protocol.transport.session import join, new_instance
 
 from chaserdock.exit_codes import STOPPED
 
-from .json_events import Start
-from .launcher import Fleet, judge
+from .launcher import Fleet, judge, print_outcome, start_line
 from .progress import ProgressReporter, Show
 
 LOG_CLOSED_S = 60.0
-"""After the end the recorder has that long (wall time) to have everything and close its log."""
+"""Wall time after the end of the mission within which the recorder must close its log."""
 _MCAP_END = b"\x89MCAP0\r\n"
 
 
 class JudgeError(ChaserdockError):
-    """There is nothing to judge."""
+    """The mission left no log."""
 
 
-def judge_mission(out: Path, link: Link, patience_s: float | None, world_away_s: float, show: Show) -> int:
-    """Watches the mission on ``link`` to its end, judges the log in ``out/SCENARIO-RUN``, and writes report.html beside
-    it; the mission's status.
+def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_s: float, show: Show) -> int:
+    """Watch the mission on ``link`` to its end, judge the log in ``out/SCENARIO-RUN``, write report.html beside it.
 
-    ``world_away_s``: a world that has been gone (wall time) for so long counts as lost. Raises JoinRefused when no
-    mission is there within ``patience_s``, JudgeError when it left no log.
+    Returns the exit status. ``world_timeout_s``: wall time after which an absent world counts as lost. Raises JoinRefused
+    when there is no mission within ``timeout_s``, JudgeError when it left no log.
     """
     node = Node("operator", "operator", link)
     try:
         stop = StopSignal(watch_parent=False)
-        mission = join(node, new_instance(), stop, patience_s)
+        mission = join(node, new_instance(), stop, timeout_s)
         if mission is None:
             return STOPPED
         folder = out / run_name(mission)
         scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
         reporter = ProgressReporter(scenario, show)
-        reporter.tell(
-            Start(
-                scenario=scenario.name,
-                seed=scenario.seed,
-                mode=mission.mode,
-                duration_s=scenario.duration_s,
-                chasers=len(scenario.chasers),
-                folder=str(folder),
-            )
-        )
+        reporter.report(start_line(scenario, mission.mode, folder))
         try:
-            failure = _watch(node, reporter, stop, world_away_s)
+            failure = _watch(node, reporter, stop, world_timeout_s)
         finally:
             reporter.close()
         if stop():
             return STOPPED
         log = folder / LOG_NAME
         if not log.exists():
-            raise JudgeError(f"{log}: there is no log; {failure or 'did the recorder write there?'}")
+            raise JudgeError(f"{log}: no such log; {failure or 'does the recorder write to this folder?'}")
         if not _wait_for_end(log):
-            failure = failure or f"the recorder has not closed its log within {LOG_CLOSED_S:g} s of the end"
-        status = judge(Fleet(), folder, failure, reporter)
+            failure = failure or f"the recorder did not close its log within {LOG_CLOSED_S:g} s after the end"
+        outcome = judge(Fleet(), folder, failure, reporter)
+        print_outcome(outcome, show)
         _write_page(log)
-        return status
+        return outcome.status
     finally:
-        node.close()  # only now, as the router may end with this
+        node.close()  # last, because the router may exit when this node leaves
 
 
-def _watch(node: Node, reporter: ProgressReporter, stop: StopSignal, world_away_s: float) -> str | None:
-    """Shows the flight until it has ended; why it failed, or None."""
-    seen = {"world": time.monotonic()}
+def _watch(node: Node, reporter: ProgressReporter, stop: StopSignal, world_timeout_s: float) -> str | None:
+    """Show the flight until it ends; return why it failed, or None."""
+    world_seen_s = time.monotonic()
 
     def changed(process: str, alive: bool) -> None:
+        nonlocal world_seen_s
         if process == "world":
-            seen["world"] = float("inf") if alive else time.monotonic()
+            world_seen_s = float("inf") if alive else time.monotonic()
 
     node.subscribe(topics.END)
     reporter.subscribe(node)
@@ -90,17 +81,17 @@ def _watch(node: Node, reporter: ProgressReporter, stop: StopSignal, world_away_
     while not stop():
         received = node.receive(0.1)
         if received is not None:
-            reporter.take(received.message)
+            reporter.update(received.message)
             if isinstance(received.message, MissionEnd):
                 return None if received.message.complete else received.message.reason
-        reporter.show()
-        if time.monotonic() - seen["world"] > world_away_s:
-            return f"the world has been gone for {world_away_s:g} s"
+        reporter.refresh()
+        if time.monotonic() - world_seen_s > world_timeout_s:
+            return f"the world has been absent for {world_timeout_s:g} s"
     return None
 
 
 def _write_page(log: Path) -> None:
-    """A page on the flight beside the log. That it cannot be written is told, and is no verdict on the flight."""
+    """Write report.html beside the log; report an error, which does not change the verdict."""
     from chaserdock.analysis.report import write_report
 
     try:
@@ -110,7 +101,7 @@ def _write_page(log: Path) -> None:
 
 
 def _wait_for_end(log: Path) -> bool:
-    """Waits until a log has its footer (a recorder's last act); False when it does not come."""
+    """Wait until a log has its footer, which the recorder writes last; return False when it does not appear."""
     deadline = time.monotonic() + LOG_CLOSED_S
     while time.monotonic() < deadline:
         with log.open("rb") as file:

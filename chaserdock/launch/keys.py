@@ -1,7 +1,7 @@
-"""A mission's keys: a certificate authority of its own, and for every process a key and a certificate.
+"""Keys of a mission: its own certificate authority, and a key and a certificate per process.
 
-Elliptic curve P-256. The authority's own key is never written: nobody can add a process later, a new mission gets
-new keys. ``FOLDER/NAME/`` holds ``ca.pem``, ``cert.pem`` and ``key.pem``, all that the process NAME may know.
+Elliptic curve P-256. The authority's private key is never written: no process can be added later, a new mission needs
+new keys. ``FOLDER/NAME/`` holds ``ca.pem``, ``cert.pem`` and ``key.pem``, all that the process NAME needs.
 """
 
 from __future__ import annotations
@@ -23,64 +23,64 @@ _FILES = ("ca.pem", "cert.pem", "key.pem")
 
 
 class KeysError(ChaserdockError):
-    """Keys that are not there, cannot be written or would be overwritten."""
+    """Keys cannot be written, or would be overwritten."""
 
 
 def names(chasers: int) -> list[str]:
-    """Everyone who gets keys: the router and all who may connect to it."""
-    return [ROUTER, *(who.common_name for who in identities(chasers))]
+    """Return the names of all that get keys: the router and every process that may connect to it."""
+    return [ROUTER, *(identity.common_name for identity in identities(chasers))]
 
 
 def init_keys(
     folder: Path, chasers: int, hosts: tuple[str, ...], days: int, now: datetime, *, shared: bool = False
 ) -> None:
-    """Makes all keys of a mission in ``folder``; ``hosts`` are the names and addresses of its router.
+    """Make all keys of a mission in ``folder``; ``hosts`` are the names and addresses of its router.
 
-    ``now``: UTC; the certificates hold from an hour before (clocks of hosts differ) for ``days``. Private keys can be
-    read by their owner alone, or by all who reach the folder when ``shared`` (a volume that only one process mounts).
-    Raises KeysError when there are keys in the folder already, or it cannot be written.
+    ``now``: UTC; certificates are valid from an hour before (clocks of hosts differ) for ``days``. Private keys are
+    readable by their owner only, or by every user when ``shared`` (a volume that only one process mounts).
+    Raises KeysError when the folder contains keys, or cannot be written.
     """
-    there = [name for name in names(chasers) if any((folder / name / f).exists() for f in _FILES)]
-    if there:
+    existing = [name for name in names(chasers) if any((folder / name / f).exists() for f in _FILES)]
+    if existing:
         raise KeysError(
-            f"{folder} holds keys already (of {', '.join(there)}); they are never overwritten, "
+            f"{folder} contains keys (of {', '.join(existing)}); they are never overwritten, "
             "choose another folder or remove them"
         )
-    begin, end = now - timedelta(hours=1), now + timedelta(days=days)
+    start, end = now - timedelta(hours=1), now + timedelta(days=days)
     authority_key = ec.generate_private_key(ec.SECP256R1())
-    authority = _certificate("chaserdock mission", authority_key, None, authority_key, begin, end, ())
+    authority = _certificate("chaserdock mission", authority_key, None, authority_key, start, end, ())
     public = serialization.Encoding.PEM
     try:
         for name in names(chasers):
             key = ec.generate_private_key(ec.SECP256R1())
             certificate = _certificate(
-                name, key, authority, authority_key, begin, end, hosts if name == ROUTER else ()
+                name, key, authority, authority_key, start, end, hosts if name == ROUTER else ()
             )
             (folder / name).mkdir(parents=True, exist_ok=True)
             _write(folder / name / "key.pem", _private(key), 0o644 if shared else 0o600)
             _write(folder / name / "ca.pem", authority.public_bytes(public), 0o644)
-            # Last: whoever finds it finds the others.
+            # Last: its presence means that the other files are complete.
             _write(folder / name / "cert.pem", certificate.public_bytes(public), 0o644)
     except OSError as error:
         raise KeysError(f"{folder}: keys cannot be written: {error.strerror or error}") from None
 
 
 def why_not_usable(folder: Path, chasers: int, now: datetime) -> str | None:
-    """None when ``folder`` holds the keys of all, valid for an hour more at least; else what is wrong."""
-    found = [name for name in names(chasers) if all((folder / name / f).is_file() for f in _FILES)]
-    if not found:
-        return "there are none"
-    if missing := sorted(set(names(chasers)) - set(found)):
-        return f"those of {', '.join(missing)} are missing"
-    for name in found:
+    """Return None when ``folder`` holds the keys of all processes, valid for an hour at least; else the reason."""
+    complete = [name for name in names(chasers) if all((folder / name / f).is_file() for f in _FILES)]
+    if not complete:
+        return "it contains no keys"
+    if missing := sorted(set(names(chasers)) - set(complete)):
+        return f"the keys of {', '.join(missing)} are missing"
+    for name in complete:
         end = x509.load_pem_x509_certificate((folder / name / "cert.pem").read_bytes()).not_valid_after_utc
         if end < now + timedelta(hours=1):
-            return f"those of {name} end at {end:%Y-%m-%d %H:%M} UTC"
+            return f"the keys of {name} expire at {end:%Y-%m-%d %H:%M} UTC"
     return None
 
 
 def remove_keys(folder: Path, chasers: int) -> None:
-    """Removes a mission's keys, as far as they are there; the folders stay (they may be mounts)."""
+    """Remove a mission's keys; the folders stay, because they may be mounts."""
     for name in names(chasers):
         for file in _FILES:
             (folder / name / file).unlink(missing_ok=True)
@@ -94,7 +94,7 @@ def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
 
 def _write(path: Path, content: bytes, mode: int) -> None:
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode), "wb") as out:
-        os.fchmod(out.fileno(), mode)  # whatever the umask
+        os.fchmod(out.fileno(), mode)  # overrides the umask
         out.write(content)
 
 
@@ -110,11 +110,11 @@ def _certificate(
     key: ec.EllipticCurvePrivateKey,
     issuer: x509.Certificate | None,
     issuer_key: ec.EllipticCurvePrivateKey,
-    begin: datetime,
+    start: datetime,
     end: datetime,
     hosts: tuple[str, ...],
 ) -> x509.Certificate:
-    """A certificate of ``name``; without an ``issuer`` the authority's own. RFC 5280, sections 4.1 and 4.2."""
+    """Make a certificate of ``name``, self-signed without an ``issuer`` (RFC 5280, sections 4.1 and 4.2)."""
     subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
     is_authority = issuer is None
     usage = x509.KeyUsage(
@@ -134,7 +134,7 @@ def _certificate(
         .issuer_name(subject if issuer is None else issuer.subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
-        .not_valid_before(begin)
+        .not_valid_before(start)
         .not_valid_after(end)
         .add_extension(x509.BasicConstraints(ca=is_authority, path_length=None), critical=True)
         .add_extension(usage, critical=True)

@@ -1,4 +1,4 @@
-"""``chaserdock run``: starts every process of a scenario, watches over them, ends them all, has the flight judged."""
+"""Fly a mission on this machine: start every process, watch them, stop them, judge the log."""
 
 from __future__ import annotations
 
@@ -10,92 +10,104 @@ import subprocess
 import sys
 import time
 import uuid
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from types import FrameType
+from typing import Any
 
 import psutil
 from chaserdock_agents.router.process import NAME as ROUTER
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import MissionEnd
-from chaserdock_protocol.process import SINGLE_THREADED
+from chaserdock_protocol.process import SINGLE_THREADED, Mode
+from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
-from chaserdock.viewer.address import DEFAULT_HOST, url_of
-from chaserdock.viewer.address import free_port as free_page_port
 
-from . import container as member
-from .json_events import Failed, Result, Start
-from .progress import ProgressReporter, Show
+from .container import is_listening
+from .json_events import Failed, JsonLine, Result, Start
+from .progress import ProgressReporter, Show, print_json_line
 
-_PATIENCE_S = 120
-_END_S = 30.0
+_START_TIMEOUT_S = 120
+_END_TIMEOUT_S = 30.0
+STOPPED_BY_OPERATOR = "stopped by the operator"
 
 
 class RunError(ChaserdockError):
-    """The run could not be started; one clear line."""
+    """The mission could not be started."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a mission ended. ``summary`` is None when there is no readable log; ``failure`` then says why."""
+
+    folder: Path
+    status: int
+    summary: dict[str, Any] | None
+    failure: str | None
 
 
 @dataclass
 class Child:
-    """One process of the mission and where its own words go."""
+    """A process of the mission and the file of its output."""
 
     name: str
     process: subprocess.Popen[bytes]
-    words: Path
+    output: Path
 
-    def last_words(self) -> str:
-        """The last line it said."""
-        lines = self.words.read_text(errors="replace").strip().splitlines()
-        return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: ended without a word"
+    def last_line(self) -> str:
+        """Return the last line of its output."""
+        lines = self.output.read_text(errors="replace").strip().splitlines()
+        return lines[-1].removeprefix("chaserdock: ") if lines else f"{self.name}: exited without output"
 
 
-# Of Zenoh's two receiving threads the second mostly wakes up in vain: with one, seven processes on two cores answer in two
-# thirds of the time (benchmarks/realtime.py). Not for a router, where one that waits for a slow reader would hold up all.
+# Of Zenoh's two receiving threads the second mostly wakes up without work: with one, seven processes on two cores need two
+# thirds of the time per tick (benchmarks/realtime.py). Not for a router, where one slow reader would block all others.
 _ZENOH_THREADS = "(rx: (worker_threads: 1))"
 
 
 @dataclass
 class Fleet:
-    """All processes of a run."""
+    """Processes of a mission."""
 
-    children: list[Child] = field(default_factory=list)
+    children: list[Child] = field(default_factory=list[Child])
     peak_memory_bytes: int = 0
-    cpu_s: dict[str, float] = field(default_factory=dict)
+    cpu_s: dict[str, float] = field(default_factory=dict[str, float])
 
     def start(self, name: str, arguments: list[str], folder: Path) -> None:
-        """Starts one; it ends by itself when this launcher dies, however that happens (its stdin closes)."""
-        words = folder / f"{name.replace('/', '-')}.txt"
+        """Start a process; it exits when this process ends for any reason (its standard input closes)."""
+        output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
-        with words.open("wb") as out:
+        with output.open("wb") as out:
             process = subprocess.Popen(
                 [sys.executable, "-m", "chaserdock", *arguments, "--watch-parent"],
                 stdin=subprocess.PIPE,
                 stdout=out,
                 stderr=subprocess.STDOUT,
                 env={**threads, **os.environ, **SINGLE_THREADED},
-                # Ctrl-C is the launcher's to pass on. Not a session of its own: Linux would share the cores between
-                # sessions ("autogroup") whatever the processes' priorities, and who woke up last would wait longest.
+                # The launcher forwards Ctrl-C. Not a new session: Linux would share the cores between sessions
+                # ("autogroup") whatever the processes' priorities, and the last one to wake up would wait longest.
                 process_group=0,
             )
-        self.children.append(Child(name, process, words))
+        self.children.append(Child(name, process, output))
 
     def running(self) -> list[Child]:
+        """Return the processes that have not exited."""
         return [c for c in self.children if c.process.poll() is None]
 
-    def is_made_up_for(self, child: Child) -> bool:
-        """Whether it is a controller whose loss another one, that flew to the end, has made up for."""
+    def is_replaced(self, child: Child) -> bool:
+        """Return whether it is a controller, and another controller flew to the end."""
         others = [c for c in self.children if c.name in topics.CONTROLLERS and c is not child]
         return child.name in topics.CONTROLLERS and any(c.process.poll() == 0 for c in others)
 
     def measure(self) -> None:
-        """Notes every process' CPU time and their memory together (proportional set size where the system tells it)."""
+        """Measure the CPU time of each process and their total memory (proportional set size where available)."""
         total = 0
         for child in self.running():
             try:
@@ -108,13 +120,13 @@ class Fleet:
         self.peak_memory_bytes = max(self.peak_memory_bytes, total)
 
     def wait(self, seconds: float) -> None:
-        """Waits until all have ended, at most so long."""
+        """Wait until all have exited, at most ``seconds``."""
         deadline = time.monotonic() + seconds
         while self.running() and time.monotonic() < deadline:
             time.sleep(0.02)
 
     def end(self) -> None:
-        """Ends whatever still runs: asked first, then made to."""
+        """Terminate, then kill, all running processes."""
         for child in self.running():
             child.process.send_signal(signal.SIGTERM)
         self.wait(5.0)
@@ -127,7 +139,7 @@ class Fleet:
 
 
 def free_port() -> int:
-    """A TCP port that nobody listens on now."""
+    """Return a TCP port on which nothing listens."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
@@ -136,7 +148,7 @@ def free_port() -> int:
 def open_hub(
     namespace: str, lease_ms: int, name: str = "operator", role: Role = "operator"
 ) -> tuple[Node, str]:
-    """A launcher's own node, which the processes connect to first, and its endpoint. Raises TransportError."""
+    """Open the launcher's node, which the processes connect to; return it and its endpoint. Raises TransportError."""
     for attempt in range(5):
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         try:
@@ -148,94 +160,109 @@ def open_hub(
 
 
 def check_keys(keys: Path, chasers: int) -> None:
-    """Raises RunError unless a mission's keys are there for so many chasers, and hold."""
-    from .keys import why_not_usable  # the cryptography takes its time to load
+    """Raise RunError unless a mission's keys exist for so many chasers and are valid."""
+    from .keys import why_not_usable  # imports cryptography, which is slow
 
     if reason := why_not_usable(keys, chasers, datetime.now(UTC)):
         raise RunError(f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`")
 
 
-def meet_at_router(
-    onlookers: Fleet, words: Path, namespace: str, lease_ms: int, keys: Path
+def network_options(namespace: str, endpoint: str, lease_ms: int) -> list[str]:
+    """Return the command-line options with which a process joins the mission."""
+    return ["-e", endpoint, "--namespace", namespace, "--lease", f"{lease_ms / 1000:g}"]
+
+
+def start_router(
+    observers: Fleet, output: Path, namespace: str, lease_ms: int, keys: Path
 ) -> tuple[Node, list[str]]:
-    """Starts a router that holds everyone to the rights of the mission's ``keys``; a launcher's own node, as its client, and
-    how the processes reach it. Raises RunError when the router does not come up."""
+    """Start a router that enforces the access rights of the mission's ``keys``.
+
+    Returns the launcher's node, a client of it, and the options with which the processes connect. Raises RunError when the
+    router does not start.
+    """
     port = free_port()
-    endpoint, common = f"tls/127.0.0.1:{port}", ["--namespace", namespace, "--keys", str(keys)]
-    onlookers.start(ROUTER, ["router", "-l", endpoint, "--lease-ms", str(lease_ms), *common], words)
-    router, deadline = onlookers.children[-1], time.monotonic() + _PATIENCE_S
-    while not member.router_there("127.0.0.1", port):
+    endpoint = f"tls/127.0.0.1:{port}"
+    secured = ["--keys", str(keys)]
+    network = network_options(namespace, endpoint, lease_ms)
+    observers.start(ROUTER, ["router", "-l", *network[1:], *secured], output)
+    router, deadline = observers.children[-1], time.monotonic() + _START_TIMEOUT_S
+    while not is_listening("127.0.0.1", port):
         if router.process.poll() is not None or time.monotonic() > deadline:
-            raise RunError(f"the router does not listen: {router.last_words()}")
+            raise RunError(f"the router does not listen: {router.last_line()}")
         time.sleep(0.05)
     link = Link(namespace, (endpoint,), (), "client", lease_ms=lease_ms, tls=Tls.in_folder(keys / "operator"))
-    return Node("operator", "operator", link), ["-e", endpoint, "--lease-ms", str(lease_ms), *common]
+    return Node("operator", "operator", link), [*network, *secured]
 
 
-def run_mission(
+def never() -> bool:
+    """Return False: nothing requests a stop."""
+    return False
+
+
+def fly_mission(
     path: Path,
     folder: Path,
-    mode: str,
-    seed: int | None,
-    overrides: tuple[str, ...],
-    show: Show,
-    view: bool = False,
+    mode: Mode = "lockstep",
+    overrides: tuple[str, ...] = (),
+    show: Show = Show.none,
+    viewer_port: int | None = None,
     keys: Path | None = None,
-) -> int:
-    """Flies a scenario; log, summary and the processes' words go to ``folder``. The exit status (``statuses``).
+    stop_requested: Callable[[], bool] = never,
+    emit: Callable[[JsonLine], None] = print_json_line,
+) -> Outcome:
+    """Fly a scenario; write log, summary and the processes' output to ``folder``.
 
-    ``view``: with the viewer's page beside it, to the end of the flight. ``keys``: through a router, over TLS, each process
-    held to its rights. Raises ViewError, RunError, ScenarioError or TransportError when it cannot be started at all.
+    ``viewer_port``: serve the live viewer there until the end of the flight. ``keys``: connect through a router, over TLS,
+    with access rights. ``stop_requested`` is polled. Installs no signal handler; an exception ends all processes.
+    Raises RunError, ScenarioError or TransportError when the mission cannot start.
     """
-    overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
-    words = folder / "processes"
+    output = folder / "processes"
     if keys is not None:
         check_keys(keys, len(scenario.chasers))
     if (folder / LOG_NAME).exists():
-        raise RunError(
-            f"{folder} holds a mission.mcap already; a log is never overwritten, choose another --out"
-        )
+        raise RunError(f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out")
     try:
-        words.mkdir(parents=True, exist_ok=True)
+        output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise RunError(f"{folder}: cannot be made: {error.strerror or error}") from None
+        raise RunError(f"{folder}: cannot be created: {error.strerror or error}") from None
     namespace = f"run-{uuid.uuid4().hex[:12]}"
-    # A silent peer is given up after the lease; in lock-step a stopped process is waited for instead.
+    # After the lease a silent peer counts as lost; in lock-step the mission waits for a stopped process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
-    fleet, onlookers, hub = Fleet(), Fleet(), None
-    stop = _Stop()
+    fleet, observers, hub = Fleet(), Fleet(), None
     try:
         if keys is not None:
-            hub, network = meet_at_router(onlookers, words, namespace, lease_ms, keys.resolve())
+            hub, network = start_router(observers, output, namespace, lease_ms, keys.resolve())
         else:
             hub, endpoint = open_hub(namespace, lease_ms)
-            network = ["-e", endpoint, "--namespace", namespace, "--lease-ms", str(lease_ms)]
-        if view:
-            start_viewer(onlookers, words, network)
+            network = network_options(namespace, endpoint, lease_ms)
+        if viewer_port is not None:
+            observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
         start_all(fleet, scenario, path, folder, mode, overrides, network)
-        reporter = ProgressReporter(scenario, show)
-        reporter.tell(
-            Start(
-                scenario=scenario.name,
-                seed=scenario.seed,
-                mode="realtime" if mode == "realtime" else "lockstep",
-                duration_s=scenario.duration_s,
-                chasers=len(scenario.chasers),
-                folder=str(folder),
-            )
-        )
+        reporter = ProgressReporter(scenario, show, emit)
+        reporter.report(start_line(scenario, mode, folder))
         try:
-            failure = watch(fleet, hub, reporter, stop)
+            failure = watch(fleet, hub, reporter, stop_requested)
         finally:
             reporter.close()
     finally:
         fleet.end()
         if hub is not None:
             hub.close()
-        onlookers.end()
-        stop.restore()
-    return judge(fleet, folder, failure, reporter, stopped=stop.asked)
+        observers.end()
+    return judge(fleet, folder, failure, reporter)
+
+
+def start_line(scenario: Scenario, mode: Mode, folder: Path) -> Start:
+    """Return the first line about a mission."""
+    return Start(
+        scenario=scenario.name,
+        seed=scenario.seed,
+        mode=mode,
+        duration_s=scenario.duration_s,
+        chasers=len(scenario.chasers),
+        folder=str(folder),
+    )
 
 
 def start_all(
@@ -247,107 +274,97 @@ def start_all(
     overrides: tuple[str, ...],
     network: list[str],
 ) -> None:
-    """Starts recorder, world, controller and chasers; in which order does not matter."""
-    words = folder / "processes"
-    patient = ["--patience", str(_PATIENCE_S)]
+    """Start recorder, world, controller and chasers; their order does not matter."""
+    output = folder / "processes"
+    timeout = ["--timeout", str(_START_TIMEOUT_S)]
     sets = [item for override in overrides for item in ("--set", override)]
     listen = [] if "--keys" in network else ["-l", "tcp/127.0.0.1:0"]
-    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, *listen], words)
-    fleet.start("controller", ["controller", *network, *patient], words)
+    fleet.start("world", ["world", str(path), "--mode", mode, *sets, *network, *listen], output)
+    fleet.start("controller", ["controller", *network, *timeout], output)
     if scenario.controller.standby:
-        fleet.start("standby", ["controller", "--standby", *network, *patient], words)
+        fleet.start("standby", ["controller", "--standby", *network, *timeout], output)
     for i in range(len(scenario.chasers)):
-        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, *patient], words)
-    fleet.start("recorder", ["record", "--out", str(folder), *network, *patient], words)
+        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, *timeout], output)
+    fleet.start("recorder", ["record", "--out", str(folder), *network, *timeout], output)
 
 
-def start_viewer(onlookers: Fleet, words: Path, network: list[str]) -> None:
-    """Starts a viewer and says where its page is. It is none of the mission's fleet: its end is no failure."""
-    port = free_page_port(DEFAULT_HOST, None)
-    onlookers.start("viewer", ["view", "--port", str(port), *network], words)
-    print(f"{url_of(DEFAULT_HOST, port)} shows the mission", file=sys.stderr, flush=True)
-
-
-def watch(fleet: Fleet, hub: Node, reporter: ProgressReporter, stop: _Stop) -> str | None:
-    """Shows the flight until it has ended; why it failed, or None."""
+def watch(
+    fleet: Fleet, hub: Node, reporter: ProgressReporter, stop_requested: Callable[[], bool]
+) -> str | None:
+    """Show the flight until it ends; return why it failed, or None."""
     hub.subscribe(topics.END)
     reporter.subscribe(hub)
-    ended: MissionEnd | None = None
+    stopping = False
     measured_s = 0.0
-    while ended is None:
+    end: MissionEnd | None = None
+    while end is None:
         received = hub.receive(0.1)
         if received is not None:
-            reporter.take(received.message)
+            reporter.update(received.message)
             if isinstance(received.message, MissionEnd):
-                ended = received.message
-        reporter.show()
+                end = received.message
+        reporter.refresh()
         if time.monotonic() - measured_s > 2.0:
             measured_s = time.monotonic()
             fleet.measure()
-        if stop.asked and not stop.passed_on:
-            stop.passed_on = True
-            reporter.say("stopping: the log is being closed")
+        if stop_requested() and not stopping:
+            stopping = True
+            reporter.print_text("stopping: the log is being closed")
             fleet.children[0].process.send_signal(signal.SIGTERM)
-        dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
-        if dead and ended is None:
-            if dead[0].name == "world" or stop.asked or not reporter.flying:
-                return "stopped by the operator" if stop.asked else dead[0].last_words()
-            for child in dead:
-                reporter.warn(child.name, child.last_words())
-    fleet.wait(_END_S)
-    if stop.asked:
-        return "stopped by the operator"
-    bad = [c for c in fleet.children if c.process.poll() != 0 and not fleet.is_made_up_for(c)]
-    if not ended.complete:
-        # The world ends with status 1 for having been left; whoever left it knows more.
-        return "; ".join([ended.reason, *(f"{c.name}: {c.last_words()}" for c in bad if c.name != "world")])
-    return bad[0].last_words() if bad else None
+        failure = None if end is not None else _premature_end(fleet, reporter, stopping)
+        if failure is not None:
+            return failure
+    fleet.wait(_END_TIMEOUT_S)
+    return STOPPED_BY_OPERATOR if stopping else _failure_at_end(fleet, end)
 
 
-def judge(
-    fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter, stopped: bool = False
-) -> int:
-    """Writes summary.json from the log, and tells it; the run's status."""
-    from chaserdock_protocol.recording.log import LogError
+def _premature_end(fleet: Fleet, reporter: ProgressReporter, stopping: bool) -> str | None:
+    """Return why the flight cannot continue, or None; report processes that it can continue without."""
+    dead = [c for c in fleet.children if c.process.poll() not in (None, 0)]
+    if dead and (dead[0].name == "world" or stopping or not reporter.flying):
+        return STOPPED_BY_OPERATOR if stopping else dead[0].last_line()
+    for child in dead:
+        reporter.report_lost(child.name, child.last_line())
+    return None
 
-    from chaserdock.analysis.summary import summarize, text_of
 
-    log = folder / LOG_NAME
+def _failure_at_end(fleet: Fleet, end: MissionEnd) -> str | None:
+    bad = [c for c in fleet.children if c.process.poll() != 0 and not fleet.is_replaced(c)]
+    if not end.complete:
+        # The world exits with status 1 because processes left it; their output says why.
+        return "; ".join([end.reason, *(f"{c.name}: {c.last_line()}" for c in bad if c.name != "world")])
+    return bad[0].last_line() if bad else None
+
+
+def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter) -> Outcome:
+    """Write summary.json from the log in ``folder``; return and report the outcome."""
+    from chaserdock.analysis.summary import summarize
+
+    stopped = failure == STOPPED_BY_OPERATOR
     try:
-        summary = summarize(log)
+        summary = summarize(folder / LOG_NAME)
     except LogError as error:
-        status = STOPPED if stopped else FAILED
-        reporter.tell(Failed(status=status, text=failure or str(error)))
-        print(f"chaserdock: {failure or error}", file=sys.stderr)
-        return status
+        outcome = Outcome(folder, STOPPED if stopped else FAILED, None, failure or str(error))
+        reporter.report(Failed(status=outcome.status, text=outcome.failure or ""))
+        return outcome
     if failure is not None:
         summary["failures"] = [failure, *summary["failures"]]
         summary["success"] = False
-    if fleet.children:  # processes elsewhere have not been measured
+    if fleet.children:  # processes on other machines are not measured
         summary |= {"peak_memory_bytes": fleet.peak_memory_bytes, "cpu_s": fleet.cpu_s}
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
-    if reporter.for_scripts:
-        reporter.tell(Result(status=status, folder=str(folder), summary=summary))
-    else:
-        print(text_of(summary))
-        print(f"log, summary and the processes' words: {folder}")
-    if not summary["success"]:
-        print(f"chaserdock: failed: {summary['failures'][0]}", file=sys.stderr)
-    return status
+    reporter.report(Result(status=status, folder=str(folder), summary=summary))
+    return Outcome(folder, status, summary, summary["failures"][0] if summary["failures"] else None)
 
 
-class _Stop:
-    """Ctrl-C or SIGTERM asked for the end; a second time makes no difference until all is put away."""
+def print_outcome(outcome: Outcome, show: Show) -> None:
+    """Print the verdict: text on standard output unless that carries JSON lines, a failure on standard error."""
+    from chaserdock.analysis.summary import text_of
 
-    def __init__(self) -> None:
-        self.asked = False
-        self.passed_on = False
-        self._before = {s: signal.signal(s, self._ask) for s in (signal.SIGINT, signal.SIGTERM)}
-
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
-
-    def restore(self) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)
+    if outcome.summary is not None and show is not Show.json:
+        print(text_of(outcome.summary))
+        print(f"log, summary and output of the processes: {outcome.folder}")
+    if outcome.failure is not None:
+        prefix = "" if outcome.summary is None else "failed: "
+        print(f"chaserdock: {prefix}{outcome.failure}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""An operator's commands to a running mission."""
+"""Send operator commands to a running mission."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from msgspec import Struct
 
 
 class OperatorError(ChaserdockError):
-    """The command could not be put to anybody."""
+    """The command is inconsistent, or there is no reply."""
 
 
 def send_command(
@@ -25,12 +25,14 @@ def send_command(
     operator: str = "",
     before_s: float | None = None,
 ) -> CommandReply:
-    """Puts a command to the controller, in the name of ``operator``, to be refused once simulated time has passed
-    ``before_s``; raises OperatorError when nobody answers in time, TransportError."""
+    """Send a command to the controller and return its reply; the controller refuses it after simulated time ``before_s``.
+
+    Raises OperatorError when there is no reply in time, TransportError.
+    """
     if (command == "goto") != (offset_m is not None):
-        raise OperatorError("--offset X Y Z goes with goto, and goto needs it")
+        raise OperatorError("--offset X Y Z: required by goto, and by no other command")
     if (command in ("isolate", "restore")) != (thruster is not None):
-        raise OperatorError("--thruster N goes with isolate and restore, and these need it")
+        raise OperatorError("--thruster N: required by isolate and restore, and by no other command")
     request = OperatorCommand(
         command=command,  # type: ignore[arg-type]
         chaser=chaser,
@@ -39,7 +41,7 @@ def send_command(
         operator=operator,
         expires_ns=None if before_s is None else round(before_s * 1e9),
     )
-    return _answer(link, topics.OPERATE_KEY, request, timeout_s, "controller")
+    return _request(link, topics.OPERATE_KEY, request, timeout_s, "controller")
 
 
 def send_thruster_fault(
@@ -51,27 +53,27 @@ def send_thruster_fault(
     timeout_s: float,
     operator: str = "",
 ) -> CommandReply:
-    """Has the world make a thruster fail; raises OperatorError when nobody answers in time, TransportError."""
+    """Inject a thruster failure in the world and return its reply. Raises OperatorError, TransportError."""
     if (kind == "weak") != (factor is not None):
-        raise OperatorError("--factor goes with weak, and weak needs it")
+        raise OperatorError("--factor: required by weak, and by no other kind")
     request = ThrusterFaultCommand(
         chaser=chaser, thruster=thruster, kind=kind, factor=factor, operator=operator
     )
-    return _answer(link, topics.THRUSTER_FAULT_KEY, request, timeout_s, "world")
+    return _request(link, topics.THRUSTER_FAULT_KEY, request, timeout_s, "world")
 
 
-def _answer(link: Link, key: str, request: Struct, timeout_s: float, who: str) -> CommandReply:
+def _request(link: Link, key: str, request: Struct, timeout_s: float, receiver: str) -> CommandReply:
     node = Node("operator", "operator", link)
     try:
-        begun_s = time.monotonic()
-        while time.monotonic() - begun_s < timeout_s:
+        start_s = time.monotonic()
+        while time.monotonic() - start_s < timeout_s:
             reply = node.query(key, request, CommandReply, timeout_s)
             if reply is not None:
                 return reply
             time.sleep(0.05)  # not connected yet
         raise OperatorError(
-            f"no {who} answered within {timeout_s:g} s (namespace {link.namespace}, "
-            f"connect {', '.join(link.connect)}); is a mission running there?"
+            f"no reply from the {receiver} within {timeout_s:g} s (namespace {link.namespace}, "
+            f"connect {', '.join(link.connect)}); is a mission running?"
         )
     finally:
         node.close()

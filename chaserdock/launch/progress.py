@@ -1,12 +1,12 @@
-"""What a person, or a script, sees while a mission flies."""
+"""Show the progress of a mission: a live table, text lines, or JSON lines."""
 
 from __future__ import annotations
 
 import math
 import sys
 import time
+from collections.abc import Callable
 from enum import StrEnum
-from typing import TextIO
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario
@@ -18,7 +18,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .flight_state import FlightState
-from .json_events import Commanded, Line, Progress, Told, line_of
+from .json_events import CommandNotice, EventNotice, JsonLine, Progress, encode_line
 
 _LIVE_EVERY_S = 0.25
 _LINE_EVERY_S = 5.0
@@ -38,99 +38,103 @@ _SUBSCRIBED = (
 
 
 class Show(StrEnum):
-    """To whom a flight is shown: ``people``: a live table on a terminal, else a line now and then, all on standard
-    error; ``nobody``; ``scripts``: JSON lines on standard output."""
+    """How progress is shown.
 
-    people = "people"
-    nobody = "nobody"
-    scripts = "scripts"
+    ``text``: a live table on a terminal, otherwise a line every few seconds, on standard error. ``none``: not at all.
+    ``json``: JSON lines, on standard output by default.
+    """
+
+    text = "text"
+    none = "none"
+    json = "json"
+
+
+def print_json_line(line: JsonLine) -> None:
+    """Print a JSON line on standard output."""
+    print(encode_line(line), flush=True)
 
 
 class ProgressReporter:
-    """Shows a flight while it is flown."""
+    """Show the progress of a mission; with ``Show.json``, every line goes to ``emit``."""
 
-    def __init__(self, scenario: Scenario, show: Show, out: TextIO | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, show: Show, emit: Callable[[JsonLine], None] = print_json_line
+    ) -> None:
         self.state = FlightState(scenario)
-        self._show = show
-        self._out = out if out is not None else sys.stdout
+        self.show = show
+        self._emit = emit
         self._console = Console(stderr=True)
         self._shown_s = time.monotonic()
-        self._gone: set[str] = set()
-        self._said = ""
+        self._lost: set[str] = set()
+        self._last_line = ""
         self._live: Live | None = None
-        if show is Show.people and self._console.is_terminal:
+        if show is Show.text and self._console.is_terminal:
             self._live = Live(console=self._console, auto_refresh=False)
             self._live.start()
 
     @property
     def flying(self) -> bool:
-        """Whether the first tick has come."""
+        """Whether the first tick has arrived."""
         return self.state.flying
 
-    @property
-    def for_scripts(self) -> bool:
-        """Whether standard output belongs to JSON lines."""
-        return self._show is Show.scripts
-
     def subscribe(self, node: Node) -> None:
-        """Subscribes what is shown."""
-        if self._show is Show.nobody:
-            node.subscribe(topics.TICK)
-            return
-        for topic in _SUBSCRIBED:
+        """Subscribe to the topics that are shown."""
+        for topic in _SUBSCRIBED if self.show is not Show.none else (topics.TICK,):
             node.subscribe(topic)
 
-    def take(self, message: object) -> None:
-        """Notes a message, and tells what it says."""
-        for told in self.state.take(message, time.monotonic()):
-            self.tell(told)
+    def update(self, message: object) -> None:
+        """Apply a message and report its notices."""
+        for notice in self.state.update(message, time.monotonic()):
+            self.report(notice)
 
-    def show(self) -> None:
-        """Shows how the mission stands, when it is time to; to be called often."""
+    def refresh(self) -> None:
+        """Show the progress when it is due; call this often."""
         now_s = time.monotonic()
         since_s = now_s - self._shown_s
         if self._live is not None and since_s > _LIVE_EVERY_S:
             self._live.update(self._page(now_s), refresh=True)
-        elif self._show is Show.scripts and self.flying and since_s > _JSON_EVERY_S:
-            self.tell(self.state.progress(now_s))
-        elif self._show is Show.people and self._live is None and since_s > _LINE_EVERY_S:
+        elif self.show is Show.json and self.flying and since_s > _JSON_EVERY_S:
+            self._emit(self.state.progress(now_s))
+        elif self.show is Show.text and self._live is None and since_s > _LINE_EVERY_S:
             line = self._line(now_s)
-            if line != self._said:  # a start that takes long is told once
-                self.say(line)
-            self._said = line
+            if line != self._last_line:  # unchanged during a slow start
+                self.print_text(line)
+            self._last_line = line
         else:
             return
         self._shown_s = now_s
 
-    def tell(self, line: Line) -> None:
-        """Tells one thing: as JSON to scripts, in words to people."""
-        if self._show is Show.scripts:
-            print(line_of(line), file=self._out, flush=True)
-        elif isinstance(line, Told | Commanded):
-            self.say(words_of(line), _style_of(line))
+    def report(self, line: JsonLine) -> None:
+        """Report one line: as JSON, or notices as text."""
+        if self.show is Show.json:
+            self._emit(line)
+        elif isinstance(line, EventNotice | CommandNotice):
+            self.print_text(text_of(line), _style_of(line))
 
-    def say(self, text: str, style: str = "") -> None:
-        """One line to people."""
-        if self._show is not Show.people:
+    def print_text(self, text: str, style: str = "") -> None:
+        """Print one line of text, with ``Show.text`` only."""
+        if self.show is not Show.text:
             return
         if self._live is not None:
             self._live.console.print(Text(text, style=style))
         else:
             print(text, file=sys.stderr, flush=True)
 
-    def warn(self, process: str, text: str) -> None:
-        """Tells once that a process is gone."""
-        if process not in self._gone:
-            self._gone.add(process)
+    def report_lost(self, process: str, text: str) -> None:
+        """Report, once, that a process has exited."""
+        if process not in self._lost:
+            self._lost.add(process)
             time_s = self.state.time_ns / 1e9
-            self.tell(
-                Told(sim_time_s=time_s, process=process, level="warning", what="has ended", detail=text)
+            self.report(
+                EventNotice(
+                    sim_time_s=time_s, process=process, level="warning", what="has exited", detail=text
+                )
             )
 
     def close(self) -> None:
-        """Tells how the mission stood last, and leaves the terminal as it was."""
-        if self._show is Show.scripts and self.flying:
-            self.tell(self.state.progress(time.monotonic()))
+        """Show the last progress and restore the terminal."""
+        if self.show is Show.json and self.flying:
+            self._emit(self.state.progress(time.monotonic()))
         if self._live is not None:
             self._live.update(self._page(time.monotonic()), refresh=True)
             self._live.stop()
@@ -145,7 +149,7 @@ class ProgressReporter:
         if not self.flying:
             return self._starting()
         progress = self.state.progress(now_s)
-        parts = [f"{self.state.scenario.name}  {head_of(self.state, progress)}"]
+        parts = [f"{self.state.scenario.name}  {headline(self.state, progress)}"]
         parts += [
             f"{c.chaser} {c.phase} {c.position_error_m * 1e3:.1f} mm {math.degrees(c.orientation_error_rad):.2f} deg"
             for c in progress.chasers
@@ -162,7 +166,14 @@ class ProgressReporter:
             ProgressBar(total=scenario.duration_s, completed=progress.sim_time_s, width=30),
         )
         table = Table()
-        for column in ("chaser", "phase", "for", "position error", "orientation error", "to the target"):
+        for column in (
+            "chaser",
+            "phase",
+            "phase time",
+            "position error",
+            "orientation error",
+            "target distance",
+        ):
             table.add_column(column, justify="right")
         for c in progress.chasers:
             table.add_row(
@@ -173,30 +184,30 @@ class ProgressReporter:
                 f"{math.degrees(c.orientation_error_rad):.3f} deg",
                 f"{c.reference_distance_m:.3f} m",
             )
-        return Group(bar, Text(head_of(self.state, progress)), table)
+        return Group(bar, Text(headline(self.state, progress)), table)
 
 
-def head_of(state: FlightState, progress: Progress) -> str:
-    """How far, how fast, how long still, and how well the target is known."""
+def headline(state: FlightState, progress: Progress) -> str:
+    """Return simulated time, speed, remaining wall time and the status of the target estimate as text."""
     text = f"{progress.sim_time_s:6.1f} of {state.scenario.duration_s:g} s  {progress.speed_now:.2f} x real time  "
-    left_s = state.left_s(progress)
-    if left_s is not None and left_s < 360_000:
-        text += f"{int(left_s) // 60}:{int(left_s) % 60:02d} left  "
+    remaining_s = state.remaining_s(progress)
+    if remaining_s is not None and remaining_s < 360_000:
+        text += f"{int(remaining_s) // 60}:{int(remaining_s) % 60:02d} left  "
     return f"{text}target: {progress.target}"
 
 
-def words_of(line: Told | Commanded) -> str:
-    """An event or an answer in words."""
-    if isinstance(line, Commanded):
-        said = "accepted" if line.accepted else "refused"
-        text = f"{line.command} chaser {line.chaser}: {said} ({line.reason})"
+def text_of(line: EventNotice | CommandNotice) -> str:
+    """Return a notice as text."""
+    if isinstance(line, CommandNotice):
+        verdict = "accepted" if line.accepted else "refused"
+        text = f"{line.command} chaser {line.chaser}: {verdict} ({line.reason})"
     else:
-        mark = "" if line.level == "info" else f"{line.level.upper()}: "
-        text = f"{mark}{line.process}: {line.what} {line.detail}".rstrip()
+        prefix = "" if line.level == "info" else f"{line.level.upper()}: "
+        text = f"{prefix}{line.process}: {line.what} {line.detail}".rstrip()
     return f"{line.sim_time_s:7.2f} s  {text}"
 
 
-def _style_of(line: Told | Commanded) -> str:
-    if isinstance(line, Told):
+def _style_of(line: EventNotice | CommandNotice) -> str:
+    if isinstance(line, EventNotice):
         return _STYLES[line.level]
     return "" if line.accepted else "yellow"

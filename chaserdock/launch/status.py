@@ -1,4 +1,4 @@
-"""``chaserdock status``: who is there on a mission's network, at which tick, in which phase."""
+"""Observe a running mission: processes, tick, speed, phases."""
 
 from __future__ import annotations
 
@@ -13,30 +13,30 @@ from rich.table import Table
 
 
 class StatusError(ChaserdockError):
-    """Nobody is there to tell about."""
+    """No process is on the network."""
 
 
 @dataclass
-class Status:
-    """What was heard while looking on; processes by name."""
+class MissionStatus:
+    """Messages received while observing; processes by name."""
 
-    alive: set[str] = field(default_factory=set)
-    presence: dict[str, Presence] = field(default_factory=dict)
-    ticks: list[Tick] = field(default_factory=list)
-    heard_s: list[float] = field(default_factory=list)
-    phases: dict[int, Reference] = field(default_factory=dict)
+    alive: set[str] = field(default_factory=set[str])
+    presence: dict[str, Presence] = field(default_factory=dict[str, Presence])
+    ticks: list[Tick] = field(default_factory=list[Tick])
+    received_s: list[float] = field(default_factory=list[float])
+    phases: dict[int, Reference] = field(default_factory=dict[int, Reference])
     target: TargetEstimate | None = None
     ended: MissionEnd | None = None
-    events: list[Event] = field(default_factory=list)
+    events: list[Event] = field(default_factory=list[Event])
 
-    def take(self, message: object, now_s: float) -> None:
-        """Notes a message that came at ``now_s`` (monotonic)."""
+    def update(self, message: object, now_s: float) -> None:
+        """Apply a message received at ``now_s`` (monotonic)."""
         match message:
             case Presence():
                 self.presence[message.process] = message
             case Tick():
                 self.ticks.append(message)
-                self.heard_s.append(now_s)
+                self.received_s.append(now_s)
             case Reference():
                 self.phases[message.chaser] = message
             case TargetEstimate():
@@ -45,17 +45,19 @@ class Status:
                 self.ended = message
             case Event():
                 self.events.append(message)
+            case _:
+                pass
 
     @property
     def speed(self) -> float | None:
-        """Simulated over wall time, from the first tick heard to the last; None without two."""
-        if len(self.ticks) < 2 or self.heard_s[-1] <= self.heard_s[0]:
+        """Return simulated over wall time between the first and the last tick; None with fewer than two."""
+        if len(self.ticks) < 2 or self.received_s[-1] <= self.received_s[0]:
             return None
         simulated_s = (self.ticks[-1].sim_time_ns - self.ticks[0].sim_time_ns) / 1e9
-        return simulated_s / (self.heard_s[-1] - self.heard_s[0])
+        return simulated_s / (self.received_s[-1] - self.received_s[0])
 
     def as_dict(self) -> dict[str, object]:
-        """For programs; ``processes`` says of each whether it is expected to answer the tick that is open."""
+        """Return plain values for JSON; ``expected``: whether the open tick waits for the process."""
         tick = self.ticks[-1] if self.ticks else None
         return {
             "tick": tick.tick if tick else None,
@@ -76,7 +78,7 @@ class Status:
 
 
 def expected(name: str, tick: Tick | None) -> bool | None:
-    """Whether the world expects this process' answer to a tick; None for those it never does, or when none flies."""
+    """Return whether a tick waits for this process; None where no tick ever does, or without a tick."""
     if tick is None:
         return None
     if name in topics.CONTROLLERS:
@@ -85,9 +87,9 @@ def expected(name: str, tick: Tick | None) -> bool | None:
     return int(number) in tick.chasers if head == "chaser" else None
 
 
-def look_on(link: Link, seconds: float) -> Status:
-    """Looks on for so long (wall time), as an operator who is not seen. Raises StatusError when nobody is there."""
-    status = Status()
+def observe(link: Link, seconds: float) -> MissionStatus:
+    """Listen for ``seconds`` of wall time without joining the mission. Raises StatusError when there is no process."""
+    status = MissionStatus()
     node = Node("operator", "operator", link)
     try:
 
@@ -108,36 +110,36 @@ def look_on(link: Link, seconds: float) -> Status:
         while time.monotonic() < deadline:
             received = node.receive(0.05)
             if received is not None:
-                status.take(received.message, time.monotonic())
+                status.update(received.message, time.monotonic())
     finally:
         node.close()
     if not status.alive:
         raise StatusError(
-            f"nobody is there within {seconds:g} s (namespace {link.namespace}, "
-            f"connect {', '.join(link.connect)}); is a mission running there?"
+            f"no process found within {seconds:g} s (namespace {link.namespace}, "
+            f"connect {', '.join(link.connect)}); is a mission running?"
         )
     return status
 
 
-def table_of(status: Status) -> Table:
-    """The status as a person reads it."""
+def table_of(status: MissionStatus) -> Table:
+    """Return the status as a table of text."""
     tick = status.ticks[-1] if status.ticks else None
     speed = f", {status.speed:.2f} x real time" if status.speed is not None else ""
-    head = f"{tick.sim_time_ns / 1e9:.2f} s, tick {tick.tick}{speed}" if tick else "no tick is flown"
+    head = f"{tick.sim_time_ns / 1e9:.2f} s, tick {tick.tick}{speed}" if tick else "no tick"
     if status.target is not None:
         head += f"; target: {status.target.status}"
     if status.ended is not None:
         head += f"; ended: {status.ended.reason}"
     table = Table(title=head)
-    for column in ("process", "instance", "in the tick", "phase", "has heard"):
+    for column in ("process", "instance", "in the tick", "phase", "connected to"):
         table.add_column(column)
     for name in sorted(status.alive):
-        presence, takes_part = status.presence.get(name), expected(name, tick)
+        presence, in_tick = status.presence.get(name), expected(name, tick)
         phase = status.phases.get(int(name.partition("/")[2])) if name.startswith("chaser/") else None
         table.add_row(
             name,
             presence.instance if presence else "-",
-            {True: "yes", False: "no", None: "-"}[takes_part],
+            {True: "yes", False: "no", None: "-"}[in_tick],
             f"{phase.phase} for {phase.phase_time_s:.1f} s" if phase else "-",
             ", ".join(sorted(presence.heard)) if presence else "-",
         )

@@ -1,4 +1,4 @@
-"""Work with recorded logs: open, repair, export, send again."""
+"""Recorded logs: open, check, repair, export, play."""
 
 from .reader import Log, open_log
 

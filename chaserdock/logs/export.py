@@ -1,4 +1,4 @@
-"""Tables of a log as Parquet or CSV files, written as the log is read: memory does not grow with its length."""
+"""Write tables of a log as Parquet or CSV files while reading it: memory does not grow with its length."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class _ParquetFile:
 
 
 class _CsvFile:
-    """Lists become JSON text; a value that is not there an empty cell."""
+    """Lists become JSON text, missing values empty cells."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._file = path.open("w", newline="", encoding="utf-8")
@@ -52,15 +52,15 @@ def _cell(value: Any) -> Any:
 
 
 def export(log: LogSource, folder: Path, format: Format, images: bool = False) -> dict[str, int]:
-    """Writes every topic of a log into ``folder``, which is made; rows by file name.
+    """Write every topic of a log into ``folder``, which is created; return the number of rows by file name.
 
-    ``images``: with the images' bytes. Raises LogError when the log or the files cannot be used.
+    ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be used.
     """
     tables: dict[str, TopicTable] = {}
     files: dict[str, Any] = {}
     rows: Counter[str] = Counter()
 
-    def put(table: TopicTable) -> None:
+    def write(table: TopicTable) -> None:
         for name, chunk in table.take_all():
             path = folder / f"{name}.{format}"
             if name not in files:
@@ -78,9 +78,9 @@ def export(log: LogSource, folder: Path, format: Format, images: bool = False) -
                 table = tables[record.topic.key] = TopicTable(record.topic, images)
             table.add(record)
             if table.number >= (_IMAGE_ROWS if images else _ROWS):
-                put(table)
+                write(table)
         for table in tables.values():
-            put(table)
+            write(table)
     except OSError as error:
         raise LogError(f"{folder}: cannot be written: {error.strerror or error}") from None
     finally:

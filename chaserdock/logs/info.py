@@ -1,4 +1,4 @@
-"""What a log holds, and whether all of it can be trusted."""
+"""Describe a log and check that it is complete."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from chaserdock_protocol.scenario import scenario_from_json
 
 
 class FileInfo(msgspec.Struct):
-    """One file; ``closed`` and ``cut_bytes`` as in ``log_scan.FileState``."""
+    """One file; ``closed`` and ``cut_bytes`` as in ``recording.scan.FileState``."""
 
     path: str
     bytes: int
@@ -25,7 +25,7 @@ class FileInfo(msgspec.Struct):
 
 
 class KeyInfo(msgspec.Struct):
-    """One key: messages, their bytes, first and last simulated time, and gaps in their own numbering."""
+    """One key: messages, their bytes, first and last simulated time, and gaps in their sequence numbers."""
 
     key: str
     messages: int = 0
@@ -36,7 +36,7 @@ class KeyInfo(msgspec.Struct):
 
 
 class LogInfo(msgspec.Struct):
-    """A whole log. ``rejected``: messages that pass no check, by key and reason. ``viewer``: messages of that layer."""
+    """A log. ``rejected``: invalid messages by key and reason. ``viewer``: messages of the viewer layer."""
 
     scenario: str
     seed: int
@@ -50,14 +50,14 @@ class LogInfo(msgspec.Struct):
 
     @property
     def whole(self) -> bool:
-        """Whether every file was ended properly, nothing is missing and every message passes."""
-        told_late = ("/presence",)  # told from before anybody listens
-        lost = any(k.lost for k in self.keys if not k.key.endswith(told_late))
+        """Whether every file was closed, no message is missing and every message is valid."""
+        # Presence is published before the recorder subscribes.
+        lost = any(k.lost for k in self.keys if not k.key.endswith("/presence"))
         return all(f.closed and not f.recovered for f in self.files) and not lost and not self.rejected
 
 
 def info_of(log: LogSource) -> LogInfo:
-    """Reads all of a log, every checksum and message checked; raises LogError where it is damaged."""
+    """Read all of a log, check every checksum and message. Raises LogError where it is damaged."""
     text, run = read_scenario(log)
     scenario = scenario_from_json(text, f"{log}: scenario")
     keys: dict[str, KeyInfo] = {}
@@ -84,7 +84,7 @@ def info_of(log: LogSource) -> LogInfo:
             ]
             seq = _seq_of(channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected)
             if seq is not None:
-                # A publisher that was started again counts from zero.
+                # A restarted publisher counts from zero.
                 key.lost += max(0, seq - last_seq.get(channel.topic, -1) - 1)
                 last_seq[channel.topic] = seq
         size = path.stat().st_size
@@ -103,19 +103,19 @@ def info_of(log: LogSource) -> LogInfo:
 
 
 def _seq_of(key: str, payload: bytes, encoding: str, rejected: Counter[str]) -> int | None:
-    found = topics.topic_of_key(key)
+    match = topics.topic_of_key(key)
     try:
-        if found is None:
-            raise Rejected("key", "none of ours")
-        message: Any = decode_logged(found[0].kind, payload, encoding)
+        if match is None:
+            raise Rejected("key", "not in the topics table")
+        message: Any = decode_logged(match[0].kind, payload, encoding)
         return message.seq
-    except Rejected as refusal:
-        rejected[f"{key}: {refusal.reason}"] += 1
+    except Rejected as error:
+        rejected[f"{key}: {error.reason}"] += 1
         return None
 
 
 def info_lines(info: LogInfo) -> list[str]:
-    """The information for people."""
+    """Return the information as lines of text."""
     run = ", ".join(f"{k} {v}" for k, v in info.run.items() if not k.startswith("version.") and k != "crc32")
     lines = [
         f"{info.scenario}, seed {info.seed}; {run}; chaserdock {info.run.get('version.chaserdock', '?')}",
@@ -123,10 +123,10 @@ def info_lines(info: LogInfo) -> list[str]:
     ]
     for f in info.files:
         end = (
-            "closed, all checksums hold" if f.closed else f"cut off ({f.cut_bytes} bytes of a broken record)"
+            "closed, all checksums valid" if f.closed else f"cut off ({f.cut_bytes} bytes of a broken record)"
         )
         if not f.closed:
-            end += "; `chaserdock log recover` makes a whole file of it"
+            end += "; `chaserdock log recover` makes a complete file of it"
         if f.recovered:
             end += "; recovered"
         lines.append(f"{f.path}: {f.bytes / 1e6:.1f} MB, {end}")
@@ -136,6 +136,6 @@ def info_lines(info: LogInfo) -> list[str]:
         lines.append(
             f"{k.key:{width}} {k.messages:9d} {k.bytes / 1e3:10.1f} {k.first_s:9.2f} {k.last_s:9.2f} {k.lost:6d}"
         )
-    lines += [f"refused: {what}: {number}" for what, number in info.rejected.items()]
-    lines.append(f"{info.viewer} messages for viewers")
+    lines += [f"rejected: {what}: {number}" for what, number in info.rejected.items()]
+    lines.append(f"{info.viewer} messages of the viewer layer")
     return lines

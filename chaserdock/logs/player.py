@@ -1,4 +1,4 @@
-"""A log sent over the network again, byte for byte, in the world's place: to recorders, viewers and whoever listens."""
+"""Publish a log again, byte for byte, in place of the world: to recorders, viewers and other subscribers."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from chaserdock_protocol.transport import Link, Node, RawSample
 
 
 class PlayError(ChaserdockError):
-    """The log could not be sent."""
+    """No recorder joined."""
 
 
-def sent_again(log: LogSource) -> Iterator[tuple[int, RawSample]]:
-    """Simulated time (ns) and content of every message but the recorder's own and the viewers', in file order."""
+def stored_samples(log: LogSource) -> Iterator[tuple[int, RawSample]]:
+    """Iterate over simulated time (ns) and content of all messages but the recorder's and the viewers', in file order."""
     for path in log_files(log):
         for channel, stored in stored_messages(path):
             if not channel.topic.startswith((VIEWER_PREFIX, "recorder/")):
@@ -30,14 +30,14 @@ def play(
     log: LogSource,
     link: Link,
     speed: float | None,
-    patience_s: float,
-    sent: Callable[[RawSample], None] | None = None,
+    timeout_s: float,
+    on_sent: Callable[[RawSample], None] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> int:
-    """Waits for a recorder, then sends all of a log; how many messages.
+    """Wait for a recorder, then publish all of a log; return the number of messages.
 
-    ``speed``: simulated over wall time, None for as fast as it goes. ``sent`` is told each message that was handed to
-    the network. Raises LogError, TransportError, or PlayError when no recorder comes within ``patience_s``.
+    ``speed``: simulated over wall time, None for as fast as possible. ``on_sent`` is called with each message that was
+    published. Raises LogError, TransportError, or PlayError when no recorder joins within ``timeout_s``.
     """
     text, run = read_scenario(log)
     node = Node("world", "analysis", link)
@@ -51,37 +51,41 @@ def play(
                     accepted=True, reason="", run_id=run.get("run_id", ""), mode=mode, scenario_json=text
                 )
             else:
-                answer = JoinReply(accepted=False, reason="a log is played here; only a recorder can join")
+                answer = JoinReply(
+                    accepted=False, reason="this is the playback of a log; only a recorder can join"
+                )
             reply(answer)
 
         node.declare_queryable(topics.JOIN_KEY, JoinRequest, admit)
-        _wait_for_recorder(node, patience_s, stopped)
-        number, begun_s, first_ns = 0, time.monotonic(), None
-        for time_ns, raw in sent_again(log):
+        _wait_for_recorder(node, timeout_s, stopped)
+        number, start_s, first_ns = 0, time.monotonic(), None
+        for time_ns, raw in stored_samples(log):
             if stopped():
                 break
             first_ns = time_ns if first_ns is None else first_ns
             if speed is not None:
-                due_s = begun_s + (time_ns - first_ns) / 1e9 / speed
+                due_s = start_s + (time_ns - first_ns) / 1e9 / speed
                 time.sleep(max(0.0, due_s - time.monotonic()))
             node.publish_raw(raw)
             number += 1
-            if sent is not None:
-                sent(raw)
+            if on_sent is not None:
+                on_sent(raw)
         return number
     finally:
         node.close()
 
 
-def _wait_for_recorder(node: Node, patience_s: float, stopped: Callable[[], bool]) -> None:
-    """Its presence comes after its subscription: from then on it hears everything."""
-    deadline = time.monotonic() + patience_s
+def _wait_for_recorder(node: Node, timeout_s: float, stopped: Callable[[], bool]) -> None:
+    """Wait for the recorder's presence, which it publishes after subscribing to everything."""
+    deadline = time.monotonic() + timeout_s
     while time.monotonic() < deadline and not stopped():
         received = node.receive(0.1)
         match received.message if received is not None else None:
             case Presence(process="recorder"):
                 return
+            case _:
+                continue
     if not stopped():
         raise PlayError(
-            f"no recorder came within {patience_s:g} s; is it on the same namespace and endpoint?"
+            f"no recorder joined within {timeout_s:g} s; is it on the same namespace and endpoint?"
         )

@@ -1,16 +1,21 @@
-"""A log for people's own programs: typed messages and tables by topic.
+"""Open a log: typed messages, and tables by topic.
 
 >>> from chaserdock.logs import open_log                                                # doctest: +SKIP
->>> log = open_log(Path("runs/main"))
->>> for estimate in log.messages("controller/target"): print(estimate.position_m)
+>>> log = open_log("runs/main")
+>>> for estimate in log.messages(TargetEstimate): print(estimate.position_m)
 >>> log.table("controller/target").to_pandas()                                  # where pandas is installed
 """
 
+# pyarrow has no type stubs.
+# pyright: reportMissingTypeStubs=false, reportUnknownMemberType=false, reportUnknownParameterType=false
+# pyright: reportUnknownVariableType=false
+
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.recording.log import (
@@ -23,46 +28,57 @@ from chaserdock_protocol.recording.log import (
 )
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Topic
+from msgspec import Struct
 
 if TYPE_CHECKING:
     import pyarrow
 
+Message = TypeVar("Message", bound=Struct)
 
-def open_log(source: LogSource) -> Log:
-    """The log in a file, a run's folder, or several files of one run; raises LogError, or ScenarioError for its scenario."""
-    text, run = read_scenario(source)
-    return Log(source, scenario_from_json(text, f"{source}: scenario"), run)
+
+def open_log(source: str | Path | Sequence[str | Path]) -> Log:
+    """Open a log: a file, the folder of a run, or the files of a rotated log. Raises LogError, ScenarioError."""
+    paths = Path(source) if isinstance(source, str | Path) else [Path(s) for s in source]
+    text, run = read_scenario(paths)
+    return Log(paths, scenario_from_json(text, f"{source}: scenario"), run)
 
 
 class Log:
-    """A log: its ``scenario``, its ``run`` data (run_id, mode, versions), its messages. Nothing is kept in memory."""
+    """A log: its ``scenario``, its ``run`` data (run_id, mode, versions), its messages. Reads the files on each call."""
 
     def __init__(self, source: LogSource, scenario: Scenario, run: dict[str, str]) -> None:
         self.source, self.scenario, self.run = source, scenario, run
 
     @cached_property
     def counts(self) -> dict[str, int]:
-        """Messages by key."""
+        """Number of messages by key."""
         return count_messages(self.source)
 
     def records(self, *names: str | Topic) -> Iterator[Record]:
-        """Messages with their keys, in file order: of topics (``topics.TARGET``), of their keys as the topics table has
-        them (``"chaser/{chaser}/sighting"``) or of concrete keys (``"chaser/0/sighting"``); of all without names.
+        """Iterate over messages with their keys, in file order; over all messages without ``names``.
 
-        Raises LogError for a name that is no topic, and where the log is damaged.
+        A name is a topic (``topics.TARGET``), its key in the topics table (``"chaser/{chaser}/sighting"``) or a
+        concrete key (``"chaser/0/sighting"``). Raises LogError for an unknown name, and where the log is damaged.
         """
         return read_log(self.source, self._keys(names) if names else None)
 
-    def messages(self, *names: str | Topic) -> Iterator[Any]:
-        """As ``records``, the messages alone."""
+    @overload
+    def messages(self, kind: type[Message], /) -> Iterator[Message]: ...
+    @overload
+    def messages(self, *names: str | Topic) -> Iterator[Any]: ...
+    def messages(self, *names: Any) -> Iterator[Any]:
+        """Iterate over messages of a type (``messages.TargetEstimate``), or by names as in ``records``."""
+        if len(names) == 1 and isinstance(names[0], type):
+            names = tuple(topic for topic in topics.TOPICS if topic.kind is names[0])
+            if not names:
+                raise LogError("messages(): no topic has messages of this type")
         return (record.message for record in self.records(*names))
 
     def table(self, name: str | Topic) -> pyarrow.Table:
-        """One tidy table of a topic, all chasers together; columns as in ``tables``. Raises LogError."""
+        """Return a topic as one table, all chasers together; columns as in ``chaserdock.logs.tables``. Raises LogError."""
         from .tables import TopicTable
 
-        topic = topic_named(name)
-        table = TopicTable(topic)
+        table = TopicTable(topic_named(name))
         for record in self.records(name):
             table.add(record)
         return table.take()
@@ -85,7 +101,7 @@ class Log:
 
 
 def topic_named(name: str | Topic) -> Topic:
-    """A topic by itself, by its key in the topics table, or by a concrete key; raises LogError."""
+    """Return a topic by itself, by its key in the topics table, or by a concrete key. Raises LogError."""
     if isinstance(name, Topic):
         return name
     for topic in topics.TOPICS:

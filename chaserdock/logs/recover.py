@@ -1,4 +1,4 @@
-"""What can be saved of a log that was cut off or damaged, as a new and whole log."""
+"""Recover the readable messages of a log that is cut off or damaged into a new log."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _CHUNK_MARK, _MARK_OFFSET = b"\x04\x00\x00\x00zstd", _HEAD.size + 28
 
 
 class Recovered(msgspec.Struct):
-    """What was saved: messages, chunks; and what was not: records whose checksum or form was broken, bytes skipped."""
+    """Recovered messages and chunks; lost: records with a wrong checksum or format, bytes skipped."""
 
     messages: int = 0
     chunks: int = 0
@@ -43,7 +43,7 @@ class Recovered(msgspec.Struct):
 
 
 def recover(log: Path, out: Path) -> Recovered:
-    """Copies every message of ``log`` that is whole, by its chunk's checksum, into the new log ``out``.
+    """Copy every message of ``log`` whose chunk has a valid checksum into the new log ``out``.
 
     Raises LogError when ``log`` is no log or holds no whole message, or ``out`` exists or cannot be written.
     """
@@ -52,7 +52,7 @@ def recover(log: Path, out: Path) -> Recovered:
             if data[: len(MCAP0_MAGIC)] != MCAP0_MAGIC:
                 raise LogError(f"{log}: no MCAP log")
             found = Recovered()
-            channels, schemas = _declared(data)
+            channels, schemas = _summary_declarations(data)
             with out.open("xb") as target:
                 try:
                     _copy(data, target, channels, schemas, found, str(log))
@@ -71,7 +71,7 @@ def recover(log: Path, out: Path) -> Recovered:
 
 
 def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
-    """Opcode and content of everything that looks like a record; after a broken one, from the next chunk on."""
+    """Iterate over opcode and content of records; after a broken one, continue with the next chunk."""
     place = len(MCAP0_MAGIC)
     while place + _HEAD.size <= len(data):
         opcode, length = _HEAD.unpack_from(data, place)
@@ -80,18 +80,18 @@ def _walk(data: mmap.mmap, found: Recovered) -> Iterator[tuple[int, bytes]]:
             content = data[place + _HEAD.size : place + _HEAD.size + length]
             if opcode == Opcode.DATA_END and length == 4:
                 return
-            if opcode != Opcode.CHUNK or _is_whole(content):
+            if opcode != Opcode.CHUNK or _is_valid(content):
                 yield opcode, content
                 place += _HEAD.size + length
                 continue
         following = _next_chunk(data, place + 1)
-        # What is left of a killed writer's last record is expected; only something in the middle was broken.
+        # A partial last record is normal after a kill; only damage before the end counts.
         found.broken_records += following < len(data)
         found.skipped_bytes += following - place
         place = following
 
 
-def _is_whole(chunk: bytes) -> bool:
+def _is_valid(chunk: bytes) -> bool:
     try:
         parse_chunk(chunk)
     except DAMAGE:
@@ -100,21 +100,21 @@ def _is_whole(chunk: bytes) -> bool:
 
 
 def _next_chunk(data: mmap.mmap, place: int) -> int:
-    """Where the next whole chunk begins; the end if there is none."""
+    """Return where the next whole chunk begins; the end of the data if there is none."""
     mark = data.find(_CHUNK_MARK, place)
     while mark >= 0:
         begin = mark - _MARK_OFFSET
         if begin >= place:
             opcode, length = _HEAD.unpack_from(data, begin)
             content = data[begin + _HEAD.size : begin + _HEAD.size + min(length, MAX_RECORD_BYTES)]
-            if opcode == Opcode.CHUNK and len(content) == length and _is_whole(content):
+            if opcode == Opcode.CHUNK and len(content) == length and _is_valid(content):
                 return begin
         mark = data.find(_CHUNK_MARK, mark + 1)
     return len(data)
 
 
-def _declared(data: mmap.mmap) -> tuple[dict[int, Channel], dict[int, Schema]]:
-    """Channels and schemas that a closed log repeats in its summary: the chunk that declared them may be lost."""
+def _summary_declarations(data: mmap.mmap) -> tuple[dict[int, Channel], dict[int, Schema]]:
+    """Return channels and schemas that a closed log repeats in its summary: the chunk that declares them may be lost."""
     channels: dict[int, Channel] = {}
     schemas: dict[int, Schema] = {}
     footer = len(data) - len(MCAP0_MAGIC) - 20 - _HEAD.size

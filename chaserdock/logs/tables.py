@@ -1,9 +1,9 @@
-"""Messages as tables: one row a message, nested fields flattened, the unit of every column in its metadata.
+"""Messages as tables: one row per message, nested fields flattened, the unit of every column in its metadata.
 
 Columns: ``key``, ``sent_ns`` (the sender's wall clock), ``time_s`` (simulated), then the message's fields. Vectors become
 ``position_m_x`` …, quaternions ``q_w`` …; lists of numbers stay lists; dictionaries become JSON text. Lists of structures
 (the solutions of a sighting) become a table of their own, with ``key``, ``seq``, ``tick``, ``time_s`` and ``index``.
-Images' bytes are left out (``data_bytes`` tells how many) unless asked for.
+The bytes of images are left out by default (``data_bytes`` is their number).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` a line, in WRF; evo, rpg and others read them."""
+"""Write trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` per line, in WRF; evo and others read them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from .reader import open_log
 
 
 def _track_of(record: Record) -> str | None:
-    """Name of the track that a message is a point of."""
+    """Return the name of the track that a message is a point of, or None."""
     message: Any = record.message
     match record.topic:
         case topics.TRUTH_BODY:
@@ -24,13 +24,14 @@ def _track_of(record: Record) -> str | None:
             return f"chaser_{message.chaser}_odometry"
         case topics.REFERENCE:
             return f"chaser_{message.chaser}_reference"
-    return None
+        case _:
+            return None
 
 
 def write_tracks(log: LogSource, folder: Path, from_s: float = 0.0, to_s: float = math.inf) -> dict[str, int]:
-    """Truth of all bodies, the target's estimate, chasers' odometries and references from ``from_s`` to ``to_s``.
+    """Write truth of all bodies, target estimate, odometry and references from ``from_s`` to ``to_s``.
 
-    Points by file name. Raises LogError when the log or the files cannot be used.
+    Returns the number of points by file name. Raises LogError when the log or the files cannot be used.
     """
     opened = open_log(log)
     wanted = (topics.TRUTH_BODY, topics.TARGET, topics.ODOMETRY, topics.REFERENCE)
@@ -57,5 +58,5 @@ def write_tracks(log: LogSource, folder: Path, from_s: float = 0.0, to_s: float 
         for file in files.values():
             file.close()
     if not points:
-        raise LogError(f"{log}: holds no track between {from_s:g} and {to_s:g} s")
+        raise LogError(f"{log}: contains no track between {from_s:g} and {to_s:g} s")
     return dict(sorted(points.items()))

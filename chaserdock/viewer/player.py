@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 
 from chaserdock_protocol.process import StopSignal, print_status
-from chaserdock_protocol.recording.scan import LogSource
+from chaserdock_protocol.recording.scan import LogError, LogSource
 
 from .address import url_of
 from .live import PERIOD_S, ViewOptions
@@ -23,8 +23,10 @@ def view_log(
     stop = StopSignal(watch_parent)
     mission = LoggedMission(source)
     line = TimeLine(mission.end_s)
+    if at_s is not None and at_s > mission.end_s:
+        raise LogError(f"--at {at_s:g}: the log ends at {mission.end_s:.2f} s")
     if at_s is not None:
-        line.at_s, line.playing = min(at_s, line.end_s), False
+        line.at_s, line.playing = at_s, False
     mode = f"log of run {mission.run.get('run_id', '?')}, {mission.run.get('mode', '?')}"
     with page_server(options.host, options.port) as server:
         truth = mission.truth and options.truth

@@ -136,7 +136,7 @@ def test_a_process_that_is_not_in_the_log_is_refused() -> None:
 def check(
     process: str, *command: str, ticks: int = 6, patience_s: float = 10.0, start_s: float = 60.0
 ) -> tuple[int, str]:
-    limits = ("--ticks", str(ticks), "--patience-s", str(patience_s), "--start-s", str(start_s))
+    limits = ("--ticks", str(ticks), "--timeout", str(patience_s), "--join-timeout", str(start_s))
     return finished("check", *limits, process, str(LOG), "--", *command)
 
 

@@ -1,9 +1,10 @@
-"""The program as scripts and shells meet it: statuses, JSON lines, help that loads nothing, completion, docs/cli.md."""
+"""The command line: statuses, JSON lines, help without heavy imports, completion, docs/cli.md."""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -13,26 +14,33 @@ from typing import Any
 
 import msgspec
 import pytest
-from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.shipped_scenarios import shipped_names
 from harness import ROOT, SHORT, chaserdock, finished, sets
 from typer.main import get_command
 
-from chaserdock.cli.main import app, main
-from chaserdock.cli.plain import PlainGroup
-from chaserdock.launch.json_events import Commanded, Failed, Line, Progress, Result, Start, Told
+from chaserdock.cli.help import GroupedHelp
+from chaserdock.cli.main import app
+from chaserdock.launch.json_events import (
+    CommandNotice,
+    EventNotice,
+    Failed,
+    JsonLine,
+    Progress,
+    Result,
+    Start,
+)
 
 
-def verbs(group: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    """Every verb, such as ``("log", "info")``."""
+def commands(group: Any, parents: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
+    """Iterate over all commands, such as ``("log", "info")``."""
     for name, command in group.commands.items():
-        if isinstance(command, PlainGroup):
-            yield from verbs(command, (*above, name))
+        if isinstance(command, GroupedHelp):
+            yield from commands(command, (*parents, name))
         else:
-            yield (*above, name)
+            yield (*parents, name)
 
 
-VERBS = list(verbs(get_command(app)))
+COMMANDS = list(commands(get_command(app)))
 HEAVY = (
     "cv2",
     "casadi",
@@ -50,37 +58,49 @@ HEAVY = (
 _LOADED_BY_HELP = """
 import contextlib, io, json, sys
 from chaserdock.cli.main import app
-told = {}
+printed = {}
 for path in json.loads(sys.argv[1]):
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
         app([*path, "--help"])
-    told[" ".join(path)] = out.getvalue()
+    printed[" ".join(path)] = out.getvalue()
 loaded = sorted(name for name in json.loads(sys.argv[2]) if name in sys.modules)
-print(json.dumps({"told": told, "loaded": loaded}))
+print(json.dumps({"printed": printed, "loaded": loaded}))
 """
 
 
-def test_help_of_every_verb_loads_nothing_heavy() -> None:
+def test_help_imports_no_heavy_module() -> None:
     done = subprocess.run(
-        [sys.executable, "-c", _LOADED_BY_HELP, json.dumps([[], *VERBS]), json.dumps(HEAVY)],
+        [sys.executable, "-c", _LOADED_BY_HELP, json.dumps([[], *COMMANDS]), json.dumps(HEAVY)],
         capture_output=True,
         text=True,
         check=True,
     )
     result = json.loads(done.stdout)
     assert result["loaded"] == []
-    assert len(result["told"]) == len(VERBS) + 1
-    for path, text in result["told"].items():
+    assert len(result["printed"]) == len(COMMANDS) + 1
+    for path, text in result["printed"].items():
         assert text.startswith(f"Usage: {path}".rstrip()) or f" {path} " in text.splitlines()[0], path
-        assert "--help" in text
+        assert "-h, --help" in text
+
+
+def test_help_lists_every_command_in_its_group() -> None:
+    status, text = finished("-h")
+    assert status == 0
+    sections = ["Fly", "Processes", "Operate", "Look at a flight", "Logs", "Reproduce and compare", "Setup"]
+    assert [line.rstrip(":") for line in text.splitlines() if re.match(r"[A-Z][a-z ]+:$", line)] == [
+        "Options",
+        *sections,
+    ]
+    for path in COMMANDS:
+        assert re.search(rf"^  {path[0]}  ", text, re.MULTILINE), path
 
 
 def test_version() -> None:
     assert finished("--version") == (0, f"chaserdock {metadata.version('chaserdock')}\n")
 
 
-def test_a_reader_that_leaves_is_no_error() -> None:
+def test_closed_pipe_is_no_error() -> None:
     golden = str(ROOT / "tests" / "golden" / "two-chasers.mcap")
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     process = chaserdock("compare", golden, golden, env={"PYTHONUNBUFFERED": ""}, **pipes)
@@ -91,17 +111,17 @@ def test_a_reader_that_leaves_is_no_error() -> None:
     process.wait()
 
 
-def test_the_page_is_up_to_date() -> None:
+def test_cli_page_is_up_to_date() -> None:
     command = [sys.executable, str(ROOT / "docs" / "make_cli.py"), "--print"]
     made = subprocess.run(command, capture_output=True, text=True, check=True, encoding="utf-8").stdout
     page = (ROOT / "docs" / "cli.md").read_text(encoding="utf-8")
     assert page == made, "run: python docs/make_cli.py"
-    for path in VERBS:
+    for path in COMMANDS:
         assert f"\n### {' '.join(path)}\n" in page
 
 
 def completed(*words: str) -> list[str]:
-    """What the shell is offered for the last word."""
+    """Return what the shell offers for the last word."""
     env = {
         **os.environ,
         "_CHASERDOCK_COMPLETE": "complete_bash",
@@ -126,19 +146,19 @@ def test_completion() -> None:
     assert completed("chaserdock", "log", "rec") == ["recover"]
 
 
-def lines_of(out: str) -> list[Line]:
-    return [msgspec.json.decode(line, type=Line, strict=True) for line in out.splitlines()]
+def lines_of(out: str) -> list[JsonLine]:
+    return [msgspec.json.decode(line, type=JsonLine, strict=True) for line in out.splitlines()]
 
 
-def flown(*arguments: str, **options: Any) -> tuple[int, list[Line], str]:
-    """Status, JSON lines and standard error of a run."""
+def flown(*arguments: str, **options: Any) -> tuple[int, list[JsonLine], str]:
+    """Return status, JSON lines and standard error of a run."""
     process = chaserdock(*arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options)
     out, error = process.communicate(timeout=300)
     return process.returncode, lines_of(out.decode()), error.decode()
 
 
 @pytest.mark.slow
-def test_run_tells_scripts_the_whole_flight(tmp_path: Path) -> None:
+def test_run_prints_json_lines_for_the_whole_flight(tmp_path: Path) -> None:
     out = tmp_path / "run"
     status, lines, error = flown("run", "single", "--json", "--out", str(out), *sets(*SHORT))
     assert isinstance(lines[0], Start)
@@ -147,8 +167,8 @@ def test_run_tells_scripts_the_whole_flight(tmp_path: Path) -> None:
     assert isinstance(last, Result)
     assert status == last.status == (0 if last.summary["success"] else 1)
     assert last.summary == json.loads((out / "summary.json").read_text())
-    told = [line for line in lines if isinstance(line, Told | Commanded)]
-    assert any(isinstance(t, Told) and t.what == "initialised by chaser 0" for t in told)
+    notices = [line for line in lines if isinstance(line, EventNotice | CommandNotice)]
+    assert any(isinstance(n, EventNotice) and n.what == "initialised by chaser 0" for n in notices)
     progress = [line for line in lines if isinstance(line, Progress)]
     assert progress
     assert progress[-1].tick == 89
@@ -158,50 +178,7 @@ def test_run_tells_scripts_the_whole_flight(tmp_path: Path) -> None:
     assert "Traceback" not in error
 
 
-@pytest.mark.parametrize(
-    ("arguments", "status", "said"),
-    [
-        (["run", "nowhere"], 2, "no such scenario file"),
-        (["run", "single", "--set", "duration_s='30'"], 2, "duration_s: must be a number (got '30')"),
-        (["run", "single", "--quiet", "--json"], 2, "one or the other"),
-        (["run"], 2, "Missing argument"),
-        (["run", "single", "--mode", "fast"], 2, "lockstep"),
-        (["nothing"], 2, "No such command"),
-        (["summary", "nowhere.mcap"], 2, "nowhere.mcap"),
-        (["log", "info", "nowhere.mcap"], 2, "nowhere.mcap"),
-        (["compare", "nowhere", "nobody"], 2, "nowhere"),
-        (["replay", "nowhere", "--through", "fusion"], 2, "nowhere"),
-        (["report", "nowhere"], 2, "nowhere"),
-        (["video", "nowhere", "--out", "a.txt"], 2, "must end in"),
-        (["campaign", "nowhere.toml"], 2, "nowhere.toml"),
-        (["command", "goto", "0"], 2, "--offset"),
-        (["status", "-e", "tcp/127.0.0.1:1", "--seconds", "0.3"], 2, "nobody is there"),
-        (["markers", "nothing", "--out", "a.pdf"], 2, "nothing"),
-        (["calibrate", "nowhere", "--out", "a.yaml"], 2, "nowhere"),
-        (["check", "controller", "nowhere", "--", "true"], 2, "nowhere"),
-        (["keys", "init"], 2, "Missing argument"),
-    ],
-    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
-)
-def test_bad_input_ends_with_status_2_and_says_why(
-    arguments: list[str],
-    status: int,
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:
-    for name, value in SINGLE_THREADED.items():  # `replay` sets these for good
-        monkeypatch.setenv(name, value)
-    monkeypatch.setattr(sys, "argv", ["chaserdock", *arguments])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    out, error = capfd.readouterr()
-    assert said in error
-    assert ended.value.code == status
-    assert out == ""
-
-
-def test_errors_are_told_to_scripts_too() -> None:
+def test_error_is_the_last_json_line() -> None:
     status, lines, error = flown("run", "nowhere", "--json")
     assert status == 2
     assert lines == [Failed(status=2, text=lines[0].text)]  # type: ignore[union-attr]

@@ -114,7 +114,7 @@ def test_tracks_are_the_poses_in_tum_order(tmp_path: Path) -> None:
     assert np.array_equal(rows[:, [7, 4, 5, 6]], track.q_wxyz)
     assert np.allclose(rows[:, 0], track.time_s, atol=1e-9)
     assert write_tracks(GOLDEN, tmp_path / "late", from_s=0.5, to_s=0.8)["target_truth.tum"] == 5
-    with pytest.raises(LogError, match="holds no track between 5 and 6 s"):
+    with pytest.raises(LogError, match="contains no track between 5 and 6 s"):
         write_tracks(GOLDEN, tmp_path / "none", 5.0, 6.0)
 
 

@@ -20,10 +20,10 @@ from cryptography import x509
 from harness import ROOT, SHORT, all_gone, chaserdock, find_child, finished, sets, wait_for_log
 from mission_keys import make_keys
 
-from chaserdock.launch import container as member
+from chaserdock.launch import container
 from chaserdock.launch.keys import KeysError, init_keys, names, why_not_usable
 from chaserdock.launch.launcher import free_port
-from chaserdock.launch.status import Status, expected
+from chaserdock.launch.status import MissionStatus, expected
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 
@@ -31,7 +31,7 @@ NOW = datetime(2026, 1, 1, tzinfo=UTC)
 # -- keys -------------------------------------------------------------------------------------------------
 
 
-def test_a_process_gets_its_own_key_and_nobody_keeps_the_authoritys(tmp_path: Path) -> None:
+def test_each_process_gets_its_own_key_and_the_authority_key_is_not_kept(tmp_path: Path) -> None:
     init_keys(tmp_path, 2, ("example.org", "10.0.0.7"), 7, NOW)
     authorities, private = set(), set()
     for name in names(2):
@@ -54,17 +54,17 @@ def test_a_process_gets_its_own_key_and_nobody_keeps_the_authoritys(tmp_path: Pa
     assert [str(a) for a in hosts.get_values_for_type(x509.IPAddress)] == ["10.0.0.7"]
 
 
-def test_keys_are_not_overwritten_and_known_to_end(tmp_path: Path) -> None:
-    assert why_not_usable(tmp_path, 1, NOW) == "there are none"
+def test_keys_are_not_overwritten_and_expire(tmp_path: Path) -> None:
+    assert why_not_usable(tmp_path, 1, NOW) == "it contains no keys"
     init_keys(tmp_path, 1, ("localhost",), 2, NOW)
     before = (tmp_path / "world" / "key.pem").read_bytes()
     with pytest.raises(KeysError, match="never overwritten"):
         init_keys(tmp_path, 1, ("localhost",), 2, NOW)
     assert (tmp_path / "world" / "key.pem").read_bytes() == before
     assert why_not_usable(tmp_path, 1, NOW) is None
-    assert "end at 2026-01-03" in (why_not_usable(tmp_path, 1, NOW + timedelta(days=2)) or "")
+    assert "expire at 2026-01-03" in (why_not_usable(tmp_path, 1, NOW + timedelta(days=2)) or "")
     (tmp_path / "chaser-0" / "key.pem").unlink()
-    assert why_not_usable(tmp_path, 1, NOW) == "those of chaser-0 are missing"
+    assert why_not_usable(tmp_path, 1, NOW) == "the keys of chaser-0 are missing"
 
 
 @pytest.mark.parametrize(
@@ -72,12 +72,12 @@ def test_keys_are_not_overwritten_and_known_to_end(tmp_path: Path) -> None:
     [
         (["chaser", "0", "--keys", "{empty}"], "make a mission's keys"),
         (["chaser", "0", "--keys", "{keys}", "-e", "tcp/127.0.0.1:1"], "must be tls/HOST:PORT"),
-        (["router", "--keys", "{keys}", "-l", "tcp/127.0.0.1:0"], "must be tls/ADDRESS:PORT"),
+        (["router", "--keys", "{keys}", "-l", "tcp/127.0.0.1:0"], "must be tls/HOST:PORT"),
         (["router", "--until", "nobody"], "--until nobody"),
-        (["status", "-e", "tcp/127.0.0.1:1", "--seconds", "0.5"], "nobody is there"),
+        (["status", "-e", "tcp/127.0.0.1:1", "--duration", "0.5"], "no process found"),
     ],
 )
-def test_wrong_use_is_one_clear_error(arguments: list[str], words: str, tmp_path: Path) -> None:
+def test_invalid_network_options_are_one_line(arguments: list[str], words: str, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     keys = make_keys(tmp_path / "keys")
     filled = [a.format(empty=tmp_path / "empty", keys=keys) for a in arguments]
@@ -91,11 +91,11 @@ def test_wrong_use_is_one_clear_error(arguments: list[str], words: str, tmp_path
 
 
 def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
-    """Every process with its own keys alone; the router is started again in flight; judged as a success."""
+    """Every process has only its own keys; the router restarts in flight; the flight is a success."""
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
     endpoint = f"tls/127.0.0.1:{free_port()}"
-    reach = ["-e", endpoint, "--lease-ms", "10000"]
-    short = sets(*SHORT, "duration_s=60.0")  # `status` looks on meanwhile, for some seconds
+    reach = ["-e", endpoint, "--lease", "10"]
+    short = sets(*SHORT, "duration_s=60.0")  # `status` listens meanwhile, for some seconds
     processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(name: str, *arguments: str) -> None:
@@ -111,7 +111,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
         start("router", "router", "-l", endpoint, "--until", "operator")
 
     try:
-        start("world", "world", "two-chaser-tracking", *short, "--rejoin-s", "30", *reach)
+        start("world", "world", "two-chaser-tracking", *short, "--rejoin-timeout", "30", *reach)
         start("controller", "controller", *reach)
         start("chaser-0", "chaser", "0", *reach)
         start("chaser-1", "chaser", "1", *reach)
@@ -153,7 +153,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     # What was on its way when the router died is lost, and the recorder says so; the flight itself is a success.
     assert statuses.pop("recorder") in (0, 1), said_by
     assert set(statuses.values()) == {0}, said_by
-    assert "denied" not in said_by["router"]  # nobody of a mission tries what it may not
+    assert "denied" not in said_by["router"]  # no process tries what it may not do
     summary = json.loads((logs[0].parent / "summary.json").read_text())
     assert summary["success"]
     assert summary["sim_time_s"] == 60.0
@@ -163,13 +163,21 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert ticks[-1].controller
 
 
-def test_one_machine_flies_with_rights_when_asked_for(tmp_path: Path) -> None:
-    """The flight is the same to the bit; the router says that it held everyone to his rights, and denied nothing."""
+def test_run_with_keys_equals_run_without(tmp_path: Path) -> None:
+    """The digests are equal; the router enforced access rights and denied nothing."""
     keys = make_keys(tmp_path / "keys")
     digests = []
-    for name, asked in (("with", ["--keys", str(keys)]), ("without", [])):
+    for name, options in (("with", ["--keys", str(keys)]), ("without", [])):
         out = tmp_path / name
-        run = ["run", "two-chaser-tracking", "-q", *sets(*SHORT, "duration_s=3.0"), "--out", str(out), *asked]
+        run = [
+            "run",
+            "two-chaser-tracking",
+            "-q",
+            *sets(*SHORT, "duration_s=3.0"),
+            "--out",
+            str(out),
+            *options,
+        ]
         status, said = finished(*run, timeout_s=240.0)
         assert status in (0, 1), said
         summary = json.loads((out / "summary.json").read_text())
@@ -182,39 +190,39 @@ def test_one_machine_flies_with_rights_when_asked_for(tmp_path: Path) -> None:
     assert not (tmp_path / "without" / "processes" / "router.txt").exists()
 
 
-def test_a_run_without_the_keys_it_is_told_of_says_so(tmp_path: Path) -> None:
+def test_run_with_missing_keys_is_rejected(tmp_path: Path) -> None:
     run = ["run", "two-chaser-tracking", "--keys", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
     status, said = finished(*run)
     assert status == 2
-    assert "there are none; make a mission's keys with `chaserdock keys init" in said
+    assert "it contains no keys; make a mission's keys with `chaserdock keys init" in said
     assert len(said.strip().splitlines()) == 1
     four = make_keys(tmp_path / "three")  # of three chasers
     status, said = finished("run", "four-chaser-docking", "--keys", str(four), "--out", str(tmp_path / "out"))
-    assert (status, "those of chaser-3 are missing" in said) == (2, True)
+    assert (status, "the keys of chaser-3 are missing" in said) == (2, True)
     assert not (tmp_path / "out").exists()
 
 
 # -- a container's main process ---------------------------------------------------------------------------
 
 
-def test_sockets_of_proc_net_tcp() -> None:
+def test_link_is_a_listening_or_connected_socket() -> None:
     with socket.socket() as listening, socket.socket() as calling:
         listening.bind(("127.0.0.1", 0))
         port = listening.getsockname()[1]
-        assert not member.linked(port)
+        assert not container.is_linked(port)
         listening.listen()
-        assert member.linked(port)
+        assert container.is_linked(port)
         calling.connect(("127.0.0.1", port))
         answering, _ = listening.accept()
-        assert member.router_there("127.0.0.1", port)
+        assert container.is_listening("127.0.0.1", port)
         listening.close()
         with answering:
-            assert member.linked(port)
-    assert not member.router_there("127.0.0.1", port)
+            assert container.is_linked(port)
+    assert not container.is_listening("127.0.0.1", port)
 
 
-def test_health_is_an_open_link_or_a_listening_router(tmp_path: Path) -> None:
-    """docker/healthy asks without Python what the member asks."""
+def test_health_check_needs_a_link_or_a_listening_router(tmp_path: Path) -> None:
+    """docker/healthy tests without Python what ``is_linked`` tests."""
 
     def health(port: int, call: str) -> int:
         environment = {
@@ -240,8 +248,8 @@ def test_health_is_an_open_link_or_a_listening_router(tmp_path: Path) -> None:
     assert health(port, "closed") != 0
 
 
-def test_a_world_gets_the_overrides_and_too_many_chasers_are_told() -> None:
-    assert member.arguments_of(["world", "x"], "a=1 b='q r'") == [
+def test_world_gets_overrides_and_too_many_chasers_are_rejected() -> None:
+    assert container.with_overrides(["world", "x"], "a=1 b='q r'") == [
         "world",
         "x",
         "--set",
@@ -249,16 +257,16 @@ def test_a_world_gets_the_overrides_and_too_many_chasers_are_told() -> None:
         "--set",
         "b=q r",
     ]
-    assert member.arguments_of(["chaser", "0"], "a=1") == ["chaser", "0"]
-    assert member.chasers_of("two-chaser-tracking", "seed=3") == 2
-    assert member.too_many_chasers("four-chaser-docking", "", 4) is None
-    reason = member.too_many_chasers("four-chaser-docking", "", 3) or ""
+    assert container.with_overrides(["chaser", "0"], "a=1") == ["chaser", "0"]
+    assert container.count_chasers("two-chaser-tracking", "seed=3") == 2
+    assert container.too_many_chasers("four-chaser-docking", "", 4) is None
+    reason = container.too_many_chasers("four-chaser-docking", "", 3) or ""
     assert "has 4 chasers" in reason
     assert "COMPOSE_PROFILES=8-chasers" in reason
-    assert [member.services_of(p) for p in ("", "8-chasers", "tools,16-chasers")] == [4, 8, 16]
+    assert [container.count_services(p) for p in ("", "8-chasers", "tools,16-chasers")] == [4, 8, 16]
 
 
-def test_a_member_passes_on_signals_and_leaves_nobody_behind(tmp_path: Path) -> None:
+def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> None:
     """A recorder without a world, stopped as Docker stops a container."""
     arguments = ["record", "--out", str(tmp_path / "run"), "-e", f"tcp/127.0.0.1:{free_port()}"]
     process = subprocess.Popen([sys.executable, "-m", "chaserdock.launch.container", *arguments])
@@ -271,14 +279,14 @@ def test_a_member_passes_on_signals_and_leaves_nobody_behind(tmp_path: Path) -> 
 # -- status -----------------------------------------------------------------------------------------------
 
 
-def test_status_tells_speed_and_who_is_in_the_tick() -> None:
-    status = Status()
+def test_status_computes_speed_and_expected_processes() -> None:
+    status = MissionStatus()
     ticks = [
         Tick(tick=k, sim_time_ns=k * 500_000_000, images=True, chasers=(0, 2), controller=False)
         for k in range(4)
     ]
     for tick in ticks:
-        status.take(tick, 10.0 + tick.tick)
+        status.update(tick, 10.0 + tick.tick)
     assert status.speed == pytest.approx(0.5)
     assert [expected(n, ticks[-1]) for n in ("chaser/0", "chaser/1", "controller", "world")] == [
         True,
@@ -286,5 +294,5 @@ def test_status_tells_speed_and_who_is_in_the_tick() -> None:
         False,
         None,
     ]
-    assert Status().speed is None
-    assert Status().as_dict()["tick"] is None
+    assert MissionStatus().speed is None
+    assert MissionStatus().as_dict()["tick"] is None

@@ -64,7 +64,7 @@ def test_missing_scenario(tmp_path: Path) -> None:
     status, said = run("no-such-mission", tmp_path / "run", timeout_s=30)
     assert status == 2
     assert said.startswith(
-        "chaserdock: no-such-mission: no such scenario file, and none of that name is shipped; there are abort, "
+        "chaserdock: no-such-mission: no such scenario file or shipped scenario; shipped: abort, "
     )
     assert len(said.strip().splitlines()) == 1
 
@@ -91,12 +91,12 @@ def test_port_in_use() -> None:
 def test_nobody_answers() -> None:
     """A chaser without a world gives up after its patience; an operator without a controller, too."""
     elsewhere = ["-e", "tcp/127.0.0.1:9", "--namespace", "empty"]
-    status, said = finished("chaser", "0", *elsewhere, "--patience", "1", timeout_s=60)
+    status, said = finished("chaser", "0", *elsewhere, "--timeout", "1", timeout_s=60)
     assert status == 2
     assert "no world answered" in said
     status, said = finished("command", "hold", "0", *elsewhere, "--timeout", "1", timeout_s=60)
     assert status == 2
-    assert "no controller answered" in said
+    assert "no reply from the controller" in said
 
 
 def foreign_session(by_hand: ByHand) -> zenoh.Session:

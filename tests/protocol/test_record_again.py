@@ -19,7 +19,7 @@ from harness import chaserdock, finished
 
 from chaserdock.launch.launcher import free_port
 from chaserdock.logs.info import info_of
-from chaserdock.logs.player import play, sent_again
+from chaserdock.logs.player import play, stored_samples
 from chaserdock.logs.recover import recover
 
 GOLDEN = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
@@ -35,13 +35,13 @@ def start_recorder(folder: Path, port: int, namespace: str, *options: str) -> su
 def by_key(log: Path) -> dict[str, list[tuple[str, bytes]]]:
     """Encodings and payloads of a log, key by key, in their order; without what its own recorder said."""
     out: dict[str, list[tuple[str, bytes]]] = defaultdict(list)
-    for _, raw in sent_again(log):
+    for _, raw in stored_samples(log):
         out[raw.key].append((raw.encoding, raw.payload))
     return dict(out)
 
 
 @pytest.mark.parametrize(
-    "options", [(), ("--rotate-s", "1"), ("--no-viewer",)], ids=["one file", "rotated", "bare"]
+    "options", [(), ("--rotate-time", "1"), ("--no-viewer",)], ids=["one file", "rotated", "bare"]
 )
 def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[str, ...]) -> None:
     port = free_port()
@@ -61,14 +61,14 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
     assert (info.viewer > 100) == ("--no-viewer" not in options)
     names = [path.name for path in log_files(tmp_path / "again")]
     assert names == (
-        ["mission-0000.mcap", "mission-0001.mcap"] if "--rotate-s" in options else ["mission.mcap"]
+        ["mission-0000.mcap", "mission-0001.mcap"] if "--rotate-time" in options else ["mission.mcap"]
     )
     for path in log_files(tmp_path / "again"):  # each stands for itself
         assert read_scenario(path)[1]["run_id"] == read_scenario(GOLDEN)[1]["run_id"]
 
 
 def test_nobody_listens(tmp_path: Path) -> None:
-    arguments = ("--namespace", "nobody", "-l", "tcp/127.0.0.1:0", "--patience", "0.5")
+    arguments = ("--namespace", "nobody", "-l", "tcp/127.0.0.1:0", "--timeout", "0.5")
     status, said = finished("log", "play", str(GOLDEN), *arguments)
     assert (status, "Traceback" in said) == (2, False)
     assert "no recorder came within 0.5 s" in said

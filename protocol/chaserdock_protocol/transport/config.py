@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +25,9 @@ QUEUE_OPTIONS: dict[str, Any] = {
         "max_wait_before_drop_fragments": 4000,
     },
 }
+
+_RUST_SOURCE = re.compile(r" at \S+\.rs:\d+\.?")
+"""Source locations that Zenoh appends to its error messages."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class RawSample(Struct, frozen=True):
 
 def open_error(error: Exception, link: Link) -> str:
     """Return one line on why a session could not be opened."""
-    text = " ".join(str(error).split())
+    text = _RUST_SOURCE.sub("", " ".join(str(error).split()))
     if link.config is not None:
         return f"cannot open the Zenoh session of {link.config}: {text}"
     listen, connect = ", ".join(link.listen) or "-", ", ".join(link.connect) or "-"

@@ -1,0 +1,197 @@
+"""Functions of the Python API, which ``import chaserdock`` exports. Heavy imports wait until a function needs them."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import cached_property
+from numbers import Integral, Real
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, cast
+
+from chaserdock_protocol.errors import ChaserdockError
+
+if TYPE_CHECKING:
+    from chaserdock_protocol.scenario import Scenario
+
+    from .launch.json_events import JsonLine
+    from .launch.launcher import Outcome
+    from .launch.progress import Show
+    from .logs.reader import Log
+    from .summary import Summary
+
+StrPath = str | Path
+
+
+class OverrideError(ChaserdockError):
+    """A scenario override has a value that TOML cannot express."""
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A flown mission: ``summary`` and the folder ``dir`` with its files; ``summary.success`` is the verdict."""
+
+    summary: Summary
+    dir: Path
+
+    @cached_property
+    def log(self) -> Log:
+        """The recorded log, open."""
+        return open_log(self.dir)
+
+
+def run(
+    scenario: StrPath,
+    *,
+    out: StrPath | None = None,
+    mode: Literal["lockstep", "realtime"] = "lockstep",
+    seed: int | None = None,
+    keys: StrPath | None = None,
+    overrides: Mapping[str, object] | None = None,
+    on_event: Callable[[JsonLine], None] | None = None,
+    **changes: object,
+) -> RunResult:
+    """Fly a scenario on this machine and judge it, as ``chaserdock run`` does.
+
+    Args:
+        scenario: a scenario file, or the name of a shipped scenario.
+        out: folder for the files of the run; a new folder in ``runs/`` by default.
+        mode: ``lockstep`` (reproducible) or ``realtime`` (simulated time follows the wall clock).
+        seed: seed of all random numbers.
+        keys: folder of a mission's keys: connect through a router, over TLS, with access rights.
+        overrides: scenario values by dotted key, such as ``{"camera.width_px": 640}``.
+        on_event: called in this thread with the objects that ``chaserdock run --json`` prints.
+        **changes: scenario values; tables are merged: ``duration_s=20, camera={"width_px": 640}``.
+
+    A mission that fails is a result with ``summary.success == False``. Raises ScenarioError for an invalid scenario or
+    override, RunError when the mission cannot start or leaves no log. An exception, such as KeyboardInterrupt, ends all
+    processes of the mission.
+    """
+    from .launch.launcher import RunError
+    from .launch.progress import Show
+    from .summary import Summary
+
+    outcome = fly(
+        scenario,
+        out=out,
+        mode=mode,
+        seed=seed,
+        sets=override_texts(overrides, changes),
+        keys=keys,
+        show=Show.none if on_event is None else Show.json,
+        emit=on_event,
+    )
+    if outcome.summary is None:
+        raise RunError(outcome.failure or f"{outcome.folder}: no readable log")
+    return RunResult(Summary.from_dict(outcome.summary), outcome.folder)
+
+
+def fly(
+    scenario: StrPath,
+    *,
+    out: StrPath | None,
+    mode: Literal["lockstep", "realtime"],
+    seed: int | None,
+    sets: tuple[str, ...],
+    keys: StrPath | None,
+    show: Show,
+    viewer_port: int | None = None,
+    stop_requested: Callable[[], bool] = lambda: False,
+    emit: Callable[[JsonLine], None] | None = None,
+) -> Outcome:
+    """Fly a scenario with ``KEY=VALUE`` overrides; the common part of ``run`` here and on the command line."""
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    from .launch.launcher import fly_mission
+    from .launch.progress import print_json_line
+
+    path = find_scenario(str(scenario))
+    folder = Path(out) if out is not None else _new_folder(path.stem)
+    return fly_mission(
+        path,
+        folder,
+        mode,
+        sets if seed is None else (*sets, f"seed={seed}"),
+        show,
+        viewer_port,
+        None if keys is None else Path(keys),
+        stop_requested,
+        emit or print_json_line,
+    )
+
+
+def open_log(source: StrPath | Sequence[StrPath]) -> Log:
+    """Open a log: the folder of a run, a file, or the files of a rotated log. Raises LogError."""
+    from .logs.reader import open_log as open_source
+
+    return open_source(source)
+
+
+def load_scenario(
+    scenario: StrPath, *, overrides: Mapping[str, object] | None = None, **changes: object
+) -> Scenario:
+    """Load a scenario file, or a shipped scenario by name, with overrides as in ``run``. Raises ScenarioError."""
+    from chaserdock_protocol.scenario import load_scenario as load
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    return load(find_scenario(str(scenario)), override_texts(overrides, changes))
+
+
+def list_scenarios() -> list[str]:
+    """Return the names of the shipped scenarios, sorted."""
+    from chaserdock_protocol.shipped_scenarios import shipped_names
+
+    return shipped_names()
+
+
+def override_texts(overrides: Mapping[str, object] | None, changes: Mapping[str, object]) -> tuple[str, ...]:
+    """Return overrides as ``key.path=VALUE`` in TOML's notation, nested tables flattened. Raises OverrideError."""
+    pairs = [*_flatten("", changes), *_flatten("", overrides or {})]
+    return tuple(f"{key}={_toml(key, value)}" for key, value in pairs)
+
+
+def _flatten(prefix: str, table: Mapping[str, object]) -> Iterator[tuple[str, object]]:
+    for key, value in table.items():
+        if isinstance(value, Mapping) and value:
+            yield from _flatten(f"{prefix}{key}.", cast("Mapping[str, object]", value))
+        else:
+            yield f"{prefix}{key}", value
+
+
+def _toml(key: str, value: object) -> str:
+    """Return a value in TOML's notation."""
+    match value:
+        case bool():
+            return str(value).lower()
+        case str() | Path():
+            return json.dumps(str(value), ensure_ascii=False)
+        case Integral():
+            return str(int(value))
+        case Real():
+            return repr(float(value))
+        case Mapping():
+            items = cast("Mapping[str, object]", value).items()
+            return "{" + ", ".join(f"{json.dumps(k)} = {_toml(key, v)}" for k, v in items) + "}"
+        case list() | tuple():
+            return "[" + ", ".join(_toml(key, v) for v in cast("Sequence[object]", value)) + "]"
+        case _:
+            raise OverrideError(f"{key}: a value of type {type(value).__name__} cannot be set in a scenario")
+
+
+_folders: set[Path] = set()
+_folders_lock = threading.Lock()
+
+
+def _new_folder(name: str) -> Path:
+    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended where needed."""
+    base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder, number = base, 1
+    with _folders_lock:
+        while folder.exists() or folder in _folders:
+            number += 1
+            folder = base.with_name(f"{base.name}-{number}")
+        _folders.add(folder)
+    return folder

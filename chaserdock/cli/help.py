@@ -1,0 +1,68 @@
+"""Command and group classes: grouped help that loads nothing but typer, and one check that every number is finite."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, cast
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+
+HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
+
+
+class FiniteCommand(TyperCommand):
+    """A command that rejects NaN and infinity, which pass typer's range checks, in every numeric option."""
+
+    def invoke(self, ctx: Any) -> Any:
+        for param in self.params:
+            value = ctx.params.get(param.name)
+            values = cast("Sequence[Any]", value if isinstance(value, list | tuple) else [value])
+            if any(isinstance(v, float) and not math.isfinite(v) for v in values):
+                raise typer.BadParameter("must be a finite number", ctx=ctx, param=param)  # type: ignore[arg-type]
+        return super().invoke(ctx)
+
+
+class GroupedHelp(TyperGroup):
+    """Print ``COMMAND … --help`` before typer prepares to parse values (which loads pydantic), commands by panel.
+
+    ``panel_order``: panels in the order of the help; others follow (typer lists groups after commands).
+    """
+
+    panel_order: ClassVar[tuple[str, ...]] = ()
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        own = args[: args.index("--")] if "--" in args else args
+        command = self.get_command(ctx, args[0]) if args else None
+        if command is not None and not ctx.resilient_parsing and {"-h", "--help"} & set(own):
+            inner = command.context_class(
+                command, info_name=args[0], parent=ctx, **(command.context_settings or {})
+            )
+            if isinstance(command, GroupedHelp) and args[1] in command.commands:
+                command.parse_args(inner, args[1:])
+            typer.echo(command.get_help(inner))
+            ctx.exit()
+        return super().parse_args(ctx, args)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:
+        """Write each command with the first sentence of its help, one section per panel."""
+        for panel, commands in panels_of(self).items():
+            with formatter.section(panel):
+                formatter.write_dl([(name, first_sentence(c.help)) for name, c in commands.items()])
+
+
+def panels_of(group: GroupedHelp) -> dict[str, dict[str, Any]]:
+    """Return the commands of a group by panel, in the order of the help."""
+    panels: dict[str, dict[str, Any]] = {panel: {} for panel in group.panel_order}
+    for name, command in group.commands.items():
+        panel = getattr(command, "rich_help_panel", None)
+        panels.setdefault(panel if isinstance(panel, str) else "Commands", {})[name] = command
+    return panels
+
+
+def first_sentence(text: str | None) -> str:
+    """Return the first sentence of a docstring, without its full stop."""
+    line = inspect.cleandoc(text or "").partition("\n\n")[0].replace("\n", " ")
+    return line.partition(". ")[0].removesuffix(".")

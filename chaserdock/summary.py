@@ -1,0 +1,129 @@
+"""The summary of a flight as typed values; docs/summary.md describes the fields. SI units and radians."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from msgspec import Struct
+
+
+class SteadyErrors(Struct, frozen=True, kw_only=True):
+    """Mean square tracking errors after the settling time; None where the flight has no such part."""
+
+    position_mse_m2: float | None
+    orientation_mse_rad2: float | None
+
+
+class Capture(Struct, frozen=True, kw_only=True):
+    """Docking by contact of one chaser; the figures at contact are None without a latch."""
+
+    latched: bool
+    verified: bool
+    latch_time_s: float | None
+    contact_lateral_m: float | None
+    contact_angle_rad: float | None
+    contact_closing_m_s: float | None
+    contact_lateral_speed_m_s: float | None
+    probe_touches: int
+    refused: list[str]
+
+
+class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Results of one chaser, measured on ground truth."""
+
+    position_mse_m2: float | None
+    orientation_mse_rad2: float | None
+    steady: SteadyErrors
+    docked: bool
+    dock_time_s: float | None
+    reached_time_s: float | None
+    min_distance_target_m: float
+    impulse_N_s: float
+    thruster_impulse_N_s: float
+    propellant_kg: float
+    capture: Capture | None = None
+
+
+class TargetEstimateErrors(Struct, frozen=True, kw_only=True):
+    """Errors of the target estimate after the settling time; None without an estimate there."""
+
+    position_rms_m: float | None
+    orientation_rms_rad: float | None
+    velocity_rms_m_s: float | None
+    omega_rms_rad_s: float | None
+    max_position_error_m: float | None
+    max_orientation_error_rad: float | None
+    nees_mean: float | None
+
+
+class Latency(Struct, frozen=True, kw_only=True):
+    """Wall time from the publication of an image to the actuator command of the same tick."""
+
+    p50: float | None
+    p99: float | None
+    max: float | None
+
+
+class SolveTimes(Struct, frozen=True, kw_only=True):
+    """Wall time of the solver per tick."""
+
+    p50: float | None
+    p95: float | None
+    max: float | None
+
+
+class Solver(Struct, frozen=True, kw_only=True):
+    """The NMPC solver: its name, solve times, failures, and plans with a relaxed keep-out constraint."""
+
+    name: str
+    solve_s: SolveTimes
+    failures: int
+    relaxed: int
+
+
+class TimedEvent(Struct, frozen=True, kw_only=True):
+    """An event, a warning, or a command with its reply."""
+
+    time_s: float
+    what: str
+
+
+class MessageCount(Struct, frozen=True, kw_only=True):
+    """Messages of one key in the log, and gaps in their numbering."""
+
+    count: int
+    lost: int
+
+
+class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """The summary of a flight, as in summary.json; ``chasers`` by chaser number."""
+
+    scenario: str
+    seed: int
+    mode: str
+    ticks: int
+    sim_time_s: float
+    wall_time_s: float
+    success: bool
+    failures: list[str]
+    not_judged: list[str]
+    events: list[TimedEvent]
+    chasers: dict[int, ChaserSummary]
+    min_distance_chasers_m: float | None
+    collisions: int
+    target_estimate: TargetEstimateErrors
+    latency_s: Latency
+    late_commands: int
+    unanswered: int
+    solver: Solver
+    messages: dict[str, MessageCount]
+    rejected: dict[str, int]
+    digest: str
+    peak_memory_bytes: int | None = None
+    cpu_s: dict[str, float] | None = None
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Summary:
+        """Return the typed form of the content of a summary.json."""
+        return msgspec.convert(values, cls, str_keys=True)

@@ -1,0 +1,182 @@
+"""Invalid command lines: one line on standard error that names the fault, status 2, nothing on standard output."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.process import SINGLE_THREADED
+from harness import ROOT
+
+from chaserdock.cli.main import main
+
+GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
+NO_MISSION = "-e tcp/127.0.0.1:1"
+
+INVALID = [
+    # commands
+    ("nothing", "No such command 'nothing'"),
+    ("rnu", "Did you mean 'run'?"),
+    ("log nothing", "No such command 'nothing'"),
+    ("keys nothing", "No such command 'nothing'"),
+    ("--nothing", "No such option: --nothing"),
+    # run
+    ("run", "Missing argument"),
+    ("run nowhere", "nowhere: no such scenario file"),
+    ("run single extra", "extra"),
+    ("run single --nothing", "No such option: --nothing"),
+    ("run single --mode fast", "'fast' is not one of 'lockstep', 'realtime'"),
+    ("run single --seed -1", "--seed"),
+    ("run single --seed 4294967296", "--seed"),
+    ("run single --seed 1.5", "--seed"),
+    ("run single --quiet --json", "--quiet and --json exclude each other"),
+    ("run single --set duration_s", "--set duration_s"),
+    ("run single --set duration_s=nan", "duration_s"),
+    ("run single --set duration_s=-1", "duration_s"),
+    ("run single --set \"duration_s='30'\"", "duration_s: must be a number (got '30')"),
+    ("run single --set camera.widht_px=640", "widht_px"),
+    ("run single --keys nowhere", "--keys nowhere"),
+    # processes
+    ("world nowhere", "nowhere: no such scenario file"),
+    ("world single --lease -5", "--lease"),
+    ("world single --rejoin-timeout -1", "--rejoin-timeout"),
+    ("world single -l tcp/nonsense", "--listen tcp/nonsense: must be PROTOCOL/HOST:PORT"),
+    ("chaser", "Missing argument"),
+    ("chaser one", "must be a whole number"),
+    ("chaser -1", "-1"),
+    ("chaser 256", "less than or equal to 255"),
+    ("chaser 0 --timeout nan", "--timeout"),
+    ("chaser 0 --timeout -1", "--timeout"),
+    ("chaser 0 --timeout inf", "'--timeout': must be a finite number"),
+    ("chaser 0 --timeout soon", "--timeout"),
+    ("chaser 0 --patience 1", "No such option: --patience"),
+    ("chaser 0 --lease nan", "--lease"),
+    ("chaser 0 --lease 0", "--lease"),
+    ("chaser 0 --net-mode router", "'router' is not one of 'peer', 'client'"),
+    ("chaser 0 -e nonsense", "--connect nonsense: must be PROTOCOL/HOST:PORT"),
+    ("chaser 0 -e tcp/127.0.0.1:99999", "--connect tcp/127.0.0.1:99999: must be PROTOCOL/HOST:PORT"),
+    ("chaser 0 -e tcp/127.0.0.1:port", "--connect tcp/127.0.0.1:port"),
+    ("chaser 0 -e ftp/127.0.0.1:21", "--connect ftp/127.0.0.1:21"),
+    ("chaser 0 -c nowhere.json5", "--config nowhere.json5: no such file"),
+    ("chaser 0 --keys nowhere", "make a mission's keys"),
+    ("chaser 0 --keys nowhere -e tcp/127.0.0.1:1", "must be tls/HOST:PORT with --keys"),
+    (f"chaser 0 --timeout 0.1 {NO_MISSION}", "no world answered within"),
+    ("controller --timeout 0", "--timeout"),
+    ("record --rotate-size 0", "--rotate-size"),
+    ("record --rotate-time nan", "--rotate-time"),
+    ("router --until nobody", "--until nobody: must be a process"),
+    ("router -l tcp/nonsense", "--listen tcp/nonsense"),
+    ("router -l tcp/203.0.113.1:7447", "Cannot assign requested address"),
+    # operator
+    ("command fly 0", "'fly' is not one of"),
+    ("command goto 0", "--offset X Y Z: required by goto"),
+    ("command hold 0 --offset 1 2 3", "--offset X Y Z: required by goto"),
+    ("command goto 0 --offset 1 2 nan", "'--offset': must be a finite number"),
+    ("command goto 0 --offset 1 2", "--offset"),
+    ("command isolate 0", "--thruster N: required by isolate and restore"),
+    ("command isolate 0 --thruster -1", "--thruster"),
+    ("command hold 0 --timeout nan", "--timeout"),
+    ("command hold 0 --before nan", "--before"),
+    (f"command hold 0 --timeout 0.2 {NO_MISSION}", "no reply from the controller within 0.2 s"),
+    ("thruster-fault 0 0 loud", "'loud' is not one of"),
+    ("thruster-fault 0 0 weak", "--factor: required by weak"),
+    ("thruster-fault 0 0 weak --factor 2", "--factor"),
+    ("thruster-fault 0 0 weak --factor nan", "--factor"),
+    (f"status --duration 0.2 {NO_MISSION}", "no process found within 0.2 s"),
+    ("status --duration nan", "--duration"),
+    (f"judge runs --timeout 0.1 {NO_MISSION}", "no world answered within"),
+    ("judge runs --world-timeout -1", "--world-timeout"),
+    ("view --at 3", "--at: needs a log"),
+    ("view {golden} --at nan", "--at"),
+    ("view {golden} --at 9999", "--at 9999: the log ends at 1.13 s"),
+    ("view --port 0", "--port"),
+    # recorded flights
+    ("summary nowhere.mcap", "nowhere.mcap"),
+    ("summary {toml}", "single.toml"),
+    ("report nowhere", "nowhere"),
+    ("figures nowhere --out {tmp}/figures", "nowhere"),
+    ("figures {golden} --out {tmp} --format gif", "'gif' is not one of 'svg', 'png', 'pdf'"),
+    ("video nowhere --out a.txt", "must end in"),
+    ("video {golden} --out {tmp}/a.mp4 --speed nan", "--speed"),
+    ("video {golden} --out {tmp}/a.mp4 --from inf", "'--from': must be a finite number"),
+    ("video {golden} --out {tmp}/a.mp4 --width 10", "--width"),
+    ("snapshot {golden} --at nan --out {tmp}/a.png", "--at"),
+    ("snapshot {golden} --at -1 --out {tmp}/a.png", "--at"),
+    ("snapshot {golden} --at 9999 --out {tmp}/a.png", "--at 9999: the last image"),
+    ("snapshot {golden} --at 1 --out {tmp}/a.txt", "must end in .png or .jpg"),
+    ("snapshot {golden} --at 1 --out {tmp}/none/a.png", "cannot be written"),
+    # logs
+    ("log info nowhere.mcap", "nowhere.mcap"),
+    ("log info", "Missing argument"),
+    ("log recover {golden} --out {golden}", "already exists"),
+    ("log export {golden} --out {tmp} --format xls", "'xls' is not one of 'parquet', 'csv'"),
+    ("log tracks {golden} --out {tmp} --from nan", "--from"),
+    ("log tracks {golden} --out {tmp} --from 5 --to 6", "contains no track between 5 and 6 s"),
+    ("log play {golden} --speed nan", "--speed"),
+    ("log play {golden} --timeout 0.2 -l tcp/127.0.0.1:0", "no recorder joined within 0.2 s"),
+    # comparison
+    ("replay nowhere --through fusion", "nowhere"),
+    ("replay {golden} --through everything", "'everything' is not one of"),
+    ("replay {golden} --through fusion --tolerance nan", "--tolerance"),
+    ("compare nowhere nobody", "nowhere"),
+    ("compare {golden} {golden} --tolerance -1", "--tolerance"),
+    ("campaign nowhere.toml", "nowhere.toml"),
+    ("campaign nowhere.toml --jobs 0", "--jobs"),
+    ("campaign nowhere.toml --only 0 --jobs 2", "--only flies one run"),
+    ("reproduce --jobs 65", "--jobs"),
+    ("study nowhere.jsonl --out {tmp}/results", "nowhere.jsonl: no such file"),
+    ("check controller nowhere -- true", "nowhere"),
+    ("check controller {golden} --timeout nan -- true", "--timeout"),
+    ("check controller {golden} --ticks 0 -- true", "--ticks"),
+    # setup
+    ("markers nothing --out a.pdf", "nothing"),
+    ("markers paper --out a.png", "must end in .pdf or .svg"),
+    ("markers paper --out a.pdf --paper a3", "'a3' is not one of 'a4', 'letter'"),
+    ("calibrate nowhere --out a.yaml", "nowhere"),
+    ("calibrate nowhere --out a.txt", "must end in .yaml, .json or .xml"),
+    ("calibrate nowhere --out a.yaml --square nan", "--square"),
+    ("calibrate nowhere --out a.yaml --square -0.03", "--square"),
+    ("keys init", "Missing argument"),
+    ("keys init {tmp} --chasers 0", "--chasers"),
+    ("keys init {tmp} --days 1.5", "--days"),
+]
+
+
+@pytest.mark.parametrize(("line", "fragment"), INVALID, ids=[line for line, _ in INVALID])
+def test_invalid_input_is_one_line_with_status_2(
+    line: str,
+    fragment: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    for name, value in SINGLE_THREADED.items():  # `replay` sets these for the whole process
+        monkeypatch.setenv(name, value)
+    names = {"golden": GOLDEN, "tmp": tmp_path, "toml": ROOT / "scenarios" / "single.toml"}
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["chaserdock", *shlex.split(line.format(**names))])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, error = capfd.readouterr()
+    assert ended.value.code == 2
+    assert out == ""
+    assert len(error.splitlines()) == 1, error
+    assert fragment in error
+    assert "Traceback" not in error
+    assert ".rs:" not in error
+
+
+def test_one_line_per_fault_of_a_scenario(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    sets = ["--set", "duration_s=-1", "--set", "camera.width_px=0"]
+    monkeypatch.setattr(sys, "argv", ["chaserdock", "run", "single", *sets])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    lines = capfd.readouterr().err.splitlines()
+    assert ended.value.code == 2
+    assert len(lines) == 2
+    assert "duration_s" in lines[0]
+    assert "camera.width_px" in lines[1]

@@ -35,7 +35,7 @@ INVALID = [
     ("run single --set duration_s", "--set duration_s"),
     ("run single --set duration_s=nan", "duration_s"),
     ("run single --set duration_s=-1", "duration_s"),
-    ("run single --set \"duration_s='30'\"", "duration_s: must be a number (got '30')"),
+    ("run single --set \"duration_s='30'\"", "duration_s: must be a number"),
     ("run single --set camera.widht_px=640", "widht_px"),
     ("run single --keys nowhere", "--keys nowhere"),
     # processes

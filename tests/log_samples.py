@@ -14,7 +14,7 @@ SCENARIO = '{"format": 2, "name": "a scenario"}'
 
 
 class Clock:
-    """A wall clock that goes when told."""
+    """A wall clock set by the test."""
 
     def __init__(self) -> None:
         self.now_s = 100.0

@@ -1,4 +1,4 @@
-"""Records the golden logs anew: ``python tests/make_golden.py``. Only after a deliberate change of what processes answer.
+"""Record the golden logs: ``python tests/make_golden.py``. Only after a deliberate change of the replies.
 
 ``two-chasers``: images through commands, of every process. ``capture``: one chaser docks on thrusters and is verified; for the
 controller and the pilot, without images and truth.

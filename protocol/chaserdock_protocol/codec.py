@@ -154,18 +154,22 @@ def _check_fields(message: Struct) -> None:
             if isinstance(value[0], Struct):
                 for item in value:
                     _check_fields(item)
-                continue
-            # One call into C for long tuples (a plan has hundreds of floats), as in _passes_fast_check.
-            length = hypot(*value)
-            if not length <= MAX_MAGNITUDE:
-                for item in value:
-                    if not -MAX_MAGNITUDE <= item <= MAX_MAGNITUDE:
-                        raise _bad_number(name, item)
-            if name == "q_wxyz":
-                if abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
-                    raise Rejected("not_unit_quaternion", f"{name} has length {length}")
-            elif name == "covariance":
-                _check_covariance(value)
+            else:
+                _check_tuple(name, value)
+
+
+def _check_tuple(name: str, values: tuple[float, ...]) -> None:
+    # One call into C for long tuples (a plan has hundreds of floats), as in _passes_fast_check.
+    length = hypot(*values)
+    if not length <= MAX_MAGNITUDE:
+        for value in values:
+            if not -MAX_MAGNITUDE <= value <= MAX_MAGNITUDE:
+                raise _bad_number(name, value)
+    if name == "q_wxyz":
+        if abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
+            raise Rejected("not_unit_quaternion", f"{name} has length {length}")
+    elif name == "covariance":
+        _check_covariance(values)
 
 
 @cache

@@ -154,7 +154,7 @@ def test_camera_off() -> None:
 # -- what a process says ------------------------------------------------------------------------------------
 
 
-def said(on: FaultLayer, topic: Topic, sent: Any) -> list[Any]:
+def published(on: FaultLayer, topic: Topic, sent: Any) -> list[Any]:
     return on.outgoing(topic, sent.chaser, sent)
 
 
@@ -170,42 +170,46 @@ def test_lying_sensor() -> None:
         ),
     )
     sent = message(Sighting, 12)
-    (lie,) = said(on, topics.SIGHTING, sent)
-    for told, true in zip(lie.solutions, sent.solutions, strict=True):
-        assert np.allclose(np.subtract(told.position_m, true.position_m), [0.1, 0.0, 0.0])
+    (lie,) = published(on, topics.SIGHTING, sent)
+    for changed, true in zip(lie.solutions, sent.solutions, strict=True):
+        assert np.allclose(np.subtract(changed.position_m, true.position_m), [0.1, 0.0, 0.0])
         assert math.isclose(
-            float(rotations.angle_between(told.q_wxyz, true.q_wxyz)), math.pi / 2, abs_tol=1e-9
+            float(rotations.angle_between(changed.q_wxyz, true.q_wxyz)), math.pi / 2, abs_tol=1e-9
         )
     codec.check_numbers(lie)
-    assert said(on, topics.SIGHTING, message(Sighting, 20)) == [message(Sighting, 20)]
-    assert said(on, topics.SIGHTING, message(Sighting, 9)) == [message(Sighting, 9)]
+    assert published(on, topics.SIGHTING, message(Sighting, 20)) == [message(Sighting, 20)]
+    assert published(on, topics.SIGHTING, message(Sighting, 9)) == [message(Sighting, 9)]
 
 
 def test_odometry_lie_is_the_worlds_to_tell() -> None:
     lie = fault(kind="odometry_lie", process="chaser/1", duration_s=1.0, offset_m=[0.0, 0.0, 0.5])
     sent = message(Odometry, 12, 1)
-    (told,) = said(layer("world", lie), topics.ODOMETRY, sent)
-    assert np.allclose(np.subtract(told.position_m, sent.position_m), [0.0, 0.0, 0.5])
-    assert said(layer("world", lie), topics.ODOMETRY, message(Odometry, 12, 0)) == [message(Odometry, 12, 0)]
+    (changed,) = published(layer("world", lie), topics.ODOMETRY, sent)
+    assert np.allclose(np.subtract(changed.position_m, sent.position_m), [0.0, 0.0, 0.5])
+    assert published(layer("world", lie), topics.ODOMETRY, message(Odometry, 12, 0)) == [
+        message(Odometry, 12, 0)
+    ]
 
 
 def test_clock_jump_moves_stamps_and_not_ticks() -> None:
     on = layer("controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=5.0))
     sent = message(WrenchCommand, 12)
-    (told,) = said(on, topics.WRENCH, sent)
-    assert told.tick == 12
+    (changed,) = published(on, topics.WRENCH, sent)
+    assert changed.tick == 12
     assert (
-        told.effective_time_ns - sent.effective_time_ns == told.expires_ns - sent.expires_ns == 5_000_000_000
+        changed.effective_time_ns - sent.effective_time_ns
+        == changed.expires_ns - sent.expires_ns
+        == 5_000_000_000
     )
     back = layer("controller", fault(kind="clock_jump", process="controller", duration_s=1.0, offset_s=-5.0))
-    assert said(back, topics.WRENCH, sent)[0].sim_time_ns == 0
+    assert published(back, topics.WRENCH, sent)[0].sim_time_ns == 0
 
 
 def test_flood() -> None:
     on = layer(
         "chaser/0", fault(kind="flood", process="chaser/0", topic="sighting", duration_s=1.0, copies=50)
     )
-    assert said(on, topics.SIGHTING, message(Sighting, 12)) == [message(Sighting, 12)] * 51
+    assert published(on, topics.SIGHTING, message(Sighting, 12)) == [message(Sighting, 12)] * 51
 
 
 # -- what happens to the process itself ----------------------------------------------------------------------
@@ -220,7 +224,7 @@ def test_a_process_dies_once_before_anything_of_its_tick() -> None:
         assert ends == (["killed"] if tick >= 10 else [])
 
 
-def test_one_that_was_started_again_lives_on() -> None:
+def test_restarted_process_ignores_a_past_kill() -> None:
     ends: list[str] = []
     on = layer("controller", fault(kind="kill", process="controller"), kill=lambda: ends.append("killed"))
     for tick in (10, 11, 12):
@@ -241,10 +245,10 @@ def test_freeze_stops_for_so_long() -> None:
     assert stops == [1.5]
 
 
-def test_begin_and_end_are_told() -> None:
+def test_begin_and_end_are_reported() -> None:
     on = layer("world", fault(kind="drop", process="chaser/0", topic="wrench", duration_s=0.3, share=0.5))
-    told = {tick: on.transitions_at(tick) for tick in range(20) if on.transitions_at(tick)}
-    assert told == {
+    changed = {tick: on.transitions_at(tick) for tick in range(20) if on.transitions_at(tick)}
+    assert changed == {
         10: [("fault begins", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],
         13: [("fault ends", "drop chaser/0, duration_s 0.3, topic wrench, share 0.5")],
     }
@@ -257,7 +261,7 @@ def test_senders() -> None:
     assert sender_of(topics.WRENCH, "1", "chaser/1") == "controller"
 
 
-def test_went_on() -> None:
+def test_extrapolation_matches_the_closed_form() -> None:
     """Against the closed form: straight on, and turned about the body's own axis."""
     still = Odometry(
         tick=3,

@@ -66,16 +66,16 @@ def test_noise_that_the_scenario_admits_is_no_jump() -> None:
 def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
     off: tuple[float, float, float], turn: float
 ) -> None:
-    watch, told = OdometryValidation(SCENARIO), []
+    watch, events_at = OdometryValidation(SCENARIO), []
     for tick in range(60):
         lie = 20 <= tick < 40
         given_, events = watch.believed(lying(flown(tick), off, turn) if lie else flown(tick))
-        told += [(tick, level) for level, _ in events]
+        events_at += [(tick, level) for level, _ in events]
         assert math.dist(given_.position_m, flown(tick).position_m) < 0.005
         assert float(rotations.angle_between(given_.q_wxyz, flown(tick).q_wxyz)) < math.radians(0.5)
         if not lie:
             assert given_ == flown(tick)
-    assert told == [(20, "warning"), (40, "info")]
+    assert events_at == [(20, "warning"), (40, "info")]
 
 
 def test_after_long_silence_anything_is_believed() -> None:
@@ -86,13 +86,13 @@ def test_after_long_silence_anything_is_believed() -> None:
 
 
 def test_agreement() -> None:
-    agreement, told = SensorConsistency(), []
+    agreement, events_at = SensorConsistency(), []
     for tick in range(100):
         now_s = tick / 16  # exact
         rejected = {2} if 30 <= tick < 60 or tick in (10, 12, 80) else set()
         seen = {0, 1, 2} if tick % 3 else {0, 2}
-        told += [(tick, level) for level, _ in agreement.observe(now_s, seen - rejected, rejected)]
-    assert told == [(40, "warning"), (70, "info")]
+        events_at += [(tick, level) for level, _ in agreement.observe(now_s, seen - rejected, rejected)]
+    assert events_at == [(40, "warning"), (70, "info")]
 
 
 def test_who_sees_nothing_does_not_disagree() -> None:

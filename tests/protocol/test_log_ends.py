@@ -10,7 +10,7 @@ from chaserdock_protocol.recording.log import LogError, LogWriter, count_message
 from log_samples import SCENARIO, Clock, flight, record
 
 
-def test_a_flush_comes_with_time_and_makes_all_before_it_readable(tmp_path: Path) -> None:
+def test_flush_period_makes_earlier_messages_readable(tmp_path: Path) -> None:
     path, clock = tmp_path / "a.mcap", Clock()
     writer = LogWriter(path, clock)
     acks = [m.RecorderAck(tick=k, sim_time_ns=k) for k in range(40)]
@@ -84,7 +84,7 @@ def test_a_log_cut_off_anywhere_yields_the_messages_before(tmp_path: Path) -> No
         assert read_scenario(cut)[0] == SCENARIO
 
 
-def test_damage_is_told_or_harmless_and_never_makes_up_messages(tmp_path: Path) -> None:
+def test_damage_is_reported_or_harmless_and_never_invents_messages(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path, Clock())
     expected = []
@@ -94,7 +94,7 @@ def test_damage_is_told_or_harmless_and_never_makes_up_messages(tmp_path: Path) 
         if n % 10 == 9:
             writer.flush()
     writer.close()
-    data, told = path.read_bytes(), 0
+    data, reported = path.read_bytes(), 0
     for place in range(0, len(data), 97):
         damaged = bytearray(data)
         damaged[place] ^= 0x55
@@ -104,7 +104,7 @@ def test_damage_is_told_or_harmless_and_never_makes_up_messages(tmp_path: Path) 
             for r in read_log(path):
                 records.append((r.key, r.message))
         except LogError:
-            told += 1
+            reported += 1
         rest = iter(expected)
         assert all(found in rest for found in records), place  # in order, as they were, none twice
-    assert told > 10
+    assert reported > 10

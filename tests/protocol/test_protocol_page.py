@@ -1,4 +1,4 @@
-"""docs/protocol.md is what the message types and the topics table say today."""
+"""docs/protocol.md matches the message types and the topics table."""
 
 from __future__ import annotations
 

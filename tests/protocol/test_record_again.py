@@ -27,7 +27,7 @@ KILLS = int(os.environ.get("CHASERDOCK_KILLS", "2"))
 
 
 def start_recorder(folder: Path, port: int, namespace: str, *options: str) -> subprocess.Popen[bytes]:
-    """The recorder process, which will join whoever plays on that port."""
+    """The recorder process, which joins the player on that port."""
     where = ["-e", f"tcp/127.0.0.1:{port}", "--namespace", namespace]
     return chaserdock("record", "--out", str(folder), *where, *options, stdout=subprocess.DEVNULL)
 

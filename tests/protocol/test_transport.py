@@ -1,4 +1,4 @@
-"""The Zenoh configuration that a link becomes: safe by default, a user's own file respected."""
+"""Zenoh configuration of a link: safe defaults, and precedence of a user's file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_namespace_is_one_word(name: str) -> None:
         zenoh_config(Link(name))
 
 
-def test_a_file_says_where_and_its_own_patience_counts(tmp_path: Path) -> None:
+def test_configuration_file_overrides_endpoints_and_timeouts(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text('{ mode: "client", connect: { endpoints: ["tcp/127.0.0.1:7"], timeout_ms: 1234 } }')
     config = zenoh_config(Link("run-1", connect=("tcp/ignored:1",), config=file))
@@ -44,7 +44,7 @@ def test_a_bad_file_is_named(tmp_path: Path) -> None:
         zenoh_config(Link("run-1", config=file))
 
 
-def test_a_bad_endpoint_is_told() -> None:
+def test_bad_endpoint_raises_an_error() -> None:
     with pytest.raises(TransportError):
         zenoh_config(Link("run-1", listen=("nonsense",)))
 
@@ -54,8 +54,8 @@ def congestion_of(node: Node, topic: topics.Topic, place: int | str | None = Non
     return str(node._publishers[key].congestion_control).rpartition(".")[2]
 
 
-def test_who_waits_for_slow_readers() -> None:
-    """In lock-step everyone. In real time nobody, but for what is said once at the end."""
+def test_slow_readers_block_only_in_lockstep() -> None:
+    """In real time, only messages published once at the end block."""
     node = Node("world", "world", Link(namespace="waits"))
     try:
         assert congestion_of(node, topics.TICK) == "BLOCK"
@@ -68,8 +68,8 @@ def test_who_waits_for_slow_readers() -> None:
         node.close()
 
 
-def test_queues_are_as_long_as_can_be() -> None:
-    """What is droppable is dropped for one reader, and only when that one has not read for long."""
+def test_transmit_queues_have_maximum_size() -> None:
+    """Droppable messages are dropped for one reader only, after it has not read for long."""
     config = zenoh_config(Link())
     sizes = json.loads(config.get_json("transport/link/tx/queue/size"))
     assert set(sizes.values()) == {16}

@@ -97,7 +97,7 @@ def fly(
                 given = passed_on(command)
                 if i in pilots:
                     pilots[i].apply_command(command)
-                    given = pilots[i].fly(given)
+                    given = pilots[i].add_pulses(given)
                 effective = timing.step_of_time(given.effective_time_ns)
                 actuators[f"chaser/{i}"].command(given, effective, physics.step_count)
                 _note(records[i], given, target, offsets[i], scenario.chasers[i].q_wxyz, odometry[i])

@@ -140,7 +140,7 @@ class Offline:
             command = passed_on(wrench)
             if i in self.pilots:
                 self.pilots[i].apply_command(wrench)
-                command = self.pilots[i].fly(command)
+                command = self.pilots[i].add_pulses(command)
             if self.actuator_gain != 1.0:
                 command = stronger(command, self.actuator_gain)
             effective = timing.step_of_time(command.effective_time_ns)

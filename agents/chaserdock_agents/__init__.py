@@ -1,1 +1,1 @@
-"""The processes around the world: chasers, recorder, launcher, analysis, command line."""
+"""Processes of a mission besides world and controller: chasers, recorder, router."""

@@ -153,7 +153,7 @@ def test_without_carry_over_too_little_never_comes() -> None:
     bench = Bench(10, carry_over=False)
     for tick in range(40):
         assert bench.tick(tick, bench.full * 0.04) == []
-        assert bench.modulator.owed_N_s.max() <= 0.0
+        assert bench.modulator.deficit_N_s.max() <= 0.0
 
 
 def test_a_thruster_that_cannot_gets_no_pulses_and_is_owed_nothing() -> None:
@@ -162,7 +162,7 @@ def test_a_thruster_that_cannot_gets_no_pulses_and_is_owed_nothing() -> None:
     can[3] = 0.0
     for tick in range(10):
         assert 3 not in {p.thruster for p in bench.tick(tick, bench.full * 0.3, can)}
-    assert bench.modulator.owed_N_s[3] == pytest.approx(0.0)
+    assert bench.modulator.deficit_N_s[3] == pytest.approx(0.0)
 
 
 def test_a_weak_thruster_opens_longer() -> None:
@@ -199,4 +199,4 @@ def test_nothing_is_owed_for_ticks_without_a_command() -> None:
     bench.tick(0, bench.full * 0.5)
     begin, end = bench.timing.effective_ns(45), bench.timing.effective_ns(46)
     bench.modulator.pulses(np.zeros(12), bench.full, begin, end)
-    assert np.abs(bench.modulator.owed_N_s).max() < 1.5 * 0.1
+    assert np.abs(bench.modulator.deficit_N_s).max() < 1.5 * 0.1

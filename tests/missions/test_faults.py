@@ -224,10 +224,10 @@ def test_killed_process_does_not_stop_the_others(victim: tuple[str, ...], tmp_pa
         apart = flight.truth["chaser/0"].velocity_m_s - flight.truth["target"].velocity_m_s
         speed = [float((v @ v) ** 0.5) for v in apart]
         assert speed[-1] < 0.2 * max(speed)
-        states = [e.what for e in flight.events if e.process == "chaser/0" and e.what.startswith("alone")]
-        assert states[-1] == "alone: hold"
+        states = [e.what for e in flight.events if e.process == "chaser/0" and e.what.startswith("fallback")]
+        assert states[-1] == "fallback: hold"
         assert states == [
-            f"alone: {what}" for what in ("plan", "brake", "hold") if f"alone: {what}" in states
+            f"fallback: {what}" for what in ("plan", "brake", "hold") if f"fallback: {what}" in states
         ]
     else:
         assert ticks[-1].chasers == (0,)
@@ -257,8 +257,8 @@ def test_frozen_controller_in_real_time(tmp_path: Path) -> None:
     result = summary(out)
     told = [e["what"].partition(": ")[2] for e in result["events"] if e["what"].startswith("chaser/0")]
     assert [t for t in told if t.startswith("no command for")]
-    assert [t for t in told if t.startswith("alone: plan")]
-    assert [t for t in told if t.startswith("commanded again")]
+    assert [t for t in told if t.startswith("fallback: plan")]
+    assert [t for t in told if t.startswith("fallback ends")]
     # Nothing stale was flown: by the time a command was passed on, no odometry had been sent that outlived it by more
     # than what may just be on its way. (Whether the thawed controller sends stale commands at all is a matter of luck;
     # that they are refused, tests/test_pilot.py holds.)

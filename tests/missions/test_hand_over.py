@@ -65,7 +65,7 @@ def test_killed_in_lockstep_the_flight_goes_on_as_if_nothing_had_been(tmp_path: 
     assert (ticks[-1].term, ticks[-1].commander, ticks[-1].standing_by) == (2, "standby", {})
     check_fencing(tmp_path / "killed" / "mission.mcap")
     assert replay(tmp_path / "killed" / "mission.mcap", "controller").equal
-    assert not [e for e in killed.events if e.what.startswith(("alone", "no command", "command refused"))]
+    assert not [e for e in killed.events if e.what.startswith(("fallback", "no command", "command refused"))]
 
 
 def test_cut_off_in_lockstep_the_standby_commands_and_keeps_the_command(tmp_path: Path) -> None:
@@ -77,8 +77,8 @@ def test_cut_off_in_lockstep_the_standby_commands_and_keeps_the_command(tmp_path
         "term 2: standby leads: no command of controller executed for 0.20 s"
     ]
     assert handed[0].sim_time_ns / 1e9 == pytest.approx(1.6, abs=0.01)
-    assert any(e.what == "alone: plan" for e in cut.events)
-    assert any(e.what == "commanded again" for e in cut.events)
+    assert any(e.what == "fallback: plan" for e in cut.events)
+    assert any(e.what == "fallback ends" for e in cut.events)
     ticks = [r.message for r in read_log(log, ["world/tick"])]
     assert (ticks[-1].term, ticks[-1].commander, list(ticks[-1].standing_by)) == (
         2,
@@ -133,7 +133,7 @@ def test_who_was_lost_and_comes_back_stands_by_and_can_take_over_again(tmp_path:
     assert [k for k, _ in groupby(t.commander for t in ticks)] == ["controller", "standby", "controller"]
     assert ticks[-1].term == 3
     flight = load_flight(log)
-    assert not [e for e in flight.events if e.what.startswith(("begins anew", "alone"))]
+    assert not [e for e in flight.events if e.what.startswith(("begins anew", "fallback"))]
     phases = [e.what for e in flight.events if "from" in e.what]
     assert len(phases) == 4  # each once: nobody began as at the start
     assert flight.world.contacts == 0

@@ -117,12 +117,17 @@ TICK = Tick(tick=9, images=False, chasers=(0,), controller=True, term=2, command
     [
         ({}, TICK, 2, None),
         ({}, TICK, 0, None),
-        ({"term": 1, "commander": "controller", "instance": "c1"}, TICK, 1, "it is of term 1, and term 2"),
-        ({"instance": "s0"}, TICK, 1, "standby s0 does not command term 2"),
-        ({"commander": "controller"}, TICK, 1, "controller s1 does not command term 2"),
+        (
+            {"term": 1, "commander": "controller", "instance": "c1"},
+            TICK,
+            1,
+            "sent in term 1, current term is 2",
+        ),
+        ({"instance": "s0"}, TICK, 1, "standby s0 does not lead term 2"),
+        ({"commander": "controller"}, TICK, 1, "controller s1 does not lead term 2"),
         ({"term": 3, "commander": "controller"}, TICK, 2, None),  # its tick is on its way
-        ({"term": 2}, TICK, 3, "it is of term 2, and term 3"),
-        ({"term": 0, "commander": "", "instance": ""}, TICK, 0, "it is of term 0"),
+        ({"term": 2}, TICK, 3, "sent in term 2, current term is 3"),
+        ({"term": 0, "commander": "", "instance": ""}, TICK, 0, "sent in term 0"),
         ({"term": 0, "commander": "", "instance": ""}, None, 0, None),
     ],
 )

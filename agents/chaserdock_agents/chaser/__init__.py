@@ -1,1 +1,1 @@
-"""The chaser process: sees the target through its camera and drives its actuators."""
+"""The chaser process: measures the target pose with its camera and drives its actuators."""

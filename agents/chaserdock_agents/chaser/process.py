@@ -1,4 +1,4 @@
-"""A chaser process: image -> sighting, wrench command -> actuators. It never sees the truth."""
+"""The chaser process: images to sightings, wrench commands to actuator commands. It has no access to ground truth."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 
-from .command_gate import brake, own_command, passed_on, refusal, stale_term
-from .fallback import Alone, LastWord, clear_m, goes_on, wrench_of
+from .command_gate import autonomous_command, brake_command, passed_on, refusal, stale_term
+from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, next_state
 from .perception import make_perception
 from .sighting import look, prediction_from
 
 
 def main(options: ProcessOptions) -> int:
-    """Runs chaser ``options.chaser``; 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
+    """Run chaser ``options.chaser``; return 0 if the mission ended, 1 if stopped before, 2 if it could not join."""
     cv2.setNumThreads(1)
     number = int(options.chaser or 0)
 
@@ -55,7 +55,7 @@ def main(options: ProcessOptions) -> int:
         finish_startup()
         while not (chaser.ended or stop()):
             chaser.listen()
-        chaser.farewell()
+        chaser.publish_farewell()
         return 0 if chaser.ended else 1
 
     return run_member(f"chaser/{number}", "chaser", options, work)
@@ -63,7 +63,11 @@ def main(options: ProcessOptions) -> int:
 
 @dataclass
 class Chaser:
-    """The state of one chaser process: what it last knew, saw and flew."""
+    """The state of one chaser process: latest messages, last executed command and fallback.
+
+    ``executed_tick`` and ``executed_ns``: tick of the last actuator command for which the world need not wait any more, and
+    time of the last executed command of the controller.
+    """
 
     node: Node
     scenario: Scenario
@@ -73,23 +77,24 @@ class Chaser:
     docking: DockingStatus | None = None
     sighting: Sighting | None = None
     tick: Tick | None = None
-    flown_tick: int = -1
-    flown_ns: int | None = None
+    executed_tick: int = -1
+    executed_ns: int | None = None
     realtime: bool = False
 
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
-        self._forgotten = self._refusing = self._stale = False
+        # Whether the current series of missing, refused or stale commands has been reported.
+        self._reported_missing = self._reported_refusal = self._reported_stale = False
         self._term = 0
         self._plan: Plan | None = None
         self._target: TargetEstimate | None = None
-        self._last = LastWord()
-        self._heeded_tick = -1
-        self._alone: Alone | None = None
-        self._clear_m = clear_m(self.scenario, self.number)
-        self._watched_tick = self._uncommanded = -1
-        self._known_ns = 0
-        self._looked: deque[int] = deque(maxlen=64)
+        self._last = LastCommand()
+        self._last_tick = -1
+        self._fallback: FallbackState | None = None
+        self._clearance_m = clearance_m(self.scenario, self.number)
+        self._thrusters_tick = self._uncommanded_tick = -1
+        self._odometry_ns = 0
+        self._processed_images: deque[int] = deque(maxlen=64)
         self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._thrusters = (
             ThrusterController(self.scenario, self.number)
@@ -99,7 +104,7 @@ class Chaser:
         self._perception = make_perception(self.scenario)
 
     def open(self, instance: str, realtime: bool) -> None:
-        """Opens the topics, then tells its presence."""
+        """Advertise and subscribe the topics, then start the heartbeat."""
         node, i = self.node, self.number
         self.realtime = realtime
         node.advertise(topics.SIGHTING, i)
@@ -116,55 +121,68 @@ class Chaser:
         node.subscribe(topics.END)
         self.heartbeat = Heartbeat(node, instance)
 
+    def publish_farewell(self) -> None:
+        """Publish the last messages of this process."""
+        tick = self.tick
+        self.heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)
+
+    # -- receiving -------------------------------------------------------------------------------------------
+
     def listen(self) -> None:
-        """Waits for one message and does what it asks for."""
+        """Wait for one message and handle it."""
         received = self.node.receive(0.2)
         match received.message if received is not None else None:
             case Image() as image:
-                self._look(image)
+                self._process_image(image)
             case Odometry() as odometry:
-                self._known_ns = odometry.sim_time_ns
-                self._know(odometry)
+                self._odometry_ns = odometry.sim_time_ns
+                self._update_odometry(odometry)
             case DockingStatus() as docking:
                 self.docking = docking
-                self._watch_thrusters()
+                self._report_thrusters()
             case Plan() as plan:
-                self._plan = plan
-                if plan.tick == self._heeded_tick:  # it came after its command
-                    self._last = LastWord(plan, self._last.target)
+                self._update_plan(plan)
             case TargetEstimate() as target:
                 self._target = target
             case WrenchCommand() as command:
-                self._fly(command)
+                self._handle_command(command)
             case Tick() as tick:
-                self.tick = tick
-                self.heartbeat.in_flight.set()
-                self._watch_thrusters()
-                self._brake_if_alone()
-                if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
-                    health = create_health(self.node, tick.tick, tick.sim_time_ns)
-                    self.node.publish(topics.HEALTH, health, self.name)
+                self._begin_tick(tick)
             case Presence() as presence:
                 self.heartbeat.take(presence)
             case MissionEnd():
                 self.ended = True
             case LostMessage() as lost if received is not None:
-                self._miss(received.topic, lost)
+                self._replace_lost(received.topic, lost)
 
-    def _know(self, odometry: Odometry) -> None:
-        """Takes its own state, unless a newer one has come before it."""
+    def _begin_tick(self, tick: Tick) -> None:
+        self.tick = tick
+        self.heartbeat.in_flight.set()
+        self._report_thrusters()
+        self._reply_without_command()
+        if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
+            health = create_health(self.node, tick.tick, tick.sim_time_ns)
+            self.node.publish(topics.HEALTH, health, self.name)
+
+    def _update_odometry(self, odometry: Odometry) -> None:
+        """Update the own state, unless a newer one has arrived before."""
         if self.odometry is not None and odometry.tick < self.odometry.tick:
             self.node.counts.stale += 1
             return
         self.odometry = odometry
-        self._watch_thrusters()
-        self._brake_if_alone()
-        self._brake_if_forgotten(odometry)
+        self._report_thrusters()
+        self._reply_without_command()
+        self._check_command_timeout(odometry)
 
-    def _miss(self, topic: Topic, lost: LostMessage) -> None:
-        """In lock-step: something has been lost on its way here, and the tick must be answered nevertheless."""
+    def _update_plan(self, plan: Plan) -> None:
+        self._plan = plan
+        if plan.tick == self._last_tick:  # the plan arrived after its command
+            self._last = LastCommand(plan, self._last.target)
+
+    def _replace_lost(self, topic: Topic, lost: LostMessage) -> None:
+        """Lock-step: handle the loss of a message, so that the tick is still replied to."""
         if topic is topics.IMAGE:
-            nothing = Sighting(
+            no_image = Sighting(
                 tick=lost.tick,
                 sim_time_ns=lost.sim_time_ns,
                 chaser=self.number,
@@ -173,164 +191,174 @@ class Chaser:
                 marker_ids=(),
                 corners_px=(),
                 rejected_ids=(),
-                detail="no image came",
+                detail="image lost",
             )
-            self.node.publish(topics.SIGHTING, nothing, self.number)
+            self.node.publish(topics.SIGHTING, no_image, self.number)
         elif topic is topics.ODOMETRY and self.odometry is not None:
-            self._know(extrapolate(self.odometry, lost.tick, lost.sim_time_ns))
+            self._update_odometry(extrapolate(self.odometry, lost.tick, lost.sim_time_ns))
         elif topic is topics.DOCKING:
-            before = self.docking
-            still = (
+            last = self.docking
+            assumed = (
                 DockingStatus(chaser=self.number, contact=False, armed=False, latched=False)
-                if before is None
-                else msgspec.structs.replace(before, contact=False)
+                if last is None
+                else msgspec.structs.replace(last, contact=False)
             )
-            self.docking = msgspec.structs.replace(still, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
-            self._watch_thrusters()
+            self.docking = msgspec.structs.replace(assumed, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
+            self._report_thrusters()
         elif topic is topics.WRENCH:
-            self._without_command(lost.tick)
+            self._mark_uncommanded(lost.tick)
 
-    def _without_command(self, tick: int) -> None:
-        """There is no command for a tick: the chaser answers it by itself, once it knows where it is."""
-        self._uncommanded = max(tick, self._uncommanded)
-        self._brake_if_alone()
-
-    def _look(self, image: Image) -> None:
-        if image.tick in self._looked:
+    def _process_image(self, image: Image) -> None:
+        if image.tick in self._processed_images:
             self.node.counts.stale += 1
             return
-        self._looked.append(image.tick)
-        begun_s = time.perf_counter()
+        self._processed_images.append(image.tick)
+        started_s = time.perf_counter()
         sighting = look(self._perception, image, prediction_from(self.sighting))
-        took_s = time.perf_counter() - begun_s
+        elapsed_s = time.perf_counter() - started_s
         if sighting.status == "bad_image" and (self.sighting is None or self.sighting.status != "bad_image"):
-            self._warn("bad image", sighting.detail, image.tick, image.sim_time_ns)
+            self._publish_warning("bad image", sighting.detail, image.tick, image.sim_time_ns)
         self.sighting = sighting
-        self.node.publish(
-            topics.SIGHTING, msgspec.structs.replace(sighting, wall_estimate_s=took_s), self.number
-        )
+        sighting = msgspec.structs.replace(sighting, wall_estimate_s=elapsed_s)
+        self.node.publish(topics.SIGHTING, sighting, self.number)
 
-    def _watch_thrusters(self) -> None:
-        """Tells the controller what the thrusters can do, and everyone what has been found of them.
+    def _report_thrusters(self) -> None:
+        """Publish the thrusters' capability and the events of fault detection.
 
-        Once a tick that is open, when it has brought the odometry and, with a docking sensor, its word, in whatever
-        order. The last odometry belongs to no open tick, and may come after the mission's end or before it.
+        Runs once per open tick, when its odometry and, with a docking sensor, the sensor's status have arrived in any
+        order. The last odometry belongs to no open tick and may arrive before or after the mission's end.
         """
         tick, odometry, docking = self.tick, self.odometry, self.docking
         if self._thrusters is None or tick is None or odometry is None:
             return
-        if odometry.tick != tick.tick or self._watched_tick >= tick.tick:
+        if odometry.tick != tick.tick or self._thrusters_tick >= tick.tick:
             return
         if self._has_port and (docking is None or docking.tick != tick.tick):
             return
-        self._watched_tick = tick.tick
+        self._thrusters_tick = tick.tick
         touched = docking is not None and (docking.contact or docking.latched)
         self.node.publish(topics.THRUSTERS, self._thrusters.observe(odometry, touched), self.number)
         for level, what, detail in self._thrusters.drain_events():
-            self._tell(level, what, detail, odometry.tick, odometry.sim_time_ns)
+            self._publish_event(level, what, detail, odometry.tick, odometry.sim_time_ns)
 
-    def _fly(self, command: WrenchCommand) -> None:
+    # -- commands --------------------------------------------------------------------------------------------
+
+    def _handle_command(self, command: WrenchCommand) -> None:
+        """Execute a command of the controller, or refuse it."""
         if command.mode == "none":
-            if not self.realtime:  # there it flies on what it has, for a command's lifetime
-                self._without_command(command.tick)
+            if not self.realtime:  # in real time the last command remains valid for its lifetime
+                self._mark_uncommanded(command.tick)
             return
         now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0
         if stale := stale_term(command, self.tick, self._term):
             self.node.counts.rejected["wrench:stale term"] += 1
-            if not self._stale:  # the first of a row
-                self._warn("command refused", stale, command.tick, now_ns)
-            self._stale = True
+            if not self._reported_stale:  # the first of a series
+                self._publish_warning("command refused", stale, command.tick, now_ns)
+            self._reported_stale = True
             return
-        if command.tick == self.flown_tick and command.term > self._term:
-            return  # said again by who took over in the middle of a tick
-        why_not = refusal(command, self.number, self.scenario.chaser, self.flown_tick, now_ns)
-        if why_not is None:
-            self.flown_ns, self._forgotten, self._refusing = command.sim_time_ns, False, False
-            self._term = command.term
-            self._stale = False
-            self._heed(command)
-            if self._thrusters is not None:
-                self._thrusters.apply_command(command)
-            self._send(passed_on(command))
+        if command.tick == self.executed_tick and command.term > self._term:
+            return  # repeated by a controller that became leader within the tick
+        reason = refusal(command, self.number, self.scenario.chaser, self.executed_tick, now_ns)
+        if reason is None:
+            self._execute(command)
             return
         self.node.counts.stale += 1
-        if not self._refusing:  # the first of a row; all are counted
-            self._warn("command refused", why_not, command.tick, now_ns)
-        self._refusing = True
-        # A tick of the world must be answered, if not with this command then with a safe one.
-        self._without_command(command.tick)
+        if not self._reported_refusal:  # the first of a series; all are counted
+            self._publish_warning("command refused", reason, command.tick, now_ns)
+        self._reported_refusal = True
+        # The world waits for a reply to the tick: without this command, a safe one.
+        self._mark_uncommanded(command.tick)
 
-    def _heed(self, command: WrenchCommand) -> None:
-        """Keeps what came with a command, for when there are none."""
-        plan, target, self._heeded_tick = self._plan, self._target, command.tick
-        self._last = LastWord(
+    def _execute(self, command: WrenchCommand) -> None:
+        self.executed_ns, self._term = command.sim_time_ns, command.term
+        self._reported_missing = self._reported_refusal = self._reported_stale = False
+        self._remember(command)
+        if self._thrusters is not None:
+            self._thrusters.apply_command(command)
+        self._reply(passed_on(command))
+
+    def _remember(self, command: WrenchCommand) -> None:
+        """Store the plan and target estimate of a command for the fallback, and end the fallback."""
+        plan, target, self._last_tick = self._plan, self._target, command.tick
+        self._last = LastCommand(
             plan if plan is not None and plan.tick == command.tick else None,
             target if target is not None and target.tick == command.tick else self._last.target,
         )
-        if self._alone is not None:
-            self._tell("info", "commanded again", f"tick {command.tick}", command.tick, command.sim_time_ns)
-        self._alone = None
+        if self._fallback is not None:
+            detail = f"tick {command.tick}"
+            self._publish_event("info", "fallback ends", detail, command.tick, command.sim_time_ns)
+        self._fallback = None
 
-    def _brake_if_alone(self) -> None:
-        """Without a controller, or its command, the chaser answers the open tick itself."""
+    # -- fallback --------------------------------------------------------------------------------------------
+
+    def _mark_uncommanded(self, tick: int) -> None:
+        """Record that no command arrives for a tick; the chaser replies itself once it knows its state."""
+        self._uncommanded_tick = max(tick, self._uncommanded_tick)
+        self._reply_without_command()
+
+    def _reply_without_command(self) -> None:
+        """Reply to the open tick with a fallback command if there is no controller or no command for the tick."""
         tick, odometry = self.tick, self.odometry
         if tick is None or odometry is None or odometry.tick != tick.tick:
             return
-        if tick.controller and self._uncommanded < tick.tick:
+        if tick.controller and self._uncommanded_tick < tick.tick:
             return
-        if self.number in tick.chasers and tick.tick > self.flown_tick:
-            if tick.controller and not self._forgotten:
-                self._forgotten = True
-                self._warn("no command", "it was lost or refused", tick.tick, odometry.sim_time_ns)
-            self._send(self._by_itself(odometry))
+        if self.number in tick.chasers and tick.tick > self.executed_tick:
+            if tick.controller and not self._reported_missing:
+                self._reported_missing = True
+                self._publish_warning("no command", "lost or refused", tick.tick, odometry.sim_time_ns)
+            self._reply(self._fallback_command(odometry))
 
-    def _brake_if_forgotten(self, odometry: Odometry) -> None:
-        """In real time nobody waits for the controller: when its commands stop coming, the chaser flies by itself."""
+    def _check_command_timeout(self, odometry: Odometry) -> None:
+        """Real time: start the fallback when no command has arrived for its lifetime."""
         if not self.realtime:
             return
-        if self.flown_ns is None:
-            self.flown_ns = odometry.sim_time_ns
-        silent_ns = odometry.sim_time_ns - self.flown_ns
+        if self.executed_ns is None:
+            self.executed_ns = odometry.sim_time_ns
+        silent_ns = odometry.sim_time_ns - self.executed_ns
         if silent_ns <= self.scenario.controller.command_lifetime_s * 1e9:
             return
-        if not self._forgotten:
-            self._forgotten = True
-            self._warn("no command", f"for {silent_ns / 1e9:.2f} s", odometry.tick, odometry.sim_time_ns)
-        # Not noted as this tick's answer: the controller's, should it still come, is better.
-        self._actuate(self._by_itself(odometry))
+        if not self._reported_missing:
+            self._reported_missing = True
+            detail = f"for {silent_ns / 1e9:.2f} s"
+            self._publish_warning("no command", detail, odometry.tick, odometry.sim_time_ns)
+        # Not recorded as the reply to this tick: a command that still arrives takes precedence.
+        self._actuate(self._fallback_command(odometry))
 
-    def _by_itself(self, odometry: Odometry) -> ActuatorCommand:
-        """The chaser's own command: see ``alone``."""
+    def _fallback_command(self, odometry: Odometry) -> ActuatorCommand:
+        """Return the chaser's own command (see ``fallback``)."""
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
-        # Whoever does not know his own motion cannot brake it.
-        lost_ns = odometry.sim_time_ns - self._known_ns
-        latched = self.docking is not None and self.docking.latched
         body = self.scenario.chaser
-        if latched or lost_ns > self.scenario.controller.command_lifetime_s * 1e9:
-            return brake(odometry, body, effective_ns, latched=True)
-        before, self._alone = (
-            self._alone,
-            goes_on(self._alone, odometry, effective_ns, self._last, self._clear_m),
-        )
-        if before is None or before.state != self._alone.state:
-            what = f"alone: {self._alone.state}"
-            self._warn(what, self._alone.text(), odometry.tick, odometry.sim_time_ns)
-        wrench = wrench_of(self._alone, odometry, effective_ns, self._last, body)
-        return own_command(odometry, effective_ns, self._alone.state, wrench)
+        latched = self.docking is not None and self.docking.latched
+        # Without recent odometry the motion is unknown and cannot be braked.
+        odometry_age_ns = odometry.sim_time_ns - self._odometry_ns
+        if latched or odometry_age_ns > self.scenario.controller.command_lifetime_s * 1e9:
+            return brake_command(odometry, body, effective_ns, latched=True)
+        before = self._fallback
+        state = next_state(before, odometry, effective_ns, self._last, self._clearance_m)
+        self._fallback = state
+        if before is None or before.mode != state.mode:
+            what = f"fallback: {state.mode}"
+            self._publish_warning(what, state.text(), odometry.tick, odometry.sim_time_ns)
+        wrench = fallback_wrench(state, odometry, effective_ns, self._last, body)
+        return autonomous_command(odometry, effective_ns, state.mode, wrench)
 
-    def _send(self, command: ActuatorCommand) -> None:
-        self.flown_tick = command.tick
+    # -- publishing ------------------------------------------------------------------------------------------
+
+    def _reply(self, command: ActuatorCommand) -> None:
+        """Publish the actuator command that is the reply to its tick."""
+        self.executed_tick = command.tick
         self._actuate(command)
 
     def _actuate(self, command: ActuatorCommand) -> None:
         if self._thrusters is not None:
-            command = self._thrusters.fly(command)
+            command = self._thrusters.add_pulses(command)
         self.node.publish(topics.ACTUATORS, command, self.number)
 
-    def _warn(self, what: str, detail: str, tick: int, time_ns: int) -> None:
-        self._tell("warning", what, detail, tick, time_ns)
+    def _publish_warning(self, what: str, detail: str, tick: int, time_ns: int) -> None:
+        self._publish_event("warning", what, detail, tick, time_ns)
 
-    def _tell(self, level: Level, what: str, detail: str, tick: int, time_ns: int) -> None:
+    def _publish_event(self, level: Level, what: str, detail: str, tick: int, time_ns: int) -> None:
         event = Event(
             tick=tick,
             sim_time_ns=time_ns,
@@ -340,8 +368,3 @@ class Chaser:
             detail=detail,
         )
         self.node.publish(topics.EVENT, event, self.name)
-
-    def farewell(self) -> None:
-        """The last messages of this process."""
-        tick = self.tick
-        self.heartbeat.farewell(tick.tick if tick else -1, tick.sim_time_ns if tick else 0)

@@ -1,4 +1,4 @@
-"""The chasers' perception again, on recorded images: their processes' own code, with a tape for a network."""
+"""Replay of the chasers' perception on recorded images: the code of their processes on a replay node."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from .process import Chaser
 
 
 def play_perception(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
-    """The sightings of all chasers."""
+    """Return the sightings of all chasers."""
     cv2.setNumThreads(1)
     chasers: dict[int, tuple[ReplayNode, Chaser]] = {}
     last_seq: dict[int, int] = {}
     for received in recorded:
         number, seq = received.message.chaser, received.message.seq
-        answers = received.topic is topics.SIGHTING
-        if number not in chasers or (answers and seq < last_seq.get(number, -1)):
-            tape = ReplayNode(f"chaser/{number}")
-            chaser = Chaser(cast(Node, tape), scenario, number)
+        is_sighting = received.topic is topics.SIGHTING
+        if number not in chasers or (is_sighting and seq < last_seq.get(number, -1)):
+            node = ReplayNode(f"chaser/{number}")
+            chaser = Chaser(cast(Node, node), scenario, number)
             chaser.heartbeat = cast(Any, SilentHeartbeat())
-            chasers[number] = tape, chaser
-        if answers:
+            chasers[number] = node, chaser
+        if is_sighting:
             last_seq[number] = seq
             continue
-        tape, chaser = chasers[number]
-        tape.put(received)
+        node, chaser = chasers[number]
+        node.put(received)
         chaser.listen()
-        yield from (said for said in tape.take_published() if said[0] is topics.SIGHTING)
+        yield from (published for published in node.take_published() if published[0] is topics.SIGHTING)
 
 
 PERCEPTION = Stage("chaser", (topics.IMAGE,), (topics.SIGHTING,), play_perception)

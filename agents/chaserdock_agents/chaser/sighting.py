@@ -1,4 +1,4 @@
-"""From an image message to a sighting message. A pure function of image, prediction and parameters."""
+"""Convert an image message to a sighting message; a pure function of image, prediction and parameters."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Image, PoseSolution, Sighting
 from numpy.typing import NDArray
 
-from .perception import Sees
+from .perception import PerceptionMethod
 
 Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
-"""Where the target may be: position (3,) in IRF and rotation (4,) TRF to IRF."""
+"""Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
 
 
 class BadImage(Exception):
-    """An image message that holds no image of the stated size."""
+    """An image message without a valid image of the stated size."""
 
 
 def decode_image(image: Image) -> NDArray[np.uint8]:
-    """Grey image (height, width), uint8, of an image message; raises BadImage."""
+    """Return the grey image (height, width), uint8, of an image message; raises BadImage."""
     shape = (image.height_px, image.width_px)
     data = np.frombuffer(image.data, dtype=np.uint8)
     if image.encoding == "mono8":
         if data.size != shape[0] * shape[1]:
             raise BadImage(
-                f"{data.size} bytes, a mono8 image of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
+                f"{data.size} bytes; a mono8 image of {shape[1]} x {shape[0]} has {shape[0] * shape[1]}"
             )
         return data.reshape(shape)
-    # Asked first, as OpenCV would take the memory for whatever size the header claims, and other formats too.
+    # Checked first, as OpenCV allocates memory for any size that the header states, and accepts other formats.
     size = _jpeg_size(image.data)
     if size is None:
-        raise BadImage(f"{data.size} bytes that are no JPEG")
+        raise BadImage(f"{data.size} bytes that are not a JPEG")
     if size != shape:
         raise BadImage(f"a JPEG of {size[1]} x {size[0]}, stated as {shape[1]} x {shape[0]}")
     pixels: Any = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
@@ -43,24 +43,24 @@ def decode_image(image: Image) -> NDArray[np.uint8]:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:
-    """Height and width in a JPEG's frame header (ITU-T T.81, B.2.2), None if there is none."""
+    """Return height and width of a JPEG's frame header (ITU-T T.81, B.2.2), None without one."""
     if data[:2] != b"\xff\xd8":
         return None
-    place = 2
-    while place + 9 <= len(data) and data[place] == 0xFF:
-        marker = data[place + 1]
+    offset = 2
+    while offset + 9 <= len(data) and data[offset] == 0xFF:
+        marker = data[offset + 1]
         if marker == 0xFF:  # a fill byte
-            place += 1
-        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # these three begin no frame
-            head = data[place + 5 : place + 9]
+            offset += 1
+        elif 0xC0 <= marker <= 0xCF and marker not in (0xC4, 0xC8, 0xCC):  # these three are not frame headers
+            head = data[offset + 5 : offset + 9]
             return int.from_bytes(head[:2], "big"), int.from_bytes(head[2:], "big")
         else:
-            place += 2 + int.from_bytes(data[place + 2 : place + 4], "big")
+            offset += 2 + int.from_bytes(data[offset + 2 : offset + 4], "big")
     return None
 
 
-def look(perception: Sees, image: Image, predicted: Prediction | None) -> Sighting:
-    """What is seen of the target in an image; ``wall_estimate_s`` is left for the caller."""
+def look(perception: PerceptionMethod, image: Image, predicted: Prediction | None) -> Sighting:
+    """Return the sighting of the target in an image; the caller sets ``wall_estimate_s``."""
     header: dict[str, Any] = {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
     try:
         seen = perception.estimate(decode_image(image), predicted)
@@ -94,7 +94,7 @@ def look(perception: Sees, image: Image, predicted: Prediction | None) -> Sighti
 
 
 def prediction_from(sighting: Sighting | None) -> Prediction | None:
-    """Where to look first in the next image: where the target was last seen, if it was."""
+    """Return the pose prediction for the next image: the last measured pose, None without one."""
     if sighting is None or not sighting.solutions:
         return None
     best = sighting.solutions[0]

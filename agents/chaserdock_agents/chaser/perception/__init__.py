@@ -1,4 +1,4 @@
-"""Markers in an image to the pose of the target (ArUco, fitted sides, PnP with covariance)."""
+"""Pose of the target from markers in an image (ArUco detection, edge-fitted corners, PnP with covariance)."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from numpy.typing import ArrayLike, NDArray
 from .pipeline import Method, Perception, PoseSolution, Sighting
 
 
-class Sees(Protocol):
-    """What a perception is: see `Perception.estimate` for the meaning of its arguments and its answer."""
+class PerceptionMethod(Protocol):
+    """Interface of a perception; see `Perception.estimate`."""
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> Sighting: ...
 
 
-def make_perception(scenario: Scenario) -> Sees:
-    """The perception that the scenario names: one of ours, or an installed ``chaserdock.perceptions`` entry point, a
-    function of (camera: Camera, target: TargetModel). Raises PluginError when there is no such thing here."""
+def make_perception(scenario: Scenario) -> PerceptionMethod:
+    """Return the perception that the scenario names: a built-in one, or an installed ``chaserdock.perceptions`` entry point,
+    a function of (camera: Camera, target: TargetModel). Raises PluginError if it is not installed."""
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
         case "default" | "paper" as method:
@@ -31,4 +31,4 @@ def make_perception(scenario: Scenario) -> Sees:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 
 
-__all__ = ["Method", "Perception", "PoseSolution", "Sees", "Sighting", "make_perception"]
+__all__ = ["Method", "Perception", "PerceptionMethod", "PoseSolution", "Sighting", "make_perception"]

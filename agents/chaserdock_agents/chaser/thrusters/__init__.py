@@ -1,1 +1,1 @@
-"""A chaser's thrusters: which of them give a wrench, when they open, and which of them have failed."""
+"""Thruster control of a chaser: allocation, pulse modulation, fault detection and self-test."""

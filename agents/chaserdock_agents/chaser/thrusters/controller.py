@@ -1,4 +1,4 @@
-"""A chaser's thrusters in flight: wrench -> thrusts -> pulses, which thrusters it trusts, what it tells of them. No I/O."""
+"""Thruster controller of a chaser: wrench to thrusts to pulses, fault detection and capability report. No I/O."""
 
 from __future__ import annotations
 
@@ -20,25 +20,27 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.thrusters import FailureKind, thrusts_max
 
 from .allocation import allocator_of
-from .fault_detection import ENOUGH, Flags, ThrusterFaultDetector, Verdict
-from .impulse_residual import Noise, at_rest, covariance, noise_of, observed_impulse
+from .fault_detection import SUFFICIENT_INFORMATION, Flags, ThrusterFault, ThrusterFaultDetector
+from .impulse_residual import ImpulseNoise, covariance, noise_of, observed_impulse, quiescent_variance
 from .modulation import Modulator
 from .self_test import ThrusterSelfTest
 
-_LEAST_SCALE = 0.02
-"""Of the body's limits: what the controller may ask for even of thrusters that cannot give every wrench any more."""
-_MOST_LOOKS = 10
-"""A thruster is tested if so many least pulses would prove that it works."""
-_FORGET_NS = 1_000_000_000
-_LONGEST_NS = 1_000_000_000
-"""No carrier period is longer."""
+_MIN_SCALE = 0.02
+"""Share of the body's limits that is reported even if the remaining thrusters cannot produce every wrench."""
+_MAX_TEST_PULSES = 10
+"""Thrusters are tested if at most this many minimum pulses prove that one works."""
+_HISTORY_NS = 1_000_000_000
+_MAX_PERIOD_NS = 1_000_000_000
+"""Upper bound of a carrier period."""
 
 
 class ThrusterController:
-    """Thrusters of chaser ``chaser``: give it every odometry, then every command. ``events`` (level, what, detail) pile up
-    until drained."""
+    """Controls the thrusters of one chaser. Call ``observe`` with every odometry, then ``add_pulses`` with every command.
 
-    def __init__(self, scenario: Scenario, chaser: int, noise: Noise | None = None) -> None:
+    ``events`` (level, what, detail) accumulate until ``drain_events``.
+    """
+
+    def __init__(self, scenario: Scenario, chaser: int, noise: ImpulseNoise | None = None) -> None:
         body = scenario.chaser
         self._body, self._timing, self._chaser = body, scenario.timing, chaser
         self._allocator = allocator_of(body)
@@ -47,114 +49,119 @@ class ThrusterController:
         self._box = np.array([body.force_max_N] * 3 + [body.torque_max_N_m] * 3)
         self._set = wrench_set(self._matrix)
         self._modulator = Modulator(body.thrusters, body.modulation, scenario.timing)
-        self._valves = Valves(body.thrusters)  # what this chaser believes of the real ones
-        least = self._full_N * [t.min_on_s for t in body.thrusters]
-        self._watch = ThrusterFaultDetector(self._matrix, self._full_N, least)
+        self._valves = Valves(body.thrusters)  # the chaser's model of the real valves
+        min_pulse_N_s = self._full_N * [t.min_on_s for t in body.thrusters]
+        self._detector = ThrusterFaultDetector(self._matrix, self._full_N, min_pulse_N_s)
         self._noise = noise or noise_of(scenario.odometry)
-        tells = (least**2 * (self._matrix**2 / at_rest(self._noise, body)[:, None]).sum(axis=0)).min()
-        # Pulses of whole periods are no test of one thruster, and neither are those that drown in noise.
-        can_tell = body.modulation.modulator == "pwm" and _MOST_LOOKS * tells >= ENOUGH
-        self._proof = ThrusterSelfTest(
-            self._allocator, least, body.thruster_test_s if can_tell else 0.0, ENOUGH
+        variance = quiescent_variance(self._noise, body)
+        information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
+        # Neither pulses of whole periods nor pulses below the noise can test a single thruster.
+        testable = (
+            body.modulation.modulator == "pwm" and _MAX_TEST_PULSES * information >= SUFFICIENT_INFORMATION
         )
-        self._may_test = False
-        self._told = [f for f in scenario.thruster_failure if f.reported and f.chaser == chaser]
-        self._failed: dict[int, Verdict] = {}
-        self._wanted_shut: frozenset[int] = frozenset()
+        self._self_test = ThrusterSelfTest(
+            self._allocator,
+            min_pulse_N_s,
+            body.thruster_test_s if testable else 0.0,
+            SUFFICIENT_INFORMATION,
+        )
+        self._test_allowed = False
+        self._reported_failures = [f for f in scenario.thruster_failure if f.reported and f.chaser == chaser]
+        self._failed: dict[int, ThrusterFault] = {}
+        self._commanded_isolated: frozenset[int] = frozenset()
         self._trusted: frozenset[int] = frozenset()
         self._free_since_ns: int | None = 0
         self._odometry: Odometry | None = None
         self._scale: float | None = None
-        self._forgotten_ns = 0
+        self._pruned_ns = 0
         self.events: list[tuple[Level, str, str]] = []
 
     @property
     def isolated(self) -> tuple[int, ...]:
-        """Thrusters whose shut-off valves are to be closed."""
-        return tuple(sorted(self._wanted_shut | (self._useless() - self._trusted)))
+        """Thrusters whose shut-off valves are to be closed, in ascending order."""
+        return tuple(sorted(self._commanded_isolated | (self._unusable() - self._trusted)))
 
-    def _useless(self) -> set[int]:
-        return {thruster for thruster, verdict in self._failed.items() if verdict.kind != "weak"}
+    def _unusable(self) -> set[int]:
+        return {thruster for thruster, fault in self._failed.items() if fault.kind != "weak"}
 
     def observe(self, odometry: Odometry, touched: bool = False) -> ThrusterReport:
-        """Looks for failed thrusters in the motion since the last odometry; what the thrusters can do now.
+        """Run fault detection on the motion since the last odometry; return the thrusters' capability.
 
-        ``touched``: the docking sensor felt something since then. That motion is not the thrusters' alone.
+        ``touched``: the docking sensor reported contact since then, so the motion is not due to the thrusters only.
         """
         before, self._odometry = self._odometry, odometry
         now_ns = odometry.sim_time_ns
-        for failure in [f for f in self._told if round(f.at_s * 1e9) <= now_ns]:
-            self._told.remove(failure)
+        for failure in [f for f in self._reported_failures if round(f.at_s * 1e9) <= now_ns]:
+            self._reported_failures.remove(failure)
             factor = 1.0 if failure.kind == "stuck_on" else failure.factor or 0.0
-            self._convict(
-                Verdict(failure.thruster, failure.kind, factor), round(failure.at_s * 1e9), "was told"
-            )
+            fault = ThrusterFault(failure.thruster, failure.kind, factor)
+            self._add_fault(fault, round(failure.at_s * 1e9), "reported")
         given = np.zeros(len(self._full_N))
         if before is not None and before.sim_time_ns < now_ns:
             given = self._impulses(before.sim_time_ns, now_ns)
             if touched:
-                self._watch.forget()
+                self._detector.reset()
             else:
-                self._compare(before, odometry, given)
-        if now_ns - self._forgotten_ns > _FORGET_NS:
-            self._forgotten_ns = now_ns
-            self._valves.forget_before(now_ns - _FORGET_NS)
+                self._detect_faults(before, odometry, given)
+        if now_ns - self._pruned_ns > _HISTORY_NS:
+            self._pruned_ns = now_ns
+            self._valves.forget_before(now_ns - _HISTORY_NS)
         return self._report(odometry, self._matrix @ given)
 
-    def _compare(self, before: Odometry, after: Odometry, thrusters: Array) -> None:
+    def _detect_faults(self, before: Odometry, after: Odometry, thrusters: Array) -> None:
         if self._free_since_ns is None or before.sim_time_ns < self._free_since_ns:
-            self._watch.forget()
+            self._detector.reset()
             return
         residual = observed_impulse(before, after, self._body) - self._matrix @ thrusters
         noise = covariance(self._noise, self._body, self._matrix, thrusters, before, after)
         time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
         suspects = self._suspects(before.sim_time_ns)
-        if (verdict := self._watch.look(residual, noise, thrusters, time_s, suspects)) is not None:
-            self._convict(verdict, after.sim_time_ns, "found")
+        if (fault := self._detector.update(residual, noise, thrusters, time_s, suspects)) is not None:
+            self._add_fault(fault, after.sim_time_ns, "detected")
         else:
-            self._proof.heard(self._watch.information, after.sim_time_ns)
+            self._self_test.add_information(self._detector.information, after.sim_time_ns)
 
     def _suspects(self, at_ns: int) -> Flags:
-        """Thrusters (n,) whose failure could be found: not those that are shut, known to have failed, or vouched for."""
-        out = {*self._failed, *self._valves.shut_at(at_ns), *self._trusted}
-        return np.array([thruster not in out for thruster in range(len(self._full_N))])
+        """Return the thrusters (n,) whose failure can be detected: not isolated, failed or trusted by command."""
+        excluded = {*self._failed, *self._valves.shut_at(at_ns), *self._trusted}
+        return np.array([thruster not in excluded for thruster in range(len(self._full_N))])
 
-    def _convict(self, verdict: Verdict, at_ns: int, how: str) -> None:
-        kind: FailureKind = verdict.kind
-        self._failed[verdict.thruster] = verdict
-        self._valves.fail(verdict.thruster, kind, at_ns, verdict.factor)
-        self._watch.forget()
-        left = f", {verdict.factor:.2f} of its thrust left" if kind == "weak" else ", isolated"
-        self.events.append(("warning", f"thruster {verdict.thruster} {kind.replace('_', ' ')}", how + left))
+    def _add_fault(self, fault: ThrusterFault, at_ns: int, how: str) -> None:
+        kind: FailureKind = fault.kind
+        self._failed[fault.thruster] = fault
+        self._valves.fail(fault.thruster, kind, at_ns, fault.factor)
+        self._detector.reset()
+        effect = f", {fault.factor:.2f} of its thrust left" if kind == "weak" else ", isolated"
+        self.events.append(("warning", f"thruster {fault.thruster} {kind.replace('_', ' ')}", how + effect))
 
     def _impulses(self, from_ns: int, to_ns: int) -> Array:
         return self._valves.impulses(np.array([from_ns, to_ns]))[0]
 
-    def _can_N(self) -> Array:
-        """What every thruster gives when opened, (n,) N, as far as known."""
-        can = self._full_N.copy()
-        for thruster, verdict in self._failed.items():
-            can[thruster] *= verdict.factor
-        can[list(self.isolated)] = 0.0
-        return can
+    def _available_N(self) -> Array:
+        """Return the known thrust of every open thruster, (n,) N."""
+        available_N = self._full_N.copy()
+        for thruster, fault in self._failed.items():
+            available_N[thruster] *= fault.factor
+        available_N[list(self.isolated)] = 0.0
+        return available_N
 
     def _report(self, odometry: Odometry, given: Array) -> ThrusterReport:
-        scale = min(1.0, self._set.box_scale(self._can_N(), self._box))
+        scale = min(1.0, self._set.box_scale(self._available_N(), self._box))
         if scale != self._scale and self._scale is not None:
-            text = f"the controller's limits are {scale:.3f} of the body's"
-            if scale < _LEAST_SCALE:
-                text = f"the thrusters left do not give force and torque in every direction ({scale:.3f} of the limits)"
-            self.events.append(("warning" if scale < _LEAST_SCALE else "info", "thrusters changed", text))
+            text = f"wrench limits are {scale:.3f} of the body's"
+            if scale < _MIN_SCALE:
+                text = f"the remaining thrusters cannot produce every wrench ({scale:.3f} of the limits)"
+            self.events.append(("warning" if scale < _MIN_SCALE else "info", "thrusters changed", text))
         self._scale = scale
-        limits = self._box * max(scale, _LEAST_SCALE)
+        limits = self._box * max(scale, _MIN_SCALE)
         effective_ns = self._timing.effective_ns(odometry.tick)
         self._valves.set_shut(self.isolated, effective_ns)
-        # Pulses that go on after the next command takes effect count beyond what of them belongs to that command.
-        under_way = self._impulses(odometry.sim_time_ns, effective_ns + _LONGEST_NS)
-        coming = self._matrix @ (under_way - self._modulator.paid_ahead_N_s(effective_ns))
+        # Pulses that extend beyond the effective time of the next command, less the part that belongs to that command.
+        pulses_N_s = self._impulses(odometry.sim_time_ns, effective_ns + _MAX_PERIOD_NS)
+        coming = self._matrix @ (pulses_N_s - self._modulator.advance_N_s(effective_ns))
         kinds: list[ThrusterState] = ["healthy"] * len(self._full_N)
-        for thruster, verdict in self._failed.items():
-            kinds[thruster] = verdict.kind
+        for thruster, fault in self._failed.items():
+            kinds[thruster] = fault.kind
         return ThrusterReport(
             tick=odometry.tick,
             sim_time_ns=odometry.sim_time_ns,
@@ -170,45 +177,47 @@ class ThrusterController:
         )
 
     def apply_command(self, command: WrenchCommand) -> None:
-        """Takes what a command says beside its wrench: what the operator wants of thrusters, whether it flies freely."""
+        """Apply a command's isolated and trusted thrusters, and whether the chaser flies freely."""
         shut, trusted = frozenset(command.isolated), frozenset(command.trusted)
         count = len(self._full_N)
         shut = frozenset(j for j in shut if j < count)
         for thruster in trusted - self._trusted:
             if self._failed.pop(thruster, None) is not None:
                 self._valves.fail(thruster, None, 0)
-        if shut != self._wanted_shut or trusted != self._trusted:
-            self._watch.forget()
-        self._wanted_shut, self._trusted = shut, trusted
-        # With its latch armed it is about to touch, or does, and wants to be pushed by nothing.
-        self._may_test = command.free and command.latch != "arm"
+        if shut != self._commanded_isolated or trusted != self._trusted:
+            self._detector.reset()
+        self._commanded_isolated, self._trusted = shut, trusted
+        # With an armed latch the chaser is about to touch and must not be disturbed.
+        self._test_allowed = command.free and command.latch != "arm"
         if not command.free:
             self._free_since_ns = None
         elif self._free_since_ns is None:
             self._free_since_ns = command.sim_time_ns
 
-    def fly(self, command: ActuatorCommand) -> ActuatorCommand:
-        """The command with the pulses of the carrier periods that begin while it acts."""
-        can_N = self._can_N()
+    def add_pulses(self, command: ActuatorCommand) -> ActuatorCommand:
+        """Return the command with the pulses of the carrier periods that begin while it acts."""
+        available_N = self._available_N()
         wrench = np.array([*command.force_N, *command.torque_N_m])
         try:
-            thrusts = self._allocator.allocate(wrench, can_N).thrusts_N
-        except RuntimeError as error:  # no reason to leave the mission: the next command is another problem
-            self.events.append(("error", "no thrusts", str(error)))
-            thrusts = np.zeros(len(can_N))
+            thrusts = self._allocator.allocate(wrench, available_N).thrusts_N
+        except RuntimeError as error:  # the next command may be solvable
+            self.events.append(("error", "thruster allocation failed", str(error)))
+            thrusts = np.zeros(len(available_N))
         begin_ns, isolated = command.effective_time_ns, self.isolated
         end_ns = self._timing.effective_ns(command.tick + 1)
         test = None
-        if self._may_test and command.source == "command":
+        if self._test_allowed and command.source == "command":
             suspects = self._suspects(begin_ns)
-            test = self._proof.burn(begin_ns, suspects, can_N, thrusts, self._modulator.period_s)
-        pulses = self._modulator.pulses(thrusts, can_N, begin_ns, end_ns, test)
+            test = self._self_test.schedule(
+                begin_ns, suspects, available_N, thrusts, self._modulator.period_s
+            )
+        pulses = self._modulator.pulses(thrusts, available_N, begin_ns, end_ns, test)
         for p in pulses:
             self._valves.pulse(p.thruster, p.open_ns, p.close_ns)
         self._valves.set_shut(isolated, begin_ns)
         return msgspec.structs.replace(command, pulses=tuple(pulses), isolated=isolated)
 
     def drain_events(self) -> list[tuple[Level, str, str]]:
-        """What has been found since the last call."""
+        """Return the events since the last call."""
         events, self.events = self.events, []
         return events

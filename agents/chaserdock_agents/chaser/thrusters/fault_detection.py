@@ -1,9 +1,9 @@
-"""Which thruster has failed: its own part in the mismatch of commanded and observed impulse (docs/thrusters.md).
+"""Thruster fault detection from the residual of commanded and observed impulse (docs/thrusters.md).
 
-Every thruster is held against two hypotheses, each with its signature: stuck on (full thrust at all times: the residual is
-what it was not asked for) and weak or stuck off (the residual is the negative of a part of what it was asked for). A
-hypothesis is accepted when the residuals are much likelier under it than under health (likelihood ratio), explain
-themselves with it (chi-square), and no other thruster explains them nearly as well. No I/O; one failure is looked for at a time.
+Two hypotheses are tested for every thruster, each with its signature: stuck on (constant full thrust: the residual is the
+part that was not commanded) and weak or stuck off (the residual is the negative of a share of what was commanded). A
+hypothesis is accepted if the residuals are much more likely under it than without a fault (likelihood ratio), are consistent
+with it (chi-square), and no other thruster explains them nearly as well. Single faults only. No I/O.
 """
 
 from __future__ import annotations
@@ -19,28 +19,27 @@ from numpy.typing import NDArray
 
 Flags = NDArray[np.bool_]
 
-_LIKELIER = 20.0
-"""Least log-likelihood gained over health: one in 5e8, for some thousand looks a minute and thruster."""
-_CLEARER = 8.0
-"""Least log-likelihood gained over the second-best thruster."""
+_MIN_GAIN = 20.0
+"""Minimum log-likelihood ratio to the fault-free hypothesis: 1 in 5e8, at some thousand tests per minute and thruster."""
+_MIN_MARGIN = 8.0
+"""Minimum log-likelihood ratio to the second-best thruster."""
 _ON_WINDOWS = (2, 3, 4, 6, 8)
-"""Ticks in a row that a thruster may have been stuck on; one alone might be a bump."""
+"""Numbers of consecutive ticks tested for a thruster stuck on; a single one may be a disturbance."""
 _OFF_WINDOWS = (2, 3, 4, 6, 9, 15, 30)
-"""Ticks in which a thruster was asked for something, the newest of them, that are looked at together."""
-_GONE = 0.85
-_NOTICEABLE = 0.3
-"""Parts of its thrust that a thruster has lost when it counts as stuck off, and as weak."""
+"""Numbers of latest ticks with commanded thrust that are tested together."""
+_STUCK_OFF_LOSS, _WEAK_LOSS = 0.85, 0.3
+"""Loss of thrust, relative, from which on a thruster counts as stuck off, and as weak."""
 _OWN_SCATTER = 0.1
-"""How well the failed thruster's own thrust is known."""
+"""Relative uncertainty of the failed thruster's thrust."""
 _LOSS_SIGMA = 0.07
-"""How well the lost part must be known."""
-ENOUGH = 1.0 / _LOSS_SIGMA**2
-"""Information about a thruster (``ThrusterFaultDetector.information``) from which on its lost part is known that well."""
+"""Maximum standard deviation of the loss for a decision."""
+SUFFICIENT_INFORMATION = 1.0 / _LOSS_SIGMA**2
+"""Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known that well."""
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """A thruster has failed; ``factor`` is what is left of its thrust (1 for stuck on)."""
+class ThrusterFault:
+    """A detected fault; ``factor``: remaining share of the thrust (1 for stuck on)."""
 
     thruster: int
     kind: FailureKind
@@ -48,56 +47,59 @@ class Verdict:
 
 
 class ThrusterFaultDetector:
-    """The evidence of the last ticks against the thrusters of one chaser; ``matrix`` (6, n) as of ``wrench_matrix``.
+    """Accumulates the residuals of the last ticks; ``matrix`` (6, n): see ``wrench_matrix``.
 
-    ``information`` (n,): how much the last look told of what every thruster has lost of its thrust, one over variance.
+    ``information`` (n,): inverse variance of every thruster's loss from the last update.
     """
 
-    def __init__(self, matrix: Array, full_N: Array, least_N_s: Array) -> None:
-        self._matrix, self._full_N, self._least_N_s = matrix, full_N, least_N_s
+    def __init__(self, matrix: Array, full_N: Array, min_pulse_N_s: Array) -> None:
+        self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
         self._on: deque[tuple[Array, Array, float]] = deque(maxlen=max(_ON_WINDOWS))
         self._off: list[deque[tuple[Array, Array, float]]] = []
         self.information = np.zeros(len(full_N))
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
-        """Starts anew: something has changed that explains what was seen so far."""
+    def reset(self) -> None:
+        """Discard the residuals: a change explains them."""
         self._on.clear()
         self._off = [deque(maxlen=max(_OFF_WINDOWS)) for _ in self._full_N]
 
-    def look(
-        self, residual: Array, noise: Array, asked_N_s: Array, time_s: float, suspects: Flags
-    ) -> Verdict | None:
-        """One tick's evidence: observed less expected impulse (6,) with its covariance (6, 6), what every thruster was to
-        give (n,) in ``time_s``; ``suspects`` (n,) are the thrusters that may have failed. A verdict, if there is one."""
-        whiten = np.linalg.inv(np.linalg.cholesky(noise))
-        seen = whiten @ residual
-        columns = whiten @ self._matrix
-        extra = self._full_N * time_s - asked_N_s
-        # Per thruster: signature times residual, signature squared; and the residual squared.
-        along, squared = columns.T @ seen, (columns**2).sum(axis=0)
-        energy = float(seen @ seen)
-        self._on.append((extra * along, extra**2 * squared, energy))
-        fired = suspects & (asked_N_s > 0.5 * self._least_N_s)
-        self.information = np.where(fired, asked_N_s**2 * squared, 0.0)
-        for thruster in np.flatnonzero(fired):
-            self._off[thruster].append((-asked_N_s * along, asked_N_s**2 * squared, energy))
-        return self._stuck_on(suspects) or self._lost(np.flatnonzero(fired).tolist(), suspects)
+    def update(
+        self, residual: Array, noise: Array, commanded_N_s: Array, time_s: float, suspects: Flags
+    ) -> ThrusterFault | None:
+        """Add the residual of one tick; return a fault if one is detected.
 
-    def _stuck_on(self, suspects: Flags) -> Verdict | None:
+        ``residual`` (6,): observed minus expected impulse; ``noise`` (6, 6): its covariance; ``commanded_N_s`` (n,):
+        expected impulse of every thruster in ``time_s``; ``suspects`` (n,): thrusters that may have failed.
+        """
+        whiten = np.linalg.inv(np.linalg.cholesky(noise))
+        white = whiten @ residual
+        columns = whiten @ self._matrix
+        extra = self._full_N * time_s - commanded_N_s
+        # Per thruster: signature times residual, and squared signature; and the squared residual.
+        along, squared = columns.T @ white, (columns**2).sum(axis=0)
+        energy = float(white @ white)
+        self._on.append((extra * along, extra**2 * squared, energy))
+        fired = suspects & (commanded_N_s > 0.5 * self._min_pulse_N_s)
+        self.information = np.where(fired, commanded_N_s**2 * squared, 0.0)
+        for thruster in np.flatnonzero(fired):
+            self._off[thruster].append((-commanded_N_s * along, commanded_N_s**2 * squared, energy))
+        return self._detect_stuck_on(suspects) or self._detect_loss(np.flatnonzero(fired).tolist(), suspects)
+
+    def _detect_stuck_on(self, suspects: Flags) -> ThrusterFault | None:
         for length in _ON_WINDOWS:
             if len(self._on) < length:
                 break
             along, squared, energy = (np.sum(x, axis=0) for x in zip(*list(self._on)[-length:], strict=True))
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
-            if _stands_out(gain, best) and _explained(
+            if _is_distinct(gain, best) and _is_consistent(
                 energy, float(2.0 * gain[best]), float(squared[best]), length
             ):
-                return Verdict(best, "stuck_on", 1.0)
+                return ThrusterFault(best, "stuck_on", 1.0)
         return None
 
-    def _lost(self, fired: list[int], suspects: Flags) -> Verdict | None:
+    def _detect_loss(self, fired: list[int], suspects: Flags) -> ThrusterFault | None:
         for thruster in fired:
             evidence = self._off[thruster]
             for length in _OFF_WINDOWS:
@@ -109,27 +111,30 @@ class ThrusterFaultDetector:
                     squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
                 )
                 gain = np.where(suspects, loss * along - loss**2 * squared / 2.0, -math.inf)
-                known = squared[thruster] >= ENOUGH
-                if not known or loss[thruster] < _NOTICEABLE or int(np.argmax(gain)) != thruster:
+                known = squared[thruster] >= SUFFICIENT_INFORMATION
+                if not known or loss[thruster] < _WEAK_LOSS or int(np.argmax(gain)) != thruster:
                     continue
-                if _stands_out(gain, thruster) and _explained(
+                if _is_distinct(gain, thruster) and _is_consistent(
                     energy, float(2.0 * gain[thruster]), float(squared[thruster]), length
                 ):
-                    gone = loss[thruster] > _GONE
-                    return Verdict(
+                    stuck_off = loss[thruster] > _STUCK_OFF_LOSS
+                    return ThrusterFault(
                         thruster,
-                        "stuck_off" if gone else "weak",
-                        0.0 if gone else float(1.0 - loss[thruster]),
+                        "stuck_off" if stuck_off else "weak",
+                        0.0 if stuck_off else float(1.0 - loss[thruster]),
                     )
         return None
 
 
-def _stands_out(gain: Array, best: int) -> bool:
+def _is_distinct(gain: Array, best: int) -> bool:
     others = np.delete(gain, best)
-    return bool(gain[best] > _LIKELIER and gain[best] - others.max(initial=-math.inf) > _CLEARER)
+    return bool(gain[best] > _MIN_GAIN and gain[best] - others.max(initial=-math.inf) > _MIN_MARGIN)
 
 
-def _explained(energy: float, taken: float, squared: float, ticks: int) -> bool:
-    """Whether what a hypothesis leaves of the residuals' ``energy`` is noise: chi-square of 6 a tick, five sigma."""
+def _is_consistent(energy: float, explained: float, squared: float, ticks: int) -> bool:
+    """Return whether the ``energy`` of the residuals less the share that the hypothesis explains is noise.
+
+    Chi-square test with 6 degrees of freedom per tick, five sigma.
+    """
     freedoms = 6.0 * ticks
-    return energy - taken < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _OWN_SCATTER**2 * squared
+    return energy - explained < freedoms + 5.0 * math.sqrt(2.0 * freedoms) + _OWN_SCATTER**2 * squared

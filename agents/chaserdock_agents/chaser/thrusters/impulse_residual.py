@@ -1,4 +1,4 @@
-"""What a chaser's motion says that its thrusters have given, beside what they should have. Pure functions."""
+"""Observed impulse of a chaser and the covariance of its residual to the expected impulse. Pure functions."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from chaserdock_protocol.scenario.odometry import OdometrySection
 
 
 @dataclass(frozen=True)
-class Noise:
-    """One sigma of what makes a healthy chaser's motion differ from what is expected of its thrusters.
+class ImpulseNoise:
+    """Standard deviations of the difference between observed and expected motion of a healthy chaser.
 
-    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of its odometry, each axis. ``scatter``: of a thruster's impulse, in
-    parts of it.
-    ``floor_*``: of the prediction itself (attitude within a tick, rounding), each axis; N s and N m s.
+    ``velocity_m_s``, ``omega_rad_s``, ``attitude_rad``: of the odometry, per axis. ``scatter``: of a thruster's impulse,
+    relative. ``floor_*``: of the prediction (attitude within a tick, rounding), per axis; N s and N m s.
     """
 
     velocity_m_s: float = 0.0
@@ -30,9 +29,9 @@ class Noise:
     floor_N_m_s: float = 2e-4
 
 
-def noise_of(odometry: OdometrySection) -> Noise:
-    """What is to be expected where a scenario says how good the chasers' odometry is."""
-    return Noise(
+def noise_of(odometry: OdometrySection) -> ImpulseNoise:
+    """Return the noise for the odometry errors of a scenario."""
+    return ImpulseNoise(
         odometry.velocity_noise_m_s,
         math.radians(odometry.omega_noise_deg_s),
         math.radians(math.hypot(odometry.attitude_noise_deg, odometry.attitude_bias_deg)),
@@ -40,10 +39,10 @@ def noise_of(odometry: OdometrySection) -> Noise:
 
 
 def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
-    """Impulse and angular impulse (6,), N s and N m s, body axes, that explain the motion between two odometries.
+    """Return impulse and angular impulse (6,), N s and N m s, body axes, from the motion between two odometries.
 
-    Force turns with the body: its impulse is taken in the attitude half way. I omega' + omega x I omega = tau
-    (Euler), with the middle rate.
+    The impulse is expressed in the mean attitude, as force rotates with the body. Torque by Euler's equation
+    I omega' + omega x I omega = tau with the mean rate.
     """
     inertia = np.asarray(body.inertia)
     turn = rotations.log(rotations.multiply(rotations.conjugate(before.q_wxyz), after.q_wxyz))
@@ -57,19 +56,20 @@ def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
 
 
 def covariance(
-    noise: Noise, body: Body, matrix: Array, thrusters_N_s: Array, before: Odometry, after: Odometry
+    noise: ImpulseNoise, body: Body, matrix: Array, thrusters_N_s: Array, before: Odometry, after: Odometry
 ) -> Array:
-    """(6, 6): of observed less expected impulse, when thrusters (n,) were to give ``thrusters_N_s`` (``matrix``: (6, n)).
+    """Return the covariance (6, 6) of observed minus expected impulse.
 
-    The faster it turns, the less the attitude half way says: a quarter of the turn is counted as one sigma.
+    ``thrusters_N_s`` (n,): expected impulses; ``matrix`` (6, n): wrench of unit thrusts. The mean attitude is less
+    accurate at higher rates: a quarter of the rotation is counted as one sigma.
     """
     turned = float(np.linalg.norm(after.omega_rad_s)) * (after.sim_time_ns - before.sim_time_ns) * 1e-9
     relative = noise.scatter**2 + (turned / 4.0) ** 2 + noise.attitude_rad**2
-    return np.diag(at_rest(noise, body)) + (matrix * (relative * thrusters_N_s**2)) @ matrix.T
+    return np.diag(quiescent_variance(noise, body)) + (matrix * (relative * thrusters_N_s**2)) @ matrix.T
 
 
-def at_rest(noise: Noise, body: Body) -> Array:
-    """Variances (6,) of the observed impulse of a body whose thrusters are quiet."""
+def quiescent_variance(noise: ImpulseNoise, body: Body) -> Array:
+    """Return the variances (6,) of the observed impulse of a body whose thrusters are closed."""
     return np.concatenate(
         [
             np.full(3, noise.floor_N_s**2 + 2.0 * (body.mass_kg * noise.velocity_m_s) ** 2),

@@ -9,7 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.command_gate import brake, passed_on, refusal
+from chaserdock_agents.chaser.command_gate import brake_command, passed_on, refusal
 from chaserdock_models import rotations
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.messages import Odometry, WrenchCommand
@@ -47,19 +47,17 @@ def test_a_good_command_is_flown_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
-        ({"chaser": 0}, "it is for chaser 0"),
-        ({"last_tick": 5}, "one for tick 5 was flown already"),
-        ({"last_tick": 9}, "it answers tick 5, and one for tick 9"),
-        ({"now_ns": 800_000_000}, "it expired at 0.800 s, and it is 0.800 s"),
-        ({"now_ns": 900_000_000}, "it expired at 0.800 s, and it is 0.900 s"),
-        ({"force_N": (0.0, -2.03, 0.0)}, "its force of 2.03 N exceeds the body's 2 N"),
-        ({"force_N": (0.0, 0.0, 1e9)}, "its force of 1e+09 N exceeds"),
-        ({"torque_N_m": (0.0, 0.0, -0.0506)}, "its torque of 0.0506 N m exceeds the body's 0.05 N m"),
+        ({"chaser": 0}, "addressed to chaser 0"),
+        ({"last_tick": 5}, "a command for tick 5 was already executed"),
+        ({"last_tick": 9}, "for tick 5, but a command for tick 9"),
+        ({"now_ns": 800_000_000}, "expired at 0.800 s, now 0.800 s"),
+        ({"now_ns": 900_000_000}, "expired at 0.800 s, now 0.900 s"),
+        ({"force_N": (0.0, -2.03, 0.0)}, "force of 2.03 N exceeds the body's 2 N"),
+        ({"force_N": (0.0, 0.0, 1e9)}, "force of 1e+09 N exceeds"),
+        ({"torque_N_m": (0.0, 0.0, -0.0506)}, "torque of 0.0506 N m exceeds the body's 0.05 N m"),
     ],
 )
-def test_a_command_that_must_not_be_flown_is_refused_with_the_reason(
-    changes: dict[str, Any], reason: str
-) -> None:
+def test_invalid_command_is_refused_with_the_reason(changes: dict[str, Any], reason: str) -> None:
     refused = why_not(**changes)
     assert refused is not None
     assert reason in refused
@@ -82,7 +80,7 @@ def test_braking_brings_a_chaser_to_rest_within_its_limits(seed: int) -> None:
             q_wxyz=tuple(x[6:10].tolist()),
             omega_rad_s=tuple(x[10:13].tolist()),
         )
-        command = brake(o, BODY, 77)
+        command = brake_command(o, BODY, 77)
         assert (command.chaser, command.tick, command.effective_time_ns, command.source) == (
             3,
             k,
@@ -101,6 +99,6 @@ def test_braking_brings_a_chaser_to_rest_within_its_limits(seed: int) -> None:
 def test_braking_in_body_axes_pushes_against_the_motion_in_the_world() -> None:
     quarter = rotations.exp([0.0, 0.0, math.pi / 2])
     o = odometry(velocity_m_s=(0.0, 0.03, 0.0), q_wxyz=tuple(quarter.tolist()), omega_rad_s=(0.0, 0.0, 0.0))
-    force = brake(o, BODY, 0).force_N
+    force = brake_command(o, BODY, 0).force_N
     assert force[0] == pytest.approx(-0.3)  # world y is the body's x; 30 kg and three seconds
     np.testing.assert_allclose(force[1:], 0.0, atol=1e-12)

@@ -43,7 +43,7 @@ def test_what_it_is_told_it_acts_upon_at_once(kind: str) -> None:
     assert np.ptp(scale) < 1e-12
     assert 0.5 < scale[0] < 1.0 or kind == "weak"
     assert any(f"thruster 4 {kind.replace('_', ' ')}" in what for _, what, _ in pilot.drain_events())
-    given = pilot.fly(passed_on(wrench(s, 2, 1.0)))
+    given = pilot.add_pulses(passed_on(wrench(s, 2, 1.0)))
     assert (4 in {p.thruster for p in given.pulses}) is False or kind == "weak"
     assert given.isolated == report.isolated
 
@@ -59,14 +59,14 @@ def test_an_operator_isolates_and_restores() -> None:
     pilot = ThrusterController(s, 0)
     pilot.observe(at_rest(s, 0))
     pilot.apply_command(wrench(s, 0, isolated=(3, 200)))  # of a thruster that is not there nothing comes
-    given = pilot.fly(passed_on(wrench(s, 0, 1.5)))
+    given = pilot.add_pulses(passed_on(wrench(s, 0, 1.5)))
     assert given.isolated == (3,)
     assert 3 not in {p.thruster for p in given.pulses}
     report = pilot.observe(at_rest(s, 1))
     assert report.isolated == (3,)
     assert np.all(limits(report) < box(s))
     pilot.apply_command(wrench(s, 1, trusted=(3,)))
-    assert pilot.fly(passed_on(wrench(s, 1))).isolated == ()
+    assert pilot.add_pulses(passed_on(wrench(s, 1))).isolated == ()
     np.testing.assert_allclose(limits(pilot.observe(at_rest(s, 2))), box(s))
 
 
@@ -77,7 +77,7 @@ def test_an_operator_may_trust_a_thruster_that_the_chaser_does_not() -> None:
     pilot = ThrusterController(s, 0)
     assert pilot.observe(at_rest(s, 0)).isolated == (4,)
     pilot.apply_command(wrench(s, 0, trusted=(4,)))
-    pilot.fly(passed_on(wrench(s, 0)))
+    pilot.add_pulses(passed_on(wrench(s, 0)))
     report = pilot.observe(at_rest(s, 1))
     assert report.isolated == ()
     assert report.thrusters[4] == "healthy"
@@ -92,7 +92,7 @@ def test_who_is_held_looks_for_no_failures() -> None:
             pilot.observe(at_rest(s, tick))
             push = wrench(s, tick, free=free, force_N=(1.5 if tick % 10 < 4 else 0.0))
             pilot.apply_command(push)
-            pilot.fly(passed_on(push))
+            pilot.add_pulses(passed_on(push))
         assert free or not pilot.drain_events()
 
 
@@ -112,7 +112,7 @@ def test_what_the_docking_sensor_feels_is_no_thrusters_fault() -> None:
             )
             pilot.observe(moved, touched)
             pilot.apply_command(wrench(s, tick))
-            pilot.fly(passed_on(wrench(s, tick)))
+            pilot.add_pulses(passed_on(wrench(s, tick)))
         assert pilot.isolated == (() if touched else (3,))
 
 
@@ -122,7 +122,7 @@ def test_impulse_given_is_told() -> None:
     total = np.zeros(3)
     for tick in range(31):
         total += pilot.observe(at_rest(s, tick), touched=True).given_impulse_N_s
-        pilot.fly(passed_on(wrench(s, tick, 0.5 if tick < 15 else 0.0)))
+        pilot.add_pulses(passed_on(wrench(s, tick, 0.5 if tick < 15 else 0.0)))
     # A second of 0.5 N; each of the thrusters that push within half of its least pulse, 15 mN s.
     np.testing.assert_allclose(total, [0.5, 0.0, 0.0], atol=0.03)
 
@@ -131,7 +131,7 @@ def test_impulse_under_way_is_told() -> None:
     s = mission(time={"rate_hz": 10, "image_hz": 10})
     pilot = ThrusterController(s, 0)
     assert limits(pilot.observe(at_rest(s, 0))).any()
-    pilot.fly(passed_on(wrench(s, 0, 1.0)))
+    pilot.add_pulses(passed_on(wrench(s, 0, 1.0)))
     # The period that began at 33 ms goes on until 133 ms, when the next command takes effect.
     half = pilot.observe(at_rest(s, 1)).coming_impulse_N_s
     assert 0.0 < half[0] < 0.1

@@ -1,4 +1,4 @@
-"""A chaser without commands: its last plan to the end, then to rest, then clear of the corridor it was in."""
+"""Fallback of a chaser without commands: its modes, and the process that enters and leaves it."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.fallback import (
-    CLEAR_M,
-    Alone,
-    LastWord,
-    at_rest,
-    clear_m,
-    goes_on,
-    planned,
-    target_at,
-    wrench_of,
+    CLEARANCE_MARGIN_M,
+    FallbackState,
+    LastCommand,
+    clearance_m,
+    extrapolate_target,
+    fallback_wrench,
+    interpolate_plan,
+    is_at_rest,
+    next_state,
 )
 from chaserdock_agents.chaser.process import Chaser
 from chaserdock_models import rotations
@@ -82,22 +82,24 @@ def target(
     )
 
 
-def flown(scenario: Scenario, last: LastWord, x: Array, seconds: float) -> tuple[list[Alone], Array]:
+def flown(
+    scenario: Scenario, last: LastCommand, x: Array, seconds: float
+) -> tuple[list[FallbackState], Array]:
     """A rigid body that flies by itself: what it did at every step, and its states (K, 13)."""
-    body, least_m = scenario.chaser, clear_m(scenario, 0)
-    did: list[Alone] = []
-    states, alone = [x], None
+    body, min_distance_m = scenario.chaser, clearance_m(scenario, 0)
+    did: list[FallbackState] = []
+    states, state = [x], None
     for k in range(round(seconds / STEP_S)):
         odometry = moving(x, k * STEP_S)
         effective_ns = odometry.sim_time_ns
-        alone = goes_on(alone, odometry, effective_ns, last, least_m)
-        u = wrench_of(alone, odometry, effective_ns, last, body)
+        state = next_state(state, odometry, effective_ns, last, min_distance_m)
+        u = fallback_wrench(state, odometry, effective_ns, last, body)
         assert np.all(np.abs(u[:3]) <= body.force_max_N * (1 + 1e-9))
         assert np.all(np.abs(u[3:]) <= body.torque_max_N_m * (1 + 1e-9))
         v = x[3:6] + rotations.rotate(x[6:10], u[:3]) / body.mass_kg * STEP_S
         omega = x[10:] + u[3:] / np.asarray(body.inertia) * STEP_S
         x = np.concatenate([x[:3] + v * STEP_S, v, rotations.integrate(x[6:10], omega, STEP_S), omega])
-        did.append(alone)
+        did.append(state)
         states.append(x)
     return did, np.array(states)
 
@@ -106,87 +108,87 @@ def start(position_m: Any = (-1.0, 0.0, 0.0), velocity_m_s: Any = ZERO, omega_ra
     return np.array([*position_m, *velocity_m_s, *Q, *omega_rad_s], dtype=float)
 
 
-def states_of(did: list[Alone]) -> list[str]:
+def states_of(did: list[FallbackState]) -> list[str]:
     """The states in a row, each once."""
-    return [a.state for k, a in enumerate(did) if k == 0 or did[k - 1].state != a.state]
+    return [a.mode for k, a in enumerate(did) if k == 0 or did[k - 1].mode != a.mode]
 
 
-def test_the_plan_is_flown_to_its_end_then_it_brakes_then_it_holds(scenario: Scenario) -> None:
+def test_fallback_flies_the_plan_then_brakes_then_holds(scenario: Scenario) -> None:
     speed = 0.03
-    last = LastWord(straight(speed), target())
+    last = LastCommand(straight(speed), target())
     did, x = flown(scenario, last, start(velocity_m_s=(speed, 0.0, 0.0)), 60.0)
     assert states_of(did) == ["plan", "brake", "hold"]
-    assert [a.state for a in did].count("plan") == STAGES
+    assert [a.mode for a in did].count("plan") == STAGES
     np.testing.assert_allclose(x[STAGES, :3], [-1.0 + 3.0 * speed, 0.0, 0.0], atol=1e-3)
-    rested = next(k for k, a in enumerate(did) if a.state == "hold")
+    rested = next(k for k, a in enumerate(did) if a.mode == "hold")
     assert np.linalg.norm(x[rested, 3:6]) < 0.005
     assert np.linalg.norm(x[-1, :3] - x[rested, :3]) < 0.01  # far enough out: it stays
 
 
-def test_off_its_plan_it_comes_back_to_it(scenario: Scenario) -> None:
+def test_fallback_returns_to_its_plan(scenario: Scenario) -> None:
     x = start((-1.0, 0.02, 0.0), (0.0, 0.0, 0.0))
-    did, states = flown(scenario, LastWord(straight(0.0), target()), x, 2.9)
+    did, states = flown(scenario, LastCommand(straight(0.0), target()), x, 2.9)
     assert states_of(did) == ["plan"]
     assert abs(states[-1, 1]) < 0.016
 
 
-def test_in_its_corridor_it_backs_out_and_goes_with_the_target(scenario: Scenario) -> None:
+def test_fallback_leaves_the_corridor_and_moves_with_the_target(scenario: Scenario) -> None:
     drift = (0.0, 0.01, 0.0)
-    last = LastWord(None, target(0.0, drift))
+    last = LastCommand(None, target(0.0, drift))
     did, x = flown(scenario, last, start((-0.45, 0.0, 0.0), (0.02, 0.0, 0.0)), 90.0)
     assert states_of(did) == ["brake", "hold"]
     away = x[:, :3] - np.outer(np.arange(len(x)) * STEP_S, drift)
-    assert did[-1].distance_m == pytest.approx(clear_m(scenario, 0))
-    assert np.linalg.norm(away[-1]) == pytest.approx(clear_m(scenario, 0), abs=0.01)
+    assert did[-1].distance_m == pytest.approx(clearance_m(scenario, 0))
+    assert np.linalg.norm(away[-1]) == pytest.approx(clearance_m(scenario, 0), abs=0.01)
     assert np.linalg.norm(away, axis=1).min() > 0.35
     np.testing.assert_allclose(x[-1, 3:6], drift, atol=1e-3)
 
 
-def test_it_comes_to_rest_however_it_turned(scenario: Scenario) -> None:
+def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
     did, x = flown(
-        scenario, LastWord(), start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)), 60.0
+        scenario, LastCommand(), start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)), 60.0
     )
     assert states_of(did) == ["brake", "hold"]
     assert did[-1].distance_m is None
-    assert "knows of no target" in did[-1].text()
-    assert at_rest(moving(x[-1], 60.0))
+    assert "the target is unknown" in did[-1].text()
+    assert is_at_rest(moving(x[-1], 60.0))
 
 
-def test_no_state_comes_again(scenario: Scenario) -> None:
+def test_fallback_modes_do_not_return(scenario: Scenario) -> None:
     fast = moving(start(velocity_m_s=(0.1, 0.0, 0.0)), 0.0)
-    for before in (Alone("brake"), Alone("hold", np.zeros(3))):
-        again = goes_on(before, fast, 0, LastWord(straight(0.1), target()), 0.5)
-        assert again.state == before.state
+    for before in (FallbackState("brake"), FallbackState("hold", np.zeros(3))):
+        again = next_state(before, fast, 0, LastCommand(straight(0.1), target()), 0.5)
+        assert again.mode == before.mode
 
 
-def test_a_plan_is_what_it_says_between_its_nodes_and_over_after_them() -> None:
+def test_plan_is_interpolated_and_ends_after_its_last_node() -> None:
     plan = straight(0.1)
-    goal = planned(plan, 250_000_000)
+    goal = interpolate_plan(plan, 250_000_000)
     assert goal is not None
     np.testing.assert_allclose(goal.position_m, [-0.975, 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(goal.velocity_m_s, [0.1, 0.0, 0.0], atol=1e-12)
-    assert planned(plan, 3_000_000_000) is None
-    assert planned(None, 0) is None
-    early = planned(msgspec.structs.replace(plan, sim_time_ns=1_000_000_000), 0)
+    assert interpolate_plan(plan, 3_000_000_000) is None
+    assert interpolate_plan(None, 0) is None
+    early = interpolate_plan(msgspec.structs.replace(plan, sim_time_ns=1_000_000_000), 0)
     assert early is not None
     np.testing.assert_allclose(early.position_m, [-1.0, 0.0, 0.0])
 
 
 @pytest.mark.parametrize("status", ["none", "lost"])
-def test_what_nobody_knows_is_no_place(status: str) -> None:
-    assert target_at(target(status=status), 10**9) is None
-    np.testing.assert_allclose(target_at(target(1.0, (0.0, 0.0, 0.5)), 2 * 10**9), [1.0, 0.0, 1.0])  # type: ignore[arg-type]
+def test_unknown_target_has_no_position(status: str) -> None:
+    assert extrapolate_target(target(status=status), 10**9) is None
+    np.testing.assert_allclose(extrapolate_target(target(1.0, (0.0, 0.0, 0.5)), 2 * 10**9), [1.0, 0.0, 1.0])  # type: ignore[arg-type]
 
 
-def test_clear_is_outside_of_the_keep_out_ball_and_of_the_corridor() -> None:
+def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
     for name in ("fault-drill", "docking-contact"):
         scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
-        assert clear_m(scenario, 0) >= scenario.limits.min_distance_target_m + CLEAR_M
+        assert clearance_m(scenario, 0) >= scenario.limits.min_distance_target_m + CLEARANCE_MARGIN_M
     docking = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
     port = docking.docking.port_of(0)
     assert port is not None
     entry = np.asarray(port.position_m) + np.asarray(port.axis) * (0.35 + docking.docking.entry_m)
-    assert clear_m(docking, 0) > np.linalg.norm(entry)
+    assert clearance_m(docking, 0) > np.linalg.norm(entry)
 
 
 # -- in its process -----------------------------------------------------------------------------------------
@@ -247,7 +249,7 @@ def sources(said: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
     return [(m.source, m.term) for t, m in said if t is topics.ACTUATORS]
 
 
-def test_states_are_named_in_the_log_each_once_and_its_end(chaser: Chaser, scenario: Scenario) -> None:
+def test_lost_controller_triggers_fallback_events_once_per_mode(chaser: Chaser, scenario: Scenario) -> None:
     plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
     tell(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
     tell(chaser, topics.ODOMETRY, at(scenario, 0))
@@ -258,16 +260,16 @@ def test_states_are_named_in_the_log_each_once_and_its_end(chaser: Chaser, scena
         said += tell(chaser, topics.TICK, tick_of(scenario, tick, "", 1))
         said += tell(chaser, topics.ODOMETRY, at(scenario, tick))
     told = [m.what for t, m in said if t is topics.EVENT]
-    assert told == ["alone: plan", "alone: hold"]  # it was at rest when the plan was over
+    assert told == ["fallback: plan", "fallback: hold"]  # it was at rest when the plan was over
     assert [s for s, _ in sources(said)].count("plan") == STAGES - 1
     tell(chaser, topics.TICK, tick_of(scenario, 40, "standby", 2))
     tell(chaser, topics.ODOMETRY, at(scenario, 40))
     said = tell(chaser, topics.WRENCH, command(scenario, 40, "standby", 2))
     assert sources(said) == [("command", 2)]
-    assert "commanded again" in [m.what for t, m in said if t is topics.EVENT]
+    assert "fallback ends" in [m.what for t, m in said if t is topics.EVENT]
 
 
-def test_a_plan_whose_command_never_came_is_not_flown(chaser: Chaser, scenario: Scenario) -> None:
+def test_plan_without_its_command_is_not_executed(chaser: Chaser, scenario: Scenario) -> None:
     tell(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
     tell(chaser, topics.ODOMETRY, at(scenario, 0))
     tell(chaser, topics.PLAN, straight(0.0))
@@ -275,7 +277,7 @@ def test_a_plan_whose_command_never_came_is_not_flown(chaser: Chaser, scenario: 
     assert [s for s, _ in sources(said)] == ["hold"]
 
 
-def test_stale_terms_are_refused_counted_and_told_once(chaser: Chaser, scenario: Scenario) -> None:
+def test_stale_terms_are_refused_counted_and_reported_once(chaser: Chaser, scenario: Scenario) -> None:
     for tick in (1, 2):
         tell(chaser, topics.TICK, tick_of(scenario, tick, "standby", 2))
         tell(chaser, topics.ODOMETRY, at(scenario, tick))
@@ -286,9 +288,7 @@ def test_stale_terms_are_refused_counted_and_told_once(chaser: Chaser, scenario:
     assert sources(tell(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))) == [("command", 2)]
 
 
-def test_who_takes_over_in_the_middle_of_a_tick_is_not_obeyed_twice(
-    chaser: Chaser, scenario: Scenario
-) -> None:
+def test_new_leader_within_a_tick_does_not_repeat_a_command(chaser: Chaser, scenario: Scenario) -> None:
     tell(chaser, topics.TICK, tick_of(scenario, 3, "controller", 1))
     tell(chaser, topics.ODOMETRY, at(scenario, 3))
     assert sources(tell(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]

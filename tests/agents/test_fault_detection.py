@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.thrusters.fault_detection import Flags, ThrusterFaultDetector, Verdict
-from chaserdock_agents.chaser.thrusters.impulse_residual import Noise, covariance, noise_of, observed_impulse
+from chaserdock_agents.chaser.thrusters.fault_detection import Flags, ThrusterFault, ThrusterFaultDetector
+from chaserdock_agents.chaser.thrusters.impulse_residual import (
+    ImpulseNoise,
+    covariance,
+    noise_of,
+    observed_impulse,
+)
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
 from chaserdock_models.wrench_set import wrench_matrix
@@ -22,10 +27,10 @@ class Case:
     """A body whose odometry comes from integrating what its thrusters really give."""
 
     def __init__(
-        self, body: str, seed: int, noise: Noise | None = None, odometry_noise: bool = False
+        self, body: str, seed: int, noise: ImpulseNoise | None = None, odometry_noise: bool = False
     ) -> None:
         self.body: Body = mission(body).chaser
-        self.noise = noise or Noise()
+        self.noise = noise or ImpulseNoise()
         self.matrix, self.full = wrench_matrix(self.body.thrusters), thrusts_max(self.body.thrusters)
         least = self.full * [t.min_on_s for t in self.body.thrusters]
         self.watch = ThrusterFaultDetector(self.matrix, self.full, least)
@@ -53,7 +58,7 @@ class Case:
             omega_rad_s=v[3],
         )
 
-    def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> Verdict | None:
+    def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> ThrusterFault | None:
         self.state = propagate(self.state, self.matrix @ given_N_s / TICK_S, self.body, TICK_S)
         self.tick += 1
         now = self._odometry()
@@ -61,7 +66,7 @@ class Case:
         spread = covariance(self.noise, self.body, self.matrix, asked_N_s, self.last, now)
         self.last = now
         everyone: Flags = np.ones(len(self.full), dtype=np.bool_)
-        return self.watch.look(
+        return self.watch.update(
             residual, spread, asked_N_s, TICK_S, everyone if suspects is None else suspects
         )
 
@@ -96,7 +101,7 @@ def test_stuck_on_is_found_within_three_ticks(body: str, thruster: int) -> None:
         given[thruster] = max(asked[thruster], case.full[thruster] * TICK_S * part)
         if (verdict := case.step(asked, given)) is not None:
             break
-    assert verdict == Verdict(thruster, "stuck_on", 1.0)
+    assert verdict == ThrusterFault(thruster, "stuck_on", 1.0)
 
 
 @pytest.mark.parametrize(
@@ -119,7 +124,7 @@ def test_a_lost_thruster_is_found_after_some_pulses(body: str, thruster: int, le
 
 @pytest.mark.parametrize("seed", range(6))
 def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
-    noise = Noise(velocity_m_s=5e-4, omega_rad_s=5e-4)
+    noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=5e-4)
     case = Case(("tetra12", "slider")[seed % 2], seed, noise, odometry_noise=True)
     for _ in range(1500):
         asked = case.random()
@@ -129,13 +134,13 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
 
 def test_the_scenarios_odometry_is_the_pilots_noise() -> None:
     s = mission(odometry={"velocity_noise_m_s": 0.002, "omega_noise_deg_s": 0.1, "attitude_noise_deg": 0.3})
-    assert noise_of(s.odometry) == Noise(0.002, np.radians(0.1), np.radians(0.3))
-    assert noise_of(mission().odometry) == Noise()
+    assert noise_of(s.odometry) == ImpulseNoise(0.002, np.radians(0.1), np.radians(0.3))
+    assert noise_of(mission().odometry) == ImpulseNoise()
 
 
 @pytest.mark.parametrize("thruster", [0, 4, 8])
 def test_noisy_odometry_takes_longer_and_finds_the_same(thruster: int) -> None:
-    noise = Noise(velocity_m_s=5e-4, omega_rad_s=5e-4)
+    noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=5e-4)
     case = Case("tetra12", thruster, noise, odometry_noise=True)
     verdict = None
     for _ in range(7):  # half a second, less the latency
@@ -143,7 +148,7 @@ def test_noisy_odometry_takes_longer_and_finds_the_same(thruster: int) -> None:
         given[thruster] = case.full[thruster] * TICK_S
         if (verdict := case.step(np.zeros(12), given)) is not None:
             break
-    assert verdict == Verdict(thruster, "stuck_on", 1.0)
+    assert verdict == ThrusterFault(thruster, "stuck_on", 1.0)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -27,12 +27,12 @@ class Bench:
         self.full = thrusts_max(chaser.thrusters)
         self.allocator = allocator_of(chaser)
         self.least = self.full * [t.min_on_s for t in chaser.thrusters]
-        self.proof = ThrusterSelfTest(self.allocator, self.least, every_s, enough=200.0)
+        self.self_test = ThrusterSelfTest(self.allocator, self.least, every_s, sufficient=200.0)
         self.able = np.ones(len(self.full), dtype=np.bool_)
 
     def burn(self, now_ns: int, can: Array | None = None, asked: Array | None = None) -> Array | None:
         can, asked = self.full if can is None else can, 0.0 * self.full if asked is None else asked
-        return self.proof.burn(now_ns, self.able & (can > 0.0), can, asked, PERIOD_S)
+        return self.self_test.schedule(now_ns, self.able & (can > 0.0), can, asked, PERIOD_S)
 
 
 @pytest.mark.parametrize("body", ["tetra12", "slider"])
@@ -49,7 +49,7 @@ def test_burns_cancel_and_reach_every_thruster_and_then_there_is_peace(body: str
         assert lost is None or impulses[lost] == 0.0
         fired = impulses >= 0.5 * bench.least
         assert fired.sum() >= 2  # what cancels it is not too little to fire
-        bench.proof.heard(np.where(fired, 150.0, 0.0), now_ns)
+        bench.self_test.add_information(np.where(fired, 150.0, 0.0), now_ns)
         tested = np.union1d(tested, np.flatnonzero(fired))
         now_ns, burns = now_ns + S // 2, burns + 1
         assert burns <= 2 * len(can)
@@ -61,23 +61,23 @@ def test_burns_cancel_and_reach_every_thruster_and_then_there_is_peace(body: str
 
 def test_one_look_is_no_proof_and_neither_are_poor_ones() -> None:
     bench = Bench()
-    assert bench.proof.unproved(0).all()
-    bench.proof.heard(np.full(12, 1e6), 0)
-    assert bench.proof.unproved(0).all()
-    bench.proof.heard(np.full(12, 1.0), 1)
-    assert not bench.proof.unproved(1).any()
+    assert bench.self_test.untested(0).all()
+    bench.self_test.add_information(np.full(12, 1e6), 0)
+    assert bench.self_test.untested(0).all()
+    bench.self_test.add_information(np.full(12, 1.0), 1)
+    assert not bench.self_test.untested(1).any()
     noisy = Bench()
     for k in range(5):
-        noisy.proof.heard(np.full(12, 30.0), k)
-    assert noisy.proof.unproved(5).all()
+        noisy.self_test.add_information(np.full(12, 30.0), k)
+    assert noisy.self_test.untested(5).all()
 
 
 @pytest.mark.parametrize("every_s", [0.0, 10.0])
 def test_what_is_old_is_forgotten_though_nobody_asks(every_s: float) -> None:
     bench = Bench(every_s=every_s)
     for k in range(1000):
-        bench.proof.heard(np.full(12, 1.0), k * S)
-    assert max(map(len, bench.proof._heard)) <= every_s + 1
+        bench.self_test.add_information(np.full(12, 1.0), k * S)
+    assert max(map(len, bench.self_test._observations)) <= every_s + 1
 
 
 def test_burns_are_apart_and_only_where_there_is_room() -> None:
@@ -97,7 +97,7 @@ def fired(odometry: dict[str, float] | None = None, chaser: Any = None, **comman
         pilot.observe(at_rest(s, tick))
         command = wrench(s, tick, **command_as)
         pilot.apply_command(command)
-        out |= {p.thruster for p in pilot.fly(passed_on(command)).pulses}
+        out |= {p.thruster for p in pilot.add_pulses(passed_on(command)).pulses}
     return out
 
 
@@ -122,6 +122,6 @@ def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -
     """Thruster 11 of tetra12 is not used at the paper's rates: without tests nobody learns that it is gone."""
     failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
     record = fly(mission(duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]))[0]
-    told = [what for _, what in record.events if "limits" not in what]
-    assert told == (["thruster 11 stuck off: found, isolated"] if finds else [])
+    reports = [what for _, what in record.events if "limits" not in what]
+    assert reports == (["thruster 11 stuck off: detected, isolated"] if finds else [])
     assert max(np.array(record.position_m)[np.array(record.time_s) > 8.0]) < 0.05

@@ -21,7 +21,7 @@ from chaserdock.cli.main import app
 from chaserdock.launch import json_events
 
 sys.path.insert(0, str(Path(__file__).parent))
-from make_protocol import doc_of, words_of
+from make_protocol import describe, doc_of
 
 PAGE = Path(__file__).with_name("cli.md")
 
@@ -108,7 +108,7 @@ def fields(kind: type[msgspec.Struct]) -> list[str]:
     assert isinstance(shape, msgspec.inspect.StructType)
     rows = ["| field | type |", "| --- | --- |"]
     for field in shape.fields:
-        words = "object" if isinstance(field.type, msgspec.inspect.DictType) else words_of(field.type)
+        words = "object" if isinstance(field.type, msgspec.inspect.DictType) else describe(field.type)
         rows.append(f"| `{field.encode_name}` | {words} |")
     return [*rows, ""]
 

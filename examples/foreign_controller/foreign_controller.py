@@ -92,7 +92,7 @@ class Target:
         self.q = unit(multiply(self.q, exp(tuple(dt * w for w in self.omega))))
         return dt
 
-    def see(self, time_s, position, q):
+    def update(self, time_s, position, q):
         if self.time_s is None:
             self.time_s, self.position, self.q = time_s, position, q
             self.velocity = self.omega = (0.0, 0.0, 0.0)
@@ -168,7 +168,7 @@ class Controller:
         self.session.put(key, msgpack.packb(fields), encoding=encoding(kind), timestamp=stamp)
 
     def join(self):
-        """Asks the world to take part, until it answers; the resolved scenario."""
+        """Send join requests until the world replies; return the resolved scenario."""
         request = msgpack.packb({"process": NAME, "instance": self.instance})
         while True:
             for answer in self.session.get(
@@ -182,7 +182,7 @@ class Controller:
             time.sleep(0.1)
 
     def listen(self):
-        """Subscribes; presence last, so that whoever hears ours can reach all the others."""
+        """Subscribe; presence last, so that a process that receives ours can reach all other subscriptions."""
         self.token = self.session.liveliness().declare_token(f"live/{NAME}")
         keys = ("world/tick", "world/end", "world/chaser/*/odometry", "chaser/*/sighting", "**/presence")
         self.subscribers = [
@@ -192,10 +192,10 @@ class Controller:
             for key in keys
         ]
         self.over = threading.Event()
-        self.heartbeat = threading.Thread(target=self.tell_presence, daemon=True)
+        self.heartbeat = threading.Thread(target=self.publish_presence, daemon=True)
         self.heartbeat.start()
 
-    def tell_presence(self):
+    def publish_presence(self):
         while not self.over.wait(0.05):
             self.publish(
                 f"{NAME}/presence", "Presence", process=NAME, instance=self.instance, heard=dict(self.heard)
@@ -227,7 +227,7 @@ class Controller:
                 self.answer(scenario, tick, target, odometry, sightings if tick["images"] else {})
                 done = now
         self.over.set()
-        self.heartbeat.join()  # what it still says is to be in the counts
+        self.heartbeat.join()  # its last messages belong to the counts
         counts = {key: n + 1 for key, n in self.seq.items()}
         time_ns = tick["sim_time_ns"] if tick else 0
         self.publish(
@@ -239,7 +239,7 @@ class Controller:
         now_s, latency_s = tick["sim_time_ns"] / 1e9, scenario["time"]["latency_s"]
         for i, sighting in sorted(sightings.items()):
             if i in odometry and sighting["solutions"]:
-                target.see(now_s, *seen_pose(scenario, odometry[i], sighting["solutions"][0]))
+                target.update(now_s, *seen_pose(scenario, odometry[i], sighting["solutions"][0]))
         known = target.time_s is not None
         if known:
             target.predict(now_s)
@@ -276,7 +276,7 @@ class Controller:
             accepted=[],
             rejected=[],
         )
-        # Last: its arrival tells the recorder that it has all of this tick.
+        # Last: it marks the end of this tick's messages for the recorder.
         nothing = {"chasers": [], "status": [], "iterations": [], "cost": [], "max_violation_m": []}
         self.publish(f"{NAME}/solver", "SolverStatus", **head, solver="foreign-pd", **nothing)
 

@@ -1,4 +1,4 @@
-"""The image is built and a short mission flown by Compose, where a Docker engine is; compose.yaml is checked anywhere."""
+"""Compose builds the image and flies a short mission, where a Docker engine runs; compose.yaml is checked everywhere."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_short_mission_by_compose(clone: Path) -> None:
     assert image["Config"]["User"] not in ("", "root", "0")
 
 
-def test_a_container_mounts_its_own_keys_alone() -> None:
+def test_container_mounts_only_its_own_keys() -> None:
     """Secrets: every service but the router, which makes them, sees one volume of keys, and that read-only."""
     service, mounts = "", {}
     for line in (ROOT / "compose.yaml").read_text(encoding="utf-8").splitlines():
@@ -104,7 +104,7 @@ def test_a_container_mounts_its_own_keys_alone() -> None:
         assert mounted == [(owner, "/keys:ro")], service
 
 
-def test_the_image_has_a_folder_for_everyones_keys() -> None:
+def test_image_has_a_key_folder_per_process() -> None:
     """A volume takes over the mode of the folder that it is mounted on; without one only root could write there."""
     found = re.search(
         r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
@@ -118,7 +118,7 @@ def test_the_image_has_a_folder_for_everyones_keys() -> None:
     }
 
 
-def test_only_the_viewers_page_is_published_and_on_the_loopback_alone() -> None:
+def test_only_the_viewer_is_published_and_on_loopback_only() -> None:
     text = (ROOT / "compose.yaml").read_text(encoding="utf-8")
     assert not re.search(r"^\s*(network_mode|privileged|container_name)\s*:", text, re.MULTILINE)
     published = re.findall(r"^\s*ports\s*:.*$", text, re.MULTILINE)

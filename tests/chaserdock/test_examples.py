@@ -1,4 +1,4 @@
-"""The worked examples of docs/extend.md fly: an own perception, an own solver, and a controller that is none of ours."""
+"""The examples of docs/extend.md fly: a perception plugin, a solver plugin, and a foreign controller."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def install(example: Path, folder: Path) -> dict[str, str]:
         ("pd_controller", ("controller.solver=pd",)),
     ],
 )
-def test_a_part_of_ones_own_flies_to_success(example: str, part: tuple[str, ...], tmp_path: Path) -> None:
+def test_plugin_flies_to_success(example: str, part: tuple[str, ...], tmp_path: Path) -> None:
     parts = tmp_path / "parts"
     parts.mkdir()
     env = install(EXAMPLES / example, parts)
@@ -64,14 +64,14 @@ def test_a_part_of_ones_own_flies_to_success(example: str, part: tuple[str, ...]
     assert summary(tmp_path / "run")["success"]
 
 
-def test_a_part_that_is_not_installed_is_named(tmp_path: Path) -> None:
+def test_missing_plugin_is_named(tmp_path: Path) -> None:
     status, said = run("single", tmp_path, "controller.solver=pd", timeout_s=60)
     assert status != 0
     assert "'pd'" in said
     assert "chaserdock.solvers" in said
 
 
-def test_the_pages_estimator_is_deaf_to_few_markers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_estimator_of_the_docs_ignores_few_markers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     page = (ROOT / "docs" / "extend.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     (tmp_path / "three_markers.py").write_text(code)
@@ -91,7 +91,7 @@ def test_the_pages_estimator_is_deaf_to_few_markers(tmp_path: Path, monkeypatch:
     np.testing.assert_allclose(found.position_m, pose.position_m)
 
 
-def test_foreign_controller_imports_nothing_of_ours() -> None:
+def test_foreign_controller_imports_only_zenoh_and_msgpack() -> None:
     tree = ast.parse(FOREIGN.read_text())
     names = {alias.name for n in ast.walk(tree) if isinstance(n, ast.Import) for alias in n.names}
     assert not [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]

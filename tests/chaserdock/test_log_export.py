@@ -1,4 +1,4 @@
-"""What is read out of a finished log: tables, typed messages, tracks."""
+"""Tables, typed messages and tracks of a finished log."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_exported_files_hold_every_message_with_units(tmp_path: Path) -> None:
         export(GOLDEN, tmp_path / "csv", "csv")
 
 
-def test_open_log_gives_typed_messages_by_topic() -> None:
+def test_open_log_iterates_typed_messages_by_topic() -> None:
     log = open_log(GOLDEN)
     assert log.scenario.name == "two-chaser-tracking"
     assert [type(x) for x in log.messages(topics.TARGET)] == [m.TargetEstimate] * 18
@@ -121,7 +121,7 @@ def test_tracks_are_the_poses_in_tum_order(tmp_path: Path) -> None:
 @pytest.mark.skipif(
     shutil.which("evo_ape") is None, reason="evo is a check from outside (GPL), not a dependency"
 )
-def test_evo_finds_our_errors(tmp_path: Path) -> None:
+def test_errors_equal_those_of_evo(tmp_path: Path) -> None:
     write_tracks(GOLDEN, tmp_path)
     errors = estimate_errors(load_flight(GOLDEN))
     for relation, ours in (("trans_part", errors["position_m"]), ("angle_rad", errors["orientation_rad"])):

@@ -1,4 +1,4 @@
-"""What is done with a finished log: damage and repair, viewers, old versions."""
+"""Finished logs: damage and repair, the viewer layer, schema migrations."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def raws(log: Path) -> list[tuple[RawSample, Any]]:
         found = topics.topic_of_key(channel.topic)
         assert found is not None
         raw = RawSample(channel.topic, channel.metadata["zenoh_encoding"], stored.data, stored.publish_time)
-        out.append((raw, codec.decode(found[0].kind, stored.data)))
+        out.append((raw, upgrades.decode_logged(found[0].kind, raw.payload, raw.encoding)))
     return out
 
 
@@ -61,7 +61,7 @@ def recorded(folder: Path, rotation: Rotation = ONE_FILE, viewer: bool = True, r
 # -- viewer layer -----------------------------------------------------------------------------------------
 
 
-def test_viewer_layer_leaves_the_verbatim_one_alone(tmp_path: Path) -> None:
+def test_viewer_layer_does_not_change_the_verbatim_layer(tmp_path: Path) -> None:
     with_layer, without = recorded(tmp_path / "a"), recorded(tmp_path / "b", viewer=False)
     assert [r.message for r in read_log(with_layer)] == [r.message for r in read_log(without)]
     assert count_messages(with_layer) == count_messages(without) == count_messages(GOLDEN)
@@ -72,7 +72,7 @@ def test_viewer_layer_leaves_the_verbatim_one_alone(tmp_path: Path) -> None:
     assert grown < 0.25 * images
 
 
-def test_viewers_get_schemas_images_and_frames(tmp_path: Path) -> None:
+def test_viewer_layer_has_schemas_images_and_frames(tmp_path: Path) -> None:
     path = recorded(tmp_path) / "mission.mcap"
     images = {
         (r.message.chaser, r.message.sim_time_ns): r.message.data
@@ -127,7 +127,7 @@ def test_rotation_by_size_keeps_every_message(tmp_path: Path) -> None:
         list(read_log(folder))
 
 
-def test_a_folder_with_a_log_is_not_recorded_into(tmp_path: Path) -> None:
+def test_folder_with_a_log_is_rejected(tmp_path: Path) -> None:
     recorded(tmp_path)
     with pytest.raises(LogError, match="holds a log already; a log is never overwritten"):
         recorded(tmp_path, Rotation(seconds=1.0))
@@ -148,7 +148,7 @@ def files_at_most(size: int) -> Iterator[None]:
 
 
 @pytest.mark.parametrize("size", [1000, 60_000, 333_333, 3_000_000])
-def test_a_full_disk_is_told_and_what_fits_stays_readable(tmp_path: Path, size: int) -> None:
+def test_full_disk_is_an_error_and_written_chunks_stay_readable(tmp_path: Path, size: int) -> None:
     with (
         files_at_most(size),
         pytest.raises(LogError, match=r"mission.mcap: cannot be written: File too large"),
@@ -163,7 +163,7 @@ def test_a_full_disk_is_told_and_what_fits_stays_readable(tmp_path: Path, size: 
     assert size < 2_000_000 or kept  # a chunk is 1 MB at most
 
 
-def test_closing_on_a_full_disk_is_told(tmp_path: Path) -> None:
+def test_closing_on_a_full_disk_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path, lambda: 0.0)
     writer.write("recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=1)), 1)
@@ -172,11 +172,11 @@ def test_closing_on_a_full_disk_is_told(tmp_path: Path) -> None:
     assert list(read_log(path)) == []
 
 
-def test_flipped_bytes_are_told_or_change_nothing_and_the_rest_is_recovered(tmp_path: Path) -> None:
+def test_flipped_bytes_are_detected_or_harmless_and_the_rest_is_recovered(tmp_path: Path) -> None:
     path, out = recorded(tmp_path / "r", repeat=4) / "mission.mcap", tmp_path / "out.mcap"
     data, expected = path.read_bytes(), [r.message for r in read_log(path)]
     scenario = read_scenario(path)
-    rng, told = np.random.default_rng(5), 0
+    rng, detected = np.random.default_rng(5), 0
     for place in [
         0,
         8,
@@ -192,7 +192,7 @@ def test_flipped_bytes_are_told_or_change_nothing_and_the_rest_is_recovered(tmp_
             assert [r.message for r in read_log(path)] == expected, place
             assert read_scenario(path) == scenario
         except LogError:
-            told += 1
+            detected += 1
             if place < 8:
                 continue  # no log at all, by its first bytes
             found = recover(path, out)
@@ -203,7 +203,7 @@ def test_flipped_bytes_are_told_or_change_nothing_and_the_rest_is_recovered(tmp_
             lost = found.broken_records + found.messages_without_channel + found.skipped_bytes
             assert lost > 0 or saved == expected
             out.unlink()
-    assert told > 30
+    assert detected > 30
 
 
 def test_cut_anywhere_and_recovered(tmp_path: Path) -> None:
@@ -231,7 +231,7 @@ def test_cut_anywhere_and_recovered(tmp_path: Path) -> None:
     assert set(refused) <= {"holds no whole message", "no MCAP log"}
 
 
-def test_lost_messages_are_noticed_without_a_checksum(tmp_path: Path) -> None:
+def test_lost_chunk_is_detected_without_a_checksum(tmp_path: Path) -> None:
     """A chunk that is cut out of a log whose writer was killed leaves a gap in the channels' numbering."""
     path, ends = tmp_path / "a.mcap", []
     writer = LogWriter(path, lambda: 0.0)
@@ -246,7 +246,7 @@ def test_lost_messages_are_noticed_without_a_checksum(tmp_path: Path) -> None:
         list(read_log(path))
 
 
-def test_log_verbs(tmp_path: Path) -> None:
+def test_log_commands(tmp_path: Path) -> None:
     log, cut = tmp_path / "a.mcap", tmp_path / "cut.mcap"
     shutil.copy(GOLDEN, log)
     status, said = finished("log", "info", str(log))
@@ -268,7 +268,7 @@ def test_log_verbs(tmp_path: Path) -> None:
 # -- versions ---------------------------------------------------------------------------------------------
 
 
-def test_messages_of_an_older_version_are_upgraded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_of_older_versions_are_migrated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As if two versions ago odometry had had its attitude scalar last and its rate in degrees: it reads as today's."""
     path = tmp_path / "old.mcap"
     now: Any = BY_TYPE[m.Odometry]
@@ -305,7 +305,7 @@ def test_messages_of_an_older_version_are_upgraded(tmp_path: Path, monkeypatch: 
         codec.decode(m.Odometry, msgspec.msgpack.encode(old), "application/msgpack;chaserdock.Odometry.v1")
 
 
-def test_upgraded_messages_are_checked_like_any_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_migrated_messages_are_validated(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(m.VERSION, m.RecorderAck, 2)
     payload = codec.encode(m.RecorderAck(tick=3))
     for made in ({"tick": "three"}, {"tick": -2}, {}, {"tick": 1}):
@@ -325,7 +325,7 @@ def test_upgraded_messages_are_checked_like_any_other(monkeypatch: pytest.Monkey
             upgrades.decode_logged(m.RecorderAck, payload, encoding)
 
 
-def test_info_counts_what_is_lost_and_refused(tmp_path: Path) -> None:
+def test_info_counts_lost_and_rejected_messages(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     scenario, run = read_scenario(GOLDEN)
     writer = LogWriter(path)

@@ -1,4 +1,4 @@
-"""A mission's bodies drawn from outside, with OpenCV: flat faces, ordered by depth (the painter's way)."""
+"""External view of a mission, drawn with OpenCV: flat faces in order of depth (painter's algorithm)."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _TARGET_PATH = (150, 150, 150)
 
 
 def tint(chaser: int) -> Array:
-    """A chaser's colour (3,), BGR, 0 to 255: that of the figures, lighter for the dark sky."""
+    """Return a chaser's colour (3,), BGR, 0 to 255: that of the figures, lightened for the dark background."""
     rgb = np.array(to_rgb(colour(chaser)))
     return (255.0 * (0.78 * rgb + 0.22))[::-1]
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """A camera that looks at ``centre_m`` (WRF) from ``distance_m`` away: azimuth and elevation in the world, radians."""
+    """A camera aimed at ``centre_m`` (WRF) from a distance of ``distance_m``: azimuth and elevation in WRF, radians."""
 
     centre_m: Array
     distance_m: float
@@ -43,15 +43,15 @@ class Viewpoint:
     height_px: int
 
     def axes(self) -> Array:
-        """Right, up and towards the viewer (3, 3), rows in WRF."""
+        """Return the camera axes right, up and backwards (3, 3), rows in WRF."""
         ca, sa = np.cos(self.azimuth_rad), np.sin(self.azimuth_rad)
         ce, se = np.cos(self.elevation_rad), np.sin(self.elevation_rad)
         back = np.array([ce * ca, ce * sa, se])
         right = np.array([-sa, ca, 0.0])
         return np.stack([right, np.cross(back, right), back])
 
-    def see(self, points_m: Array) -> tuple[Array, Array]:
-        """Pixels (..., 2) and depths (...) in metres of points (..., 3) in WRF; behind the viewer pixels mean nothing."""
+    def project(self, points_m: Array) -> tuple[Array, Array]:
+        """Return pixels (..., 2) and depths (...) in metres of points (..., 3) WRF; pixels are invalid at depths <= 0."""
         local = (points_m - self.centre_m) @ self.axes().T
         depth = self.distance_m - local[..., 2]
         focal = 1.25 * min(self.width_px, 1.35 * self.height_px)
@@ -61,7 +61,7 @@ class Viewpoint:
 
 
 def _fixed(px: Array) -> NDArray[np.int32]:
-    # OpenCV's fixed-point coordinates overflow far outside; nothing there is seen anyway.
+    # Clip points far outside the image: OpenCV's fixed-point coordinates overflow.
     return np.round(np.clip(px, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
 
 
@@ -72,7 +72,7 @@ def _fill(image: Pixels, px: Array, bgr: Array) -> None:
 def _lines(
     image: Pixels, view: Viewpoint, points_m: Array, bgr: Sequence[float], closed: bool = False
 ) -> None:
-    px, depth = view.see(points_m)
+    px, depth = view.project(points_m)
     if len(px) > 1 and np.all(depth > _NEAR_M):
         cv2.polylines(image, [_fixed(px)], closed, bgr, 1, cv2.LINE_AA, _SHIFT)
 
@@ -86,10 +86,10 @@ def draw(
     paths: dict[int | None, Array],
     seeing: frozenset[int],
 ) -> Pixels:
-    """The image (height, width, 3), BGR, of target and chasers.
+    """Draw target and chasers into an image (height, width, 3), BGR.
 
     ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
-    under None. ``seeing``: chasers whose image was used; their cameras' outlines are brighter.
+    under None. ``seeing``: chasers whose image was used; their camera frustums are brighter.
     """
     image = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
     for body, points in paths.items():
@@ -109,13 +109,13 @@ def draw(
                 visible.append((float(np.linalg.norm(away)), position, attitude, face, corners, light, hue))
     visible.sort(key=lambda item: -item[0])
     for _, position, attitude, face, corners, light, hue in visible:
-        px, depth = view.see(corners)
+        px, depth = view.project(corners)
         if np.any(depth <= _NEAR_M):
             continue
         bgr = np.full(3, float(face.grey)) if hue is None else hue * (0.3 + 0.75 * face.grey / 128.0)
         _fill(image, px, bgr * light)
         for quad, grey in face.decals:
-            px, _ = view.see(rotations.rotate(attitude, quad) + position)
+            px, _ = view.project(rotations.rotate(attitude, quad) + position)
             _fill(image, px, np.full(3, grey * light))
     for i, (position, attitude) in chasers.items():
         strength = 1.0 if i in seeing else 0.4
@@ -125,7 +125,7 @@ def draw(
         for corner in far:
             _lines(image, view, np.stack([origin, corner]), bgr)
         _lines(image, view, far, bgr, closed=True)
-        (x, y), _ = view.see(position)
-        place = (round(float(np.clip(x, -1e4, 1e4))) + 22, round(float(np.clip(y, -1e4, 1e4))) - 20)
-        cv2.putText(image, str(i), place, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
+        (x, y), _ = view.project(position)
+        label_px = (round(float(np.clip(x, -1e4, 1e4))) + 22, round(float(np.clip(y, -1e4, 1e4))) - 20)
+        cv2.putText(image, str(i), label_px, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
     return image

@@ -1,4 +1,4 @@
-"""Growing tables of numbers, eight bytes each; a long flight's lie in a temporary file, and not in memory."""
+"""Growing tables of 8-byte numbers. Large tables are stored in a temporary file."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError
 from numpy.typing import NDArray
 
-# A megabyte; two minutes of a body's motion are half of it.
-_HELD = 1 << 17
+# Numbers held in memory: 1 MB, twice the motion of one body over two minutes.
+_MAX_IN_MEMORY = 1 << 17
 
 
 class Columns:
-    """Rows of ``width`` numbers. What goes beyond a megabyte is put into a temporary file (in ``TMPDIR``).
+    """Rows of ``width`` numbers. Data beyond 1 MB moves to a temporary file (in ``TMPDIR``).
 
-    Raises ChaserdockError where that file cannot be written.
+    Methods raise ChaserdockError when that file cannot be written.
     """
 
     def __init__(self, width: int) -> None:
@@ -29,45 +29,45 @@ class Columns:
         self._file: IO[bytes] | None = None
 
     def add(self, *groups: Iterable[float]) -> None:
-        """Adds a row, its numbers in groups."""
+        """Add a row, given as groups of numbers."""
         for group in groups:
             self._data.extend(group)
-        if len(self._data) >= _HELD:
-            self._put_away()
+        if len(self._data) >= _MAX_IN_MEMORY:
+            self._spill()
 
-    def _put_away(self) -> None:
+    def _spill(self) -> None:
         try:
             if self._file is None:
-                # Unbuffered: what is mapped must have reached the file.
+                # Unbuffered: the memory map must see all data.
                 self._file = tempfile.TemporaryFile(prefix="chaserdock-", buffering=0)  # noqa: SIM115
             rest = memoryview(self._data).cast("B")
             while rest:
                 rest = rest[self._file.write(rest) :]
         except OSError as error:
             raise ChaserdockError(
-                f"{tempfile.gettempdir()}: cannot hold the flight's tables: {error.strerror or error}; "
-                "TMPDIR can name another folder"
+                f"{tempfile.gettempdir()}: cannot store the tables of the flight: {error.strerror or error}; "
+                "TMPDIR selects another folder"
             ) from None
         self._data = array("d")
 
     def table(self) -> Array:
-        """All rows (K, width), not to be written to; nothing may be added afterwards. Raises ValueError for a torn row.
+        """Return all rows (K, width), read-only; no row may be added afterwards. Raise ValueError for an incomplete row.
 
-        A long table is read from its file as it is used, and takes memory for as long as it, or a part of it, is held.
+        A large table is mapped from its file and occupies memory while it, or a part of it, is referenced.
         """
         if self._file is None:
             return np.frombuffer(self._data, dtype=float).reshape(-1, self.width)
         if self._data:
-            self._put_away()
+            self._spill()
         mapped = mmap.mmap(self._file.fileno(), 0, prot=mmap.PROT_READ)
         return np.frombuffer(mapped, dtype=float).reshape(-1, self.width)
 
 
 def nanoseconds(time_s: Array) -> NDArray[np.int64]:
-    """Times in whole nanoseconds; exact for what was whole nanoseconds and is below 104 days."""
+    """Convert seconds to integer nanoseconds, exact up to 104 days."""
     return np.rint(time_s * 1e9).astype(np.int64)
 
 
 def rows_since(time_ns: NDArray[np.int64], at_ns: NDArray[np.int64]) -> NDArray[np.intp]:
-    """For each of ``at_ns`` the last row of the rising ``time_ns`` that is not later; -1 where there is none."""
+    """Return for each of ``at_ns`` the last row of the ascending ``time_ns`` that is not later, or -1."""
     return np.searchsorted(time_ns, at_ns, side="right") - 1

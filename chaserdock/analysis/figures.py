@@ -1,7 +1,7 @@
-"""Figures of a recorded flight, one function each: the paper's figures and what explains them.
+"""Figures of a recorded flight, one function each: the paper's figures and diagnostics.
 
-A figure is drawn from what the log holds; where that is not enough the function raises ``Nothing`` with the reason.
-Errors are measured on ground truth, as in ``summary``. Chasers keep their colour through all figures.
+A function raises ``MissingData`` when the log lacks what it needs. Errors refer to ground truth, as in ``summary``. A
+chaser has the same colour in all figures.
 """
 
 from __future__ import annotations
@@ -18,59 +18,62 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from .camera_figures import cameras, consistency, estimate, latency, solver
-from .flight import Flight, Track, load_flight
+from .flight import RecordedFlight, Track, load_flight
 from .plots import (
     AXES_XYZ,
     FAINT,
     LIMIT,
-    Nothing,
+    SERIES,
+    MissingData,
     colour,
     dashes,
-    few,
+    decimated,
+    decimation,
     legend_above,
     limit_line,
     new_figure,
     save,
-    step_of,
     styled,
 )
-from .summary import tracking_errors
-from .time_series import Traces, load_traces
+from .summary import estimate_errors, known_estimates, tracking_errors
+from .time_series import OUTCOMES, ImageOutcome, ImageOutcomes, Traces, load_traces
 
 
-def flown(flight: Flight) -> list[int]:
-    """Chasers whose motion is in the log; raises Nothing when there are none, or no target."""
+def flown(flight: RecordedFlight) -> list[int]:
+    """Return the chasers whose motion is in the log. Raise MissingData without any, or without target."""
     if "target" not in flight.truth:
-        raise Nothing("the log holds no ground truth of the target")
+        raise MissingData("the log holds no ground truth of the target")
     numbers = [i for i in range(len(flight.scenario.chasers)) if f"chaser/{i}" in flight.truth]
     if not numbers:
-        raise Nothing("the log holds no ground truth of any chaser")
+        raise MissingData("the log holds no ground truth of any chaser")
     return numbers
 
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
-    """A chaser's positions as many as are drawn, the last among them: WRF, and in the target's axes from its centre."""
+    """Return the drawn positions of a chaser, including the last one: WRF, and relative to the target in TRF."""
     n = min(len(own.time_s), len(target.time_s))
-    rows = np.unique(np.append(np.arange(n)[few(n)], n - 1))
+    rows = np.unique(np.append(np.arange(n)[decimated(n)], n - 1))
     position = own.position_m[rows]
     return position, rotations.rotate_inverse(target.q_wxyz[rows], position - target.position_m[rows])
 
 
-def trajectories(flight: Flight, _: Traces) -> Figure:
+def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     target = flight.truth["target"]
     paths = {i: _path(flight.truth[f"chaser/{i}"], target) for i in numbers}
     figure = Figure(figsize=(9.6, 4.6))
-    for place, title in enumerate(("In the world (WRF)", "Relative to the target, in its axes (TRF)")):
+    for place, title in enumerate(("World frame (WRF)", "Relative to the target, target frame (TRF)")):
         axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
         if place:
             axes.scatter(0.0, 0.0, 0.0, color=FAINT, marker="s", s=28, label="target")
         else:
             axes.plot(
-                *target.position_m[few(len(target.time_s))].T, color=FAINT, linewidth=1.6, label="target"
+                *target.position_m[decimated(len(target.time_s))].T,
+                color=FAINT,
+                linewidth=1.6,
+                label="target",
             )
         for i in numbers:
             p = paths[i][place]
@@ -90,14 +93,14 @@ def trajectories(flight: Flight, _: Traces) -> Figure:
     return figure
 
 
-def _mark_phases(axes: Axes, flight: Flight, words: bool) -> None:
-    """Thin lines where a chaser changes phase, after the first; its name on top, once."""
-    told: dict[tuple[float, str], None] = {}
-    for what in flight.told.values():
-        told |= dict.fromkeys(what.phases[1:])
-    for time_s, name in told:
+def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
+    """Mark the phase changes of all chasers by thin lines, labelled once."""
+    changes: dict[tuple[float, str], None] = {}
+    for history in flight.references.values():
+        changes |= dict.fromkeys(history.phases[1:])
+    for time_s, name in changes:
         axes.axvline(time_s, color=FAINT, linewidth=0.7, linestyle=":")
-        if words:
+        if labelled:
             axes.annotate(
                 name,
                 (time_s, 1.0),
@@ -109,13 +112,13 @@ def _mark_phases(axes: Axes, flight: Flight, words: bool) -> None:
             )
 
 
-def tracking(flight: Flight, _: Traces) -> Figure:
+def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, (top, bottom) = new_figure(2, sharex=True)
     s = flight.scenario
     for i in numbers:
         time_s, position, angle = tracking_errors(flight, i)
-        d = few(len(time_s))
+        d = decimated(len(time_s))
         top.semilogy(time_s[d], np.maximum(position[d], 1e-7), color=colour(i), label=f"chaser {i}")
         bottom.semilogy(time_s[d], np.maximum(np.degrees(angle[d]), 1e-5), color=colour(i))
     for axes, limit, unit in (
@@ -125,14 +128,14 @@ def tracking(flight: Flight, _: Traces) -> Figure:
         axes.axvspan(s.settling_s, s.steady_until_s or s.duration_s, color=FAINT, alpha=0.08, linewidth=0)
         _mark_phases(axes, flight, axes is top)
         if limit is not None:
-            limit_line(axes, limit, f"RMS allowed in the shaded time: {limit:g} {unit}")
+            limit_line(axes, limit, f"RMS limit in the shaded interval: {limit:g} {unit}")
     top.set(ylabel="position error / m", xlim=(0, max(float(flight.truth["target"].time_s[-1]), 1e-3)))
     bottom.set(ylabel="orientation error / °", xlabel="time / s")
     legend_above(top)
     return figure
 
 
-def docking(flight: Flight, _: Traces) -> Figure:
+def docking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, (top, bottom) = new_figure(2, sharex=True)
     s, target = flight.scenario, flight.truth["target"]
@@ -142,16 +145,16 @@ def docking(flight: Flight, _: Traces) -> Figure:
         n = min(len(own.time_s), len(target.time_s))
         distance = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)
         nearest = min(nearest, float(distance.min()))
-        d, time_s = few(n), own.time_s[:n]
+        d, time_s = decimated(n), own.time_s[:n]
         top.plot(time_s[d], distance[d], color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
         if n > 2:
             speed = -np.gradient(distance, time_s)
             bottom.plot(time_s[d], speed[d] * 1e3, color=colour(i), linestyle=dashes(i))
     limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
-    # The two may be close: this one is named below its line.
+    # The two limits may be close: the label of this one is below its line.
     top.axhspan(0.0, s.limits.min_distance_target_m, color=LIMIT, alpha=0.10, linewidth=0)
     top.annotate(
-        f"not allowed: below {s.limits.min_distance_target_m:g} m",
+        f"keep-out: below {s.limits.min_distance_target_m:g} m",
         (1.0, s.limits.min_distance_target_m),
         xycoords=("axes fraction", "data"),
         xytext=(-2, -10),
@@ -163,7 +166,7 @@ def docking(flight: Flight, _: Traces) -> Figure:
     top.set(
         ylabel="distance to the target / m", ylim=(min(nearest, s.limits.min_distance_target_m) * 0.5, None)
     )
-    limit_line(bottom, s.approach.max_speed_m_s * 1e3, "greatest speed of an approach")
+    limit_line(bottom, s.approach.max_speed_m_s * 1e3, "approach speed limit")
     bottom.set(
         ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=(0, max(float(target.time_s[-1]), 1e-3))
     )
@@ -175,38 +178,38 @@ def docking(flight: Flight, _: Traces) -> Figure:
     return figure
 
 
-def separation(flight: Flight, _: Traces) -> Figure:
+def separation(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     if len(numbers) < 2:
-        raise Nothing("there is one chaser only")
+        raise MissingData("the mission has only one chaser")
     figure, (axes,) = new_figure(1, height=2.8)
     for k, (i, j) in enumerate(combinations(numbers, 2)):
         a, b = flight.truth[f"chaser/{i}"], flight.truth[f"chaser/{j}"]
         n = min(len(a.time_s), len(b.time_s))
         distance = np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
-        d = few(n)
-        axes.plot(a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i} and {j}")
+        d = decimated(n)
+        axes.plot(a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}")
     least = flight.scenario.limits.min_distance_chasers_m
-    limit_line(axes, least, f"least allowed {least:g} m")
+    limit_line(axes, least, f"limit {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
     axes.set_xlim(0, max(float(flight.truth["target"].time_s[-1]), 1e-3))
     legend_above(axes)
     return figure
 
 
-def inputs(flight: Flight, traces: Traces) -> Figure:
+def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     if not traces.inputs:
-        raise Nothing("the log holds no two ticks of any chaser")
+        raise MissingData("the log holds fewer than two ticks of every chaser")
     body = flight.scenario.chaser
     figure, axes = new_figure(len(traces.inputs), 2, height=1.55, sharex=True, sharey="col")
-    for row, (i, given) in enumerate(traces.inputs.items()):
+    for row, (i, applied) in enumerate(traces.inputs.items()):
         for column, (values, limit) in enumerate(
-            ((given.force_N, body.force_max_N), (given.torque_N_m * 1e3, body.torque_max_N_m * 1e3))
+            ((applied.force_N, body.force_max_N), (applied.torque_N_m * 1e3, body.torque_max_N_m * 1e3))
         ):
             a = axes[2 * row + column]
             for k, name in enumerate("xyz"):
                 a.stairs(
-                    values[:, k], given.edges_s, color=AXES_XYZ[k], label=name, linewidth=0.9, baseline=None
+                    values[:, k], applied.edges_s, color=AXES_XYZ[k], label=name, linewidth=0.9, baseline=None
                 )
             for sign in (1.0, -1.0):
                 a.axhline(sign * limit, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
@@ -219,131 +222,305 @@ def inputs(flight: Flight, traces: Traces) -> Figure:
     return figure
 
 
-def thrusters(_: Flight, traces: Traces) -> Figure:
+def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
     firing = {i: t for i, t in traces.inputs.items() if t.thruster_duty.shape[1]}
     if not firing:
-        raise Nothing("the actuators were ideal: there are no thrusters, or the log does not tell of them")
+        raise MissingData("the actuators were ideal, or the log holds no thruster data: no thrusters to draw")
     figure, axes = new_figure(len(firing), height=1.9, sharex=True)
-    for a, (i, given) in zip(axes, firing.items(), strict=True):
-        number = given.thruster_duty.shape[1]
+    for a, (i, applied) in zip(axes, firing.items(), strict=True):
+        number = applied.thruster_duty.shape[1]
         mesh: Any = a.pcolormesh(
-            given.edges_s,
+            applied.edges_s,
             np.arange(number + 1) - 0.5,
-            given.thruster_duty.T,
+            applied.thruster_duty.T,
             cmap="cividis_r",
             vmin=0.0,
             vmax=1.0,
             rasterized=True,
         )
         a.set(ylabel=f"chaser {i}\nthruster")
-        figure.colorbar(mesh, ax=a, label="share open", pad=0.01)
+        figure.colorbar(mesh, ax=a, label="duty cycle", pad=0.01)
         a.grid(False)
     axes[-1].set_xlabel("time / s")
     return figure
 
 
+_OUTCOME_COLOURS: dict[ImageOutcome, str] = {
+    "used": SERIES[2],
+    "rejected": SERIES[1],
+    "no marker": "#d9dce1",
+    "bad image": LIMIT,
+    "not processed": SERIES[3],
+}
+
+
+def component_errors(flight: RecordedFlight) -> tuple[Array, Array, Array]:
+    """Return times (K,) s, errors (K, 12) truth minus estimate, and their sigmas (K, 12), decimated for drawing.
+
+    Order and axes follow the covariance: position and velocity WRF, attitude and rate TRF.
+    """
+    a, b = (rows[decimated(len(rows))] for rows in known_estimates(flight))
+    if not len(a):
+        raise MissingData("the target was never estimated in this log, or its ground truth is missing")
+    truth, e = flight.truth["target"], flight.estimate
+    turn = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[a]), truth.q_wxyz[b]))
+    errors = np.concatenate(
+        [
+            truth.position_m[b] - e.position_m[a],
+            truth.velocity_m_s[b] - e.velocity_m_s[a],
+            turn,
+            truth.omega_rad_s[b] - e.omega_rad_s[a],
+        ],
+        axis=1,
+    )
+    return e.time_s[a], errors, np.sqrt(np.maximum(flight.variances(a), 0.0))
+
+
+def estimate(flight: RecordedFlight, _: Traces) -> Figure:
+    time_s, errors, sigmas = component_errors(flight)
+    figure, axes = new_figure(4, 3, height=1.45, sharex=True, sharey="row")
+    kinds = (
+        ("position / mm", 1e3),
+        ("velocity / mm s⁻¹", 1e3),
+        ("attitude / °", np.degrees(1.0)),
+        ("rate / ° s⁻¹", np.degrees(1.0)),
+    )
+    settled = time_s >= min(flight.scenario.settling_s, time_s[-1] / 2.0)
+    for row, (label, factor) in enumerate(kinds):
+        part = slice(3 * row, 3 * row + 3)
+        e, s = errors[:, part] * factor, 3.0 * sigmas[:, part] * factor
+        for k, name in enumerate("xyz"):
+            a = axes[3 * row + k]
+            a.fill_between(time_s, -s[:, k], s[:, k], color=FAINT, alpha=0.18, linewidth=0)
+            a.plot(time_s, e[:, k], color=AXES_XYZ[k], linewidth=0.8)
+            if row == 0:
+                a.set_title(name)
+            if row == 3:
+                a.set_xlabel("time / s")
+        axes[3 * row].set_ylabel(label)
+        # The initial bounds are wide and do not set the scale.
+        reach = 1.6 * max(float(np.max(s[settled])), float(np.max(np.abs(e[settled]))))
+        axes[3 * row].set_ylim(-reach, reach)
+    axes[0].set_xlim(0, max(float(time_s[-1]), 1e-3))
+    return figure
+
+
+def consistency(flight: RecordedFlight, _: Traces) -> Figure:
+    from scipy.stats import chi2
+
+    component_errors(flight)  # raises MissingData without estimates
+    errors = estimate_errors(flight)
+    low, high = chi2.ppf((0.025, 0.975), df=6)
+    figure, (axes,) = new_figure(1)
+    d = decimated(len(errors["nees"]))
+    axes.semilogy(errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8)
+    axes.axhspan(low, high, color=SERIES[2], alpha=0.15, linewidth=0)
+    axes.axhline(6.0, color=SERIES[2], linewidth=0.8)
+    outside = np.mean((errors["nees"] < low) | (errors["nees"] > high))
+    axes.set_title(
+        f"mean {np.mean(errors['nees']):.2f} (6 expected); {100 * outside:.1f} % outside the 95 % band"
+    )
+    axes.set(ylabel="NEES", xlabel="time / s", xlim=(0, max(float(errors["time_s"][-1]), 1e-3)))
+    return figure
+
+
+def _bars(axes: Axes, outcomes: ImageOutcomes, row: float, period_s: float) -> None:
+    """Draw one row of the raster: a bar for each interval of images with the same outcome; gaps stay empty."""
+    spans: dict[ImageOutcome, list[tuple[float, float]]] = {}
+    for first_s, last_s, outcome in outcomes.intervals(1.5 * period_s):
+        spans.setdefault(outcome, []).append((first_s, last_s - first_s + period_s))
+    for outcome, bars in spans.items():
+        axes.broken_barh(bars, (row - 0.36, 0.72), facecolor=_OUTCOME_COLOURS[outcome], linewidth=0)
+
+
+def cameras(flight: RecordedFlight, traces: Traces) -> Figure:
+    if not traces.image_outcomes:
+        raise MissingData("the log holds no image")
+    period_s = 1.0 / flight.scenario.time.image_hz
+    figure, (top, bottom) = new_figure(2, sharex=True, height=2.0)
+    for row, (i, outcomes) in enumerate(traces.image_outcomes.items()):
+        _bars(top, outcomes, row, period_s)
+        sightings = flight.sightings.get(i)
+        if sightings is not None:
+            d = decimated(len(sightings.time_s))
+            bottom.step(
+                sightings.time_s[d],
+                sightings.markers[d],
+                where="post",
+                color=colour(i),
+                label=f"chaser {i}",
+                linewidth=0.9,
+            )
+    present = {OUTCOMES[code] for o in traces.image_outcomes.values() for code in np.unique(o.code)}
+    for outcome, shade in _OUTCOME_COLOURS.items():
+        if outcome in present:
+            top.bar(0, 0, color=shade, label=outcome)
+    top.set_yticks(range(len(traces.image_outcomes)), [f"chaser {i}" for i in traces.image_outcomes])
+    top.invert_yaxis()
+    top.grid(False)
+    legend_above(top)
+    bottom.set(ylabel="markers used", xlabel="time / s", ylim=(-0.2, None))
+    bottom.yaxis.set_major_locator(MaxNLocator(integer=True))
+    if bottom.get_legend_handles_labels()[0]:
+        legend_above(bottom)
+    last_s = max(float(o.time_s[-1]) for o in traces.image_outcomes.values())
+    bottom.set_xlim(0, last_s + period_s)
+    return figure
+
+
+def _distribution(axes: Axes, values: Array, number: int) -> None:
+    """Draw the empirical distribution function over milliseconds."""
+    ordered = np.sort(values) * 1e3
+    share = np.arange(1, len(ordered) + 1) / len(ordered) * 100.0
+    d = decimated(len(ordered))
+    axes.plot(ordered[d], share[d], color=colour(number))
+
+
+def _time_and_distribution(quantity: str) -> tuple[Figure, Axes, Axes]:
+    figure, (left, right) = new_figure(1, 2, height=2.6, width_ratios=[2.2, 1.0])
+    left.set(ylabel=quantity, xlabel="time / s", yscale="log")
+    right.set(xlabel=quantity, ylabel="cumulative share / %", ylim=(0, 101), xscale="log")
+    for axis in (left.yaxis, right.xaxis):
+        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_formatter(NullFormatter())
+    return figure, left, right
+
+
+def solver(flight: RecordedFlight, _: Traces) -> Figure:
+    solves = flight.solves
+    if not len(solves.time_s):
+        raise MissingData("the log holds no solve of the controller")
+    values = solves.wall_s
+    figure, left, right = _time_and_distribution("solve time / ms")
+    d, bad = decimated(len(values)), solves.imperfect
+    left.plot(solves.time_s[d], np.maximum(values[d], 1e-6) * 1e3, ".", markersize=2.2, color=SERIES[0])
+    if np.any(bad):
+        statuses = ", ".join(sorted(set(solves.statuses) - {"solved"}))
+        d = decimated(int(np.sum(bad)))
+        left.plot(solves.time_s[bad][d], values[bad][d] * 1e3, "x", markersize=4, color=LIMIT, label=statuses)
+        legend_above(left)
+    limit_line(left, 1e3 / flight.scenario.time.rate_hz, "tick period")
+    _distribution(right, np.maximum(values, 1e-6), 0)
+    p50, p95 = np.percentile(values, (50, 95)) * 1e3
+    right.set_title(f"median {p50:.1f} ms, 95th percentile {p95:.1f} ms")
+    return figure
+
+
+def latency(_: RecordedFlight, traces: Traces) -> Figure:
+    if not traces.latency:
+        raise MissingData("no image in the log led to an actuator command")
+    figure, left, right = _time_and_distribution("latency / ms")
+    for i, rows in traces.latency.items():
+        values = np.maximum(rows[:, 1], 1e-6)
+        d = decimated(len(values))
+        left.plot(rows[d, 0], values[d] * 1e3, ".", markersize=2.2, color=colour(i), label=f"chaser {i}")
+        _distribution(right, values, i)
+    legend_above(left)
+    return figure
+
+
 @dataclass(frozen=True)
-class Kind:
-    """One figure: its file name, title, what it shows in a sentence, and how it is drawn."""
+class FigureKind:
+    """A figure: file name, title, caption and drawing function."""
 
     name: str
     title: str
     caption: str
-    draw: Callable[[Flight, Traces], Figure]
+    draw: Callable[[RecordedFlight, Traces], Figure]
 
 
-KINDS: tuple[Kind, ...] = (
-    Kind(
+FIGURES: tuple[FigureKind, ...] = (
+    FigureKind(
         "trajectories",
         "Trajectories",
-        "Paths of the centres of mass; a dot where each chaser started, a triangle where it ended.",
+        "Paths of the centres of mass; dot: start, triangle: end.",
         trajectories,
     ),
-    Kind(
+    FigureKind(
         "tracking",
         "Tracking errors",
-        "Distance and angle of each chaser from its reference pose on the true target. Shaded: the time that counts as "
-        "steady.",
+        "Distance and angle of each chaser from its reference pose on the true target. Shaded: steady-state interval.",
         tracking,
     ),
-    Kind(
+    FigureKind(
         "docking",
         "Docking",
-        "Distance of each chaser's centre from the target's, and how fast it shrinks.",
+        "Distance between the centres of chaser and target, and the closing speed.",
         docking,
     ),
-    Kind(
+    FigureKind(
         "separation",
-        "Between the chasers",
+        "Separation of the chasers",
         "Distance between the centres of each pair of chasers.",
         separation,
     ),
-    Kind(
+    FigureKind(
         "inputs",
-        "Inputs",
-        "Force and torque that the actuators gave, body axes, mean over each tick; dashed: the actuators' limits.",
+        "Actuator forces and torques",
+        "Applied force and torque, body axes, mean over each tick; dashed: actuator limits.",
         inputs,
     ),
-    Kind(
-        "thrusters", "Thruster firings", "Share of each tick that each thruster's valve was open.", thrusters
+    FigureKind(
+        "thrusters", "Thruster firings", "Share of each tick during which each valve was open.", thrusters
     ),
-    Kind(
+    FigureKind(
         "estimate",
         "Errors of the target estimate",
-        "Truth less estimate by axis, and the filter's own three-sigma bounds (position and velocity WRF, attitude and "
-        "rate TRF).",
+        "Truth minus estimate by axis, with the filter's three-sigma bounds (position and velocity WRF, attitude and rate "
+        "TRF).",
         estimate,
     ),
-    Kind(
+    FigureKind(
         "consistency",
         "Consistency of the target estimate",
-        "Normalized estimation error squared over the six pose errors; 95 % of the values of a consistent filter lie in "
-        "the band. Above it a filter trusts itself too much, below it too little.",
+        "Normalized estimation error squared (NEES) of the pose, six degrees of freedom. A consistent filter has 95 % of its "
+        "values within the band; values above it indicate an overconfident filter, values below it a conservative one.",
         consistency,
     ),
-    Kind(
+    FigureKind(
         "cameras",
-        "What each camera saw",
-        "Top: what became of each image. Below: markers that a used pose was computed from.",
+        "Camera images",
+        "Top: outcome of each image. Bottom: number of markers used for the pose.",
         cameras,
     ),
-    Kind(
+    FigureKind(
         "solver",
         "Solve times",
-        "Wall-clock time of the controller's solve, on the machine that flew this; dashed: the tick's period.",
+        "Wall-clock time of the controller's solve on the machine of this flight; dashed: tick period.",
         solver,
     ),
-    Kind(
+    FigureKind(
         "latency",
         "Latency",
-        "Wall clock from an image's publication to the actuator command that answers its tick. In lock-step it shows "
-        "the machine's load and changes nothing in the flight.",
+        "Wall-clock time from the publication of an image to the actuator command of its tick. In lock-step it reflects "
+        "the load of the machine and does not affect the flight.",
         latency,
     ),
 )
 
 
-def drawn(flight: Flight, traces: Traces) -> Iterator[tuple[Kind, Figure | str]]:
-    """Every figure, or why there is none, one at a time."""
+def draw_figures(flight: RecordedFlight, traces: Traces) -> Iterator[tuple[FigureKind, Figure | str]]:
+    """Yield every figure, or the reason why it is missing."""
     with styled():
-        for kind in KINDS:
+        for kind in FIGURES:
             try:
                 yield kind, kind.draw(flight, traces)
-            except Nothing as reason:
+            except MissingData as reason:
                 yield kind, str(reason)
 
 
 def write_figures(log: Path, out: Path, ending: str) -> tuple[list[Path], dict[str, str]]:
-    """Writes all figures of a log (or run folder) to the folder ``out``; the files, and why a figure is missing by name.
+    """Write all figures of a log (or run folder) to ``out``; return the files, and the reason of each missing figure.
 
-    Raises LogError for an unreadable log and ChaserdockError for a folder that cannot be written.
+    Raise LogError for an unreadable log and ChaserdockError for a folder that is not writable.
     """
     flight = load_flight(log)
-    traces = load_traces(log, range(len(flight.scenario.chasers)), step_of(flight.world.ticks))
+    traces = load_traces(log, range(len(flight.scenario.chasers)), decimation(flight.world.ticks))
     files, missing = [], {}
     try:
         out.mkdir(parents=True, exist_ok=True)
-        for kind, figure in drawn(flight, traces):
+        for kind, figure in draw_figures(flight, traces):
             if isinstance(figure, str):
                 missing[kind.name] = figure
                 continue

@@ -1,4 +1,4 @@
-"""A recorded flight as arrays: time along the first axis, one row a tick. Built while the log is read."""
+"""A recorded flight as arrays, one row per tick, built while the log is read."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from chaserdock_protocol.messages import (
     Sighting,
     SolverStatus,
     TargetEstimate,
+    Tick,
     WorldTruth,
 )
 from chaserdock_protocol.recording.log import LogSource, Record, read_log, read_scenario
@@ -31,7 +32,7 @@ from numpy.typing import NDArray
 
 from .columns import Columns
 
-# Wall-clock matters: how often presence was told, who counted what, when the recorder confirmed.
+# Messages whose number or content depends on the wall clock.
 NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK, topics.STATE)
 _POSE = (0, 1, 2, 6, 7, 8)
 _UPPER = np.triu_indices(6)
@@ -41,7 +42,7 @@ _RATES = np.array([13 * k for k in (3, 4, 5, 9, 10, 11)])
 
 @dataclass
 class Track:
-    """Motion of one body by tick: times (K,) s, positions and velocities (K, 3) WRF, attitudes (K, 4), rates (K, 3)."""
+    """Motion of one body: times (K,) s, positions and velocities (K, 3) WRF, attitudes (K, 4), rates (K, 3)."""
 
     time_s: Array
     position_m: Array
@@ -51,14 +52,14 @@ class Track:
 
 
 class Tracks(Mapping[str, Track]):
-    """Tracks by name. A long one is in memory only while it is held: ask again rather than keep it."""
+    """Tracks by name. A long track occupies memory only while it is referenced."""
 
     def __init__(self, motions: dict[str, Columns]) -> None:
         self._motions = motions
 
     def __getitem__(self, name: str) -> Track:
         t = self._motions[name].table()
-        # Times by themselves: whoever keeps them for an axis must not keep all of the motion.
+        # A copy of the times: a reference to them must not keep the whole table in memory.
         return Track(t[:, 0].copy(), t[:, 1:4], t[:, 4:7], t[:, 7:11], t[:, 11:14])
 
     def __iter__(self) -> Iterator[str]:
@@ -69,9 +70,8 @@ class Tracks(Mapping[str, Track]):
 
 
 @dataclass
-class Told:
-    """What a chaser was told to do: ``offset_m`` (K, 3), TRF, since ``time_s`` (K,), where it changed; and when (s) which
-    phase began."""
+class ReferenceHistory:
+    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s) and name of its phases."""
 
     time_s: Array
     offset_m: Array
@@ -79,8 +79,8 @@ class Told:
 
 
 @dataclass
-class Seen:
-    """A chaser's sightings: exposure times (K,) s, whether anything was seen, and how many markers were used."""
+class SightingHistory:
+    """Sightings of a chaser: exposure times (K,) s, whether the target was seen, number of markers used."""
 
     time_s: Array
     seen: NDArray[np.bool_]
@@ -88,8 +88,8 @@ class Seen:
 
 
 @dataclass
-class Solves:
-    """The solver's work where it had any: times (K,) s, wall-clock seconds (K,), whether any plan was less than solved."""
+class SolverHistory:
+    """Solves of the controller: times (K,) s, wall-clock durations (K,) s, whether a status other than ``solved`` occurred."""
 
     name: str | None
     time_s: Array
@@ -99,8 +99,8 @@ class Solves:
 
 
 @dataclass
-class World:
-    """What the world tells of all bodies together. ``latched``: at the end; ``contacts``: how often two came to touch."""
+class WorldHistory:
+    """Totals of the world's ground truth. ``latched``: at the end; ``contacts``: number of times two bodies touched."""
 
     ticks: int = 0
     late_commands: int = 0
@@ -109,7 +109,7 @@ class World:
     latched: tuple[int, ...] = ()
     _touching: set[Any] = field(default_factory=set)
 
-    def take(self, message: WorldTruth) -> None:
+    def add(self, message: WorldTruth) -> None:
         self.ticks += 1
         self.late_commands += message.late_commands
         touching = set(message.contacts)
@@ -120,11 +120,11 @@ class World:
 
 
 @dataclass
-class Flight:
-    """What a log holds, without the images. Mappings by body name or chaser.
+class RecordedFlight:
+    """Content of a log without the images. Mappings by body name or chaser.
 
-    ``estimates`` has the fused estimate's motion as ``target``; ``estimate_known`` (K,): whether the target was known.
-    ``expected_commands``: how many actuator commands all ticks together waited for.
+    ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the target was tracked or
+    predicted. ``expected_commands``: number of actuator commands that all ticks expected.
     """
 
     scenario: Scenario
@@ -136,10 +136,10 @@ class Flight:
     estimates: Tracks
     estimate_known: NDArray[np.bool_]
     covariances: Columns
-    told: dict[int, Told]
-    sightings: dict[int, Seen]
-    solves: Solves
-    world: World
+    references: dict[int, ReferenceHistory]
+    sightings: dict[int, SightingHistory]
+    solves: SolverHistory
+    world: WorldHistory
     events: list[Event]
     replies: list[CommandReply]
     counts: dict[str, int]
@@ -152,22 +152,22 @@ class Flight:
 
     @property
     def estimate(self) -> Track:
-        """Motion of the target as the fusion took it to be."""
+        """Estimated motion of the target."""
         return self.estimates["target"]
 
     def pose_covariance(self, rows: NDArray[np.intp]) -> Array:
-        """Covariances (K, 6, 6) of position (WRF) and attitude (TRF) at these rows (K,) of the estimate."""
-        return _unpacked(self.covariances.table()[rows, :21])
+        """Return covariances (K, 6, 6) of position (WRF) and attitude (TRF) at these rows (K,) of the estimate."""
+        return _symmetric(self.covariances.table()[rows, :21])
 
     def variances(self, rows: NDArray[np.intp]) -> Array:
-        """Variances (K, 12) of position and velocity (WRF), attitude and rate (TRF) at these rows of the estimate."""
+        """Return variances (K, 12) of position and velocity (WRF), attitude and rate (TRF) at these rows of the estimate."""
         table = self.covariances.table()[rows]
         pose, rates = table[:, :21][:, [0, 6, 11, 15, 18, 20]], table[:, 21:]
         return np.concatenate([pose[:, :3], rates[:, :3], pose[:, 3:], rates[:, 3:]], axis=1)
 
 
-def _unpacked(upper: Array) -> Array:
-    """Symmetric matrices (K, 6, 6) from their upper triangles (K, 21)."""
+def _symmetric(upper: Array) -> Array:
+    """Return symmetric matrices (K, 6, 6) with the given upper triangles (K, 21)."""
     out = np.empty((len(upper), 6, 6))
     out[:, _UPPER[0], _UPPER[1]] = upper
     out[:, _UPPER[1], _UPPER[0]] = upper
@@ -175,12 +175,12 @@ def _unpacked(upper: Array) -> Array:
 
 
 @dataclass
-class _Told:
+class _ReferenceCollector:
     changes: Columns = field(default_factory=lambda: Columns(4))
     phases: list[tuple[float, str]] = field(default_factory=list)
     last: tuple[float, ...] | None = None
 
-    def take(self, message: Reference) -> None:
+    def add(self, message: Reference) -> None:
         time_s = message.sim_time_ns / 1e9
         if message.offset_m != self.last:
             self.changes.add((time_s,), message.offset_m)
@@ -188,30 +188,32 @@ class _Told:
         if not self.phases or self.phases[-1][1] != message.phase:
             self.phases.append((time_s, message.phase))
 
-    def finish(self) -> Told:
+    def finish(self) -> ReferenceHistory:
         table = self.changes.table()
-        return Told(table[:, 0], table[:, 1:], self.phases)
+        return ReferenceHistory(table[:, 0], table[:, 1:], self.phases)
 
 
-def _motion() -> Columns:
+def _motion_table() -> Columns:
     return Columns(14)
 
 
 @dataclass
 class _Collector:
-    bodies: dict[str, Columns] = field(default_factory=lambda: defaultdict(_motion))
+    bodies: dict[str, Columns] = field(default_factory=lambda: defaultdict(_motion_table))
     impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     thruster_impulse: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     propellant: dict[str, float] = field(default_factory=lambda: defaultdict(float))
-    target: Columns = field(default_factory=_motion)
+    target: Columns = field(default_factory=_motion_table)
     known: bytearray = field(default_factory=bytearray)
     covariance: Columns = field(default_factory=lambda: Columns(27))
-    told: dict[int, _Told] = field(default_factory=lambda: defaultdict(_Told))
+    references: dict[int, _ReferenceCollector] = field(
+        default_factory=lambda: defaultdict(_ReferenceCollector)
+    )
     sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
     solves: Columns = field(default_factory=lambda: Columns(3))
     statuses: Counter[str] = field(default_factory=Counter)
     solver: str | None = None
-    world: World = field(default_factory=World)
+    world: WorldHistory = field(default_factory=WorldHistory)
     events: list[Event] = field(default_factory=list)
     replies: list[CommandReply] = field(default_factory=list)
     health: dict[str, Health] = field(default_factory=dict)
@@ -226,7 +228,41 @@ class _Collector:
     tick: int = -1
     tick_expected: int = 0
 
-    def take(self, record: Record) -> None:
+    def add(self, record: Record) -> None:
+        """Add a message of the log."""
+        message = record.message
+        self._count(record)
+        if record.topic is topics.TICK:
+            self._add_tick(message, record.sent_ns)
+        elif record.topic is topics.IMAGE:
+            self.sent[message.chaser, message.tick] = record.sent_ns
+        elif record.topic is topics.ACTUATORS:
+            sent_ns = self.sent.pop((message.chaser, message.tick), None)
+            if sent_ns is not None:
+                self.latency.add(((record.sent_ns - sent_ns) / 1e9,))
+        match message:
+            case BodyTruth():
+                self._add_body(message)
+            case TargetEstimate():
+                self._add_estimate(message)
+            case Reference():
+                self.references[message.chaser].add(message)
+            case Sighting():
+                seen = message.status == "seen"
+                self.sightings[message.chaser].add((message.sim_time_ns / 1e9, seen, len(message.marker_ids)))
+            case SolverStatus():
+                self._add_solve(message)
+            case WorldTruth():
+                self.world.add(message)
+            case Event():
+                self.events.append(message)
+            case CommandReply():
+                self.replies.append(message)
+            case Health():
+                self.health[message.process] = message
+
+    def _count(self, record: Record) -> None:
+        """Update counts, gaps in the sequence numbers, and the digest."""
         message = record.message
         self.counts[record.key] += 1
         last = self.last_seq.get(record.key, -1)
@@ -235,50 +271,32 @@ class _Collector:
         if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
             self.hashes.setdefault(record.key, hashlib.sha256()).update(content)
-        if record.topic is topics.TICK:
-            told_again = message.tick == self.tick
-            self.expected += len(message.chasers) - (self.tick_expected if told_again else 0)
-            self.tick, self.tick_expected = message.tick, len(message.chasers)
-            self.wall = [*self.wall[:1], record.sent_ns]
-        elif record.topic is topics.IMAGE:
-            self.sent[message.chaser, message.tick] = record.sent_ns
-        elif record.topic is topics.ACTUATORS:
-            begun = self.sent.pop((message.chaser, message.tick), None)
-            if begun is not None:
-                self.latency.add(((record.sent_ns - begun) / 1e9,))
-        match message:
-            case BodyTruth():
-                self._body(message)
-            case TargetEstimate():
-                _add_motion(self.target, message)
-                self.known.append(message.status in ("tracking", "predicting"))
-                covariance = np.asarray(message.covariance)
-                self.covariance.add(covariance[_KEPT].tolist(), covariance[_RATES].tolist())
-            case Reference():
-                self.told[message.chaser].take(message)
-            case Sighting():
-                seen = (message.sim_time_ns / 1e9, message.status == "seen", len(message.marker_ids))
-                self.sightings[message.chaser].add(seen)
-            case SolverStatus():
-                self.solver = self.solver or message.solver
-                self.statuses.update(message.status)
-                if message.chasers:
-                    imperfect = any(s != "solved" for s in message.status)
-                    self.solves.add((message.sim_time_ns / 1e9, message.wall_solve_s, imperfect))
-            case WorldTruth():
-                self.world.take(message)
-            case Event():
-                self.events.append(message)
-            case CommandReply():
-                self.replies.append(message)
-            case Health():
-                self.health[message.process] = message
 
-    def _body(self, message: BodyTruth) -> None:
+    def _add_tick(self, message: Tick, sent_ns: int) -> None:
+        # A later revision of the same tick replaces the number of commands that it expects.
+        replaced = self.tick_expected if message.tick == self.tick else 0
+        self.expected += len(message.chasers) - replaced
+        self.tick, self.tick_expected = message.tick, len(message.chasers)
+        self.wall = [*self.wall[:1], sent_ns]
+
+    def _add_body(self, message: BodyTruth) -> None:
         _add_motion(self.bodies[message.body], message)
         self.impulse[message.body] += message.absolute_impulse_N_s
         self.thruster_impulse[message.body] += sum(message.thruster_impulse_N_s)
         self.propellant[message.body] += message.propellant_kg
+
+    def _add_estimate(self, message: TargetEstimate) -> None:
+        _add_motion(self.target, message)
+        self.known.append(message.status in ("tracking", "predicting"))
+        covariance = np.asarray(message.covariance)
+        self.covariance.add(covariance[_KEPT].tolist(), covariance[_RATES].tolist())
+
+    def _add_solve(self, message: SolverStatus) -> None:
+        self.solver = self.solver or message.solver
+        self.statuses.update(message.status)
+        if message.chasers:
+            imperfect = any(s != "solved" for s in message.status)
+            self.solves.add((message.sim_time_ns / 1e9, message.wall_solve_s, imperfect))
 
 
 def _add_motion(table: Columns, message: BodyTruth | TargetEstimate) -> None:
@@ -286,18 +304,18 @@ def _add_motion(table: Columns, message: BodyTruth | TargetEstimate) -> None:
     table.add((m.sim_time_ns / 1e9,), m.position_m, m.velocity_m_s, m.q_wxyz, m.omega_rad_s)
 
 
-def _seen(columns: Columns) -> Seen:
+def _sighting_history(columns: Columns) -> SightingHistory:
     t = columns.table()
-    return Seen(t[:, 0].copy(), t[:, 1] > 0.0, t[:, 2].astype(np.intp))
+    return SightingHistory(t[:, 0].copy(), t[:, 1] > 0.0, t[:, 2].astype(np.intp))
 
 
-def load_flight(log: LogSource) -> Flight:
-    """The flight in a log; raises LogError when it cannot be read or was not recorded by chaserdock."""
+def load_flight(log: LogSource) -> RecordedFlight:
+    """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by chaserdock."""
     text, run = read_scenario(log)
     scenario = scenario_from_json(text, f"{log}: scenario")
     c = _Collector()
     for record in read_log(log):
-        c.take(record)
+        c.add(record)
     digest = hashlib.sha256()
     for key in sorted(c.hashes):
         digest.update(f"{key} {c.hashes[key].hexdigest()}\n".encode())
@@ -305,7 +323,7 @@ def load_flight(log: LogSource) -> Flight:
     for health in c.health.values():
         rejected.update(health.rejected)
     solves = c.solves.table()
-    return Flight(
+    return RecordedFlight(
         scenario=scenario,
         run=run,
         truth=Tracks(dict(c.bodies)),
@@ -315,9 +333,11 @@ def load_flight(log: LogSource) -> Flight:
         estimates=Tracks({"target": c.target}),
         estimate_known=np.frombuffer(c.known, dtype=np.bool_),
         covariances=c.covariance,
-        told={i: told.finish() for i, told in c.told.items()},
-        sightings={i: _seen(columns) for i, columns in c.sightings.items()},
-        solves=Solves(c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses),
+        references={i: collector.finish() for i, collector in c.references.items()},
+        sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
+        solves=SolverHistory(
+            c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses
+        ),
         world=c.world,
         events=c.events,
         replies=c.replies,

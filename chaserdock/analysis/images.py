@@ -1,4 +1,4 @@
-"""The cameras' images of a log in step with what was found in them, a few at a time, never all in memory."""
+"""Camera images of a log with their sightings, streamed: only a few are in memory at a time."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from chaserdock_protocol.topics import IMAGE, SIGHTING
 
 Pair = tuple[Image, Sighting | None]
 
-_HELD = 4
+_MAX_WAITING = 4
 
 
 def pairs(log: Path, chasers: int) -> Iterator[Pair]:
-    """Every image with the sighting of the same exposure, or None where the log has none; each chaser's by time.
+    """Yield every image with the sighting of the same exposure, or None; the images of one chaser in order of time.
 
-    A log's order is that of arrival: a sighting may lie a little before its image, or behind the next one. Holds at most
-    a few images a chaser; raises LogError where the log cannot be read.
+    A log is ordered by arrival: a sighting may precede its image or follow the next one. Raise LogError for an
+    unreadable log.
     """
     waiting: dict[int, deque[Image]] = defaultdict(deque)
     early: dict[int, dict[int, Sighting]] = defaultdict(dict)
@@ -33,9 +33,9 @@ def pairs(log: Path, chasers: int) -> Iterator[Pair]:
             images.append(message)
         else:
             sightings[message.sim_time_ns] = message
-            if len(sightings) > _HELD:
+            if len(sightings) > _MAX_WAITING:
                 del sightings[min(sightings)]
-        while images and (images[0].sim_time_ns in sightings or len(images) > _HELD):
+        while images and (images[0].sim_time_ns in sightings or len(images) > _MAX_WAITING):
             first = images.popleft()
             yield first, sightings.pop(first.sim_time_ns, None)
     for chaser, images in sorted(waiting.items()):
@@ -46,10 +46,10 @@ def pairs(log: Path, chasers: int) -> Iterator[Pair]:
 def shots(
     log: Path, chasers: int, every_s: float, first_s: float = 0.0
 ) -> Iterator[tuple[float, dict[int, Pair]]]:
-    """At ``first_s`` and then ``every_s`` (simulated seconds): the time and each chaser's latest image up to then.
+    """Yield at ``first_s`` and then ``every_s`` (simulated seconds) the time and each chaser's latest image up to then.
 
-    The last one comes at or after the end of the images; none does where that is before ``first_s``. Where
-    the log's order is not that of time, a chaser's image may be one older than it could be.
+    The last item lies at or after the last image; there is none if that precedes ``first_s``. Where the log is not
+    ordered by time, an image may be older by one than necessary.
     """
     latest: dict[int, Pair] = {}
     number, time_s = 0, -math.inf
@@ -65,7 +65,7 @@ def shots(
 
 
 def columns_for(number: int, aspect: float, width_px: int, height_px: int) -> tuple[int, int]:
-    """In how many columns ``number`` images of this aspect (width over height) get largest, and how wide each then is."""
+    """Return the number of columns that maximizes the size of ``number`` images of this aspect ratio, and their width."""
     best = (1, 1)
     for columns in range(1, number + 1):
         rows = math.ceil(number / columns)

@@ -1,7 +1,7 @@
-"""How our figures look, and how they become files or a piece of a page.
+"""Style of the figures, and their export to files or inline SVG.
 
-One style for all: colours that the colour-blind tell apart (Okabe and Ito, 2008) and that stand on white paper and on a
-dark page alike; text as text. In a page the colours become CSS variables, so that a figure follows the page's theme.
+The colours are distinguishable for colour-blind readers (Okabe and Ito, 2008) on white and on dark backgrounds. Text
+stays text. In an inline SVG the colours are CSS variables, so that a figure follows the theme of the page.
 """
 
 from __future__ import annotations
@@ -61,49 +61,49 @@ _VARIABLES = {
 }
 
 
-MOST_DRAWN = 20_000
-"""Of a longer series every n-th value is drawn: a figure of ten hours would be a file of gigabytes."""
+MAX_POINTS = 20_000
+"""Longer series are decimated: an undecimated figure of ten hours would have gigabytes."""
 
 
-def step_of(number: int) -> int:
-    """Every how many of ``number`` values one is drawn."""
-    return max(1, -(-number // MOST_DRAWN))
+def decimation(number: int) -> int:
+    """Return the factor by which a series of ``number`` values is decimated."""
+    return max(1, -(-number // MAX_POINTS))
 
 
-def few(number: int) -> slice:
-    """The values out of ``number`` that are drawn, evenly spread."""
-    return slice(None, None, step_of(number))
+def decimated(number: int) -> slice:
+    """Return the slice that selects the drawn values out of ``number``."""
+    return slice(None, None, decimation(number))
 
 
-class Nothing(Exception):
-    """A figure cannot be drawn; the text says what the log lacks."""
+class MissingData(Exception):
+    """A figure cannot be drawn; the text names what the log lacks."""
 
 
 def styled(salt: str = "chaserdock") -> AbstractContextManager[None]:
-    """Our style, for as long as the context lasts; ``salt`` fixes the ids that matplotlib gives to SVG elements."""
+    """Apply the style within a context; ``salt`` makes the ids of SVG elements reproducible."""
     settings: Any = STYLE | {"svg.hashsalt": salt}
     return matplotlib.rc_context(settings)
 
 
 def colour(number: int) -> str:
-    """The colour of chaser ``number`` in every figure."""
+    """Return the colour of chaser ``number`` in every figure."""
     return SERIES[number % len(SERIES)]
 
 
 def dashes(number: int) -> Any:
-    """The line style of chaser or pair ``number`` where lines may lie upon one another: the lower one shows through."""
+    """Return a line style for chaser or pair ``number``; overlapping lines stay visible."""
     return ("-", (0, (5, 2)), (0, (2, 1.5)), (0, (7, 2, 1.5, 2)))[number % 4]
 
 
 def new_figure(rows: int, columns: int = 1, height: float = 2.3, **options: Any) -> tuple[Figure, list[Axes]]:
-    """A figure of the page's width with its axes, row by row; ``height`` of one row in inches."""
+    """Create a figure of the page's width; return it and its axes row by row. ``height`` of one row in inches."""
     figure = Figure(figsize=(9.6, 0.35 + height * rows))
     axes: Any = figure.subplots(rows, columns, squeeze=False, **options)
     return figure, list(axes.ravel())
 
 
 def limit_line(axes: Axes, value: float, label: str) -> None:
-    """A dashed limit across the axes, named at its right end."""
+    """Draw a dashed limit across the axes, labelled at its right end."""
     axes.axhline(value, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
     axes.annotate(
         label,
@@ -118,20 +118,20 @@ def limit_line(axes: Axes, value: float, label: str) -> None:
 
 
 def legend_above(axes: Axes, columns: int = 8) -> None:
-    """The legend in one row over the axes' right end, off the data."""
+    """Place the legend in one row above the right end of the axes."""
     axes.legend(
         loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=columns, borderaxespad=0.1, handlelength=1.4
     )
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Writes a figure in the format that the path's ending names; equal figures give equal SVG files."""
+    """Write a figure in the format of the path's suffix; equal figures give equal SVG files."""
     with styled(path.stem):
         figure.savefig(path, facecolor="white", metadata={"Date": None} if path.suffix == ".svg" else None)
 
 
 def to_inline_svg(figure: Figure, name: str, title: str) -> str:
-    """An ``svg`` element for a page: ids unique to ``name``, colours by CSS variables, nothing that points elsewhere."""
+    """Return an ``svg`` element for a page: ids unique to ``name``, colours as CSS variables, no external references."""
     out = io.StringIO()
     with styled(name):
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})
@@ -141,7 +141,7 @@ def to_inline_svg(figure: Figure, name: str, title: str) -> str:
     text = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", text, count=2)
     text = re.sub(r'(<svg[^>]*?) width="[^"]*"', r"\1", text, count=1)
     text = re.sub(r'(<svg[^>]*?) height="[^"]*"', r"\1", text, count=1)
-    # In a page, ids of all figures share one name space, and SVG needs no xlink prefix.
+    # All figures of a page share one namespace of ids. SVG needs no xlink prefix.
     text = re.sub(r'\bid="', f'id="{name}-', text)
     text = text.replace("url(#", f"url(#{name}-").replace('xlink:href="#', f'href="#{name}-')
     for hexadecimal, variable in _VARIABLES.items():

@@ -1,4 +1,11 @@
-"""Data of the page's 3-D replay: a flight thinned to what an eye can follow, faces, and small camera images."""
+"""Data of the report's 3-D replay: the decimated flight, faces, and small camera images.
+
+The replay is our own canvas script (page/replay.js, 12 kB) because the export of viser 1.1 (``StateSerializer.as_html``),
+although it opens offline from ``file://``, was measured to fit the report less well. For docking-contact (70 s at 10 Hz)
+it adds 1.2 MB, 0.8 MB of it the client; our data add 0.16 MB (camera images excluded). It needs WebAssembly and thus a page policy
+with ``unsafe-eval``; with the policy of the report it does not start. It contains no GUI elements: no table and camera
+images that follow the time line, and no seeking from the list of events.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +19,10 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.recording.log import LogError
 from numpy.typing import NDArray
 
-from .flight import Flight, Track
+from .flight import RecordedFlight, Track
 from .images import Pair, shots
 from .scene import Face, scene_of
-from .snapshot import view
+from .snapshot import annotated_image
 from .summary import tracking_errors
 from .time_series import Traces
 
@@ -25,7 +32,7 @@ _SHOT_WIDTH_PX = 256
 
 
 def _numbers(values: Array, digits: int) -> list[float]:
-    # As text of fixed length, and without the -0.0 that JSON would carry along.
+    # Adding 0.0 turns -0.0 into 0.0.
     return (np.round(np.asarray(values, dtype=float).ravel(), digits) + 0.0).tolist()
 
 
@@ -45,10 +52,10 @@ def _thinned(track: Track, rows: NDArray[Any]) -> dict[str, Any]:
     return {"p": _numbers(track.position_m[rows], 4), "q": _numbers(track.q_wxyz[rows], 4)}
 
 
-def replay_data(flight: Flight, traces: Traces, images: dict[str, Any]) -> dict[str, Any]:
-    """Plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases, what became of images.
+def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) -> dict[str, Any]:
+    """Return plain values for JSON: times (s), flat positions (m, WRF) and attitudes, phases, outcomes of images.
 
-    Bodies' rows are those of ``times``, at most 1200 and evenly spread; a body that was lost has fewer.
+    The rows of the bodies are those of ``times``, at most 1200, evenly spaced; a lost body has fewer.
     """
     target = flight.truth["target"]
     rows = np.arange(0, len(target.time_s), max(1, -(-len(target.time_s) // _MOST_SAMPLES)))
@@ -62,16 +69,16 @@ def replay_data(flight: Flight, traces: Traces, images: dict[str, Any]) -> dict[
         mine = rows[rows < len(own.time_s)]
         _, position, _ = tracking_errors(flight, i)
         distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)
-        # Far flown strays must not make all others small.
+        # Distant chasers must not reduce the scale for all others.
         reach_m = max(reach_m, min(float(distance.max()), 3.0))
-        looks = list(traces.looks[i].stretches()) if i in traces.looks else []
-        told = flight.told.get(i)
+        outcomes = traces.image_outcomes.get(i)
+        reference = flight.references.get(i)
         chasers.append(
             {
                 "id": i,
                 **_thinned(own, mine),
-                "phase": [[round(t, 3), name] for t, name in (told.phases if told else [])],
-                "look": [[round(t, 3), look] for t, _, look in looks],
+                "phase": [[round(t, 3), name] for t, name in (reference.phases if reference else [])],
+                "outcome": [[round(t, 3), o] for t, _, o in outcomes.intervals()] if outcomes else [],
                 "error_mm": [float(f"{1e3 * e:.3g}") for e in position[mine]],
             }
         )
@@ -92,10 +99,10 @@ def replay_data(flight: Flight, traces: Traces, images: dict[str, Any]) -> dict[
     }
 
 
-def small_images(log: Path, flight: Flight) -> dict[str, Any]:
-    """Camera images with detections, as data URLs, at most 120 a chaser: ``times`` (s) and ``chasers`` by number.
+def small_images(log: Path, flight: RecordedFlight) -> dict[str, Any]:
+    """Return camera images with detections as data URLs, at most 120 per chaser: ``times`` (s) and ``chasers`` by number.
 
-    An empty text stands where a chaser had no readable image.
+    A missing or unreadable image is an empty string.
     """
     number = len(flight.scenario.chasers)
     every_s = max(1.0, flight.scenario.duration_s / _MOST_SHOTS)
@@ -108,9 +115,9 @@ def small_images(log: Path, flight: Flight) -> dict[str, Any]:
     return {"times": times, "chasers": {i: urls for i, urls in out.items() if any(urls)}}
 
 
-def _data_url(flight: Flight, pair: Pair) -> str:
+def _data_url(flight: RecordedFlight, pair: Pair) -> str:
     try:
-        image = view(flight.scenario, *pair, _SHOT_WIDTH_PX)
+        image = annotated_image(flight.scenario, *pair, _SHOT_WIDTH_PX)
     except LogError:
         return ""
     _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 72])

@@ -1,7 +1,7 @@
-"""One self-contained page about a recorded flight: verdict, tables, 3-D replay, figures, events, scenario, versions.
+"""Self-contained HTML report of a recorded flight: result, tables, 3-D replay, figures, events, scenario, versions.
 
-Opens from a file without a network; the page forbids itself any request (Content-Security-Policy). A log that
-holds less gives a page with less, which says what is missing.
+The page opens from a file without a network; its Content-Security-Policy forbids requests. It names the parts that an
+incomplete log lacks.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any
 
 from chaserdock_protocol.errors import ChaserdockError
 
-from .figures import drawn
-from .flight import Flight, load_flight
-from .plots import step_of, to_inline_svg
+from .figures import draw_figures
+from .flight import RecordedFlight, load_flight
+from .plots import decimation, to_inline_svg
 from .replay_scene import replay_data, small_images
 from .summary import summary_of
 from .time_series import load_traces
@@ -29,9 +29,9 @@ _DASH = "–"  # noqa: RUF001
 
 
 def write_report(log: Path, out: Path | None = None) -> Path:
-    """Writes the page of a log (or run folder), by default as ``report.html`` beside the log, and tells where.
+    """Write the report of a log (or run folder), by default ``report.html`` beside the log; return its path.
 
-    Raises LogError for a log that cannot be read and ChaserdockError where the page cannot be written.
+    Raise LogError for an unreadable log and ChaserdockError for a path that is not writable.
     """
     out = out or (log if log.is_dir() else log.parent) / "report.html"
     text = report_of(log)
@@ -43,14 +43,14 @@ def write_report(log: Path, out: Path | None = None) -> Path:
 
 
 def report_of(log: Path) -> str:
-    """The page as text; raises LogError for a log that cannot be read."""
+    """Return the report as HTML. Raise LogError for an unreadable log."""
     flight = load_flight(log)
     result = summary_of(flight)
-    every = step_of(flight.world.ticks)
+    every = decimation(flight.world.ticks)
     traces = load_traces(log, range(len(flight.scenario.chasers)), every)
     missing: list[str] = []
     figures = []
-    for kind, figure in drawn(flight, traces):
+    for kind, figure in draw_figures(flight, traces):
         if isinstance(figure, str):
             missing.append(f"{kind.title}: {figure}.")
             continue
@@ -63,7 +63,7 @@ def report_of(log: Path) -> str:
     if "target" in flight.truth:
         data = replay_data(flight, traces, small_images(log, flight))
         replay = _replay(data)
-        # "</" would end the script element, wherever it stood.
+        # "</" would end the script element.
         text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
         code = (_PAGE / "replay.js").read_text(encoding="utf-8")
         script = (
@@ -78,7 +78,7 @@ def report_of(log: Path) -> str:
         _numbers(flight, result),
         replay,
         '<h2 id="figures">Figures</h2>',
-        f'<p class="faint">A long flight: one of {every} ticks is drawn; tables are of all.</p>'
+        f'<p class="faint">Long flight: figures show one of {every} ticks; tables use all.</p>'
         if every > 1
         else "",
         *figures,
@@ -96,7 +96,7 @@ def report_of(log: Path) -> str:
 
 
 def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """A table; the first cell of a row names it. Cells are text, and escaped here."""
+    """Return a table as HTML; the first cell of each row is its header. Cells are plain text and are escaped."""
     top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
     lines = []
     for row in rows:
@@ -108,18 +108,18 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     )
 
 
-def _shown(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
+def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
     if value is None:
         return _DASH
-    # With "#" trailing zeros stay; a bare point at the end does not.
+    # "#" keeps trailing zeros; a trailing decimal point is removed.
     return f"{f'{value * factor:#.{digits}g}'.rstrip('.')} {unit}".rstrip()
 
 
 def _rms(mean_square: float | None, unit: str, factor: float) -> str:
-    return _shown(None if mean_square is None else math.sqrt(mean_square), unit, factor)
+    return _quantity(None if mean_square is None else math.sqrt(mean_square), unit, factor)
 
 
-def _head(flight: Flight, result: dict[str, Any]) -> str:
+def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
     s = flight.scenario
     verdict = (
         '<span class="verdict good">success</span>'
@@ -143,23 +143,23 @@ def _outcome(result: dict[str, Any]) -> str:
     if not result["failures"]:
         return ""
     items = "".join(f"<li>{escape(f)}</li>" for f in result["failures"])
-    return f'<h2>Not met</h2><ul class="bad">{items}</ul>'
+    return f'<h2>Criteria not met</h2><ul class="bad">{items}</ul>'
 
 
-def _chasers(flight: Flight, result: dict[str, Any]) -> str:
+def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     if not result["chasers"]:
-        return "<h2>Chasers</h2><p>The log holds no motion of any chaser.</p>"
+        return "<h2>Chasers</h2><p>The log holds no motion of a chaser.</p>"
     degree = math.degrees(1.0)
     rows = [
         (
             f"chaser {i}",
             _rms(c["steady"]["position_mse_m2"], "mm", 1e3),
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
-            _shown(c["position_mse_m2"], "m²"),
-            _shown(c["orientation_mse_rad2"], "rad²"),
+            _quantity(c["position_mse_m2"], "m²"),
+            _quantity(c["orientation_mse_rad2"], "rad²"),
             f"{c['dock_time_s']:.2f} s" if c["docked"] else "no",
-            _shown(c["min_distance_target_m"], "m"),
-            _shown(c["impulse_N_s"], "N s"),
+            _quantity(c["min_distance_target_m"], "m"),
+            _quantity(c["impulse_N_s"], "N s"),
         )
         for i, c in result["chasers"].items()
     ]
@@ -171,57 +171,61 @@ def _chasers(flight: Flight, result: dict[str, Any]) -> str:
         "position MSE, whole run",
         "orientation MSE, whole run",
         "docked since",
-        "nearest to target",
+        "minimum distance to target",
         "impulse",
     )
     until = s.steady_until_s or s.duration_s
     return (
         "<h2>Chasers</h2>"
         + table(head, rows)
-        + '<p class="faint">Chaser against its reference pose on the true target. '
-        + f"Steady: {s.settling_s:g} s to {until:g} s.</p>"
+        + '<p class="faint">Errors relative to the reference pose on the true target. '
+        + f"Steady state: {s.settling_s:g} s to {until:g} s.</p>"
     )
 
 
-def _numbers(flight: Flight, result: dict[str, Any]) -> str:
+def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     e, degree = result["target_estimate"], math.degrees(1.0)
     estimate = [
-        ("position", _shown(e["position_rms_m"], "mm", 1e3), _shown(e["max_position_error_m"], "mm", 1e3)),
+        (
+            "position",
+            _quantity(e["position_rms_m"], "mm", 1e3),
+            _quantity(e["max_position_error_m"], "mm", 1e3),
+        ),
         (
             "orientation",
-            _shown(e["orientation_rms_rad"], "°", degree),
-            _shown(e["max_orientation_error_rad"], "°", degree),
+            _quantity(e["orientation_rms_rad"], "°", degree),
+            _quantity(e["max_orientation_error_rad"], "°", degree),
         ),
-        ("velocity", _shown(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
-        ("rate", _shown(e["omega_rms_rad_s"], "°/s", degree), ""),
+        ("velocity", _quantity(e["velocity_rms_m_s"], "mm/s", 1e3), ""),
+        ("rate", _quantity(e["omega_rms_rad_s"], "°/s", degree), ""),
     ]
     latency, solver = result["latency_s"], result["solver"]
     safety = [
-        ("nearest two chasers", _shown(result["min_distance_chasers_m"], "m")),
+        ("minimum distance between chasers", _quantity(result["min_distance_chasers_m"], "m")),
         ("collisions", str(result["collisions"])),
-        ("mean NEES of the estimate (6 expected)", _shown(e["nees_mean"], "")),
-        (f"solve time ({solver['name']}), median", _shown(solver["solve_s"]["p50"], "ms", 1e3)),
-        ("solve time, 95 %", _shown(solver["solve_s"]["p95"], "ms", 1e3)),
+        ("mean NEES of the estimate (6 expected)", _quantity(e["nees_mean"], "")),
+        (f"solve time ({solver['name']}), median", _quantity(solver["solve_s"]["p50"], "ms", 1e3)),
+        ("solve time, 95th percentile", _quantity(solver["solve_s"]["p95"], "ms", 1e3)),
         ("failed solves", str(solver["failures"])),
-        ("exposure to command, median", _shown(latency["p50"], "ms", 1e3)),
-        ("exposure to command, 99 %", _shown(latency["p99"], "ms", 1e3)),
+        ("exposure to command, median", _quantity(latency["p50"], "ms", 1e3)),
+        ("exposure to command, 99th percentile", _quantity(latency["p99"], "ms", 1e3)),
         ("late commands", str(result["late_commands"])),
         ("messages lost", str(sum(m["lost"] for m in result["messages"].values()))),
     ]
     return (
         f'<div class="pair"><section><h2>Target estimate</h2>{table(("", "RMS", "largest error"), estimate)}'
-        f'<p class="faint">Fused estimate against the truth, after {flight.scenario.settling_s:g} s, '
-        "at the time of exposure.</p></section>"
+        f'<p class="faint">Fused estimate relative to ground truth at the time of exposure, from '
+        f"{flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
     )
 
 
 def _replay(data: dict[str, Any]) -> str:
     end = data["times"][-1]
-    seen = list(data["images"]["chasers"])
-    columns = 1 if len(seen) <= 4 else 2
-    width = 256 if len(seen) <= 2 else 210 if len(seen) == 3 else 190
-    images = "".join(f'<img data-chaser="{i}" alt="image of chaser {i}">' for i in seen)
+    cameras = list(data["images"]["chasers"])
+    columns = 1 if len(cameras) <= 4 else 2
+    width = 256 if len(cameras) <= 2 else 210 if len(cameras) == 3 else 190
+    images = "".join(f'<img data-chaser="{i}" alt="image of chaser {i}">' for i in cameras)
     views = (
         f'<div id="replay-views" style="grid-template-columns: repeat({columns}, 1fr); width: {width * columns}px">'
         f"{images}</div>"
@@ -239,12 +243,12 @@ def _replay(data: dict[str, Any]) -> str:
 <input id="replay-time" type="range" min="0" max="{end}" step="0.05" value="0" aria-label="time">
 <span id="replay-clock"></span>
 <label>speed <select id="replay-speed">{speeds}</select></label>
-<label><input id="replay-ride" type="checkbox"> ride on the target</label></div>
+<label><input id="replay-ride" type="checkbox"> target frame</label></div>
 <div class="wide"><table>
-<thead><tr><th></th><th>phase</th><th>to the target</th><th>position error</th><th>image</th></tr></thead>
+<thead><tr><th></th><th>phase</th><th>distance to target</th><th>position error</th><th>image</th></tr></thead>
 <tbody>{rows}</tbody></table></div>
-<p class="faint">Drag to turn, wheel to zoom; arrow keys, +, − and space do the same. Ground truth. A camera's outline is
-bright while its image is used; chaser colours are the figures'.</p>
+<p class="faint">Drag to rotate, wheel to zoom; or arrow keys, + and −; space starts and stops. Ground truth. A camera frustum is
+bright while its image is used. Chasers have the colours of the figures.</p>
 </div>"""  # noqa: RUF001
 
 
@@ -252,25 +256,25 @@ def _missing(missing: list[str]) -> str:
     if not missing:
         return ""
     items = "".join(f"<li>{escape(m)}</li>" for m in missing)
-    return f'<h3 id="missing">Not in this log</h3><ul class="faint">{items}</ul>'
+    return f'<h3 id="missing">Missing from this log</h3><ul class="faint">{items}</ul>'
 
 
-def _events(result: dict[str, Any], jumps: bool) -> str:
+def _events(result: dict[str, Any], seekable: bool) -> str:
     if not result["events"]:
         return '<h2 id="events">Events</h2><p>None recorded.</p>'
     rows = []
     for event in result["events"]:
         time_s = event["time_s"]
-        shown = f"{time_s:.2f} s"
-        if jumps:
-            shown = (
-                f'<button type="button" data-time="{time_s:.3f}" title="show in the replay">{shown}</button>'
+        label = f"{time_s:.2f} s"
+        if seekable:
+            label = (
+                f'<button type="button" data-time="{time_s:.3f}" title="show in the replay">{label}</button>'
             )
-        rows.append(f'<tr><td>{shown}</td><td class="text">{escape(event["what"])}</td></tr>')
+        rows.append(f'<tr><td>{label}</td><td class="text">{escape(event["what"])}</td></tr>')
     return f'<h2 id="events">Events</h2><div class="wide"><table><tbody>{"".join(rows)}</tbody></table></div>'
 
 
-def _details(flight: Flight, result: dict[str, Any]) -> str:
+def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
     scenario = json.dumps(flight.scenario.model_dump(mode="json"), indent=2, ensure_ascii=False)
     versions = [
         (k.removeprefix("version."), v) for k, v in sorted(flight.run.items()) if k.startswith("version.")
@@ -278,13 +282,13 @@ def _details(flight: Flight, result: dict[str, Any]) -> str:
     run = [(k, v) for k, v in sorted(flight.run.items()) if not k.startswith("version.")]
     messages = [(key, str(m["count"]), str(m["lost"])) for key, m in result["messages"].items()]
     refused = [(reason, str(count)) for reason, count in result["rejected"].items()]
-    # The whole digest, too: two pages of the same flight can be told to be the same.
+    # The full digest identifies equal flights.
     run.append(("digest", result["digest"]))
     return (
         '<h2 id="scenario">Scenario and data</h2>'
         f"<details><summary>Scenario as flown</summary><pre>{escape(scenario)}</pre></details>"
         f"<details><summary>Messages</summary>{table(('topic', 'in the log', 'lost'), messages)}"
-        + (f"<h3>Refused at a process' boundary</h3>{table(('reason', 'count'), refused)}" if refused else "")
+        + (f"<h3>Rejected on receipt</h3>{table(('reason', 'count'), refused)}" if refused else "")
         + "</details>"
         f"<details><summary>Summary as JSON</summary><pre>{escape(json.dumps(result, indent=2))}</pre></details>"
         f'<h2 id="versions">Run and versions</h2>{table(("", ""), [*run, *versions])}'

@@ -1,4 +1,4 @@
-"""The bodies of a mission as coloured faces in their own axes, for those who draw them: the page's replay, the video."""
+"""Bodies of a mission as coloured faces in body axes, for the 3-D replay, the video and the viewer."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, fac
 from chaserdock_protocol.scenario import Scenario
 
 Grey = int
-"""0 black to 255 white, in full light."""
+"""0 black to 255 white, fully lit."""
 
 _PROBE_WIDTH_M = 0.012
-# A long thin box is cut, so that ordering faces by their centres' depth puts every part of it right.
+# A long thin box is divided, so that ordering faces by the depth of their centres is correct.
 _LONGEST_PIECE_M = 0.06
 
 
 @dataclass(frozen=True)
 class Face:
-    """A flat quadrangle ``corners_m`` (4, 3) in body axes, its outward ``normal``; ``decals`` are painted on it in turn."""
+    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``; ``decals`` are painted on it in order."""
 
     corners_m: Array
     normal: Array
@@ -31,7 +31,7 @@ class Face:
 
 @dataclass(frozen=True)
 class Scene:
-    """Faces of the target (TRF) and of any chaser (CRF), and the far corners (4, 3) of a camera's view in CRF."""
+    """Faces of the target (TRF) and of a chaser (CRF), and the far corners (4, 3) of the camera frustum in CRF."""
 
     target: tuple[Face, ...]
     chaser: tuple[Face, ...]
@@ -40,7 +40,7 @@ class Scene:
 
 
 def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey], ...]:
-    """Quadrangles (4, 3) in TRF of a printed marker: white border, black square, and the white cells, row by row."""
+    """Return the quadrangles (4, 3) in TRF of a marker: white border, black square, and the white cells row by row."""
     table = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, model.dictionary))
     n = table.markerSize + 2
     cells = np.asarray(cv2.aruco.generateImageMarker(table, marker.id, n, borderBits=1)) > 0
@@ -62,14 +62,14 @@ def marker_decals(model: TargetModel, marker: Marker) -> tuple[tuple[Array, Grey
 
 
 def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
-    """The six faces of a box in the axes it is given in; with a ``model``, the markers that lie on them."""
+    """Return the six faces of a box in its parent axes; with a ``model``, including the markers on them."""
     out = []
     for index in range(6):
         q = rotations.multiply(box.q_wxyz, face_rotation(index))
         width, height, depth = face_extent(box.size_m, index)
         flat = [[x * width / 2, y * height / 2, depth] for x, y in ((-1, 1), (1, 1), (1, -1), (-1, -1))]
         normal = rotations.rotate(q, (0.0, 0.0, 1.0))
-        # White borders may reach under neighbouring markers: all of them come first.
+        # White borders may extend under neighbouring markers: all borders come first.
         borders: list[tuple[Array, Grey]] = []
         prints: list[tuple[Array, Grey]] = []
         for marker in model.markers if model else ():
@@ -95,7 +95,7 @@ def _probe(front_m: float, reach_m: float) -> list[Face]:
 
 
 def scene_of(scenario: Scenario, view_m: float = 0.22) -> Scene:
-    """What a scenario's bodies look like; ``view_m``: how far the outline of a camera's view is drawn."""
+    """Return the faces of a scenario's bodies; ``view_m``: length of the drawn camera frustum."""
     model = scenario.target_model()
     body = scenario.chaser
     front = body.size_m[0] / 2.0

@@ -1,4 +1,4 @@
-"""What every camera saw at one moment of a recorded flight, with the detections drawn, as one image."""
+"""Mosaic of all camera images at one time of a recorded flight, with the detections drawn."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ _AXES = ((80, 80, 255), (90, 220, 90), (255, 160, 60))
 
 
 def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
-    """BGR mosaic of all chasers' images exposed at or just before ``at_s``, each ``width_px`` wide.
+    """Return a BGR mosaic of each chaser's last image exposed up to ``at_s``, each ``width_px`` wide.
 
-    Raises LogError when the log cannot be read or holds no image up to then.
+    Raise LogError for an unreadable log or one without an image up to then.
     """
     scenario = scenario_from_json(read_scenario(log)[0], f"{log}: scenario")
     numbers = range(len(scenario.chasers))
@@ -42,7 +42,7 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
         raise LogError(f"{log}: holds no image up to {at_s:g} s")
     if at_s > end_s + 1.0 / scenario.time.image_hz:
         raise LogError(f"--at {at_s:g}: the last image of {log} is of {end_s:.2f} s")
-    views = [view(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
+    views = [annotated_image(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
     columns = math.ceil(math.sqrt(len(views)))
     blank = np.zeros_like(views[0])
     views += [blank] * (-len(views) % columns)
@@ -50,37 +50,39 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
     return np.vstack(rows)
 
 
-def view(scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int) -> NDArray[np.uint8]:
-    """BGR image ``width_px`` wide with the sighting's markers and pose drawn; raises LogError for a bad image."""
+def annotated_image(
+    scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int
+) -> NDArray[np.uint8]:
+    """Return the image as BGR, ``width_px`` wide, with the sighting's markers and pose. Raise LogError for a bad image."""
     try:
         grey = decode_image(image)
     except BadImage as error:
         raise LogError(
             f"image of chaser {image.chaser} at {image.sim_time_ns / 1e9:.2f} s: {error}"
         ) from None
-    # People see the dark side of things better after a gamma correction; the cameras had no such luck.
+    # A gamma correction for display makes the shaded side visible.
     gamma = np.array([255 * (v / 255) ** 0.6 for v in range(256)]).astype(np.uint8)
-    view: Any = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
+    canvas: Any = cv2.cvtColor(cv2.LUT(grey, gamma), cv2.COLOR_GRAY2BGR)
     scale = width_px / image.width_px
-    view = cv2.resize(view, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA)
+    canvas = cv2.resize(canvas, (width_px, round(image.height_px * scale)), interpolation=cv2.INTER_AREA)
     if sighting is not None and sighting.sim_time_ns == image.sim_time_ns:
         corners = (np.reshape(sighting.corners_px, (-1, 4, 2)) + 0.5) * scale - 0.5
         for square in corners:
             points = np.round(square * 16).astype(np.int32)
-            cv2.polylines(view, [points], True, _MARKER, 1, cv2.LINE_AA, 4)
+            cv2.polylines(canvas, [points], True, _MARKER, 1, cv2.LINE_AA, 4)
         if sighting.solutions:
-            _axes(view, scenario, sighting, scale)
+            _draw_axes(canvas, scenario, sighting, scale)
     count = len(sighting.marker_ids) if sighting else 0
-    seen = f"{count} marker{'s' if count > 1 else ''}" if count else "sees nothing"
+    seen = f"{count} marker{'s' if count > 1 else ''}" if count else "no marker"
     text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen}"
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
-    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # a small image gets small words
-    cv2.putText(view, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
-    return np.asarray(view, dtype=np.uint8)
+    size = 0.5 * min(1.0, (width_px - 16) / length_px)  # shrink the text on a small image
+    cv2.putText(canvas, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
+    return np.asarray(canvas, dtype=np.uint8)
 
 
-def _axes(view: NDArray[np.uint8], scenario: Scenario, sighting: Sighting, scale: float) -> None:
-    """The measured target frame: x red, y green, z blue, 8 cm each."""
+def _draw_axes(canvas: NDArray[np.uint8], scenario: Scenario, sighting: Sighting, scale: float) -> None:
+    """Draw the measured target frame: x red, y green, z blue, 8 cm each."""
     best = sighting.solutions[0]
     points = np.vstack([np.zeros(3), 0.08 * np.eye(3)])
     irf = rotations.rotate(best.q_wxyz, points) + best.position_m
@@ -90,4 +92,4 @@ def _axes(view: NDArray[np.uint8], scenario: Scenario, sighting: Sighting, scale
     ends = np.round(px * 16).astype(int)
     for k, colour in enumerate(_AXES):
         a, b = ends[0].tolist(), ends[k + 1].tolist()
-        cv2.line(view, a, b, colour, 2, cv2.LINE_AA, 4)
+        cv2.line(canvas, a, b, colour, 2, cv2.LINE_AA, 4)

@@ -1,4 +1,4 @@
-"""summary.json: a flight judged, ground truth against reference. SI units and radians; keys as in docs/summary.md."""
+"""Evaluation of a flight on ground truth: ``summary.json``. SI units and radians; keys as in docs/summary.md."""
 
 from __future__ import annotations
 
@@ -15,28 +15,34 @@ from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
-from .capture import capture_failures, capture_of, capture_text, nearest_allowed_m
 from .columns import nanoseconds, rows_since
-from .flight import Flight, Track, load_flight
+from .criteria import (
+    capture_failures,
+    capture_of,
+    capture_text,
+    nearest_allowed_m,
+    not_reached,
+    reached_time,
+)
+from .flight import RecordedFlight, Track, load_flight
 from .judged_criteria import judged_criteria
-from .reached import not_reached, reached_time
 
-_PART = 1 << 14  # rows that are worked on at a time
+_BLOCK = 1 << 14  # rows processed at a time
 
 
 def summarize(log: Path) -> dict[str, Any]:
-    """The summary of a log; raises LogError when the log cannot be read."""
+    """Evaluate a log. Raise LogError for an unreadable log."""
     return summary_of(load_flight(log))
 
 
-def true_reference(flight: Flight, chaser: int, rows: slice, target: Track) -> tuple[Array, Array]:
-    """Positions (K, 3) WRF and attitudes (K, 4) that a chaser should have had, at these rows of the target's truth.
+def true_reference(flight: RecordedFlight, chaser: int, rows: slice, target: Track) -> tuple[Array, Array]:
+    """Return the reference positions (K, 3) WRF and attitudes (K, 4) of a chaser at these rows of the target's truth.
 
-    The commanded offset on the *true* target, so that errors of estimation count as errors of tracking. Before
-    the controller names an offset it is the scenario's.
+    They are the commanded offset on the *true* target: estimation errors count as tracking errors. Before the first
+    command the offset is the scenario's.
     """
     c = flight.scenario.chasers[chaser]
-    offsets = told_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
+    offsets = commanded_offsets(flight, chaser, np.array(c.position_m), target.time_s[rows])
     positions = target.position_m[rows] + rotations.rotate(target.q_wxyz[rows], offsets)
     q_off = np.array(c.q_wxyz)
     if flight.scenario.approach.face_target:
@@ -44,34 +50,34 @@ def true_reference(flight: Flight, chaser: int, rows: slice, target: Track) -> t
     return positions, rotations.multiply(target.q_wxyz[rows], q_off)
 
 
-def told_offsets(flight: Flight, chaser: int, before: Array, time_s: Array) -> Array:
-    """The offset (K, 3) that a chaser was told, TRF, at the times (K,); ``before`` the first one, (3,)."""
-    told = flight.told.get(chaser)
-    if told is None:
+def commanded_offsets(flight: RecordedFlight, chaser: int, before: Array, time_s: Array) -> Array:
+    """Return the commanded offsets (K, 3) TRF of a chaser at the times (K,); ``before`` (3,) until the first command."""
+    history = flight.references.get(chaser)
+    if history is None:
         return np.broadcast_to(before, (len(time_s), 3))
-    row = rows_since(nanoseconds(told.time_s), nanoseconds(time_s))
-    return np.vstack([before, told.offset_m])[row + 1]
+    row = rows_since(nanoseconds(history.time_s), nanoseconds(time_s))
+    return np.vstack([before, history.offset_m])[row + 1]
 
 
-def parts(number: int) -> Iterator[slice]:
-    """``number`` rows, a part at a time: what is computed on the way must not need the memory of a whole long flight."""
-    return (slice(k, min(k + _PART, number)) for k in range(0, number, _PART))
+def blocks(number: int) -> Iterator[slice]:
+    """Yield ``number`` rows in blocks, which bounds the memory of intermediate arrays."""
+    return (slice(k, min(k + _BLOCK, number)) for k in range(0, number, _BLOCK))
 
 
-def tracking_errors(flight: Flight, chaser: int) -> tuple[Array, Array, Array]:
-    """Times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from its true reference."""
+def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, Array]:
+    """Return times (K,), position errors (K,) m and orientation errors (K,) rad of a chaser from its true reference."""
     own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
     n = min(len(target.time_s), len(own.time_s))
     position, angle = np.empty(n), np.empty(n)
-    for rows in parts(n):
+    for rows in blocks(n):
         positions, attitudes = true_reference(flight, chaser, rows, target)
         position[rows] = np.linalg.norm(own.position_m[rows] - positions, axis=1)
         angle[rows] = rotations.angle_between(attitudes, own.q_wxyz[rows])
     return target.time_s[:n], position, angle
 
 
-def known_estimates(flight: Flight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Rows of the estimate (K,) at which the target was known, and the rows of its truth at the same times."""
+def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows of the estimate (K,) with a known target, and the rows of its truth at the same times."""
     none = np.zeros(0, dtype=np.intp)
     truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
     if truth is None or not len(known):
@@ -82,27 +88,27 @@ def known_estimates(flight: Flight) -> tuple[NDArray[np.intp], NDArray[np.intp]]
     return known[both], row[both]
 
 
-def estimate_errors(flight: Flight) -> dict[str, Array]:
-    """Errors of the fused estimate where there is one: ``time_s``, ``position_m``, ``orientation_rad``,
+def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
+    """Return errors of the fused estimate: ``time_s``, ``position_m``, ``orientation_rad``,
     ``velocity_m_s``, ``omega_rad_s`` and ``nees`` (over position and attitude), each (K,)."""
     a, b = known_estimates(flight)
-    truth = flight.truth.get("target", flight.estimate)  # without a truth there are no rows
+    truth = flight.truth.get("target", flight.estimate)  # without truth there are no rows
     e = flight.estimate
     errors = {
         name: np.empty(len(a))
         for name in ("position_m", "orientation_rad", "velocity_m_s", "omega_rad_s", "nees")
     }
-    for rows in parts(len(a)):
+    for rows in blocks(len(a)):
         i, j = a[rows], b[rows]
         position = truth.position_m[j] - e.position_m[i]
         angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[i]), truth.q_wxyz[j]))
         pose = np.concatenate([position, angle], axis=1)
-        weighed = np.linalg.solve(flight.pose_covariance(i), pose[:, :, None])[:, :, 0]
+        weighted = np.linalg.solve(flight.pose_covariance(i), pose[:, :, None])[:, :, 0]
         errors["position_m"][rows] = np.linalg.norm(position, axis=1)
         errors["orientation_rad"][rows] = np.linalg.norm(angle, axis=1)
         errors["velocity_m_s"][rows] = np.linalg.norm(truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1)
         errors["omega_rad_s"][rows] = np.linalg.norm(truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1)
-        errors["nees"][rows] = np.einsum("ki,ki->k", pose, weighed)
+        errors["nees"][rows] = np.einsum("ki,ki->k", pose, weighted)
     return {"time_s": e.time_s[a], **errors}
 
 
@@ -130,15 +136,15 @@ def _distance(a: Track, b: Track) -> Array:
     return np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
 
 
-def dock_time(flight: Flight, chaser: int) -> float | None:
-    """When a chaser came into the docking tolerances for good (s), on ground truth, or None if it is not docked.
+def dock_time(flight: RecordedFlight, chaser: int) -> float | None:
+    """Return the time (s) from which on a chaser stays within the docking tolerances; None if it is not docked.
 
-    Docked: its reference is at the docking distance, and at the end it has been within the scenario's position
+    Docked: the reference is at the docking distance, and at the end the chaser has been within the scenario's position
     and angle tolerances of it for at least ``docked_time_s``.
     """
     approach = flight.scenario.approach
     time_s, position, angle = tracking_errors(flight, chaser)
-    away = np.linalg.norm(told_offsets(flight, chaser, np.full(3, math.inf), time_s), axis=1)
+    away = np.linalg.norm(commanded_offsets(flight, chaser, np.full(3, math.inf), time_s), axis=1)
     reached = np.abs(away - approach.dock_distance_m) < 1e-6
     limit = math.radians(approach.docked_angle_deg)
     inside = reached & (position <= approach.docked_position_m) & (angle <= limit)
@@ -149,15 +155,15 @@ def dock_time(flight: Flight, chaser: int) -> float | None:
     return float(since) if time_s[-1] - since >= approach.docked_time_s else None
 
 
-def _unanswered(flight: Flight) -> int:
-    """Commands that a tick expected and that never came (in lock-step none can be missing)."""
+def _unanswered(flight: RecordedFlight) -> int:
+    """Return the number of expected commands that never arrived (0 in lock-step)."""
     return max(
         0, flight.expected_commands - sum(n for key, n in flight.counts.items() if key.endswith("/actuators"))
     )
 
 
-def summary_of(flight: Flight) -> dict[str, Any]:
-    """The summary of a flight as plain values for JSON."""
+def summary_of(flight: RecordedFlight) -> dict[str, Any]:
+    """Evaluate a flight; return plain values for JSON."""
     s = flight.scenario
     chasers, names = {}, [f"chaser/{i}" for i in range(len(s.chasers))]
     until = s.steady_until_s or s.duration_s
@@ -235,25 +241,25 @@ def summary_of(flight: Flight) -> dict[str, Any]:
     return result
 
 
-def _events(flight: Flight) -> list[dict[str, Any]]:
-    told = [(e.sim_time_ns, f"{e.process}: {e.what} {e.detail}".strip()) for e in flight.events]
+def _events(flight: RecordedFlight) -> list[dict[str, Any]]:
+    events = [(e.sim_time_ns, f"{e.process}: {e.what} {e.detail}".strip()) for e in flight.events]
     for r in flight.replies:
-        said = "accepted" if r.accepted else "refused"
-        told.append((r.sim_time_ns, f"command {r.command} chaser {r.chaser}: {said}: {r.reason}"))
-    return [{"time_s": t / 1e9, "what": what} for t, what in sorted(told)]
+        outcome = "accepted" if r.accepted else "refused"
+        events.append((r.sim_time_ns, f"command {r.command} chaser {r.chaser}: {outcome}: {r.reason}"))
+    return [{"time_s": t / 1e9, "what": what} for t, what in sorted(events)]
 
 
-def _messages(flight: Flight) -> dict[str, dict[str, int]]:
+def _messages(flight: RecordedFlight) -> dict[str, dict[str, int]]:
     out: dict[str, dict[str, int]] = defaultdict(lambda: {"count": 0, "lost": 0})
     for key, count in flight.counts.items():
-        # Presence is told before anybody listens; what was missed then is no loss.
+        # Presence is published before subscriptions exist: missing messages are not losses.
         lost = 0 if key.endswith("/presence") else flight.lost.get(key, 0)
         out[key] = {"count": count, "lost": lost}
     return dict(out)
 
 
 def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
-    """Which of the scenario's criteria a summary does not meet, in words."""
+    """Return a message for each criterion of the scenario that a summary violates."""
     out = []
     if result["sim_time_s"] < s.duration_s - 1.0 / s.time.rate_hz:
         out.append(f"ended at {result['sim_time_s']:.2f} s of {s.duration_s:g} s")
@@ -318,7 +324,7 @@ def _limit(
 
 
 def text_of(result: dict[str, Any]) -> str:
-    """The summary for people, a few lines."""
+    """Format the summary as a few lines of text."""
     factor = result["sim_time_s"] / result["wall_time_s"] if result["wall_time_s"] else 0.0
     lines = [
         f"{result['scenario']}: {'success' if result['success'] else 'FAILED'}; {result['sim_time_s']:.1f} s flown in "
@@ -332,7 +338,7 @@ def text_of(result: dict[str, Any]) -> str:
                 f"steady RMS {math.sqrt(steady['position_mse_m2']) * 1e3:.2f} mm, "
                 f"{math.degrees(math.sqrt(steady['orientation_mse_rad2'])):.3f} deg; "
             )
-        line += f"nearest to the target {c['min_distance_target_m']:.3f} m"
+        line += f"closest to the target {c['min_distance_target_m']:.3f} m"
         if c["propellant_kg"] > 0.0:
             line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
         if c["docked"]:
@@ -352,7 +358,7 @@ def text_of(result: dict[str, Any]) -> str:
         latency = result["latency_s"]
         lines.append(
             f"  exposure to command: median {latency['p50'] * 1e3:.1f} ms, p99 {latency['p99'] * 1e3:.1f} ms; "
-            f"{result['late_commands']} commands late, {result['unanswered']} never came"
+            f"{result['late_commands']} commands late, {result['unanswered']} missing"
         )
     lines += [f"  not met: {failure}" for failure in result["failures"]]
     lines += [f"  not judged: {reason}" for reason in result["not_judged"]]

@@ -1,4 +1,4 @@
-"""A film of a recorded flight: the mission from outside beside what the cameras saw, detections drawn."""
+"""Video of a recorded flight: external view beside the camera images with their detections."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from chaserdock_protocol.recording.log import LogError
 
 from .chase_camera import Pixels, Pose, Viewpoint, draw, tint
 from .columns import nanoseconds
-from .flight import Flight, Track, load_flight
+from .flight import RecordedFlight, Track, load_flight
 from .images import Pair, columns_for, shots
 from .scene import scene_of
-from .snapshot import view
+from .snapshot import annotated_image
 from .summary import tracking_errors
 
 ENDINGS = (".mp4", ".webp", ".gif")
@@ -39,27 +39,27 @@ def write_video(
     height_px: int = 720,
     part_s: tuple[float, float] = (0.0, math.inf),
     quality: int = 60,
-    told: Callable[[float], None] = lambda time_s: None,
+    report_progress: Callable[[float], None] = lambda time_s: None,
 ) -> int:
-    """Writes the film of a log (or run folder) and returns the number of its frames.
+    """Write the video of a log (or run folder); return the number of frames.
 
-    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds a second of film; ``part_s``: the
-    simulated times of the first and last frame; ``quality``: of .webp, 0 to 100; ``told`` hears of each frame's
-    simulated time. Raises LogError for a log that cannot be read or holds no motion or image, and
-    ChaserdockError for a size or file that cannot be.
+    ``out`` ends in .mp4 (H.264, yuv420p), .webp or .gif. ``speed``: simulated seconds per second of video; ``part_s``:
+    simulated times of the first and last frame; ``quality``: of .webp, 0 to 100; ``report_progress`` receives the
+    simulated time of each frame. Raise LogError for an unreadable log or one without motion or image, ChaserdockError
+    for an invalid size or file.
     """
     ending = out.suffix.lower()
     if ending not in _CODECS:
         raise ChaserdockError(f"{out}: must end in {', '.join(ENDINGS)}")
     if width_px % 2 or height_px % 2:
         raise ChaserdockError(
-            f"{width_px} x {height_px} pixels: both must be even for the film to play everywhere"
+            f"{width_px} x {height_px} pixels: both must be even (required by H.264 with yuv420p)"
         )
     if not part_s[0] < part_s[1]:
-        raise ChaserdockError(f"a film from {part_s[0]:g} s to {part_s[1]:g} s has no length")
+        raise ChaserdockError(f"a video from {part_s[0]:g} s to {part_s[1]:g} s has no length")
     flight = load_flight(log)
     if "target" not in flight.truth:
-        raise LogError(f"{log}: holds no motion of the target; there is nothing to film")
+        raise LogError(f"{log}: holds no motion of the target; nothing to film")
     number = 0
     try:
         with av.open(str(out), "w") as container:
@@ -72,7 +72,7 @@ def write_video(
             elif ending == ".webp":
                 stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
             for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
-                told(time_s)
+                report_progress(time_s)
                 image = av.VideoFrame.from_ndarray(frame, format="bgr24")
                 image.pts = number
                 container.mux(stream.encode(image))
@@ -83,32 +83,32 @@ def write_video(
         raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
     if not number:
         out.unlink(missing_ok=True)
-        begun = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
-        raise LogError(f"{log}: holds no image{begun}; there is nothing to film")
+        after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""
+        raise LogError(f"{log}: holds no image{after}; nothing to film")
     return number
 
 
 def frames(
     log: Path,
-    flight: Flight,
+    flight: RecordedFlight,
     every_s: float,
     width_px: int,
     height_px: int,
     part_s: tuple[float, float] = (0.0, math.inf),
 ) -> Iterator[tuple[float, Pixels]]:
-    """Simulated time (s) and film frame (height, width, 3), BGR, ``every_s`` of simulated time within ``part_s``."""
+    """Yield simulated time (s) and video frame (height, width, 3), BGR, every ``every_s`` of simulated time in ``part_s``."""
     number = len(flight.scenario.chasers)
     camera = flight.scenario.camera
     aspect = camera.width_px / camera.height_px
     columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
     rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
     side_px = columns * shot_px
-    director = _Director(flight, width_px - side_px, height_px, part_s)
+    external = _ExternalView(flight, width_px - side_px, height_px, part_s)
     for time_s, latest in shots(log, number, every_s, part_s[0]):
         if time_s > part_s[1] + 1e-9:
             return
         frame = np.zeros((height_px, width_px, 3), dtype=np.uint8)
-        frame[:, : width_px - side_px] = director.shoot(time_s)
+        frame[:, : width_px - side_px] = external.draw(time_s)
         top = max(0, (height_px - rows * shot_height_px) // 2)
         for i in range(number):
             x = width_px - side_px + (i % columns) * shot_px
@@ -120,25 +120,27 @@ def frames(
         yield time_s, frame
 
 
-def _camera(flight: Flight, chaser: int, pair: Pair | None, width_px: int) -> Pixels:
+def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: int) -> Pixels:
     height = round(width_px * flight.scenario.camera.height_px / flight.scenario.camera.width_px)
-    said = "no image yet"
+    status = "no image yet"
     if pair is not None:
         try:
-            return view(flight.scenario, *pair, width_px)
+            return annotated_image(flight.scenario, *pair, width_px)
         except LogError:
-            said = "unreadable image"
+            status = "unreadable image"
     empty = np.full((height, width_px, 3), 24, dtype=np.uint8)
     cv2.putText(
-        empty, f"chaser {chaser}  {said}", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA
+        empty, f"chaser {chaser}  {status}", (8, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, _INK, 1, cv2.LINE_AA
     )
     return empty
 
 
-class _Director:
-    """Knows the flight and where to look at it from; one image a time."""
+class _ExternalView:
+    """Draws the mission from a fixed direction, one image at a time."""
 
-    def __init__(self, flight: Flight, width_px: int, height_px: int, part_s: tuple[float, float]) -> None:
+    def __init__(
+        self, flight: RecordedFlight, width_px: int, height_px: int, part_s: tuple[float, float]
+    ) -> None:
         self.flight = flight
         self.size = (width_px, height_px)
         self.scene = scene_of(flight.scenario)
@@ -153,18 +155,18 @@ class _Director:
             shown = (own.time_s[:n] >= part_s[0]) & (own.time_s[:n] <= part_s[1])
             away_m = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)[shown]
             reach = max(reach, float(away_m.max(initial=0.0)))
-        # Far flown strays must not make all others small.
+        # Distant chasers must not reduce the scale for all others.
         self.distance_m = 3.5 * min(reach, 3.0)
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
-        self.phases = {i: flight.told[i].phases if i in flight.told else [] for i in self.numbers}
+        self.phases = {i: flight.references[i].phases if i in flight.references else [] for i in self.numbers}
         self.seen = {
             i: set(nanoseconds(s.time_s[s.seen]).tolist())
             for i in self.numbers
             if (s := flight.sightings.get(i)) is not None
         }
 
-    def shoot(self, time_s: float) -> Pixels:
-        """The mission from outside at a simulated time, with clock and phases."""
+    def draw(self, time_s: float) -> Pixels:
+        """Draw the mission at a simulated time, with clock and phases."""
         chasers = {i: _pose(own, time_s) for i, own in self.chasers.items()}
         paths: dict[int | None, Any] = {None: _trail(self.target, time_s)}
         paths |= {i: _trail(own, time_s) for i, own in self.chasers.items()}
@@ -186,7 +188,7 @@ class _Director:
             phase = next((name for t, name in reversed(self.phases[i]) if t <= time_s + 1e-9), "waiting")
             times, position, _ = self.errors[i]
             row = min(int(np.searchsorted(times, time_s + 1e-6)) - 1, len(times) - 1)
-            error = f"{1e3 * position[max(row, 0)]:7.2f} mm off" if len(times) else ""
+            error = f"{1e3 * position[max(row, 0)]:7.2f} mm error" if len(times) else ""
             y = self.size[1] - 14 - 20 * (len(self.numbers) - 1 - line)
             put(f"chaser {i}  {phase:<9}", _MARGIN_PX + 4, y, tint(i).tolist())
             put(error, _MARGIN_PX + 180, y, _INK)
@@ -201,7 +203,7 @@ def _time_of(track: Track, time_s: float) -> float:
 
 
 def _pose(track: Track, time_s: float) -> Pose:
-    """The pose at the last tick up to a time: what an image of that time shows."""
+    """Return the pose at the last tick up to a time, as in an image of that time."""
     row = _row(track, time_s)
     return track.position_m[row], track.q_wxyz[row]
 

@@ -11,7 +11,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.recording.log import LogSource, read_log
 
-from chaserdock.analysis.flight import NOT_IN_DIGEST, Flight, load_flight
+from chaserdock.analysis.flight import NOT_IN_DIGEST, RecordedFlight, load_flight
 from chaserdock.analysis.summary import summary_of
 
 from .difference import Comparison, TopicDifference, difference_lines, first_difference
@@ -76,7 +76,7 @@ def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[Top
     return comparison.finish()
 
 
-def _apart(a: Flight, b: Flight) -> dict[str, Apart]:
+def _apart(a: RecordedFlight, b: RecordedFlight) -> dict[str, Apart]:
     out = {}
     for name in [*(n for n in a.truth if n in b.truth), "target estimate"]:
         estimate = name == "target estimate"

@@ -15,7 +15,7 @@ from chaserdock_protocol.messages import Image
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import Scenario
 
-from chaserdock.analysis.snapshot import view
+from chaserdock.analysis.snapshot import annotated_image
 
 from . import text as words
 from .history import History
@@ -262,7 +262,7 @@ class Page:
     def _image(self, image: Image, sighting: Any) -> Any:
         """RGB, the size of a tile; black for a damaged one, of which the table says "bad image"."""
         try:
-            drawn = view(self._scenario, image, sighting, _IMAGE_PX)[:, :, ::-1]
+            drawn = annotated_image(self._scenario, image, sighting, _IMAGE_PX)[:, :, ::-1]
         except LogError:
             drawn = np.zeros((*self._tile, 3), np.uint8)
         return drawn if drawn.shape[:2] == self._tile else cv2.resize(drawn, self._tile[::-1])

@@ -1,8 +1,9 @@
-"""Replay: today's code against a log, equal or told where; comparison of messages and of runs."""
+"""Replay of logs through current code; comparison of messages and of runs."""
 
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 import zlib
 from collections.abc import Iterable, Iterator
@@ -17,6 +18,7 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.recording.log import LogWriter, Record, read_log, read_scenario
 from chaserdock_protocol.recording.scan import stored_messages
+from chaserdock_protocol.recording.schema_migrations import UPGRADES, current_key, decode_logged
 from chaserdock_protocol.replay_node import order_by_tick
 from chaserdock_protocol.transport import ReceivedMessage
 from harness import finished
@@ -57,9 +59,9 @@ def test_every_golden_log_is_replayed() -> None:
 @pytest.mark.parametrize(("log", "through"), REPLAYS, ids=lambda p: getattr(p, "stem", p))
 def test_golden_logs_replay_equal(log: Path, through: str) -> None:
     found = replay(log, through, tolerance=TOLERANCE)
-    told = "\n".join(difference_lines(found.topics, ("recorded", "now")))
-    assert found.equal, told
-    assert sum(t.compared for t in found.topics) >= 18, told
+    differences = "\n".join(difference_lines(found.topics, ("recorded", "now")))
+    assert found.equal, differences
+    assert sum(t.compared for t in found.topics) >= 18, differences
     assert found.notes == []
 
 
@@ -69,8 +71,8 @@ def test_replay_is_deterministic(through: str) -> None:
     assert replay(GOLDEN, through, what_if) == replay(GOLDEN, through, what_if)
 
 
-def test_order_in_the_file_does_not_matter(tmp_path: Path) -> None:
-    """A recorder hears the processes in any order; here each key comes whole, after the other."""
+def test_replay_does_not_depend_on_the_order_in_the_file(tmp_path: Path) -> None:
+    """A recorder receives the processes in any order; here the keys are shuffled within a tick."""
     shuffled, path = (
         sorted(read_log(GOLDEN), key=lambda r: r.message.tick * 1000 + zlib.crc32(r.key.encode()) % 7),
         tmp_path / "s.mcap",
@@ -83,7 +85,7 @@ def test_order_in_the_file_does_not_matter(tmp_path: Path) -> None:
     assert replay(path, "controller", tolerance=TOLERANCE).equal
 
 
-def test_a_change_in_the_filter_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_replay_finds_a_change_in_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """The filter's estimate moved by a tenth of a millimetre from half a second on: the diff says where and when."""
     original = mekf.Mekf.update
 
@@ -106,7 +108,7 @@ def test_a_change_in_the_filter_is_found(monkeypatch: pytest.MonkeyPatch) -> Non
     assert first_difference(found.topics) == "controller/target: position_m at 0.533 s (tick 8)"
 
 
-def test_what_if_changes_what_depends_on_it_alone() -> None:
+def test_override_changes_only_dependent_messages() -> None:
     """Other weights: other commands, the same estimate."""
     found = {t.key: t for t in replay(GOLDEN, "controller", ("controller.weight_force=5.0",)).topics}
     assert found["controller/chaser/0/wrench"].unequal > 10
@@ -115,7 +117,7 @@ def test_what_if_changes_what_depends_on_it_alone() -> None:
     assert estimate == replay(GOLDEN, "fusion").topics
 
 
-def test_missing_and_extra_answers_are_told(tmp_path: Path) -> None:
+def test_missing_and_extra_answers_are_reported(tmp_path: Path) -> None:
     def change(record: Record) -> Any:
         if record.topic is topics.SIGHTING and record.message.chaser == 1 and record.message.tick == 5:
             return None
@@ -128,28 +130,31 @@ def test_missing_and_extra_answers_are_told(tmp_path: Path) -> None:
     assert found["chaser/0/sighting"].equal
 
 
-def test_operators_commands_are_replayed(tmp_path: Path) -> None:
-    """A command that the log holds acts in the replay at its tick: without it the flights would not be equal."""
+def test_operator_commands_are_replayed(tmp_path: Path) -> None:
+    """A recorded command takes effect in the replay at its tick."""
     command = m.OperatorCommand(tick=9, sim_time_ns=600_000_000, command="hold", chaser=1)
 
-    def with_command(path: Path, told: bool) -> Path:
+    def with_command(path: Path, commanded: bool) -> Path:
         source = rewritten(GOLDEN, path.with_suffix(".tmp"))
         writer = LogWriter(path)
         writer.describe(read_scenario(source)[0], {"mode": "lockstep"})
         for r in read_log(source):
             writer.write(r.key, m.encoding_of(type(r.message)), codec.encode(r.message), r.sent_ns)
-        if told:
+        if commanded:
             writer.write("controller/operated", m.encoding_of(m.OperatorCommand), codec.encode(command), 1)
         writer.close()
         return path
 
-    for told, extra in ((False, 0), (True, 1)):
-        found = {t.key: t for t in replay(with_command(tmp_path / f"{told}.mcap", told), "controller").topics}
-        # The reply to it is said now, and was never recorded.
+    for commanded, extra in ((False, 0), (True, 1)):
+        found = {
+            t.key: t
+            for t in replay(with_command(tmp_path / f"{commanded}.mcap", commanded), "controller").topics
+        }
+        # Today's reply has no recorded counterpart.
         assert found["controller/command"].alone == [0, extra]
 
 
-def test_command_line(tmp_path: Path) -> None:
+def test_replay_command(tmp_path: Path) -> None:
     log = str(GOLDEN)
     status, said = finished("replay", log, "--through", "fusion", "--tolerance", str(TOLERANCE))
     assert (status, said.splitlines()[-1]) == (0, "equal to the log"), said
@@ -176,7 +181,7 @@ def test_command_line(tmp_path: Path) -> None:
 # -- order ------------------------------------------------------------------------------------------------
 
 
-def test_by_tick_puts_a_ticks_messages_in_the_stages_order() -> None:
+def test_by_tick_orders_messages_of_a_tick_for_the_stage() -> None:
     from chaserdock_controller.replay import CONTROLLER
 
     def received(topic: topics.Topic, tick: int, **changes: Any) -> ReceivedMessage:
@@ -213,7 +218,7 @@ def test_by_tick_puts_a_ticks_messages_in_the_stages_order() -> None:
 @pytest.mark.parametrize(
     "sample", [s for s in BY_TYPE.values() if isinstance(s, m.Message)], ids=lambda s: type(s).__name__
 )
-def test_every_changed_field_is_found_and_nothing_else(sample: m.Message) -> None:
+def test_every_changed_field_is_found(sample: m.Message) -> None:
     assert list(field_differences(sample, sample)) == []
     for name in sample.__struct_fields__:
         value = getattr(sample, name)
@@ -238,7 +243,7 @@ def test_every_changed_field_is_found_and_nothing_else(sample: m.Message) -> Non
         assert [f[0] for f in found] == expected
 
 
-def test_differences_inside_structures_have_their_place() -> None:
+def test_differences_in_nested_structures_are_located() -> None:
     sample: Any = BY_TYPE[m.Sighting]
     moved = msgspec.structs.replace(sample.solutions[1], position_m=(0.25, -1.0, 3.0))
     other = msgspec.structs.replace(sample, solutions=(sample.solutions[0], moved))
@@ -267,7 +272,7 @@ def compared(a: Iterable[m.Message], b: Iterable[m.Message], tolerance: float = 
     return topic
 
 
-def test_comparison_tells_first_largest_and_numbers() -> None:
+def test_comparison_reports_first_and_largest_difference() -> None:
     topic = compared(ticks(50), ticks(50, x=0.5, jump_at=20))
     field = topic.fields["position_m"]
     assert (topic.compared, topic.unequal, topic.alone) == (50, 30, [0, 0])
@@ -278,8 +283,8 @@ def test_comparison_tells_first_largest_and_numbers() -> None:
     assert compared(ticks(3), ticks(9)).alone == [0, 6]
 
 
-def test_comparison_forgets_what_never_finds_a_partner() -> None:
-    """Memory stays bounded when one side says something at every tick that the other never does."""
+def test_comparison_has_bounded_memory() -> None:
+    """Memory is bounded when one side publishes a key at every tick that the other never does."""
     comparison = Comparison()
     for message in ticks(60_000):
         comparison.add(0, "only here", message)
@@ -294,7 +299,7 @@ def test_comparison_forgets_what_never_finds_a_partner() -> None:
 # -- two runs ---------------------------------------------------------------------------------------------
 
 
-def test_compare_equal_runs(tmp_path: Path) -> None:
+def test_equal_runs_compare_equal(tmp_path: Path) -> None:
     shutil.copy(GOLDEN, tmp_path / "mission.mcap")
     found = compare(GOLDEN, tmp_path)
     assert found.equal
@@ -302,7 +307,7 @@ def test_compare_equal_runs(tmp_path: Path) -> None:
     assert comparison_lines(found) == [f"equal flights, digest {found.digests[0]}"]
 
 
-def test_compare_names_what_came_apart_and_when(tmp_path: Path) -> None:
+def test_compare_reports_deviations_of_bodies(tmp_path: Path) -> None:
     def change(record: Record) -> Any:
         message = record.message
         if record.key == "truth/body/chaser/1" and message.tick >= 6:
@@ -322,12 +327,18 @@ def test_compare_names_what_came_apart_and_when(tmp_path: Path) -> None:
     assert any("chasers.1.position_mse_m2" in line for line in comparison_lines(found))
 
 
-def test_stored_bytes_of_the_golden_log_are_todays_encoding() -> None:
-    """What was recorded encodes to the same bytes today: no field was renamed, retyped or reordered unnoticed."""
+def test_golden_log_encodes_to_the_same_values_after_its_upgrades() -> None:
+    """No field was renamed, retyped or reordered without an upgrade."""
     for channel, stored in stored_messages(GOLDEN):
-        found = topics.topic_of_key(channel.topic)
-        if found is None or channel.topic.startswith("/viewer/"):
+        topic = topics.topic_of_key(current_key(channel.topic))
+        if topic is None or channel.topic.startswith("/viewer/"):
             continue
-        values = msgspec.msgpack.decode(stored.data)
-        again = msgspec.msgpack.decode(codec.encode(codec.decode(found[0].kind, stored.data)))
+        encoding = channel.metadata["zenoh_encoding"]
+        recorded = re.fullmatch(r"application/msgpack;chaserdock\.(\w+)\.v(\d+)", encoding)
+        assert recorded is not None
+        values, version = msgspec.msgpack.decode(stored.data), int(recorded[2])
+        while (upgrade := UPGRADES.get((topic[0].kind.__name__, version))) is not None:
+            values, version = upgrade(values), version + 1
+        message = decode_logged(topic[0].kind, stored.data, encoding)
+        again = msgspec.msgpack.decode(codec.encode(message))
         assert {k: again[k] for k in values} == values

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from harness import run, summary
 
-from chaserdock.analysis.flight import Flight, load_flight
+from chaserdock.analysis.flight import RecordedFlight, load_flight
 
 DRILL = "fault-drill"
 SHORT = ("duration_s=6.0", "timeline=[]", "success.docked=[]", "settling_s=1.0")
@@ -16,14 +16,16 @@ SHORT = ("duration_s=6.0", "timeline=[]", "success.docked=[]", "settling_s=1.0")
 pytestmark = pytest.mark.slow
 
 
-def flown(out: Path, *faults: str, arguments: list[str] | None = None) -> tuple[int, Flight, dict[str, Any]]:
+def flown(
+    out: Path, *faults: str, arguments: list[str] | None = None
+) -> tuple[int, RecordedFlight, dict[str, Any]]:
     listed = ", ".join("{" + fault + "}" for fault in faults)
     status, said = run(DRILL, out, *SHORT, f"fault=[{listed}]", arguments=arguments or [])
     assert (out / "summary.json").exists(), said
     return status, load_flight(out / "mission.mcap"), summary(out)
 
 
-def truth_of(flight: Flight) -> list[bytes]:
+def truth_of(flight: RecordedFlight) -> list[bytes]:
     return [flight.truth[name].position_m.tobytes() for name in sorted(flight.truth)]
 
 

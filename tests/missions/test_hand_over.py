@@ -14,7 +14,7 @@ from chaserdock_protocol.messages import ActuatorCommand, Event, Tick
 from chaserdock_protocol.recording.log import LogError, read_log
 from harness import ByHand, run, sets, summary, wait_for_log
 
-from chaserdock.analysis.flight import Flight, load_flight
+from chaserdock.analysis.flight import RecordedFlight, load_flight
 from chaserdock.replay.run import replay
 
 DRILL = "fault-drill"
@@ -23,14 +23,14 @@ SHORT = ("duration_s=4.0", "timeline=[]", "success.docked=[]", "settling_s=1.0",
 pytestmark = pytest.mark.slow
 
 
-def flown(out: Path, fault: str = "", *overrides: str) -> tuple[int, Flight, dict[str, Any]]:
+def flown(out: Path, fault: str = "", *overrides: str) -> tuple[int, RecordedFlight, dict[str, Any]]:
     faults = [f"fault=[{{{fault}}}]"] if fault else []
     status, said = run(DRILL, out, *SHORT, *faults, *overrides)
     assert (out / "summary.json").exists(), said
     return status, load_flight(out / "mission.mcap"), summary(out)
 
 
-def truth_of(flight: Flight) -> dict[str, Any]:
+def truth_of(flight: RecordedFlight) -> dict[str, Any]:
     return {name: flight.truth[name].position_m for name in sorted(flight.truth)}
 
 

@@ -1,4 +1,4 @@
-// The 3-D replay: bodies as flat faces on a 2-D canvas, ordered by depth; no library, no request.
+// 3-D replay: flat faces on a 2-D canvas in order of depth (painter's algorithm), without library or request.
 (function () {
   "use strict";
   const data = JSON.parse(document.getElementById("replay-data").textContent);
@@ -26,7 +26,7 @@
   function sum(a, b) { return [a[0] + b[0], a[1] + b[1], a[2] + b[2]]; }
   function minus(a, b) { return [a[0] - b[0], a[1] - b[1], a[2] - b[2]]; }
 
-  // Rows of a flat track at a time: position linear, attitude linear and normalized (samples lie close).
+  // Interpolation of a flat track: position linear, attitude linear and normalized (samples are close).
   function place(t) {
     let low = 0, high = data.times.length - 1;
     while (high - low > 1) { const mid = (low + high) >> 1; if (data.times[mid] <= t) low = mid; else high = mid; }
@@ -45,9 +45,9 @@
     return { p: p.map((v, k) => v * (1 - f) + r[k] * f), m: matrix(mixed.map((v) => v / n)) };
   }
   function at(list, t) {
-    let found = null;
-    for (const item of list) { if (item[0] > t + 1e-9) break; found = item[1]; }
-    return found;
+    let last = null;
+    for (const item of list) { if (item[0] > t + 1e-9) break; last = item[1]; }
+    return last;
   }
 
   function css(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
@@ -92,7 +92,7 @@
       context.closePath(); context.fill(); context.stroke();
     }
 
-    // Paths: flown ones strong, the rest faint. Riding on the target they are in its axes.
+    // Paths: past strong, future faint. In the target frame they are relative to the target.
     const now = place(time)[0];
     function path(body, colour) {
       const past = [], coming = [];
@@ -142,12 +142,12 @@
       }
     }
 
-    // What each camera looks at, bright while its image is used.
+    // Camera frustums, bright while the image is used.
     data.chasers.forEach((c, k) => {
       const colour = css("--series-" + (c.id % 8));
       const origin = see(sum(apply(poses[k].m, data.scene.camera_origin), poses[k].p));
       const far = [0, 3, 6, 9].map((n) => see(sum(apply(poses[k].m, data.scene.camera_corners.slice(n, n + 3)), poses[k].p)));
-      context.globalAlpha = at(c.look, time) === "used" ? 0.9 : 0.25;
+      context.globalAlpha = at(c.outcome, time) === "used" ? 0.9 : 0.25;
       far.forEach((corner) => line([origin, corner], colour, 0.8));
       line([...far, far[0]], colour, 0.8);
       context.globalAlpha = 1;
@@ -164,7 +164,7 @@
       const [a] = place(time);
       by("replay-row-" + c.id).replaceChildren(...[
         "chaser " + c.id, at(c.phase, time) || "–", Math.hypot(...minus(poses[k].p, target.p)).toFixed(3) + " m",
-        a < c.error_mm.length ? c.error_mm[a].toPrecision(3) + " mm" : "–", at(c.look, time) || "–",
+        a < c.error_mm.length ? c.error_mm[a].toPrecision(3) + " mm" : "–", at(c.outcome, time) || "–",
       ].map((text, n) => {
         const cell = document.createElement(n ? "td" : "th");
         cell.textContent = text;

@@ -26,13 +26,13 @@ from flight_cases import scenario
 from harness import SHORT, finished, run
 
 from chaserdock.analysis.chase_camera import Viewpoint, draw
-from chaserdock.analysis.figures import KINDS, thrusters, write_figures
+from chaserdock.analysis.figures import FIGURES, thrusters, write_figures
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.images import columns_for, pairs, shots
-from chaserdock.analysis.plots import Nothing
+from chaserdock.analysis.plots import MissingData
 from chaserdock.analysis.report import report_of, table, write_report
 from chaserdock.analysis.scene import scene_of
-from chaserdock.analysis.time_series import LOOKS, Inputs, Looks, Traces, load_traces
+from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutcomes, Traces, load_traces
 from chaserdock.analysis.video import frames, write_video
 
 TICK_NS = 1_000_000_000 // 15
@@ -141,14 +141,14 @@ def page(flown: Path) -> Page:
     return checked(report_of(flown / "mission.mcap"))
 
 
-def test_a_page_has_every_figure_and_refers_to_nothing_outside(flown: Path, page: Page) -> None:
+def test_report_has_every_figure_and_no_external_reference(flown: Path, page: Page) -> None:
     drawn = {i for i in page.ids if i.startswith("figure-")}
-    assert drawn >= {f"figure-{k.name}" for k in KINDS if k.name != "thrusters"}
+    assert drawn >= {f"figure-{k.name}" for k in FIGURES if k.name != "thrusters"}
     assert {"replay-section", "events", "scenario", "versions"} <= set(page.ids)
     assert json.loads((flown / "summary.json").read_text())["digest"] in page.words
 
 
-def test_the_replay_shows_the_recorded_motion(flown: Path, page: Page) -> None:
+def test_replay_data_equal_the_recorded_motion(flown: Path, page: Page) -> None:
     data = json.loads(page.data)
     truth = load_flight(flown / "mission.mcap").truth
     assert np.all(np.diff(data["times"]) > 0)
@@ -164,12 +164,12 @@ def test_the_replay_shows_the_recorded_motion(flown: Path, page: Page) -> None:
         assert all(url.startswith("data:image/jpeg;base64,") for url in urls)
 
 
-def test_equal_logs_give_equal_pages(tmp_path: Path) -> None:
+def test_equal_logs_give_equal_reports(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 4)
     assert report_of(log) == report_of(log)
 
 
-def test_a_log_cut_off_gives_a_page(flown: Path, tmp_path: Path) -> None:
+def test_truncated_log_gives_a_report(flown: Path, tmp_path: Path) -> None:
     whole = (flown / "mission.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: int(0.6 * len(whole))])
@@ -178,7 +178,7 @@ def test_a_log_cut_off_gives_a_page(flown: Path, tmp_path: Path) -> None:
     assert "ended at" in page.words
 
 
-def test_a_flight_that_never_saw_the_target_gives_a_page_that_says_so(tmp_path: Path) -> None:
+def test_report_of_a_flight_without_sightings_names_what_is_missing(tmp_path: Path) -> None:
     page = checked(report_of(made_log(tmp_path / "blind.mcap", 8)))
     assert {"figure-tracking", "figure-cameras", "figure-inputs", "replay"} <= set(page.ids)
     assert "figure-estimate" not in page.ids
@@ -187,19 +187,19 @@ def test_a_flight_that_never_saw_the_target_gives_a_page_that_says_so(tmp_path: 
 
 
 @pytest.mark.parametrize("ticks", [0, 1])
-def test_a_flight_aborted_at_once_gives_a_page(tmp_path: Path, ticks: int) -> None:
+def test_flight_aborted_at_once_gives_a_report(tmp_path: Path, ticks: int) -> None:
     page = checked(report_of(made_log(tmp_path / "aborted.mcap", ticks)))
     assert "ended at 0.00 s of 2 s" in page.words
     assert ("replay" in page.ids) == (ticks > 0)
 
 
-def test_a_log_without_truth_gives_a_page_that_says_so(tmp_path: Path) -> None:
+def test_report_of_a_log_without_truth_names_what_is_missing(tmp_path: Path) -> None:
     page = checked(report_of(made_log(tmp_path / "dark.mcap", 5, truth=False)))
     assert "no ground truth of the target" in page.words
     assert "figure-cameras" in page.ids
 
 
-def test_tables_escape_what_they_show() -> None:
+def test_tables_escape_their_cells() -> None:
     assert "&lt;b&gt;" in table(("<b>",), [("<b>", "&")])
     assert "<b>" not in table(("<b>",), [("<b>", "&")])
 
@@ -207,7 +207,7 @@ def test_tables_escape_what_they_show() -> None:
 @pytest.mark.skipif(
     shutil.which("chromium") is None, reason="no chromium on PATH: structure alone is checked"
 )
-def test_a_browser_runs_the_replay(tmp_path: Path) -> None:
+def test_replay_runs_in_a_browser(tmp_path: Path) -> None:
     page = tmp_path / "page.html"
     page.write_text(report_of(made_log(tmp_path / "a.mcap", 5, chasers=2)), encoding="utf-8")
     options = ["--headless=new", "--no-sandbox", "--disable-gpu", "--virtual-time-budget=2000", "--dump-dom"]
@@ -220,62 +220,66 @@ def test_a_browser_runs_the_replay(tmp_path: Path) -> None:
 # -- figures ------------------------------------------------------------------------------------------------
 
 
-def test_figures_are_files_of_the_format(tmp_path: Path) -> None:
+def test_figures_are_written_in_the_requested_format(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8, chasers=2)
     for ending, begins in (("svg", b"<?xml"), ("pdf", b"%PDF")):
         files, missing = write_figures(log, tmp_path / ending, ending)
-        assert {f.stem for f in files} | set(missing) == {k.name for k in KINDS}
+        assert {f.stem for f in files} | set(missing) == {k.name for k in FIGURES}
         assert {"tracking", "docking", "separation", "inputs", "cameras"} <= {f.stem for f in files}
         assert all(f.read_bytes().startswith(begins) for f in files)
         if ending == "svg":
             assert all(ElementTree.parse(f).getroot().tag.endswith("svg") for f in files)
 
 
-def test_inputs_are_the_impulses_over_the_ticks(tmp_path: Path) -> None:
+def test_forces_are_impulses_divided_by_tick_durations(tmp_path: Path) -> None:
     given = load_traces(made_log(tmp_path / "a.mcap", 5), [0]).inputs[0]
     assert given.edges_s.shape == (5,)
     np.testing.assert_allclose(given.force_N, np.tile([1.5, 0.0, 0.0], (4, 1)), rtol=1e-6)
     assert given.thruster_duty.shape == (4, 0)
 
 
-def test_images_have_their_fate(tmp_path: Path) -> None:
-    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).looks[0]
-    assert {LOOKS[code] for code in nothing.code} == {"nothing"}
-    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).looks[0]
-    assert list(seen.stretches()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
+def test_every_image_has_an_outcome(tmp_path: Path) -> None:
+    nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).image_outcomes[0]
+    assert {OUTCOMES[code] for code in nothing.code} == {"no marker"}
+    seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).image_outcomes[0]
+    assert list(seen.intervals()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
     np.testing.assert_array_equal(seen.time_s, [k * TICK_NS / 1e9 for k in range(4)])
 
 
-def test_stretches_end_where_the_fate_changes_and_at_gaps() -> None:
-    looks = Looks(np.array([0.0, 1.0, 2.0, 3.0, 7.0]), np.array([0, 0, 2, 2, 2]))
-    assert list(looks.stretches()) == [(0.0, 1.0, "used"), (2.0, 7.0, "nothing")]
-    assert list(looks.stretches(1.5)) == [(0.0, 1.0, "used"), (2.0, 3.0, "nothing"), (7.0, 7.0, "nothing")]
-    assert list(Looks(np.zeros(0), np.zeros(0, dtype=np.intp)).stretches()) == []
+def test_intervals_end_at_changes_and_gaps() -> None:
+    outcomes = ImageOutcomes(np.array([0.0, 1.0, 2.0, 3.0, 7.0]), np.array([0, 0, 2, 2, 2]))
+    assert list(outcomes.intervals()) == [(0.0, 1.0, "used"), (2.0, 7.0, "no marker")]
+    assert list(outcomes.intervals(1.5)) == [
+        (0.0, 1.0, "used"),
+        (2.0, 3.0, "no marker"),
+        (7.0, 7.0, "no marker"),
+    ]
+    assert list(ImageOutcomes(np.zeros(0), np.zeros(0, dtype=np.intp)).intervals()) == []
 
 
-def test_inputs_of_several_ticks_are_means_over_all_of_them(tmp_path: Path) -> None:
+def test_forces_over_several_ticks_are_means(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
     one, three = (load_traces(log, [0], every).inputs[0] for every in (1, 3))
     np.testing.assert_array_equal(three.edges_s, one.edges_s[::3])
     np.testing.assert_allclose(three.force_N, one.force_N[:6].reshape(2, 3, 3).mean(axis=1), rtol=1e-12)
 
 
-def test_thrusters_are_drawn_where_there_are_any(tmp_path: Path) -> None:
+def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
     flight = load_flight(made_log(tmp_path / "a.mcap", 5))
     traces = load_traces(tmp_path / "a.mcap", [0])
-    with pytest.raises(Nothing, match="no thrusters"):
+    with pytest.raises(MissingData, match="no thrusters"):
         thrusters(flight, traces)
     duty = np.linspace(0.0, 1.0, 24).reshape(2, 12)
-    given = Inputs(np.array([0.0, 1.0, 2.0]), np.zeros((2, 3)), np.zeros((2, 3)), duty)
+    given = ActuatorHistory(np.array([0.0, 1.0, 2.0]), np.zeros((2, 3)), np.zeros((2, 3)), duty)
     figure = thrusters(flight, Traces({0: given}, {}, {}))
     drawn: Any = figure.axes[0].collections[0]
     np.testing.assert_array_equal(np.reshape(drawn.get_array(), (12, 2)), duty.T)
 
 
-# -- images and film ----------------------------------------------------------------------------------------
+# -- images and video ---------------------------------------------------------------------------------------
 
 
-def test_images_come_with_the_sighting_of_the_same_exposure(flown: Path) -> None:
+def test_images_are_paired_with_sightings_of_the_same_exposure(flown: Path) -> None:
     found = list(pairs(flown / "mission.mcap", 2))
     counts = load_flight(flown / "mission.mcap").counts
     assert len(found) == counts["world/chaser/0/image"] + counts["world/chaser/1/image"]
@@ -284,7 +288,7 @@ def test_images_come_with_the_sighting_of_the_same_exposure(flown: Path) -> None
         assert (sighting.chaser, sighting.sim_time_ns) == (image.chaser, image.sim_time_ns)
 
 
-def test_shots_hold_the_latest_images_and_no_later_one(tmp_path: Path) -> None:
+def test_shots_hold_the_latest_images(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 16, chasers=2)
     found = list(shots(log, 2, 0.25))
     assert [time_s for time_s, _ in found] == [0.0, 0.25, 0.5, 0.75, 1.0]
@@ -294,7 +298,7 @@ def test_shots_hold_the_latest_images_and_no_later_one(tmp_path: Path) -> None:
             assert 0.0 <= time_s - image.sim_time_ns / 1e9 < 1 / 15 + 1e-6
 
 
-def test_images_fit_their_place() -> None:
+def test_image_columns_fit_the_frame() -> None:
     for number in range(1, 17):
         columns, width = columns_for(number, 16 / 9, 480, 720)
         rows = -(-number // columns)
@@ -307,8 +311,8 @@ def test_images_fit_their_place() -> None:
     ("azimuth", "elevation", "face"),
     [(0, 0, 0), (180, 0, 1), (90, 0, 2), (-90, 0, 3), (0, 90, 4), (0, -90, 5)],
 )
-def test_the_drawn_target_bears_its_markers(model: str, azimuth: float, elevation: float, face: int) -> None:
-    """Drawn face-on, a face shows exactly the markers that lie on it, neither mirrored nor turned over."""
+def test_drawn_target_shows_its_markers(model: str, azimuth: float, elevation: float, face: int) -> None:
+    """Drawn face-on, a face shows exactly the markers on it, neither mirrored nor rotated."""
     wanted = target_model(model)
     scene = scene_of(scenario(target={"model": model}))
     view = Viewpoint(np.zeros(3), 1.2, np.radians(azimuth), np.radians(elevation), 1200, 1200)
@@ -323,11 +327,11 @@ def test_the_drawn_target_bears_its_markers(model: str, azimuth: float, elevatio
     for marker_id, found in zip(np.ravel(ids).tolist(), corners, strict=True):
         marker = wanted.marker(int(marker_id))
         assert marker is not None
-        expected, _ = view.see(marker.corners_trf_m())
+        expected, _ = view.project(marker.corners_trf_m())
         np.testing.assert_allclose(np.reshape(found, (4, 2)), expected, atol=2.0)
 
 
-def test_a_film_plays(flown: Path, tmp_path: Path) -> None:
+def test_video_is_playable(flown: Path, tmp_path: Path) -> None:
     out = tmp_path / "film.mp4"
     number = write_video(flown, out, speed=2.0, fps=10, width_px=640, height_px=360)
     with av.open(str(out)) as container:
@@ -339,8 +343,8 @@ def test_a_film_plays(flown: Path, tmp_path: Path) -> None:
     assert np.mean(np.abs(images[0].astype(float) - images[-1])) > 0.3  # something moves
 
 
-def test_a_film_of_a_part(tmp_path: Path) -> None:
-    """Frames from the first time named to the last; a part without length, or behind the end, is no film."""
+def test_video_of_an_interval(tmp_path: Path) -> None:
+    """Frames cover the interval; an empty interval or one after the end raises an error."""
     log = made_log(tmp_path / "a.mcap", 8)
     every = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180)]
     part = [time_s for time_s, _ in frames(log, load_flight(log), 1 / 15, 320, 180, (every[2], every[5]))]
@@ -352,7 +356,7 @@ def test_a_film_of_a_part(tmp_path: Path) -> None:
     assert not (tmp_path / "a.webp").exists()
 
 
-def test_a_film_for_a_web_page(tmp_path: Path) -> None:
+def test_video_as_webp_and_gif(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 8)
     for name, begins in (("a.webp", b"RIFF"), ("a.gif", b"GIF89a")):
         assert write_video(log, tmp_path / name, width_px=320, height_px=180) == 8
@@ -362,27 +366,29 @@ def test_a_film_for_a_web_page(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "size", "fault"), [("a.avi", (320, 180), "must end in"), ("a.mp4", (321, 180), "must be even")]
 )
-def test_an_impossible_film_is_refused(tmp_path: Path, name: str, size: tuple[int, int], fault: str) -> None:
+def test_invalid_video_format_is_rejected(
+    tmp_path: Path, name: str, size: tuple[int, int], fault: str
+) -> None:
     log = made_log(tmp_path / "a.mcap", 2)
     with pytest.raises(ChaserdockError, match=fault):
         write_video(log, tmp_path / name, width_px=size[0], height_px=size[1])
     assert not (tmp_path / name).exists()
 
 
-def test_a_film_of_nothing_is_refused(tmp_path: Path) -> None:
+def test_video_without_images_is_rejected(tmp_path: Path) -> None:
     log = made_log(tmp_path / "a.mcap", 0)
     with pytest.raises(LogError, match="nothing to film"):
         write_video(log, tmp_path / "a.mp4")
     assert not (tmp_path / "a.mp4").exists()
 
 
-def test_the_program_says_what_is_wrong(tmp_path: Path) -> None:
+def test_report_command_prints_a_one_line_error(tmp_path: Path) -> None:
     status, said = finished("report", str(tmp_path))
     assert (status, "holds no log" in said, "Traceback" in said) == (2, True, False)
 
 
-def test_a_log_that_is_not_there_is_named(tmp_path: Path) -> None:
-    for make in (report_of_path, figures_of_path, film_of_path):
+def test_missing_log_is_named(tmp_path: Path) -> None:
+    for make in (report_of_path, figures_of_path, video_of_path):
         with pytest.raises(ChaserdockError, match="none: cannot be read: No such file"):
             make(tmp_path / "none", tmp_path)
 
@@ -395,5 +401,5 @@ def figures_of_path(log: Path, out: Path) -> None:
     write_figures(log, out, "svg")
 
 
-def film_of_path(log: Path, out: Path) -> None:
+def video_of_path(log: Path, out: Path) -> None:
     write_video(log, out / "a.mp4")

@@ -1,0 +1,107 @@
+"""Docking and goal criteria of a recorded flight, evaluated on ground truth."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.docking_geometry import centre_offset
+from chaserdock_protocol.scenario import Scenario
+
+from .flight import RecordedFlight
+
+_CONTACT_SLACK_M = 0.02
+
+
+def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
+    """Return the capture of a chaser as plain values for JSON; None without a port.
+
+    ``latched``: at the end. ``latch_time_s`` and the contact values are those of the touch that closed the latch.
+    """
+    if flight.scenario.docking.port_of(chaser) is None:
+        return None
+    touches = [t for t in flight.world.touches if t.chaser == chaser]
+    latching = [t for t in touches if t.latched]
+    last = latching[-1] if latching else None
+    reference = flight.references.get(chaser)
+    return {
+        "latched": chaser in flight.world.latched,
+        "verified": reference is not None and reference.phases[-1][1] == "verified",
+        "latch_time_s": None if last is None else last.sim_time_ns / 1e9,
+        "contact_lateral_m": None if last is None else last.lateral_m,
+        "contact_angle_rad": None if last is None else last.angle_rad,
+        "contact_closing_m_s": None if last is None else last.closing_m_s,
+        "contact_lateral_speed_m_s": None if last is None else last.lateral_speed_m_s,
+        "probe_touches": len(touches),
+        "refused": [t.refused for t in touches if not t.latched],
+    }
+
+
+def nearest_allowed_m(s: Scenario, chaser: int) -> float:
+    """Return the smallest allowed distance of a chaser from the target's centre; smaller for a chaser with a port."""
+    port, limit = s.docking.port_of(chaser), s.limits.min_distance_target_m
+    if port is None:
+        return limit
+    latched_m = float(np.linalg.norm(centre_offset(port, s.chaser.probe_reach_m, 0.0)))
+    return min(limit, latched_m - _CONTACT_SLACK_M)
+
+
+def capture_failures(result: dict[str, Any], s: Scenario) -> list[str]:
+    """Return a message for each chaser that should be latched and verified but is not."""
+    out = []
+    for i in s.success.latched:
+        capture = result["chasers"].get(str(i), {}).get("capture")
+        if capture is None or not capture["latched"]:
+            refused = capture["refused"] if capture else []
+            out.append(
+                f"chaser {i} is not latched" + (f"; last rejected touch: {refused[-1]}" if refused else "")
+            )
+        elif not capture["verified"]:
+            out.append(f"chaser {i} is latched but not verified by a pull test")
+    return out
+
+
+def capture_text(capture: dict[str, Any]) -> str:
+    """Describe a capture as part of a line."""
+    if capture["latch_time_s"] is None:
+        return "; never latched"
+    state = "verified" if capture["verified"] else "latched" if capture["latched"] else "released"
+    return (
+        f"; {state}, latched at {capture['latch_time_s']:.1f} s: {capture['contact_lateral_m'] * 1e3:.2f} mm and "
+        f"{np.degrees(capture['contact_angle_rad']):.2f} deg off, closing at "
+        f"{capture['contact_closing_m_s'] * 1e3:.1f} mm/s"
+    )
+
+
+def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
+    """Return the simulated time (s) from which on a chaser stays at the goal of its last ``goto``; None if it does not.
+
+    The goal is the one of the scenario, on the true target. Chasers without a ``goto`` in the time line have none.
+    """
+    goal, success = flight.scenario.goal_of(chaser), flight.scenario.success
+    if goal is None:
+        return None
+    start_s, offset_m = goal
+    target, own = flight.truth["target"], flight.truth[f"chaser/{chaser}"]
+    n = min(len(target.time_s), len(own.time_s))
+    goal_m = target.position_m[:n] + rotations.rotate(target.q_wxyz[:n], np.array(offset_m))
+    away = np.linalg.norm(own.position_m[:n] - goal_m, axis=1) > success.reached_position_m
+    outside = np.flatnonzero(away | (target.time_s[:n] < start_s))
+    first = int(outside[-1]) + 1 if len(outside) else 0
+    return float(target.time_s[first]) if first < n else None
+
+
+def not_reached(scenario: Scenario, chaser: int, time_s: float | None) -> list[str]:
+    """Return the violations of ``success.reached``, given the time from which on the chaser stayed at its goal."""
+    success, goal = scenario.success, scenario.goal_of(chaser)
+    if chaser not in success.reached or goal is None:
+        return []
+    if time_s is None:
+        return [f"chaser {chaser} is not within {success.reached_position_m:g} m of its goal"]
+    took_s = time_s - goal[0]
+    if success.reached_within_s is not None and took_s > success.reached_within_s:
+        return [
+            f"chaser {chaser} reached its goal after {took_s:.1f} s, at most {success.reached_within_s:g} s allowed"
+        ]
+    return []

@@ -1,4 +1,4 @@
-"""A headless Chromium for tests of the viewer's page: Debian's, driven by Playwright, drawing without a GPU."""
+"""Headless Chromium for tests of the viewer's page, driven by Playwright, without a GPU."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import psutil
 from playwright.sync_api import Browser, Page, sync_playwright
 
 PATIENCE_MS = 600_000.0
-"""A busy machine without a GPU takes its time; nothing here is judged by how long it took."""
+"""Generous: rendering without a GPU is slow, and no test measures it."""
 _NO_GPU = ("--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 
 
 def why_no_browser() -> str:
-    """Why pages cannot be tried here, or nothing."""
-    return "" if chromium_path() else "no chromium here (Debian: apt-get install chromium)"
+    """Return the reason why no browser is available, or an empty string."""
+    return "" if chromium_path() else "chromium is not installed (Debian: apt-get install chromium)"
 
 
 def chromium_path() -> str | None:
@@ -25,7 +25,7 @@ def chromium_path() -> str | None:
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """A browser of its own, ended in any case, frozen or not."""
+    """Run a browser and end it in any case, even if frozen."""
     with sync_playwright() as playwright:
         before = set(psutil.Process().children(recursive=True))
         browser = playwright.chromium.launch(executable_path=chromium_path(), args=list(_NO_GPU))
@@ -39,7 +39,7 @@ def chromium() -> Iterator[Browser]:
 
 
 def open_page(browser: Browser, url: str, width_px: int = 1000, height_px: int = 600) -> Page:
-    """A tab on ``url``, drawing coarsely to spare the processor."""
+    """Open a tab on ``url`` at low resolution, which reduces the load."""
     page = browser.new_page(viewport={"width": width_px, "height": height_px})
     page.set_default_timeout(PATIENCE_MS)
     page.goto(f"{url}/?fixedDpr=0.3")
@@ -47,7 +47,7 @@ def open_page(browser: Browser, url: str, width_px: int = 1000, height_px: int =
 
 
 def freeze(browser_of: psutil.Process) -> list[psutil.Process]:
-    """Stops (SIGSTOP) every process of the browsers that ``browser_of`` has started; which they are."""
+    """Stop (SIGSTOP) every browser process that ``browser_of`` has started; return them."""
     chromes = [p for p in browser_of.children(recursive=True) if "chrom" in p.name()]
     for process in chromes:
         process.suspend()

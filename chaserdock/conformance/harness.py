@@ -1,4 +1,4 @@
-"""The test stand: a world and its partners out of a log, over real Zenoh, around one foreign process."""
+"""Test stand: world and partners replayed from a log over Zenoh, for one process under test."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from chaserdock.launch.launcher import open_hub
 
 from .rules import Finding, Ledger
-from .ticks import CheckError, Turn, named, read_turns
+from .ticks import CheckError, RecordedTick, read_turns, with_instance
 
 SILENT_TICKS = 3
-"""After so many ticks without an answer the check gives up."""
+"""Number of unanswered ticks after which the check stops."""
 _LEASE_MS = 60_000
 _END_S = 5.0
 
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found: ``findings`` empty if the process keeps the protocol. ``ticks`` of the log were played."""
+    """Result of a check: ``findings`` is empty if the process conforms; ``ticks`` of the log were played."""
 
     findings: list[Finding]
     ticks: int
@@ -45,18 +45,18 @@ class Checked:
 def check(
     log: LogSource, process: str, command: list[str], ticks: int, start_s: float, patience_s: float
 ) -> Checked:
-    """Runs ``command`` as ``process`` against the first ``ticks`` of a log.
+    """Run ``command`` as ``process`` against the first ``ticks`` of a log.
 
-    ``{endpoint}`` and ``{namespace}`` in the command are replaced. It has ``start_s`` of wall time until it has joined
-    up with its partners, then ``patience_s`` for each tick, and as long to end. Raises LogError, ScenarioError,
-    TransportError, or CheckError when the command cannot be run or the log cannot be played to it.
+    ``{endpoint}`` and ``{namespace}`` in the command are replaced. Wall-clock timeouts: ``start_s`` to join and discover
+    the partners, ``patience_s`` per tick and to end. Raise LogError, ScenarioError, TransportError, or CheckError when
+    the command or the log is unusable.
     """
     recorded = read_turns(log, process, ticks)
     namespace = f"check-{uuid.uuid4().hex[:12]}"
     node, endpoint = open_hub(namespace, _LEASE_MS, "world", "analysis")
     try:
         ledger = Ledger(process, recorded.scenario)
-        stand = Stand(node, ledger, recorded.scenario_json)
+        stand = TestStand(node, ledger, recorded.scenario_json)
         filled = [word.replace("{endpoint}", endpoint).replace("{namespace}", namespace) for word in command]
         child = _start(filled)
         try:
@@ -78,7 +78,7 @@ def _start(command: list[str]) -> subprocess.Popen[bytes]:
 
 
 def _end(child: subprocess.Popen[bytes]) -> None:
-    """Ends whatever of it still runs; it has a session of its own."""
+    """Terminate the process group, which is a session of its own."""
     for number in (signal.SIGTERM, signal.SIGKILL):
         if child.poll() is None:
             os.killpg(child.pid, number)
@@ -89,13 +89,13 @@ def _end(child: subprocess.Popen[bytes]) -> None:
     child.wait()
 
 
-class Stand:
-    """Plays a log's messages to one process and keeps the ledger of what it says. All but the callbacks in one thread."""
+class TestStand:
+    """Plays the messages of a log to one process and records its messages. Single-threaded except for the callbacks."""
 
     def __init__(self, node: Node, ledger: Ledger, scenario_json: str) -> None:
         self._node, self._ledger, self._scenario_json = node, ledger, scenario_json
         self._inbox: BoundedQueue[RawSample | JoinRequest | tuple[str, bool]] = BoundedQueue()
-        # What this stand has sent comes back to it, too; the rest is the checked process'.
+        # The stand receives its own messages, too; all others come from the process under test.
         self._sent: Counter[tuple[str, str, bytes]] = Counter()
         self._numbers: Counter[str] = Counter()
         self._alive: set[str] = set()
@@ -103,7 +103,7 @@ class Stand:
         present = {"world", "controller", *(f"chaser/{i}" for i in range(len(ledger.scenario.chasers)))}
         self._partners = presence.required_peers(ledger.process, present) - {ledger.process}
         self._instances = {name: presence.new_instance() for name in sorted(self._partners)}
-        self._told_s = 0.0
+        self._presence_sent_s = 0.0
         self._period_s = presence.EARLY_PERIOD_S
         node.subscribe_raw("**", self._arrived)
         node.watch_liveliness(self._alive_changed)
@@ -111,12 +111,12 @@ class Stand:
         node.declare_liveliness()
 
     def fly(
-        self, child: subprocess.Popen[bytes], turns: list[Turn], start_s: float, patience_s: float
+        self, child: subprocess.Popen[bytes], turns: list[RecordedTick], start_s: float, patience_s: float
     ) -> int:
-        """The whole check; the number of ticks that were played."""
+        """Run the whole check; return the number of ticks played."""
         ledger = self._ledger
-        if not self._wait(self._joined_up, child, start_s):
-            self._not_joined_up(child, start_s)
+        if not self._wait(self._has_joined, child, start_s):
+            self._report_failed_join(child, start_s)
             return 0
         self._period_s = presence.STEADY_PERIOD_S
         played = self._play(child, turns, patience_s)
@@ -127,45 +127,45 @@ class Stand:
         if child.poll() is None:
             self._publish(topics.END, end)
             ended = self._wait(lambda: False, child, patience_s) or child.poll() is not None
-            # Its token goes when its session closes: all it has sent has come by then.
+            # The liveliness token disappears with the session, after all messages have arrived.
             self._wait(lambda: ledger.process not in self._alive, None, min(patience_s, _END_S))
             if not ended:
-                ledger.find(ledger.process, f"does not end within {patience_s:g} s of the mission's end")
+                ledger.report(ledger.process, f"does not end within {patience_s:g} s of the mission's end")
             elif child.returncode != 0:
-                ledger.find(ledger.process, f"ended with status {child.returncode}")
+                ledger.report(ledger.process, f"ended with status {child.returncode}")
         ledger.finish()
         return played
 
-    def _play(self, child: subprocess.Popen[bytes], turns: list[Turn], patience_s: float) -> int:
+    def _play(self, child: subprocess.Popen[bytes], turns: list[RecordedTick], patience_s: float) -> int:
         ledger, silent = self._ledger, 0
         first = () if ledger.role == "controller" else (topics.ACTUATORS,)
         for k, recorded in enumerate(turns):
-            turn = named(recorded, ledger.process, ledger.instance or "")
+            turn = with_instance(recorded, ledger.process, ledger.instance or "")
             ledger.open(turn)
             for raw in turn.opening:
                 self._send(raw)
-            # A chaser has told what it sees before the controller can answer.
+            # A chaser publishes its sighting before the controller can answer.
             if first:
                 self._wait(lambda: not ledger.due(*first), child, patience_s)
             for raw in turn.answers:
                 self._send(raw)
             if not self._wait(lambda: not ledger.due(), child, patience_s):
                 if child.poll() is not None:
-                    ledger.find(
+                    ledger.report(
                         ledger.process, f"ended before the mission's end, with status {child.returncode}"
                     )
                     return k + 1
                 ledger.miss(patience_s)
                 silent += 1
                 if silent == SILENT_TICKS:
-                    ledger.find(ledger.process, f"given up after {SILENT_TICKS} ticks without an answer")
+                    ledger.report(ledger.process, f"stopped after {SILENT_TICKS} ticks without an answer")
                     return k + 1
         return len(turns)
 
     # -- joining up ---------------------------------------------------------------------------------------
 
     def _joins(self, request: JoinRequest, reply: Callable[[JoinReply], None]) -> None:
-        """On Zenoh's thread."""
+        """Answer a join request, on Zenoh's thread."""
         self._inbox.put(request, 0)
         right = request.process == self._ledger.process
         reply(
@@ -174,32 +174,32 @@ class Stand:
             else JoinReply(accepted=False, reason=f"this check is for {self._ledger.process}")
         )
 
-    def _joined_up(self) -> bool:
+    def _has_joined(self) -> bool:
         ledger = self._ledger
-        return ledger.instance is not None and ledger.process in self._alive and not self._unheard()
+        return ledger.instance is not None and ledger.process in self._alive and not self._undiscovered()
 
-    def _unheard(self) -> list[str]:
+    def _undiscovered(self) -> list[str]:
         heard = self._ledger.heard
         return [name for name, instance in self._instances.items() if heard.get(name) != instance]
 
-    def _not_joined_up(self, child: subprocess.Popen[bytes], start_s: float) -> None:
+    def _report_failed_join(self, child: subprocess.Popen[bytes], start_s: float) -> None:
         ledger, name = self._ledger, self._ledger.process
         ended = child.poll() is not None
         if ended:
-            ledger.find(name, f"ended before the first tick, with status {child.returncode}")
+            ledger.report(name, f"ended before the first tick, with status {child.returncode}")
         if ledger.instance is None:
             refused = self._node.counts.rejected
             detail = "; ".join(key for key in refused if key.startswith(topics.JOIN_KEY))
-            ledger.find(
+            ledger.report(
                 topics.JOIN_KEY, f"{name} did not join{'' if ended else f' within {start_s:g} s'}", detail
             )
             return
         if not self._was_alive:
-            ledger.find(topics.LIVE_KEY.format(process=name), "no liveliness token")
+            ledger.report(topics.LIVE_KEY.format(process=name), "no liveliness token")
         if not ledger.present:
-            ledger.find(topics.PRESENCE.key_of(name), "no presence told")
-        elif unheard := self._unheard():
-            ledger.find(topics.PRESENCE.key_of(name), "has not heard its partners", ", ".join(unheard))
+            ledger.report(topics.PRESENCE.key_of(name), "no presence published")
+        elif unheard := self._undiscovered():
+            ledger.report(topics.PRESENCE.key_of(name), "has not discovered its partners", ", ".join(unheard))
 
     # -- the network --------------------------------------------------------------------------------------
 
@@ -214,18 +214,18 @@ class Stand:
         self._node.publish_raw(raw)
 
     def _wait(self, done: Callable[[], bool], child: subprocess.Popen[bytes] | None, seconds: float) -> bool:
-        """Listens, and tells the partners' presence, until ``done``; False when the child ends or time is up first."""
+        """Process messages and publish the partners' presence until ``done``; return False if the child ends or on timeout."""
         deadline = time.monotonic() + seconds
         ended = False
         while not done():
             if ended or time.monotonic() > deadline:
                 return False
-            if time.monotonic() - self._told_s >= self._period_s:
-                self._told_s = time.monotonic()
-                self._tell_presence()
-            # Whatever it had said before it ended is taken in before that counts.
+            if time.monotonic() - self._presence_sent_s >= self._period_s:
+                self._presence_sent_s = time.monotonic()
+                self._publish_presence()
+            # Process all messages that preceded its end.
             ended = child is not None and child.poll() is not None
-            self._listen(0.3 if ended else 0.02)
+            self._receive(0.3 if ended else 0.02)
         return True
 
     def _arrived(self, raw: RawSample) -> None:
@@ -234,16 +234,16 @@ class Stand:
     def _alive_changed(self, name: str, alive: bool) -> None:
         self._inbox.put((name, alive), 0)
 
-    def _listen(self, seconds: float) -> None:
-        """Takes in one message, and all that wait behind it."""
+    def _receive(self, seconds: float) -> None:
+        """Process one message and all queued ones."""
         try:
-            self._take(self._inbox.get(seconds))
+            self._process(self._inbox.get(seconds))
             while True:
-                self._take(self._inbox.get(0))
+                self._process(self._inbox.get(0))
         except queue.Empty:
             return
 
-    def _take(self, item: RawSample | JoinRequest | tuple[str, bool]) -> None:
+    def _process(self, item: RawSample | JoinRequest | tuple[str, bool]) -> None:
         ledger = self._ledger
         if isinstance(item, RawSample):
             sent = (item.key, item.encoding, item.payload)
@@ -252,10 +252,10 @@ class Stand:
                 if not self._sent[sent]:
                     del self._sent[sent]
                 return
-            ledger.take(item)
+            ledger.add(item)
         elif isinstance(item, JoinRequest):
             if item.process != ledger.process:
-                ledger.find(topics.JOIN_KEY, "joins under another name", repr(item.process))
+                ledger.report(topics.JOIN_KEY, "joins under another name", repr(item.process))
             else:
                 ledger.instance = item.instance
         else:
@@ -263,9 +263,9 @@ class Stand:
             (self._alive.add if alive else self._alive.discard)(name)
             self._was_alive |= alive and name == ledger.process
             if alive and name not in (ledger.process, "world"):
-                ledger.find(topics.LIVE_KEY.format(process=name), "another process' liveliness token")
+                ledger.report(topics.LIVE_KEY.format(process=name), "another process' liveliness token")
 
-    def _tell_presence(self) -> None:
+    def _publish_presence(self) -> None:
         ledger = self._ledger
         others = dict(self._instances)
         if ledger.instance is not None and ledger.present:

@@ -1,4 +1,4 @@
-"""What a recorded log has to say to one process, tick by tick."""
+"""Input of one process from a log, tick by tick."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
 
-# By so many ticks the messages of a lock-step flight may come late to a recorder, by far.
+# Generous bound on the delay of messages at a recorder in a lock-step flight, in ticks.
 _LATE_TICKS = 64
 
 
 class CheckError(ChaserdockError):
-    """A check that cannot be done as asked; the text is one clear line."""
+    """A check is impossible with the given arguments."""
 
 
 @dataclass
-class Turn:
-    """One tick: the world's messages in ``opening``, then what the others answered to it in ``answers``.
+class RecordedTick:
+    """One recorded tick: the world's messages in ``opening``, the answers of the other processes in ``answers``.
 
     ``exposure_ns``: the time of the process' own image, None without one.
     """
@@ -34,8 +34,8 @@ class Turn:
     exposure_ns: int | None = None
 
 
-def named(turn: Turn, process: str, instance: str) -> Turn:
-    """The turn with ``instance`` for the start of ``process`` that the recorded tick gives the command to, if it does."""
+def with_instance(turn: RecordedTick, process: str, instance: str) -> RecordedTick:
+    """Return the tick with ``instance`` as the commander's instance, if ``process`` is the commander."""
     if turn.tick.commander != process:
         return turn
     tick = msgspec.structs.replace(turn.tick, instance=instance)
@@ -49,15 +49,15 @@ def named(turn: Turn, process: str, instance: str) -> Turn:
 
 @dataclass(frozen=True)
 class Recorded:
-    """A log as one process would hear it. ``scenario_json`` is what the world answers who joins."""
+    """Input of one process. ``scenario_json``: content of the world's join reply."""
 
     scenario: Scenario
     scenario_json: str
-    turns: list[Turn]
+    turns: list[RecordedTick]
 
 
 def role_of(process: str, chasers: int) -> tuple[Role, int | None]:
-    """Role and chaser's number of the process to be checked; raises CheckError unless the mission has it."""
+    """Return role and chaser number of a process. Raise CheckError unless it is part of the mission."""
     if process == "controller":
         return "controller", None
     if process.startswith("chaser/") and topics.is_process_name(process):
@@ -68,35 +68,35 @@ def role_of(process: str, chasers: int) -> tuple[Role, int | None]:
     raise CheckError(f"{process}: must be controller or chaser/N")
 
 
-def topics_told(role: Role) -> list[Topic]:
-    """What belongs to a tick and reaches a process of this role from others, in the order it is played."""
-    told = [
+def input_topics(role: Role) -> list[Topic]:
+    """Return the topics of a tick that a role receives from others, in the order of playing."""
+    inputs = [
         t
         for t in topics.TOPICS
         if role in t.readers and t.writer not in ("any", role) and t.rate in ("tick", "image")
     ]
-    return sorted(told, key=lambda t: (t.writer != "world", t is not topics.TICK, topics.TOPICS.index(t)))
+    return sorted(inputs, key=lambda t: (t.writer != "world", t is not topics.TICK, topics.TOPICS.index(t)))
 
 
 def read_turns(log: LogSource, process: str, most: int) -> Recorded:
-    """The first ``most`` ticks of a log, up to the first that did not expect an answer of ``process``.
+    """Read the first ``most`` ticks of a log, up to the first one without an expected answer of ``process``.
 
-    Raises LogError, ScenarioError, or CheckError when there is nothing to play.
+    Raise LogError, ScenarioError, or CheckError when there is nothing to play.
     """
     text, run = read_scenario(log)
     if run.get("mode") == "realtime":
         raise CheckError(
-            f"{log}: flown in real time; a check needs a lock-step log, where every tick is whole"
+            f"{log}: flown in real time; a check needs a lock-step log, in which every tick is complete"
         )
     scenario = scenario_from_json(text, f"{log}: scenario")
     role, number = role_of(process, len(scenario.chasers))
-    told = topics_told(role)
+    inputs = input_topics(role)
     keys = [
         topic.key_of(place)
-        for topic in told
+        for topic in inputs
         for place in (_places(number, len(scenario.chasers)) if "{chaser}" in topic.key else (None,))
     ]
-    turns: dict[int, Turn] = {}
+    turns: dict[int, RecordedTick] = {}
     waiting: dict[int, list[tuple[int, RawSample, int | None]]] = {}
     for record in read_log(log, keys):
         message = record.message
@@ -107,16 +107,16 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
             if message.revision or not _expected(message, number):
                 most = min(most, message.tick)
             else:
-                turns[message.tick] = Turn(message)
+                turns[message.tick] = RecordedTick(message)
         exposure_ns = message.sim_time_ns if isinstance(message, Image) else None
-        waiting.setdefault(message.tick, []).append((told.index(record.topic), raw, exposure_ns))
+        waiting.setdefault(message.tick, []).append((inputs.index(record.topic), raw, exposure_ns))
     played = []
     for tick in range(most):
         if tick not in turns:
             break
         turn = turns[tick]
         for rank, raw, exposure_ns in sorted(waiting[tick], key=lambda item: item[0]):
-            (turn.opening if told[rank].writer == "world" else turn.answers).append(raw)
+            (turn.opening if inputs[rank].writer == "world" else turn.answers).append(raw)
             turn.exposure_ns = exposure_ns if exposure_ns is not None else turn.exposure_ns
         played.append(turn)
     if not played:

@@ -1,1 +1,1 @@
-"""Recorded inputs through today's code, and two sets of messages compared field by field."""
+"""Replay of recorded inputs through current code, and comparison of messages field by field."""

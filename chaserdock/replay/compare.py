@@ -1,4 +1,4 @@
-"""Two recorded flights side by side: summaries, digests, the first message that differs, how far the bodies came apart."""
+"""Comparison of two recorded flights: summaries, digests, first different message, deviations of the bodies."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from chaserdock.analysis.summary import summary_of
 
 from .difference import Comparison, TopicDifference, difference_lines, first_difference
 
-# Matters of the machine, by the beginning of their names: shown, and no difference between flights.
+# Prefixes of values that depend on the machine: shown, but not a difference between flights.
 _WALL = ("wall_time_s", "latency_s.", "solver.solve_s.", "peak_memory_bytes", "cpu_s", "messages.", "digest")
 
 
-class Apart(msgspec.Struct):
-    """How far two tracks of one body ever are apart, and when."""
+class Deviation(msgspec.Struct):
+    """Largest deviation between two tracks of one body, and its time."""
 
     position_m: float
     position_time_s: float
@@ -30,12 +30,12 @@ class Apart(msgspec.Struct):
 
 
 class RunComparison(msgspec.Struct):
-    """``summary``: keys whose values differ, both values. ``apart``: by track; ``target estimate`` is the fused one."""
+    """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target estimate`` is the fused one."""
 
     digests: tuple[str, str]
     first_difference: str | None
     summary: dict[str, tuple[Any, Any]]
-    apart: dict[str, Apart]
+    deviations: dict[str, Deviation]
     topics: list[TopicDifference]
 
     @property
@@ -44,7 +44,7 @@ class RunComparison(msgspec.Struct):
 
 
 def flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Nested dictionaries as one, keys joined by dots."""
+    """Flatten nested dictionaries; join keys with dots."""
     if not isinstance(value, dict):
         return {name: value}
     out: dict[str, Any] = {}
@@ -54,7 +54,7 @@ def flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def compare(first: Path, second: Path, tolerance: float = 0.0) -> RunComparison:
-    """Compares the flights in two logs or run folders; raises LogError or ScenarioError."""
+    """Compare the flights in two logs or run folders. Raise LogError or ScenarioError."""
     flights = load_flight(first), load_flight(second)
     a, b = (flat(summary_of(f)) for f in flights)
     topics = _messages(first, second, tolerance)
@@ -62,7 +62,7 @@ def compare(first: Path, second: Path, tolerance: float = 0.0) -> RunComparison:
         digests=(flights[0].digest, flights[1].digest),
         first_difference=first_difference(topics),
         summary={k: (a.get(k), b.get(k)) for k in {**a, **b} if a.get(k) != b.get(k)},
-        apart=_apart(*flights),
+        deviations=_deviations(*flights),
         topics=topics,
     )
 
@@ -76,7 +76,7 @@ def _messages(first: LogSource, second: LogSource, tolerance: float) -> list[Top
     return comparison.finish()
 
 
-def _apart(a: RecordedFlight, b: RecordedFlight) -> dict[str, Apart]:
+def _deviations(a: RecordedFlight, b: RecordedFlight) -> dict[str, Deviation]:
     out = {}
     for name in [*(n for n in a.truth if n in b.truth), "target estimate"]:
         estimate = name == "target estimate"
@@ -87,31 +87,33 @@ def _apart(a: RecordedFlight, b: RecordedFlight) -> dict[str, Apart]:
         position = np.linalg.norm(one.position_m[k] - other.position_m[m], axis=1)
         angle = rotations.angle_between(one.q_wxyz[k], other.q_wxyz[m])
         p, q = int(np.argmax(position)), int(np.argmax(angle))
-        out[name] = Apart(
+        out[name] = Deviation(
             float(position[p]), float(one.time_s[k][p]), float(angle[q]), float(one.time_s[k][q])
         )
     return out
 
 
-def comparison_lines(found: RunComparison) -> list[str]:
-    """The comparison for people."""
-    if found.equal:
-        return [f"equal flights, digest {found.digests[0]}"]
+def comparison_lines(result: RunComparison) -> list[str]:
+    """Format the comparison as lines of text."""
+    if result.equal:
+        return [f"equal flights, digest {result.digests[0]}"]
     lines = ["summary (first, second, second / first):"]
     for wall in (False, True):
-        for key, (x, y) in sorted(found.summary.items()):
+        for key, (x, y) in sorted(result.summary.items()):
             if key.startswith(_WALL) != wall or not isinstance(x, int | float | None | bool | str):
                 continue
             ratio = f"  {y / x:8.3f}" if _is_size(x) and _is_size(y) else ""
-            lines.append(f"  {key}: {_shown(x)}  {_shown(y)}{ratio}{'  (the machine)' if wall else ''}")
-    lines.append("largest distance between the flights:")
-    for name, d in found.apart.items():
+            lines.append(
+                f"  {key}: {_format(x)}  {_format(y)}{ratio}{'  (machine-dependent)' if wall else ''}"
+            )
+    lines.append("largest deviations between the flights:")
+    for name, d in result.deviations.items():
         lines.append(
             f"  {name}: {d.position_m:.3g} m at {d.position_time_s:.2f} s, "
             f"{d.orientation_rad:.3g} rad at {d.orientation_time_s:.2f} s"
         )
-    lines += difference_lines(found.topics, ("first", "second"))
-    lines.append(f"first difference: {found.first_difference or 'none within the tolerance'}")
+    lines += difference_lines(result.topics, ("first", "second"))
+    lines.append(f"first difference: {result.first_difference or 'none within the tolerance'}")
     return lines
 
 
@@ -119,5 +121,5 @@ def _is_size(x: Any) -> bool:
     return isinstance(x, int | float) and not isinstance(x, bool) and x != 0
 
 
-def _shown(x: Any) -> str:
+def _format(x: Any) -> str:
     return f"{x:.6g}" if isinstance(x, float) else str(x)

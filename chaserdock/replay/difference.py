@@ -1,4 +1,4 @@
-"""Messages compared field by field: where two runs, or a log and today's code, differ first and most."""
+"""Comparison of messages field by field: first and largest differences of two runs, or of a log and current code."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import msgspec
 from chaserdock_protocol.messages import Message
 
 Side = int
-"""0: the recorded, or first; 1: today's, or second."""
+"""0: recorded, or first; 1: current, or second."""
 
 
 class FieldDifference(msgspec.Struct):
-    """One field's differences. ``largest`` is the greatest absolute difference of numbers; None where it has no size."""
+    """Differences of one field. ``largest``: largest absolute difference of numbers, else None."""
 
     name: str
     unequal: int = 0
@@ -26,10 +26,7 @@ class FieldDifference(msgspec.Struct):
 
 
 class TopicDifference(msgspec.Struct):
-    """One key: messages compared, those that differ, those that only one side has, and the fields that differ.
-
-    ``alone_time_s`` is the simulated time of the first message that only one side has, seconds.
-    """
+    """Differences of one key. ``alone``: numbers of messages that only one side has; ``alone_time_s``: time of the first one."""
 
     key: str
     compared: int = 0
@@ -44,15 +41,15 @@ class TopicDifference(msgspec.Struct):
 
     @property
     def first_time_s(self) -> float | None:
-        """Simulated time of the first difference of any kind, None if there is none."""
+        """Simulated time of the first difference, or None."""
         times = [f.first_time_s for f in self.fields.values()]
         return min([*times, *([self.alone_time_s] if self.alone_time_s is not None else [])], default=None)
 
 
 def field_differences(a: Any, b: Any, name: str = "") -> Iterator[tuple[str, Any, Any, float | None]]:
-    """Fields that differ: name (items of lists share one), both values, and their distance if they are numbers.
+    """Yield different fields: name (shared by the items of a list), both values, and the difference of numbers.
 
-    ``seq`` is the transport's, ``wall_`` fields are the clock's: neither is compared.
+    Transport and wall-clock fields (``seq``, ``wall_...``) are not compared.
     """
     if isinstance(a, msgspec.Struct) and type(a) is type(b):
         for field in a.__struct_fields__:
@@ -82,14 +79,14 @@ def _is_number(x: Any) -> TypeGuard[int | float]:
     return isinstance(x, int | float) and not isinstance(x, bool)
 
 
-# More waiting messages than this, and those that fell this many ticks behind both sides have no partner.
+# Beyond this number of waiting messages, those this many ticks behind both sides count as unpaired.
 _MANY_WAITING, _BEHIND_TICKS = 20_000, 300
 
 
 class Comparison:
-    """Pairs the messages of two sides (by key, tick, and their order within it) and notes how they differ.
+    """Pairs the messages of two sides by key, tick and order within it, and collects their differences.
 
-    Numbers that are at most ``tolerance`` apart count as equal. Memory does not grow with the flights' length.
+    Numbers that differ by at most ``tolerance`` count as equal. Memory is bounded.
     """
 
     def __init__(self, tolerance: float = 0.0) -> None:
@@ -103,14 +100,14 @@ class Comparison:
         self._number = 0
 
     def add(self, side: Side, key: str, message: Message) -> None:
-        """Takes one message of a side."""
+        """Add a message of one side."""
         self._last_tick[side] = max(self._last_tick[side], message.tick)
         other = self._waiting[1 - side].get((key, message.tick))
         if not other:
             self._waiting[side][key, message.tick].append(message)
             self._number += 1
             if self._number > _MANY_WAITING:
-                self._give_up(min(self._last_tick) - _BEHIND_TICKS)
+                self._drop_unpaired(min(self._last_tick) - _BEHIND_TICKS)
             return
         partner = other.pop(0)
         if not other:
@@ -127,8 +124,8 @@ class Comparison:
         topic = self._topic(key)
         topic.compared += 1
         unequal = False
-        for name, x, y, apart in field_differences(a, b):
-            if apart is not None and apart <= self._tolerance:
+        for name, x, y, difference in field_differences(a, b):
+            if difference is not None and difference <= self._tolerance:
                 continue
             unequal = True
             time_s = a.sim_time_ns / 1e9
@@ -138,11 +135,11 @@ class Comparison:
                     name=name, first_tick=a.tick, first_time_s=time_s, first=(x, y)
                 )
             field.unequal += 1
-            if apart is not None and apart > (field.largest or 0.0):
-                field.largest, field.largest_time_s = apart, time_s
+            if difference is not None and difference > (field.largest or 0.0):
+                field.largest, field.largest_time_s = difference, time_s
         topic.unequal += unequal
 
-    def _give_up(self, before_tick: float) -> None:
+    def _drop_unpaired(self, before_tick: float) -> None:
         for side, waiting in enumerate(self._waiting):
             for key, tick in [k for k in waiting if k[1] < before_tick]:
                 for message in waiting.pop((key, tick)):
@@ -154,13 +151,13 @@ class Comparison:
                         topic.alone_time_s = time_s
 
     def finish(self) -> list[TopicDifference]:
-        """What differs, by key; keys that are equal are there, too."""
-        self._give_up(float("inf"))
+        """Return the results by key, including equal keys."""
+        self._drop_unpaired(float("inf"))
         return [self._topics[key] for key in sorted(self._topics)]
 
 
 def first_difference(topics: list[TopicDifference]) -> str | None:
-    """Topic, field and time of the first difference of all, in words."""
+    """Describe topic, field and time of the first difference."""
     unequal = [t for t in topics if not t.equal]
     if not unequal:
         return None
@@ -168,11 +165,11 @@ def first_difference(topics: list[TopicDifference]) -> str | None:
     fields = sorted(first.fields.values(), key=lambda f: (f.first_time_s, f.name))
     if fields and fields[0].first_time_s == first.first_time_s:
         return f"{first.key}: {fields[0].name} at {first.first_time_s:.3f} s (tick {fields[0].first_tick})"
-    return f"{first.key}: a message at {first.first_time_s or 0.0:.3f} s that only one side has"
+    return f"{first.key}: a message at {first.first_time_s or 0.0:.3f} s present on one side only"
 
 
 def difference_lines(topics: list[TopicDifference], sides: tuple[str, str]) -> Iterator[str]:
-    """The differences, one topic after the other, for people. Equal topics are one line together."""
+    """Format the differences by topic. Equal topics share one line."""
     equal = [t for t in topics if t.equal]
     yield f"equal: {len(equal)} topics, {sum(t.compared for t in equal)} messages"
     for t in topics:
@@ -181,14 +178,14 @@ def difference_lines(topics: list[TopicDifference], sides: tuple[str, str]) -> I
         yield f"{t.key}: {t.unequal} of {t.compared} messages differ"
         for side, number in zip(sides, t.alone, strict=True):
             if number:
-                yield f"  {number} only {side}; the first that only one has is at {t.alone_time_s:.3f} s"
+                yield f"  {number} only {side}; the first unpaired one is at {t.alone_time_s:.3f} s"
         for f in sorted(t.fields.values(), key=lambda f: (f.first_time_s, f.name)):
-            values = ", ".join(f"{side} {_shown(x)}" for side, x in zip(sides, f.first, strict=True))
+            values = ", ".join(f"{side} {_format(x)}" for side, x in zip(sides, f.first, strict=True))
             yield f"  {f.name}: {f.unequal} times, first at {f.first_time_s:.3f} s (tick {f.first_tick}): {values}"
             if f.largest is not None:
                 yield f"    largest difference {f.largest:.3g} at {f.largest_time_s:.3f} s"
 
 
-def _shown(value: Any) -> str:
+def _format(value: Any) -> str:
     text = repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -1,4 +1,4 @@
-"""A log through one stage of today's code: what it says now against what was recorded."""
+"""Replay of a log through one stage of the current code, compared with the recorded output."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from .difference import Comparison, TopicDifference
 
 
 class ReplayError(ChaserdockError):
-    """A replay that cannot be done as asked."""
+    """A replay is impossible with the given arguments."""
 
 
 class Replay(msgspec.Struct):
-    """What a replay found. ``notes`` are reservations, in words."""
+    """Result of a replay. ``notes``: limitations of the comparison."""
 
     through: str
     topics: list[TopicDifference]
@@ -34,11 +34,11 @@ class Replay(msgspec.Struct):
 
 
 def stage_of(name: str) -> Stage:
-    """The stage of that name (entry points, group ``chaserdock.replays``); raises ReplayError."""
-    found = {e.name: e for e in entry_points(group="chaserdock.replays")}
-    if name not in found:
-        raise ReplayError(f"--through {name}: must be one of {', '.join(sorted(found))}")
-    return found[name].load()
+    """Return the stage of that name (entry points, group ``chaserdock.replays``). Raise ReplayError."""
+    stages = {e.name: e for e in entry_points(group="chaserdock.replays")}
+    if name not in stages:
+        raise ReplayError(f"--through {name}: must be one of {', '.join(sorted(stages))}")
+    return stages[name].load()
 
 
 def _places(topic: Topic, stage: Stage, chasers: int) -> Iterable[int | str | None]:
@@ -48,9 +48,9 @@ def _places(topic: Topic, stage: Stage, chasers: int) -> Iterable[int | str | No
 
 
 def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolerance: float = 0.0) -> Replay:
-    """Replays a log through ``perception``, ``fusion`` or ``controller``, its scenario changed by ``overrides``.
+    """Replay a log through ``perception``, ``fusion`` or ``controller`` with ``overrides`` of its scenario.
 
-    Raises LogError, ScenarioError or ReplayError.
+    Raise LogError, ScenarioError or ReplayError.
     """
     stage = stage_of(through)
     text, run = read_scenario(log)
@@ -82,6 +82,6 @@ def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolera
     notes = []
     if not lockstep:
         notes.append(
-            "flown in real time: when a message reached its reader is not recorded, differences are no proof"
+            "flown in real time: arrival times are not recorded, so that differences are not conclusive"
         )
     return Replay(through=through, topics=comparison.finish(), notes=notes)

@@ -1,5 +1,5 @@
-"""The web viewer: one page for a running mission and for a recorded log.
+"""Web viewer for running missions and for logs.
 
-``now`` and ``history`` hold what the messages say, ``words`` and ``plots`` what the page tells of it, all without a
-browser; ``stage`` and ``page`` draw with viser, which ``server`` opens; ``live`` and ``logged`` are its two sources.
+``snapshot`` and ``history`` hold the data, ``text``, ``plots`` and ``shapes`` format them, all without viser. ``scene`` and
+``page`` draw with viser on a server of ``server``. The data come from ``live`` or ``logged``.
 """

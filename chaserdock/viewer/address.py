@@ -1,4 +1,4 @@
-"""Where the viewer's page is served, and who may come in. No browser here, and no viser: a launcher asks, too."""
+"""Address of the viewer's page and admission of connections. Imports no viser: the launcher uses it, too."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _TRIES = 20
 
 
 class ViewError(ChaserdockError):
-    """The page cannot be served; one clear line."""
+    """The page cannot be served."""
 
 
 def free_port(host: str, port: int | None) -> int:
-    """``port``, or without one the first from 8080 on that nobody listens on. Raises ViewError."""
+    """Return ``port``, or without one the first free port from 8080 on. Raise ViewError."""
     first, reason = DEFAULT_PORT if port is None else port, ""
     for candidate in range(first, first + _TRIES if port is None else first + 1):
         try:
@@ -26,7 +26,7 @@ def free_port(host: str, port: int | None) -> int:
                 0
             ]
             with socket.socket(family, kind, protocol) as probe:
-                # As asyncio's servers do: a port whose last connections are just closing can be had.
+                # As in asyncio servers: a port with connections in TIME_WAIT is available.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 probe.bind(address)
                 return int(probe.getsockname()[1])
@@ -39,16 +39,15 @@ def free_port(host: str, port: int | None) -> int:
 
 
 def url_of(host: str, port: int) -> str:
-    """Where a browser on this machine finds the page."""
+    """Return the URL of the page for a browser on this machine."""
     shown = DEFAULT_HOST if host in ("0.0.0.0", "::") else host
     return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
 
 
-def may_connect(origin: str | None, asked: str, host: str) -> bool:
-    """Whether a web socket may be opened: from our own page (``Origin`` is the ``Host`` that was asked), or from a
-    program (which sends no ``Origin``). On the loopback the host's name must be the loopback's, too: another name that
-    leads here is somebody's trick (DNS rebinding)."""
-    name = urlsplit(f"//{asked}").hostname
+def may_connect(origin: str | None, requested_host: str, host: str) -> bool:
+    """Return whether a web socket may be opened: by our own page (``Origin`` equals ``Host``) or by a program (no
+    ``Origin``). On a loopback address ``Host`` must be a loopback name, which prevents DNS rebinding."""
+    name = urlsplit(f"//{requested_host}").hostname
     if host in _LOOPBACK and name not in _LOOPBACK:
         return False
-    return origin is None or urlsplit(origin).netloc == asked
+    return origin is None or urlsplit(origin).netloc == requested_host

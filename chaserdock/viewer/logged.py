@@ -1,4 +1,4 @@
-"""A log as the viewer reads it: read through once, then opened at any moment. Images stay in the file."""
+"""Random access to a log for the viewer: indexed in one pass, images stay in the file."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from mcap.records import Channel
 from mcap.records import Message as McapMessage
 
 from .history import History
-from .snapshot import OF_ALL, OF_CHASERS, Now
+from .snapshot import OF_ALL, OF_CHASERS, MissionState
 
-_TOLD = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
-_OPENED = (
+_EVENT_TOPICS = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
+_DECODED = (
     topics.ODOMETRY,
     topics.REFERENCE,
     topics.TARGET,
@@ -43,14 +43,14 @@ _OPENED = (
     topics.TRUTH_BODY,
     topics.ACTUATORS,
     topics.TICK,
-    *_TOLD,
+    *_EVENT_TOPICS,
 )
-"""What the plots and the list of events are made of: opened while the log is read through."""
+"""Topics of the plots and of the event list, decoded while the log is indexed."""
 _CHUNKS_KEPT = 24
 
 
 class _Exposure(msgspec.Struct):
-    """What is read of an image when it is not looked at."""
+    """The fields of an image needed for the index."""
 
     tick: int
     chaser: int
@@ -60,7 +60,7 @@ _exposure = msgspec.msgpack.Decoder(_Exposure)
 
 
 class LoggedMission:
-    """A recorded mission: ``history`` is all of it, ``at`` the present at any time of it. Raises LogError."""
+    """A recorded mission: ``history`` covers all of it, ``at`` returns the state at any time. Raises LogError."""
 
     def __init__(self, source: LogSource) -> None:
         text, self.run = read_scenario(source)
@@ -71,8 +71,8 @@ class LoggedMission:
         self.truth = False
         self._chunks: list[tuple[Path, int]] = []
         self._channels: dict[Path, dict[int, Channel]] = {}
-        # By key, of each chunk that holds some of its messages: time of the first of them, and the chunk's number. An
-        # entry a message would be half a gigabyte after ten hours.
+        # By key: for each chunk with messages of that key, the time of the first one and the chunk's number. One entry
+        # per message would take 0.5 GB for ten hours.
         self._index: dict[str, tuple[array[int], array[int]]] = defaultdict(lambda: (array("q"), array("l")))
         self._latest: dict[str, int] = defaultdict(int)
         self._shown = {topic.key_of(): topic for topic in OF_ALL}
@@ -81,9 +81,9 @@ class LoggedMission:
         self._shown |= {topics.TRUTH_BODY.key_of(body): topics.TRUTH_BODY for body in bodies}
         self._chunk = lru_cache(maxsize=_CHUNKS_KEPT)(self._read_chunk)
         for path in log_files(source):
-            self._read_through(path)
+            self._index_file(path)
 
-    def _read_through(self, path: Path) -> None:
+    def _index_file(self, path: Path) -> None:
         state, channels = FileState(), self._channels.setdefault(path, {})
         for opcode, content in records(path, state):
             if opcode != Opcode.CHUNK:
@@ -97,9 +97,9 @@ class LoggedMission:
             self._chunks.append((path, state.place))
             for record in inside:
                 if isinstance(record, McapMessage):
-                    self._note(channels[record.channel_id], record, number)
+                    self._index_message(channels[record.channel_id], record, number)
 
-    def _note(self, channel: Channel, stored: McapMessage, chunk: int) -> None:
+    def _index_message(self, channel: Channel, stored: McapMessage, chunk: int) -> None:
         key = channel.topic
         if key.startswith(VIEWER_PREFIX):
             return
@@ -109,7 +109,7 @@ class LoggedMission:
         topic = found[0]
         if key in self._shown:
             times, chunks = self._index[key]
-            # A log's order is that of arrival; of one key it is that of time but for what came late.
+            # A log is ordered by arrival; within a key by time, except for late messages.
             self._latest[key] = max(stored.log_time, self._latest[key])
             if not chunks or chunks[-1] != chunk:
                 times.append(self._latest[key])
@@ -119,21 +119,21 @@ class LoggedMission:
                 seen = _exposure.decode(stored.data)
             except msgspec.DecodeError:
                 return
-            self.history.exposed(seen.chaser, seen.tick, stored.publish_time)
-        elif topic in _OPENED and (message := self._open(topic, channel, stored)) is not None:
-            self.history.take(topic, message, stored.publish_time)
+            self.history.add_exposure(seen.chaser, seen.tick, stored.publish_time)
+        elif topic in _DECODED and (message := self._decode(topic, channel, stored)) is not None:
+            self.history.update(topic, message, stored.publish_time)
             self.truth |= topic is topics.TRUTH_BODY
             if topic is topics.TICK:
                 self.end_s = max(self.end_s, message.sim_time_ns / 1e9)
 
-    def _open(self, topic: Topic, channel: Channel, stored: McapMessage) -> Any:
+    def _decode(self, topic: Topic, channel: Channel, stored: McapMessage) -> Any:
         try:
             return decode_logged(topic.kind, stored.data, channel.metadata.get("zenoh_encoding", ""))
         except Rejected:
             return None
 
     def _read_chunk(self, number: int) -> dict[str, list[tuple[Channel, McapMessage]]]:
-        """A chunk's messages by key."""
+        """Return the messages of a chunk by key."""
         path, place = self._chunks[number]
         try:
             inside = parse_chunk(record_at(path, place))
@@ -146,22 +146,22 @@ class LoggedMission:
                 out[channel.topic].append((channel, record))
         return out
 
-    def at(self, time_s: float) -> Now:
-        """The mission at a simulated time: of every key its latest message up to then. Raises LogError."""
-        now, until = Now.of(self.chasers), round(time_s * 1e9) + 1
+    def at(self, time_s: float) -> MissionState:
+        """Return the state at a simulated time: the latest message of every key up to then. Raise LogError."""
+        state, until = MissionState.empty(self.chasers), round(time_s * 1e9) + 1
         for key, topic in self._shown.items():
             times, chunks = self._index[key]
             last = bisect_right(times, until) - 1
             if last < 0:
                 continue
-            # The first one of the chunk is early enough, whatever its own time: others before it were later.
+            # The first message of the chunk counts whatever its own time: an earlier one had a later time.
             first, *more = self._chunk(chunks[last])[key]
             channel, stored = first
             for later in more:
                 if later[1].log_time > until:
                     break
                 channel, stored = later
-            message = self._open(topic, channel, stored)
+            message = self._decode(topic, channel, stored)
             if message is not None:
-                now.take(topic, message)
-        return now
+                state.update(topic, message)
+        return state

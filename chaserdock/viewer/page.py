@@ -1,4 +1,4 @@
-"""The page round the scene: state, commands, images, plots, what happened, and a time line on a log."""
+"""Panels of the page: state, commands, images, plots, events, and the time line of a log."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from chaserdock_protocol.scenario import Scenario
 
 from chaserdock.analysis.snapshot import annotated_image
 
-from . import text as words
+from . import text
 from .history import History
 from .plots import Plot, plots_of, points_of
-from .scene import VIEWS, Stage
-from .snapshot import Now
+from .scene import VIEWS, SceneView
+from .snapshot import MissionState
 
 COMMANDS = ("approach", "hold", "retreat", "abort")
 Command = Callable[[str, int], None]
@@ -34,22 +34,22 @@ _COLOURS = {"approach": "green", "hold": "blue", "retreat": "orange", "abort": "
 
 
 @dataclass
-class TimeLine:
-    """Where a log is looked at; the buttons write it, the player reads it."""
+class Timeline:
+    """Playback position of a log: written by the controls, read by the player."""
 
     end_s: float
     at_s: float = 0.0
     playing: bool = True
     speed: float = 1.0
     moved: bool = field(default=False, repr=False)
-    """The slider was moved by a person since the player looked."""
+    """The user has moved the slider since the last step of the player."""
 
 
 SPEEDS = ("0.25", "0.5", "1", "2", "5", "10", "20")
 
 
 class Page:
-    """One mission's page on a server, for all tabs alike. ``command`` is called on viser's threads; None: no buttons."""
+    """The page of one mission, shared by all tabs. ``command`` is called on viser's threads; None: no buttons."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Page:
         dark: bool,
         truth: bool,
         command: Command | None,
-        timeline: TimeLine | None,
+        timeline: Timeline | None,
     ) -> None:
         self._server, self._scenario = server, scenario
         self._timeline = timeline
@@ -75,7 +75,7 @@ class Page:
         self._theme(dark)
         server.gui.set_panel_label(f"chaserdock · {scenario.name}")
         with server.atomic():
-            self._stage = Stage(server, scenario)
+            self._scene_view = SceneView(server, scenario)
             self._main_panel(dark, command)
             self._plots: list[tuple[Plot, Any]] = []
             self._left_panels(truth)
@@ -101,14 +101,14 @@ class Page:
         if command is not None:
             with gui.add_folder("Commands"):
                 self._buttons(command)
-        with gui.add_folder("What happened"):
+        with gui.add_folder("Events"):
             self._events = gui.add_markdown("")
         with gui.add_folder("View", expand_by_default=False):
             self._view_options(dark)
 
     def _buttons(self, command: Command) -> None:
         gui = self._server.gui
-        self._answer = gui.add_markdown("")
+        self._reply = gui.add_markdown("")
         for i in range(len(self._scenario.chasers)):
             group = gui.add_button_group(f"chaser {i}", COMMANDS)
 
@@ -116,7 +116,7 @@ class Page:
             def _(event: Any, chaser: int = i) -> None:
                 command(event.target.value, chaser)
 
-    def _time_line(self, line: TimeLine) -> None:
+    def _time_line(self, line: Timeline) -> None:
         gui = self._server.gui
         with gui.add_folder("Time line"):
             self._slider = gui.add_slider(
@@ -127,12 +127,12 @@ class Page:
 
         @self._slider.on_update
         def _(event: Any) -> None:
-            if event.client is not None:  # a person, not the player
+            if event.client is not None:  # the user, not the player
                 line.at_s, line.moved = float(event.target.value), True
 
         @play.on_click
         def _(event: Any) -> None:
-            if event.target.value == "to start":  # playing or not, as it was
+            if event.target.value == "to start":  # keeps playing or pausing
                 line.at_s, line.moved = 0.0, True
             else:
                 line.playing = event.target.value == "play"
@@ -142,12 +142,12 @@ class Page:
             line.speed = float(event.target.value)
 
     def _view_options(self, dark: bool) -> None:
-        gui, stage = self._server.gui, self._stage
-        stands = gui.add_dropdown("stands still", VIEWS, initial_value=VIEWS[0])
+        gui, scene_view = self._server.gui, self._scene_view
+        frame = gui.add_dropdown("fixed frame", VIEWS, initial_value=VIEWS[0])
         toggles: tuple[tuple[str, Callable[[bool], None]], ...] = (
-            ("corridors", stage.show_corridors),
-            ("keep-out", stage.show_keep_out),
-            ("camera views", stage.show_views),
+            ("corridors", scene_view.show_corridors),
+            ("keep-out", scene_view.show_keep_out),
+            ("camera views", scene_view.show_views),
         )
         for name, show in toggles:
             box = gui.add_checkbox(name, True)
@@ -158,9 +158,9 @@ class Page:
 
         darkness = gui.add_checkbox("dark", dark)
 
-        @stands.on_update
+        @frame.on_update
         def _(event: Any) -> None:
-            stage.view = event.target.value
+            scene_view.view = event.target.value
 
         @darkness.on_update
         def _(event: Any) -> None:
@@ -203,45 +203,49 @@ class Page:
 
     @property
     def watched(self) -> bool:
-        """Whether any browser looks."""
+        """Whether a browser is connected."""
         return bool(self._server.get_clients())
 
-    def answer(self, text: str) -> None:
-        """What came of a command."""
-        self._answer.content = text
+    def show_reply(self, text: str) -> None:
+        """Show the outcome of a command."""
+        self._reply.content = text
 
-    def draw(self, now: Now, history: History, mode: str, speed: float | None, lost: set[str]) -> None:
-        """The present: the scene and one chaser's image each time, words and plots twice a second."""
+    def draw(
+        self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
+    ) -> None:
+        """Draw the scene and one chaser's image; twice per second also text and plots."""
         slow = time.monotonic() - self._drawn_s >= _SLOW_S
         with self._server.atomic():
-            self._stage.draw(now, history, slow)
+            self._scene_view.draw(state, history, slow)
             if self._slider is not None:
-                self._slider.value = round(now.time_s(), 1)
+                self._slider.value = round(state.time_s(), 1)
             if slow:
                 self._drawn_s = time.monotonic()
-                self._write(now, history, mode, speed, lost)
-        self._draw_image(now)
+                self._write(state, history, mode, speed, lost)
+        self._draw_image(state)
 
-    def _write(self, now: Now, history: History, mode: str, speed: float | None, lost: set[str]) -> None:
-        for element, text in (
-            (self._head, words.head(self._scenario, now, mode, speed)),
-            (self._table, words.chasers(now, history)),
-            (self._faults, words.faults(now, history, lost)),
-            (self._events, words.happened(history.lines_until(now.time_s(), 12))),
+    def _write(
+        self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
+    ) -> None:
+        for element, content in (
+            (self._head, text.head(self._scenario, state, mode, speed)),
+            (self._table, text.chasers(state, history)),
+            (self._faults, text.faults(state, history, lost)),
+            (self._events, text.events(history.lines_until(state.time_s(), 12))),
         ):
-            if element.content != text:
-                element.content = text
-        if now.time_s() != self._plotted_s:
-            self._plotted_s = now.time_s()
+            if element.content != content:
+                element.content = content
+        if state.time_s() != self._plotted_s:
+            self._plotted_s = state.time_s()
             for plot, chart in self._plots:
-                chart.data = points_of(plot, history, 0.0, now.time_s())
+                chart.data = points_of(plot, history, 0.0, state.time_s())
 
-    def _draw_image(self, now: Now) -> None:
+    def _draw_image(self, state: MissionState) -> None:
         for i in self._in_turn():
-            image = now.chasers[i].image
+            image = state.chasers[i].image
             if image is None:
                 continue
-            sighting = now.chasers[i].sighting_in(image)
+            sighting = state.chasers[i].sighting_in(image)
             version = (image.sim_time_ns, sighting is not None)
             if self._shown_images.get(i) != version:
                 self._shown_images[i] = version
@@ -260,7 +264,7 @@ class Page:
         yield from ((first + k) % number for k in range(number))
 
     def _image(self, image: Image, sighting: Any) -> Any:
-        """RGB, the size of a tile; black for a damaged one, of which the table says "bad image"."""
+        """Return an RGB image of the size of a tile; black for an unreadable image."""
         try:
             drawn = annotated_image(self._scenario, image, sighting, _IMAGE_PX)[:, :, ::-1]
         except LogError:

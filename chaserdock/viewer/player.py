@@ -1,4 +1,4 @@
-"""The viewer on a log: the same page with a time line."""
+"""Viewer of a log: the page with a time line."""
 
 from __future__ import annotations
 
@@ -10,19 +10,20 @@ from chaserdock_protocol.recording.scan import LogError, LogSource
 from .address import url_of
 from .live import PERIOD_S, ViewOptions
 from .logged import LoggedMission
-from .page import Page, TimeLine
+from .page import Page, Timeline
 from .server import page_server
 
 
 def view_log(
     source: LogSource, options: ViewOptions, at_s: float | None = None, watch_parent: bool = False
 ) -> int:
-    """Serves the page on a log until stopped; 0. It plays from the start, or stands still at ``at_s``.
+    """Serve the page until stopped; return 0. Play from the start, or pause at ``at_s``.
 
-    Raises LogError, or ViewError when the page cannot be served."""
+    Raise LogError, or ViewError if the page cannot be served.
+    """
     stop = StopSignal(watch_parent)
     mission = LoggedMission(source)
-    line = TimeLine(mission.end_s)
+    line = Timeline(mission.end_s)
     if at_s is not None and at_s > mission.end_s:
         raise LogError(f"--at {at_s:g}: the log ends at {mission.end_s:.2f} s")
     if at_s is not None:
@@ -37,19 +38,19 @@ def view_log(
             begun_s = time.monotonic()
             if page.watched:
                 advance(line, begun_s - before_s)
-                now = mission.at(line.at_s)
+                state = mission.at(line.at_s)
                 if not truth:
-                    now.truth.clear()
-                page.draw(now, mission.history, mode, None, set())
+                    state.truth.clear()
+                page.draw(state, mission.history, mode, None, set())
             before_s = begun_s
             took_s = time.monotonic() - begun_s
             time.sleep(max(PERIOD_S - took_s, 0.2 * took_s))
     return 0
 
 
-def advance(line: TimeLine, wall_s: float) -> None:
-    """Moves a playing time line on by so much wall time; it stops at its end, and plays from the start after that."""
-    if line.moved:  # a person has just put it somewhere
+def advance(line: Timeline, wall_s: float) -> None:
+    """Advance a playing time line by ``wall_s`` of wall time; it stops at its end."""
+    if line.moved:  # the slider has just been moved
         line.moved = False
         return
     if not line.playing:

@@ -1,4 +1,4 @@
-"""What the page plots: which series, and how many points of them a browser gets. No browser here."""
+"""Plots of the page: their series, decimated for the browser."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from chaserdock_models.arrays import Array
 from .history import History, Quantity
 
 POINTS = 240
-"""Most points of one curve: about one for each pixel of its width."""
+"""Maximum number of points of a curve: about one per pixel."""
 
 COLOURS = (
     "#2f7ed8",
@@ -30,24 +30,24 @@ COLOURS = (
     "#3949ab",
     "#6d9b3a",
 )
-"""One a chaser: told apart on white and on black alike."""
+"""Colour of each chaser, distinguishable on white and on black."""
 ESTIMATE_COLOUR = "#e0a800"
 
 
 Curve = tuple[str, str, Quantity, int | None]
-"""Label, colour, quantity, and the chaser that it is of, or None."""
+"""Label, colour, quantity, and chaser or None."""
 
 
 @dataclass(frozen=True)
 class Plot:
-    """One plot and its curves."""
+    """A plot and its curves."""
 
     title: str
     curves: tuple[Curve, ...]
 
 
 def plots_of(chasers: int, truth: bool) -> tuple[Plot, ...]:
-    """The page's plots; the estimate's error only where the truth is known."""
+    """Return the plots of the page; the estimation error only with ground truth."""
 
     def each(quantity: Quantity) -> tuple[Curve, ...]:
         return tuple((str(i), COLOURS[i % len(COLOURS)], quantity, i) for i in range(chasers))
@@ -60,36 +60,36 @@ def plots_of(chasers: int, truth: bool) -> tuple[Plot, ...]:
         Plot("distance to the target, m", each("distance_m")),
         Plot("position error, mm", each("position_error_mm")),
         Plot("orientation error, deg", each("orientation_error_deg")),
-        *((Plot("error of the target's estimate", estimate),) if truth else ()),
+        *((Plot("error of the target estimate", estimate),) if truth else ()),
         Plot("solve time, ms", (("controller", COLOURS[0], "solve_ms", None),)),
-        Plot("image to command, ms of wall time", each("latency_ms")),
+        Plot("image to command, ms wall time", each("latency_ms")),
     )
 
 
 def points_of(plot: Plot, history: History, begin_s: float, until_s: float) -> tuple[Array, ...]:
-    """Times (K,) and, for each curve, its values (K,), K at most ``POINTS``; two at least, zeros where nothing is known.
+    """Return times (K,) and the values (K,) of each curve, 2 <= K <= ``POINTS``; zeros without data.
 
-    Time is cut into equal bins, and a curve shows the largest value in each, so that no peak is lost. Where a curve has
-    no value in a bin in which another has, it goes on as before.
+    Each value is the maximum of an equal time bin, so that no peak is lost. A curve without a value in a bin of another
+    curve keeps its previous value.
     """
-    found = [history.series[quantity, chaser].until(until_s) for _, _, quantity, chaser in plot.curves]
+    series = [history.series[quantity, chaser].until(until_s) for _, _, quantity, chaser in plot.curves]
     edges = np.linspace(begin_s, max(until_s, begin_s + 1e-3), POINTS + 1)
-    peaks = np.full((len(found), POINTS), np.nan)
-    for row, (times, values) in zip(peaks, found, strict=True):
+    peaks = np.full((len(series), POINTS), np.nan)
+    for row, (times, values) in zip(peaks, series, strict=True):
         inside = times >= begin_s
         bins = np.clip(np.searchsorted(edges, times[inside], side="right") - 1, 0, POINTS - 1)
         np.fmax.at(row, bins, values[inside])
     used = np.flatnonzero(~np.isnan(peaks).all(axis=0))
     if used.size == 0:
-        return tuple(np.zeros(2) for _ in range(len(found) + 1))
+        return tuple(np.zeros(2) for _ in range(len(series) + 1))
     if used.size == 1:
         used = np.repeat(used, 2)
     centres = (edges[:-1] + edges[1:]) / 2.0
-    return (centres[used], *(_carried_on(row[used]) for row in peaks))
+    return (centres[used], *(_filled(row[used]) for row in peaks))
 
 
-def _carried_on(values: Array) -> Array:
-    """Without gaps: each takes the value before it, the first ones the first that is there; zeros without any."""
+def _filled(values: Array) -> Array:
+    """Fill gaps with the previous value, the start with the first one; return zeros without any."""
     known = np.flatnonzero(~np.isnan(values))
     if known.size == 0:
         return np.zeros_like(values)

@@ -1,4 +1,4 @@
-"""The 3-D scene: bodies, estimate, plans, corridors, keep-out, camera views, drawn with viser."""
+"""3-D scene, drawn with viser: bodies, estimate, plans, corridors, keep-out sphere, camera frustums."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from chaserdock.analysis.scene import scene_of
 from . import shapes
 from .history import History
 from .plots import COLOURS, ESTIMATE_COLOUR
-from .snapshot import Now, Pose, pose_of
+from .snapshot import MissionState, Pose, pose_of
 
 ViewFrom = Literal["beside the target", "on the target", "the world"]
 VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
-"""Which axes stand still on the screen: the world's, moved along with the target; the target's own; the world's."""
+"""Frame fixed on the screen: world axes at the target's position; target frame; world frame."""
 
 TRAIL_S = 60.0
 _VIEW_M = 0.22
-_NOWHERE = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
+_IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 def _rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-class Stage:
-    """The scene of one mission; everything under ``/scene``, whose place makes the view stand still."""
+class SceneView:
+    """Scene of one mission. The pose of the root node ``/scene`` realizes the fixed frame."""
 
     def __init__(self, server: viser.ViserServer, scenario: Scenario) -> None:
         self._scenario = scenario
         self._scene = scene = server.scene
         scene.configure_default_lights(cast_shadow=False)
         self._root = scene.add_frame("/scene", show_axes=False)
-        looks = scene_of(scenario)
-        self._target = self._body("/scene/target", shapes.mesh_of(looks.target))
+        bodies = scene_of(scenario)
+        self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
         size = scenario.target_model().size_m
         self._lines("/scene/estimate/box", shapes.box_edges(size) * 1.02, _rgb(ESTIMATE_COLOUR), 2.0)
@@ -58,7 +58,7 @@ class Stage:
         for i in range(len(scenario.chasers)):
             colour = _rgb(COLOURS[i % len(COLOURS)])
             name = f"/scene/chaser_{i}"
-            self._chasers.append(self._body(name, shapes.mesh_of(looks.chaser, colour)))
+            self._chasers.append(self._body(name, shapes.mesh_of(bodies.chaser, colour)))
             scene.add_label(f"{name}/name", str(i), position=(0.0, 0.0, 0.75 * scenario.chaser.size_m[2]))
             self._frustums.append(
                 scene.add_camera_frustum(
@@ -102,49 +102,49 @@ class Stage:
         )
 
     def show_corridors(self, shown: bool) -> None:
-        """Corridors on or off."""
+        """Show or hide the corridors."""
         for corridor in self._corridors:
             corridor.visible = shown
 
     def show_keep_out(self, shown: bool) -> None:
-        """The sphere that the chasers may not plan to enter, on or off."""
+        """Show or hide the keep-out sphere."""
         self._keep_out.visible = shown
 
     def show_views(self, shown: bool) -> None:
-        """The cameras' views on or off."""
+        """Show or hide the camera frustums."""
         for frustum in self._frustums:
             frustum.visible = shown
 
-    def draw(self, now: Now, history: History, slow: bool) -> None:
-        """The present; lines that grow (trails) only when ``slow`` says so."""
-        estimate, true = now.estimate(), now.true_target()
+    def draw(self, state: MissionState, history: History, slow: bool) -> None:
+        """Draw the state; update trails only if ``slow``."""
+        estimate, true = state.estimate(), state.true_target()
         shown = true or estimate
-        self._put(self._target, shown)
-        self._put(self._estimate, estimate)
-        self._stand_still(shown or _NOWHERE)
-        keep_out_m = now.keep_out_m(self._scenario.limits.min_distance_target_m)
+        self._place(self._target, shown)
+        self._place(self._estimate, estimate)
+        self._fix_frame(shown or _IDENTITY)
+        keep_out_m = state.keep_out_m(self._scenario.limits.min_distance_target_m)
         if keep_out_m != self._keep_out_m:
             self._keep_out_m, self._keep_out.points = keep_out_m, shapes.sphere(keep_out_m)
-        for i, chaser in enumerate(now.chasers):
-            self._put(self._chasers[i], now.chaser(i))
-            self._put(self._references[i], pose_of(chaser.reference) if chaser.reference else None)
+        for i, chaser in enumerate(state.chasers):
+            self._place(self._chasers[i], state.chaser(i))
+            self._place(self._references[i], pose_of(chaser.reference) if chaser.reference else None)
             if chaser.plan is not None:
                 self._plans[i].points = shapes.polyline(np.reshape(chaser.plan.positions_m, (-1, 3)))
             if slow and estimate is not None:
-                trail = history.trails[i].between(now.time_s() - TRAIL_S, now.time_s())
+                trail = history.trails[i].between(state.time_s() - TRAIL_S, state.time_s())
                 self._trails[i].points = shapes.polyline(trail)
 
-    def _stand_still(self, target: Pose) -> None:
+    def _fix_frame(self, target: Pose) -> None:
         if self.view == "the world":
-            q, p = _NOWHERE.q_wxyz, _NOWHERE.position_m
+            q, p = _IDENTITY.q_wxyz, _IDENTITY.position_m
         elif self.view == "on the target":
             q = rotations.conjugate(target.q_wxyz)
             p = -rotations.rotate(q, target.position_m)
         else:
-            q, p = _NOWHERE.q_wxyz, -target.position_m
+            q, p = _IDENTITY.q_wxyz, -target.position_m
         self._root.position, self._root.wxyz = p, q
 
-    def _put(self, node: Any, pose: Pose | None) -> None:
+    def _place(self, node: Any, pose: Pose | None) -> None:
         if node.visible != (pose is not None):
             node.visible = pose is not None
         if pose is not None:

@@ -1,4 +1,4 @@
-"""The bodies, corridors and lines of the 3-D scene as plain arrays. No browser here."""
+"""Bodies, corridors and lines of the 3-D scene as arrays."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from chaserdock.analysis.scene import Face
 
-# What is painted on a face lies this far above it, layer by layer, so that the browser's depth tells them apart.
+# Offset of each painted layer above its face, so that the depth buffer separates them.
 _LAYER_M = 0.0004
 _SIDES = 24
 
@@ -28,7 +28,7 @@ class Mesh:
 
 
 def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> Mesh:
-    """Faces with what is painted on them, in the body's axes; ``tint`` colours the faces, not the paint."""
+    """Return faces with their decals as a mesh in body axes; ``tint`` colours the faces, not the decals."""
     corners: list[Array] = []
     normals: list[Array] = []
     colours: list[Array] = []
@@ -40,11 +40,10 @@ def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> 
         normals += [face.normal] * (1 + len(face.decals))
         colours.append(np.tile(colour, (4, 1)))
         for layer, (painted, grey) in enumerate(face.decals):
-            # The border, then the black square, then its white cells: three layers do.
+            # Three layers: border, black square, white cells.
             corners.append(painted + face.normal * _LAYER_M * (1 + min(layer, 2)))
             colours.append(np.full((4, 3), float(grey)))
-    # Each quadrangle has corners of its own, so that the browser shades it flat; outside is where its corners go
-    # round to the left.
+    # Vertices are not shared, so that each quadrangle has flat shading; corners are counterclockwise seen from outside.
     quads = np.array([_counterclockwise(c, n) for c, n in zip(corners, normals, strict=True)])
     halves = np.array([[0, 1, 2], [0, 2, 3]], dtype=np.int32)
     triangles = (4 * np.arange(len(quads), dtype=np.int32)[:, None, None] + halves).reshape(-1, 3)
@@ -52,39 +51,39 @@ def mesh_of(faces: Iterable[Face], tint: tuple[int, int, int] | None = None) -> 
 
 
 def _counterclockwise(corners: Array, normal: Array) -> Array:
-    """Corners (4, 3) in the order that has ``normal`` (3,) outside."""
+    """Return the corners (4, 3) counterclockwise about ``normal`` (3,)."""
     turned = np.cross(corners[1] - corners[0], corners[2] - corners[0]) @ normal
     return corners if turned > 0.0 else corners[::-1]
 
 
 def polyline(points: Array) -> NDArray[np.float32]:
-    """Points (K, 3) as segments (K - 1, 2, 3); one of no length where there are fewer than two points."""
+    """Convert points (K, 3) to segments (K - 1, 2, 3); one of zero length for fewer than two points."""
     if len(points) < 2:
         points = np.zeros((2, 3)) if len(points) == 0 else np.repeat(points, 2, axis=0)
     return np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
 
 
 def box_edges(size_m: tuple[float, float, float]) -> NDArray[np.float32]:
-    """The twelve edges (12, 2, 3) of a box about the origin."""
+    """Return the twelve edges (12, 2, 3) of a box about the origin."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
     return np.array([[corners[a], corners[b]] for a, b in pairs], dtype=np.float32)
 
 
 def tube(begin_m: Array, end_m: Array, radius_m: float) -> NDArray[np.float32]:
-    """A cylinder about the line between two points (3,), as segments (K, 2, 3): rings and four lines along it."""
+    """Return a cylinder about the line between two points (3,) as segments (K, 2, 3): rings and four generatrices."""
     axis = (end_m - begin_m) / max(1e-12, float(np.linalg.norm(end_m - begin_m)))
-    aside = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    aside /= np.linalg.norm(aside)
+    radial = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    radial /= np.linalg.norm(radial)
     angles = np.linspace(0.0, 2.0 * np.pi, _SIDES + 1)
-    circle = radius_m * (np.outer(np.cos(angles), aside) + np.outer(np.sin(angles), np.cross(axis, aside)))
+    circle = radius_m * (np.outer(np.cos(angles), radial) + np.outer(np.sin(angles), np.cross(axis, radial)))
     rings = [polyline(circle + begin_m + share * (end_m - begin_m)) for share in (0.0, 0.5, 1.0)]
     along = np.stack([circle[:-1:6] + begin_m, circle[:-1:6] + end_m], axis=1).astype(np.float32)
     return np.concatenate([*rings, along])
 
 
 def sphere(radius_m: float) -> NDArray[np.float32]:
-    """A ball about the origin, as circles of latitude and longitude (K, 2, 3)."""
+    """Return a sphere about the origin as circles of latitude and longitude (K, 2, 3)."""
     angles = np.linspace(0.0, 2.0 * np.pi, 2 * _SIDES + 1)
     flat = np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1)
     circles = []
@@ -97,21 +96,21 @@ def sphere(radius_m: float) -> NDArray[np.float32]:
 
 
 def corridor_of(scenario: Scenario, chaser: int) -> NDArray[np.float32] | None:
-    """A chaser's way in, in TRF, as segments (K, 2, 3); None where it has none.
+    """Return a chaser's approach corridor in TRF as segments (K, 2, 3), or None.
 
-    By capture: where its centre may be from the corridor's entry to the port, then within the final approach's limits.
-    Else, the line from its place to the docking distance, as wide as what counts as docked.
+    With capture: the region allowed for its centre from the corridor entry to the port, narrower in the final approach.
+    Otherwise: the line from its station to the docking distance, with the radius of the docking tolerance.
     """
     docking, port = scenario.docking, scenario.docking.port_of(chaser)
     if docking.kind == "capture":
         if port is None:
             return None
         reach_m = scenario.chaser.probe_reach_m
-        entry, last, there = (
+        entry, final, port_m = (
             centre_offset(port, reach_m, g) for g in (docking.entry_m, docking.final_m, 0.0)
         )
         return np.concatenate(
-            [tube(entry, last, docking.corridor.lateral_m), tube(last, there, docking.final.lateral_m)]
+            [tube(entry, final, docking.corridor.lateral_m), tube(final, port_m, docking.final.lateral_m)]
         )
     begin = np.array(scenario.chasers[chaser].position_m)
     distance_m = float(np.linalg.norm(begin))

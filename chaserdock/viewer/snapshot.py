@@ -1,4 +1,4 @@
-"""The mission as it is at one moment: the latest message of each kind, and what follows from them. No I/O."""
+"""State of a mission at one time: the latest message of each kind, and derived values."""
 
 from __future__ import annotations
 
@@ -41,8 +41,7 @@ OF_CHASERS = (
     topics.PLAN,
 )
 OF_ALL = (topics.TICK, topics.TARGET, topics.SOLVER, topics.END)
-"""Topics of which the present shows the latest message: of each chaser, of the mission. The order is that in which
-messages of one tick follow from one another."""
+"""Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
 
 _KEPT = 32
 
@@ -56,13 +55,13 @@ class Pose:
 
 
 def pose_of(message: Odometry | BodyTruth | TargetEstimate | Reference) -> Pose:
-    """Where the body of a message is."""
+    """Return the pose in a message."""
     return Pose(np.array(message.position_m), np.array(message.q_wxyz))
 
 
 @dataclass
-class ChaserNow:
-    """The latest of one chaser; None where nothing has come yet."""
+class ChaserState:
+    """Latest messages of one chaser; None before the first."""
 
     odometry: Odometry | None = None
     reference: Reference | None = None
@@ -76,8 +75,8 @@ class ChaserNow:
     _odometries: OrderedDict[int, Odometry] = field(default_factory=OrderedDict)
     _sightings: OrderedDict[int, Sighting] = field(default_factory=OrderedDict)
 
-    def take(self, message: Any) -> None:
-        """Notes a message of this chaser."""
+    def update(self, message: Any) -> None:
+        """Store a message of this chaser."""
         match message:
             case Odometry():
                 self.odometry = message
@@ -101,16 +100,16 @@ class ChaserNow:
                 self.thrusters = message
 
     def error(self) -> tuple[float, float] | None:
-        """Distance (m) and angle (rad) of the chaser from its reference, by its own odometry; None while unknown."""
-        there = self.reference
-        here = self._odometries.get(there.tick) if there is not None else None
-        if there is None or here is None:
+        """Return distance (m) and angle (rad) from the reference, by odometry; None while unknown."""
+        reference = self.reference
+        odometry = self._odometries.get(reference.tick) if reference is not None else None
+        if reference is None or odometry is None:
             return None
-        away_m = float(np.linalg.norm(np.subtract(here.position_m, there.position_m)))
-        return away_m, float(rotations.angle_between(there.q_wxyz, here.q_wxyz))
+        distance_m = float(np.linalg.norm(np.subtract(odometry.position_m, reference.position_m)))
+        return distance_m, float(rotations.angle_between(reference.q_wxyz, odometry.q_wxyz))
 
     def sighting_in(self, image: Image) -> Sighting | None:
-        """What was found in that image, if that is known."""
+        """Return the sighting of that image, if received."""
         return self._sightings.get(image.sim_time_ns)
 
 
@@ -121,10 +120,10 @@ def _keep(store: OrderedDict[int, Any], key: int, message: Any) -> None:
 
 
 @dataclass
-class Now:
-    """The latest of everything; ``truth`` by body (``target``, ``chaser/0``), empty where it may not be read."""
+class MissionState:
+    """Latest messages of the mission; ``truth`` by body (``target``, ``chaser/0``), empty without access to it."""
 
-    chasers: list[ChaserNow]
+    chasers: list[ChaserState]
     tick: Tick | None = None
     target: TargetEstimate | None = None
     solver: SolverStatus | None = None
@@ -132,12 +131,12 @@ class Now:
     truth: dict[str, BodyTruth] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, chasers: int) -> Now:
-        """Nothing known yet of so many chasers."""
-        return cls([ChaserNow() for _ in range(chasers)])
+    def empty(cls, chasers: int) -> MissionState:
+        """Return the state before the first message."""
+        return cls([ChaserState() for _ in range(chasers)])
 
-    def take(self, topic: Topic, message: Any) -> None:
-        """Notes a message; chasers that this mission does not have are not noted."""
+    def update(self, topic: Topic, message: Any) -> None:
+        """Store a message; ignore chasers that are not part of the mission."""
         match message:
             case Tick():
                 self.tick = message
@@ -150,39 +149,34 @@ class Now:
             case BodyTruth():
                 self.truth[message.body] = message
             case _ if topic in OF_CHASERS and message.chaser < len(self.chasers):
-                self.chasers[message.chaser].take(message)
+                self.chasers[message.chaser].update(message)
 
     def time_s(self) -> float:
-        """Simulated time of the latest tick."""
+        """Return the simulated time of the latest tick."""
         return self.tick.sim_time_ns / 1e9 if self.tick is not None else 0.0
 
     def estimate(self) -> Pose | None:
-        """Where the target is thought to be."""
+        """Return the estimated pose of the target."""
         return pose_of(self.target) if self.target is not None and self.target.status != "none" else None
 
     def true_target(self) -> Pose | None:
-        """Where the target is, for those who may know."""
+        """Return the true pose of the target, with access to ground truth."""
         return pose_of(self.truth[TARGET]) if TARGET in self.truth else None
 
     def chaser(self, i: int) -> Pose | None:
-        """Where a chaser is: truly where that is known, else as it says itself."""
+        """Return the pose of a chaser: ground truth if available, else odometry."""
         body, odometry = self.truth.get(f"chaser/{i}"), self.chasers[i].odometry
         known = body if body is not None else odometry
         return pose_of(known) if known is not None else None
 
     def distance_m(self, i: int) -> float | None:
-        """From a chaser's centre to the target's, as estimated."""
+        """Return the distance between the centres of chaser and estimated target."""
         target, odometry = self.estimate(), self.chasers[i].odometry
         if target is None or odometry is None:
             return None
         return float(np.linalg.norm(np.subtract(odometry.position_m, target.position_m)))
 
-    def keep_out_m(self, otherwise: float) -> float:
-        """How near to the target the chasers may plan to come: the largest that holds for one of them."""
+    def keep_out_m(self, default: float) -> float:
+        """Return the largest minimum distance to the target that applies to a chaser."""
         limits = [c.reference.min_distance_target_m for c in self.chasers if c.reference is not None]
-        return max(limits, default=otherwise)
-
-
-def in_target(pose: Pose, target: Pose) -> Array:
-    """A body's position (3,) in TRF."""
-    return rotations.rotate_inverse(target.q_wxyz, pose.position_m - target.position_m)
+        return max(limits, default=default)

@@ -1,4 +1,4 @@
-"""What the page says in words, as Markdown: the state of the mission, of each chaser, what happened. No browser here."""
+"""Text of the page as Markdown: state of the mission and of each chaser, faults, events."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ import math
 from chaserdock_protocol.scenario import Scenario
 
 from .history import History, Line
-from .snapshot import ChaserNow, Now
+from .snapshot import ChaserState, MissionState
 
 _MARKS = {"info": "", "warning": "⚠ ", "error": "⛔ "}
 _FRESH_S = 2.0
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
 
 
-def head(scenario: Scenario, now: Now, mode: str, speed: float | None) -> str:
-    """Where the mission is: time, speed, the target's estimate, how it ended."""
-    lines = [f"**{scenario.name}** · {mode}", f"**{now.time_s():.1f} s** of {scenario.duration_s:g} s"]
+def head(scenario: Scenario, state: MissionState, mode: str, speed: float | None) -> str:
+    """Return time, speed, estimator status, and how the mission ended."""
+    lines = [f"**{scenario.name}** · {mode}", f"**{state.time_s():.1f} s** of {scenario.duration_s:g} s"]
     if speed is not None:
         lines[1] += f" · {speed:.2f} x real time"
-    if now.target is not None:
-        lines.append(f"target: {now.target.status}, used by the filter: {_numbers(now.target.accepted)}")
-        if now.target.rejected:
-            lines[-1] += f", refused: {_numbers(now.target.rejected)}"
-    if now.ended is not None:
-        lines.append(f"{'ended' if now.ended.complete else '⛔ ended early'}: {now.ended.reason}")
+    if state.target is not None:
+        lines.append(f"target: {state.target.status}, used by the filter: {_numbers(state.target.accepted)}")
+        if state.target.rejected:
+            lines[-1] += f", rejected: {_numbers(state.target.rejected)}"
+    if state.ended is not None:
+        lines.append(f"{'ended' if state.ended.complete else '⛔ ended early'}: {state.ended.reason}")
     return "  \n".join(lines)
 
 
@@ -32,29 +32,29 @@ def _numbers(chasers: tuple[int, ...]) -> str:
     return ", ".join(map(str, chasers)) or "none"
 
 
-def chasers(now: Now, history: History) -> str:
-    """A table, one row a chaser."""
+def chasers(state: MissionState, history: History) -> str:
+    """Return a table with one row per chaser."""
     rows = [
-        "| # | phase | error | to target | sees | latency |",
+        "| # | phase | error | distance | markers | latency |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for i, chaser in enumerate(now.chasers):
-        error, distance = chaser.error(), now.distance_m(i)
-        latency = history.series["latency_ms", i].last(now.time_s() + _FRESH_S, 2.0 * _FRESH_S)
+    for i, chaser in enumerate(state.chasers):
+        error, distance = chaser.error(), state.distance_m(i)
+        latency = history.series["latency_ms", i].last(state.time_s() + _FRESH_S, 2.0 * _FRESH_S)
         cells = (
             f"**{i}**",
             chaser.reference.phase if chaser.reference is not None else "-",
             f"{error[0] * 1e3:.2f} mm, {math.degrees(error[1]):.3f}°" if error is not None else "-",
             f"{distance:.3f} m" if distance is not None else "-",
-            sees(chaser),
+            visibility(chaser),
             f"{latency:.0f} ms" if latency is not None else "-",
         )
         rows.append("| " + " | ".join(cells) + " |")
     return "\n".join(rows)
 
 
-def sees(chaser: ChaserNow) -> str:
-    """What its camera has of the target."""
+def visibility(chaser: ChaserState) -> str:
+    """Return the number of markers in view, or the status of the sighting."""
     if chaser.sighting is None:
         return "-"
     if chaser.sighting.status != "seen":
@@ -63,41 +63,41 @@ def sees(chaser: ChaserNow) -> str:
     return f"{markers} marker{'s' if markers != 1 else ''}"
 
 
-def faults(now: Now, history: History, lost: set[str]) -> str:
-    """What is not as it should be just now; ``lost``: processes that were there and are gone."""
-    out = [f"**{name}** is gone" for name in sorted(lost)]
-    if now.target is not None and now.target.status == "lost":
+def faults(state: MissionState, history: History, lost: set[str]) -> str:
+    """Return the present faults; ``lost``: processes that have disappeared."""
+    out = [f"**{name}** has disappeared" for name in sorted(lost)]
+    if state.target is not None and state.target.status == "lost":
         out.append("the target is lost")
-    expected = set(now.tick.chasers) if now.tick is not None else set(range(len(now.chasers)))
-    for i, chaser in enumerate(now.chasers):
+    expected = set(state.tick.chasers) if state.tick is not None else set(range(len(state.chasers)))
+    for i, chaser in enumerate(state.chasers):
         if i not in expected:
-            out.append(f"chaser {i} takes no part")
-        if chaser.wrench is not None and chaser.wrench.mode in ("brake", "coast"):
-            out.append(f"chaser {i}: the controller lets it {chaser.wrench.mode}")
-        if chaser.actuators is not None and chaser.actuators.source != "command":
-            out.append(
-                f"chaser {i} flies by itself ({chaser.actuators.source}): it has no command it can trust"
-            )
-        if chaser.thrusters is not None:
-            bad = [
-                f"{k} {s.replace('_', ' ')}"
-                for k, s in enumerate(chaser.thrusters.thrusters)
-                if s != "healthy"
-            ]
-            if bad:
-                out.append(f"chaser {i}: thruster {', '.join(bad)}")
-    if now.tick is not None and not now.tick.controller:
-        out.append("the controller takes no part")
-    if now.solver is not None:
-        for i, status in zip(now.solver.chasers, now.solver.status, strict=False):
-            if status not in _GOOD_SOLVES:
-                out.append(f"chaser {i}: solver says {status}")
-    counted = ", ".join(f"{process} {n}" for process, n in sorted(history.refused.items()) if n)
+            out.append(f"chaser {i} does not participate")
+        out += _chaser_faults(i, chaser)
+    if state.tick is not None and not state.tick.controller:
+        out.append("the controller does not participate")
+    if state.solver is not None:
+        statuses = zip(state.solver.chasers, state.solver.status, strict=False)
+        out += [f"chaser {i}: solver status {s}" for i, s in statuses if s not in _GOOD_SOLVES]
+    counted = ", ".join(f"{process} {n}" for process, n in sorted(history.rejected.items()) if n)
     if counted:
-        out.append(f"messages refused or lost: {counted}")
-    return "\n".join(f"- ⚠ {text}" for text in out) or "none"
+        out.append(f"messages rejected or lost: {counted}")
+    return "\n".join(f"- ⚠ {fault}" for fault in out) or "none"
 
 
-def happened(lines: list[Line]) -> str:
-    """What happened, the newest first."""
-    return "\n".join(f"- `{x.time_s:7.2f} s` {_MARKS[x.level]}{x.text}" for x in lines) or "nothing yet"
+def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
+    out = []
+    if chaser.wrench is not None and chaser.wrench.mode in ("brake", "coast"):
+        out.append(f"chaser {i}: the controller commands {chaser.wrench.mode}")
+    if chaser.actuators is not None and chaser.actuators.source != "command":
+        out.append(f"chaser {i}: fallback ({chaser.actuators.source}), no valid command")
+    if chaser.thrusters is not None:
+        statuses = enumerate(chaser.thrusters.thrusters)
+        bad = [f"{k} {s.replace('_', ' ')}" for k, s in statuses if s != "healthy"]
+        if bad:
+            out.append(f"chaser {i}: thruster {', '.join(bad)}")
+    return out
+
+
+def events(lines: list[Line]) -> str:
+    """Return the event lines, newest first."""
+    return "\n".join(f"- `{x.time_s:7.2f} s` {_MARKS[x.level]}{x.text}" for x in lines) or "none"

@@ -1,4 +1,4 @@
-"""``chaserdock check``: who keeps the protocol passes, and every kind of breach is found."""
+"""``chaserdock check``: conforming processes pass, every kind of violation is found."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PROCESSES = ("controller", "chaser/0", "chaser/1")
 
 @pytest.fixture(scope="module")
 def said() -> dict[str, list[tuple[int, RawSample]]]:
-    """What every process said in the golden flight, with the tick."""
+    """Return the messages of every process in the golden flight, with their ticks."""
     out: dict[str, list[tuple[int, RawSample]]] = {name: [] for name in PROCESSES}
     for record in read_log(LOG):
         raw = RawSample(record.key, encoding_of(type(record.message)), codec.encode(record.message), 0)
@@ -42,29 +42,29 @@ def instance_of(messages: list[tuple[int, RawSample]]) -> str:
 
 
 def keep(process: str, messages: list[tuple[int, RawSample]], recorded: Recorded) -> Ledger:
-    """The ledger after a whole flight, each tick's messages after its opening, as a check would hear them."""
+    """Return the ledger after a whole flight, with each tick's messages after its opening."""
     ledger = Ledger(process, recorded.scenario, instance_of(messages))
     end = recorded.turns[-1].tick.tick
-    # Presence has no tick, and comes before all; the farewell comes last.
+    # Presence has no tick and comes first; the farewell comes last.
     ordered = sorted(messages, key=lambda m: (m[1].key.endswith("/farewell"), m[0]))
     for raw in (r for t, r in ordered if t < 0):
-        ledger.take(raw)
+        ledger.add(raw)
     for turn in recorded.turns:
         ledger.open(turn)
         for tick, raw in ordered:
             if tick == turn.tick.tick and not raw.key.endswith("/farewell"):
-                ledger.take(raw)
+                ledger.add(raw)
         if ledger.due():
             ledger.miss(1.0)
     for tick, raw in ordered:
         if tick > end or raw.key.endswith("/farewell"):
-            ledger.take(raw)
+            ledger.add(raw)
     ledger.finish()
     return ledger
 
 
 @pytest.mark.parametrize("process", PROCESSES)
-def test_what_our_own_processes_said_is_in_order(
+def test_our_own_processes_conform_in_the_golden_flight(
     process: str, said: dict[str, list[tuple[int, RawSample]]]
 ) -> None:
     recorded = read_turns(LOG, process, 1000)
@@ -81,7 +81,7 @@ def changed(raw: RawSample, **fields: Any) -> RawSample:
     return msgspec.structs.replace(raw, payload=codec.encode(message))
 
 
-BREACHES: list[tuple[str, Callable[[RawSample], list[RawSample]], str, str]] = [
+VIOLATIONS: list[tuple[str, Callable[[RawSample], list[RawSample]], str, str]] = [
     ("controller/target", lambda r: [msgspec.structs.replace(r, encoding="application/msgpack")], "", "wrong encoding"),
     ("controller/target", lambda r: [msgspec.structs.replace(r, payload=b"\xff")], "", "not of the message's type"),
     ("controller/target", lambda r: [changed(r, position_m=(math.nan, 0.0, 0.0))], "", "not finite"),
@@ -92,42 +92,42 @@ BREACHES: list[tuple[str, Callable[[RawSample], list[RawSample]], str, str]] = [
     ("controller/solver", lambda r: [changed(r, tick=6)], "", "another tick than the open one"),
     ("controller/solver", lambda r: [changed(r, sim_time_ns=1)], "", "wrong sim_time_ns"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, effective_time_ns=1)], "", "wrong effective_time_ns"),
-    ("controller/chaser/1/wrench", lambda r: [changed(r, chaser=0)], "", "another one's than the key's"),
-    ("controller/chaser/1/wrench", lambda r: [changed(r, force_N=(1e3, 0.0, 0.0))], "", "the chaser refuses"),
+    ("controller/chaser/1/wrench", lambda r: [changed(r, chaser=0)], "", "differs from the key's"),
+    ("controller/chaser/1/wrench", lambda r: [changed(r, force_N=(1e3, 0.0, 0.0))], "", "the chaser rejects"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, term=7)], "", "not the tick's term"),
     ("controller/chaser/1/wrench", lambda r: [changed(r, instance="another")], "", "not the tick's term"),
     ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="chaser/0/actuators")], "chaser/0/actuators",
      "must not write"),
     ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="truth/world")], "truth/world", "must not write"),
-    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="my/own")], "my/own", "does not have"),
+    ("controller/target", lambda r: [r, msgspec.structs.replace(r, key="my/own")], "my/own", "not part of the protocol"),
     ("controller/presence", lambda r: [changed(r, process="chaser/0")], "", "another process' presence"),
     ("controller/farewell", lambda r: [], "", "no farewell"),
-    ("controller/farewell", lambda r: [changed(r, published={})], "", "not what was published"),
+    ("controller/farewell", lambda r: [changed(r, published={})], "", "wrong number of published messages"),
     ("controller/farewell", lambda r: [changed(r, process="world")], "", "another process' farewell"),
 ]  # fmt: skip
 
 
-@pytest.mark.parametrize(("key", "breach", "where", "what"), BREACHES)
-def test_a_breach_is_found(
+@pytest.mark.parametrize(("key", "violation", "where", "what"), VIOLATIONS)
+def test_violation_is_found(
     key: str,
-    breach: Callable[[RawSample], list[RawSample]],
+    violation: Callable[[RawSample], list[RawSample]],
     where: str,
     what: str,
     said: dict[str, list[tuple[int, RawSample]]],
 ) -> None:
     recorded = read_turns(LOG, "controller", 1000)
-    # At tick 5; presence and farewell, which answer no tick, always.
+    # At tick 5; always for presence and farewell, which have no tick.
     always = key in ("controller/presence", "controller/farewell")
     messages = [
         (tick, new)
         for tick, raw in said["controller"]
-        for new in (breach(raw) if raw.key == key and (always or tick == 5) else [raw])
+        for new in (violation(raw) if raw.key == key and (always or tick == 5) else [raw])
     ]
     lines = [f.line() for f in keep("controller", messages, recorded).findings.values()]
     assert any(line.startswith(where or key) and what in line for line in lines), lines
 
 
-def test_a_process_that_is_not_in_the_log_is_refused() -> None:
+def test_unknown_process_is_rejected() -> None:
     for process in ("chaser/2", "world", "chaser/01", ""):
         with pytest.raises(CheckError):
             read_turns(LOG, process, 10)
@@ -141,7 +141,7 @@ def check(
 
 
 @pytest.mark.parametrize("process", ["controller", "chaser/0"])
-def test_our_own_process_keeps_the_protocol(process: str) -> None:
+def test_our_own_process_conforms(process: str) -> None:
     words = [sys.executable, "-m", "chaserdock", *process.split("/")]
     status, out = check(process, *words, "-e", "{endpoint}", "--namespace", "{namespace}", ticks=100)
     assert status == 0, out
@@ -149,7 +149,7 @@ def test_our_own_process_keeps_the_protocol(process: str) -> None:
 
 
 def foreign(path: Path, old: str = "", new: str = "") -> tuple[int, str]:
-    """The foreign example under check, with a fault put into it."""
+    """Check the foreign example with an injected fault."""
     source = FOREIGN.read_text()
     assert old in source
     path.write_text(source.replace(old, new, 1) if old else source)
@@ -158,7 +158,7 @@ def foreign(path: Path, old: str = "", new: str = "") -> tuple[int, str]:
     return check("controller", *command, patience_s=patience_s, start_s=start_s)
 
 
-def test_foreign_example_keeps_the_protocol(tmp_path: Path) -> None:
+def test_foreign_example_conforms(tmp_path: Path) -> None:
     status, out = foreign(tmp_path / "foreign.py")
     assert status == 0, out
 
@@ -173,10 +173,10 @@ def test_foreign_example_keeps_the_protocol(tmp_path: Path) -> None:
         ('            if key == "world/end":\n                break', "", "does not end within"),
         ('NAME, NAMESPACE = "controller"', 'NAME, NAMESPACE = "chaser/0"', "joins under another name"),
         ("self.session.liveliness().declare_token", "str", "live/controller: no liveliness token"),
-        ("self.heard[message", "self.inbox, self.seen = self.inbox, [message", "has not heard its partners"),
+        ("self.heard[message", "self.inbox, self.seen = self.inbox, [message", "has not discovered its partners"),
     ],
 )  # fmt: skip
-def test_a_broken_process_is_found_out(old: str, new: str, finding: str, tmp_path: Path) -> None:
+def test_faulty_process_is_detected(old: str, new: str, finding: str, tmp_path: Path) -> None:
     status, out = foreign(tmp_path / "foreign.py", old, new)
     assert status == 1, out
     assert finding in out
@@ -186,7 +186,7 @@ def test_a_broken_process_is_found_out(old: str, new: str, finding: str, tmp_pat
     ("process", "command", "complaint"),
     [("chaser/7", "true", "chasers are 0 to 1"), ("controller", "/no/such/program", "cannot be run")],
 )
-def test_a_check_that_cannot_be_done_says_why(process: str, command: str, complaint: str) -> None:
+def test_impossible_check_states_the_reason(process: str, command: str, complaint: str) -> None:
     status, out = check(process, command)
     assert status == 2
     assert complaint in out

@@ -320,9 +320,9 @@ def test_compare_reports_deviations_of_bodies(tmp_path: Path) -> None:
     found = compare(GOLDEN, rewritten(GOLDEN, tmp_path / "b.mcap", change))
     assert not found.equal
     assert found.first_difference == "truth/body/chaser/1: position_m at 0.400 s (tick 6)"
-    assert found.apart["chaser/1"].position_m == pytest.approx((0.01**2 + 0.002**2) ** 0.5)
-    assert found.apart["chaser/1"].position_time_s == pytest.approx(0.8)
-    assert found.apart["chaser/0"].position_m == 0.0
+    assert found.deviations["chaser/1"].position_m == pytest.approx((0.01**2 + 0.002**2) ** 0.5)
+    assert found.deviations["chaser/1"].position_time_s == pytest.approx(0.8)
+    assert found.deviations["chaser/0"].position_m == 0.0
     assert [t.key for t in found.topics if not t.equal] == ["truth/body/chaser/1"]
     assert any("chasers.1.position_mse_m2" in line for line in comparison_lines(found))
 

@@ -1,4 +1,4 @@
-"""What the viewer tells of a mission, without a browser: the present, the past, plots, shapes, logs, who may connect."""
+"""Viewer without a browser: state, history, plots, shapes, logs, admission of connections."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from chaserdock.viewer import text as words
 from chaserdock.viewer.address import ViewError, may_connect, url_of
 from chaserdock.viewer.history import History, Series
 from chaserdock.viewer.logged import LoggedMission
-from chaserdock.viewer.page import TimeLine
+from chaserdock.viewer.page import Timeline
 from chaserdock.viewer.player import advance
 from chaserdock.viewer.server import page_server
-from chaserdock.viewer.snapshot import Now
+from chaserdock.viewer.snapshot import MissionState
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
@@ -49,9 +49,9 @@ def mission() -> LoggedMission:
 # -- the present --------------------------------------------------------------------------------------------
 
 
-def test_the_error_is_that_of_one_tick(mission: LoggedMission) -> None:
-    """Odometry runs ahead of the reference that answers it; the two of one tick are compared."""
-    now = Now.of(1)
+def test_tracking_error_compares_messages_of_one_tick(mission: LoggedMission) -> None:
+    """Odometry arrives before the reference of its tick."""
+    state = MissionState.empty(1)
     for tick, x in enumerate((0.0, 1.0, 2.0)):
         at = Odometry(
             tick=tick,
@@ -61,44 +61,44 @@ def test_the_error_is_that_of_one_tick(mission: LoggedMission) -> None:
             q_wxyz=UPRIGHT,
             omega_rad_s=(0, 0, 0),
         )
-        now.take(topics.ODOMETRY, at)
-    assert now.chasers[0].error() is None
+        state.update(topics.ODOMETRY, at)
+    assert state.chasers[0].error() is None
     there = Reference(
         tick=1, chaser=0, phase="hold", phase_time_s=0.0, position_m=(1.0, 0.25, 0.0), q_wxyz=UPRIGHT,
         offset_m=(0, 0, 0), min_distance_target_m=0.5,
     )  # fmt: skip
-    now.take(topics.REFERENCE, there)
-    assert now.chasers[0].error() == pytest.approx((0.25, 0.0))
-    assert now.keep_out_m(0.1) == 0.5
-    assert Now.of(1).keep_out_m(0.1) == 0.1
+    state.update(topics.REFERENCE, there)
+    assert state.chasers[0].error() == pytest.approx((0.25, 0.0))
+    assert state.keep_out_m(0.1) == 0.5
+    assert MissionState.empty(1).keep_out_m(0.1) == 0.1
 
 
-def test_a_chaser_that_the_mission_does_not_have_is_not_noted() -> None:
-    now, history = Now.of(1), History(1)
+def test_messages_of_unknown_chasers_are_ignored() -> None:
+    state, history = MissionState.empty(1), History(1)
     stray = Odometry(
         chaser=7, position_m=(0, 0, 0), velocity_m_s=(0, 0, 0), q_wxyz=UPRIGHT, omega_rad_s=(0, 0, 0)
     )
-    now.take(topics.ODOMETRY, stray)
-    history.take(topics.ODOMETRY, stray, 0)
-    assert now.chasers[0].odometry is None
+    state.update(topics.ODOMETRY, stray)
+    history.update(topics.ODOMETRY, stray, 0)
+    assert state.chasers[0].odometry is None
 
 
-def test_faults_are_told(mission: LoggedMission) -> None:
-    now, history = mission.at(1.0), mission.history
-    assert words.faults(now, history, set()) == "none"
-    assert "**chaser/1** is gone" in words.faults(now, history, {"chaser/1"})
-    now.take(topics.TICK, Tick(tick=20, images=True, chasers=(0,), controller=False))
+def test_faults_are_listed(mission: LoggedMission) -> None:
+    state, history = mission.at(1.0), mission.history
+    assert words.faults(state, history, set()) == "none"
+    assert "**chaser/1** has disappeared" in words.faults(state, history, {"chaser/1"})
+    state.update(topics.TICK, Tick(tick=20, images=True, chasers=(0,), controller=False))
     brake = ActuatorCommand(
         chaser=0, effective_time_ns=0, source="brake", force_N=(0, 0, 0), torque_N_m=(0, 0, 0)
     )
-    now.take(topics.ACTUATORS, brake)
-    told = words.faults(now, history, set())
+    state.update(topics.ACTUATORS, brake)
+    listed = words.faults(state, history, set())
     for text in (
-        "chaser 1 takes no part",
-        "the controller takes no part",
-        "chaser 0 flies by itself (brake)",
+        "chaser 1 does not participate",
+        "the controller does not participate",
+        "chaser 0: fallback (brake)",
     ):
-        assert text in told
+        assert text in listed
 
 
 # -- the past -----------------------------------------------------------------------------------------------
@@ -106,7 +106,7 @@ def test_faults_are_told(mission: LoggedMission) -> None:
 
 @quick
 @given(st.lists(st.floats(0, 1e4), max_size=300), st.integers(4, 50))
-def test_a_series_stays_in_order_and_bounded(times: list[float], most: int) -> None:
+def test_series_is_ordered_and_bounded(times: list[float], most: int) -> None:
     series = Series(most)
     for t in times:
         series.add(t, t)
@@ -120,7 +120,7 @@ def test_a_series_stays_in_order_and_bounded(times: list[float], most: int) -> N
 
 @quick
 @given(st.lists(st.tuples(st.floats(0.0, 60.0), st.floats(-1e3, 1e3)), min_size=1, max_size=2000))
-def test_plots_lose_no_peak_and_have_no_gaps(samples: list[tuple[float, float]]) -> None:
+def test_plots_keep_peaks_and_fill_gaps(samples: list[tuple[float, float]]) -> None:
     history = History(2)
     kept = {}
     for t, v in sorted(samples):
@@ -136,29 +136,29 @@ def test_plots_lose_no_peak_and_have_no_gaps(samples: list[tuple[float, float]])
     assert set(second) == {5.0}
 
 
-def test_a_plot_of_nothing_is_still_one_that_can_be_drawn() -> None:
+def test_plot_without_data_can_be_drawn() -> None:
     for plot in plots.plots_of(3, True):
         points = plots.points_of(plot, History(3), 0.0, 10.0)
         assert [len(p) for p in points] == [2] * (len(plot.curves) + 1)
 
 
-def test_what_happened_is_told_newest_first_and_once() -> None:
+def test_events_are_listed_newest_first_without_repetition() -> None:
     history = History(1)
-    history.take(topics.EVENT, Event(sim_time_ns=10**9, process="world", level="warning", what="late"), 0)
+    history.update(topics.EVENT, Event(sim_time_ns=10**9, process="world", level="warning", what="late"), 0)
     reply = CommandReply(
         sim_time_ns=2 * 10**9, command="approach", chaser=0, accepted=False, reason="why not"
     )
     for _ in range(3):
-        history.take(topics.COMMAND, reply, 0)
-    history.take(topics.END, MissionEnd(sim_time_ns=3 * 10**9, reason="all flown", complete=True), 0)
+        history.update(topics.COMMAND, reply, 0)
+    history.update(topics.END, MissionEnd(sim_time_ns=3 * 10**9, reason="all flown", complete=True), 0)
     texts = [line.text for line in history.lines_until(2.5, 10)]
     assert texts == ["approach chaser 0: refused, why not", "world: late"]
     assert history.lines_until(9.0, 1)[0].text == "the mission has ended: all flown"
 
 
-def test_latency_is_from_the_image_to_the_command_of_its_tick(mission: LoggedMission) -> None:
+def test_latency_is_measured_from_image_to_command_of_its_tick(mission: LoggedMission) -> None:
     history = History(1)
-    history.exposed(0, 5, 1_000_000_000)
+    history.add_exposure(0, 5, 1_000_000_000)
     command = ActuatorCommand(
         tick=5,
         sim_time_ns=1,
@@ -168,7 +168,7 @@ def test_latency_is_from_the_image_to_the_command_of_its_tick(mission: LoggedMis
         force_N=(0, 0, 0),
         torque_N_m=(0, 0, 0),
     )
-    history.take(topics.ACTUATORS, command, 1_025_000_000)
+    history.update(topics.ACTUATORS, command, 1_025_000_000)
     assert history.series["latency_ms", 0].until(1.0)[1].tolist() == [25.0]
     assert len(mission.history.series["latency_ms", 1]) >= 17
 
@@ -176,33 +176,31 @@ def test_latency_is_from_the_image_to_the_command_of_its_tick(mission: LoggedMis
 # -- a log --------------------------------------------------------------------------------------------------
 
 
-def test_a_log_is_opened_at_any_moment(mission: LoggedMission) -> None:
+def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
     assert mission.truth
     assert mission.end_s == pytest.approx(17 / 15, abs=1e-6)
     for tick in (7, 17):
-        now = mission.at(tick / 15)
-        assert now.tick is not None
-        assert now.tick.tick == tick
-        for i, chaser in enumerate(now.chasers):
+        state = mission.at(tick / 15)
+        assert state.tick is not None
+        assert state.tick.tick == tick
+        for i, chaser in enumerate(state.chasers):
             of_it = (chaser.odometry, chaser.reference, chaser.image, chaser.sighting, chaser.actuators)
             assert [(m.chaser, m.tick) for m in of_it if m is not None] == [(i, tick)] * 5
             assert chaser.image is not None
             assert chaser.sighting_in(chaser.image) is chaser.sighting
             assert chaser.error() is not None
-        assert set(now.truth) == {"target", "chaser/0", "chaser/1"}
-        assert now.ended is None or tick == 17
+        assert set(state.truth) == {"target", "chaser/0", "chaser/1"}
+        assert state.ended is None or tick == 17
     assert all(len(mission.history.series["position_error_mm", i]) >= 17 for i in (0, 1))
     assert len(mission.history.series["estimate_error_mm", None]) >= 17
-    assert "approach chaser 0: accepted, phase approach" in words.happened(
-        mission.history.lines_until(9.0, 99)
-    )
+    assert "approach chaser 0: accepted, phase approach" in words.events(mission.history.lines_until(9.0, 99))
     table = words.chasers(mission.at(1.0), mission.history)
     assert table.count("1 marker") == 2
     assert "| approach |" in table
     assert "| hold |" in table
 
 
-def test_a_log_cut_off_is_shown_up_to_there(tmp_path: Path) -> None:
+def test_truncated_log_is_shown_up_to_its_end(tmp_path: Path) -> None:
     whole = GOLDEN.read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: int(0.8 * len(whole))])
@@ -211,7 +209,7 @@ def test_a_log_cut_off_is_shown_up_to_there(tmp_path: Path) -> None:
     assert mission.at(mission.end_s).tick is not None
 
 
-def test_what_is_no_log_is_one_clear_line(tmp_path: Path) -> None:
+def test_invalid_log_prints_a_one_line_error(tmp_path: Path) -> None:
     (tmp_path / "x.mcap").write_bytes(b"no log at all")
     with pytest.raises(LogError, match="no MCAP log"):
         LoggedMission(tmp_path / "x.mcap")
@@ -222,8 +220,8 @@ def test_what_is_no_log_is_one_clear_line(tmp_path: Path) -> None:
     ]
 
 
-def test_a_time_line_plays_to_its_end_and_obeys_a_person() -> None:
-    line = TimeLine(10.0, speed=2.0)
+def test_time_line_plays_to_its_end_and_follows_the_slider() -> None:
+    line = Timeline(10.0, speed=2.0)
     advance(line, 1.0)
     assert line.at_s == 2.0
     line.at_s, line.moved = 9.5, True
@@ -239,7 +237,7 @@ def test_a_time_line_plays_to_its_end_and_obeys_a_person() -> None:
 
 
 @pytest.mark.parametrize("name", ["four-chaser-docking", "docking-contact"])
-def test_bodies_are_closed_and_seen_from_outside(name: str) -> None:
+def test_mesh_normals_point_outwards(name: str) -> None:
     from chaserdock.analysis.scene import scene_of
 
     scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml")
@@ -253,7 +251,7 @@ def test_bodies_are_closed_and_seen_from_outside(name: str) -> None:
     assert np.all(np.einsum("ij,ij->i", normals, np.repeat(quads, 2, axis=0)) > 0.0)
 
 
-def test_a_corridor_is_where_the_chaser_may_be() -> None:
+def test_corridor_covers_the_allowed_region() -> None:
     held = load_scenario(ROOT / "scenarios" / "four-chaser-docking.toml")
     line = shapes.corridor_of(held, 0)
     assert line is not None
@@ -273,7 +271,7 @@ def test_a_corridor_is_where_the_chaser_may_be() -> None:
 
 
 @pytest.mark.parametrize(
-    ("origin", "asked", "host", "allowed"),
+    ("origin", "requested_host", "host", "allowed"),
     [
         ("http://127.0.0.1:8080", "127.0.0.1:8080", "127.0.0.1", True),
         ("http://localhost:8080", "localhost:8080", "127.0.0.1", True),
@@ -286,11 +284,13 @@ def test_a_corridor_is_where_the_chaser_may_be() -> None:
         ("https://evil.example", "lab-7:8080", "0.0.0.0", False),
     ],
 )
-def test_only_our_own_page_may_connect(origin: str | None, asked: str, host: str, allowed: bool) -> None:
-    assert may_connect(origin, asked, host) is allowed
+def test_only_our_own_page_may_connect(
+    origin: str | None, requested_host: str, host: str, allowed: bool
+) -> None:
+    assert may_connect(origin, requested_host, host) is allowed
 
 
-def test_a_port_that_is_taken_is_said_or_gone_round() -> None:
+def test_occupied_port_is_reported_or_skipped() -> None:
     with page_server("127.0.0.1", None) as first:
         with pytest.raises(
             ViewError, match=f"port {first.get_port()} of 127.0.0.1: .*; choose another with --port"
@@ -303,7 +303,7 @@ def test_a_port_that_is_taken_is_said_or_gone_round() -> None:
         page_server("203.0.113.7", None).__enter__()
 
 
-def test_rights_show_the_truth_to_a_viewer_and_not_with_an_operators_keys(tmp_path: Path) -> None:
+def test_access_rights_give_ground_truth_to_viewers_only(tmp_path: Path) -> None:
     keys = make_keys(tmp_path / "keys")
     with router_with_rights(keys) as endpoint:
         world = Node("world", "world", client(keys, "world", endpoint))
@@ -338,8 +338,8 @@ def test_rights_show_the_truth_to_a_viewer_and_not_with_an_operators_keys(tmp_pa
                 node.close()
 
 
-def test_who_follows_gets_the_newest_and_never_holds_up_the_publisher() -> None:
-    """Of 5,000 messages that nobody took, the last four are there; the publisher has long sent them all."""
+def test_subscriber_gets_the_newest_and_never_blocks_the_publisher() -> None:
+    """Of 5,000 unread messages the last four are kept; the publisher is not delayed."""
     link = Link("follow", (), ("tcp/127.0.0.1:17999",))
     world, looker = Node("world", "world", link), None
     try:

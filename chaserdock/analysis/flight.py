@@ -254,6 +254,11 @@ class _Collector:
                 self._add_solve(message)
             case WorldTruth():
                 self.world.add(message)
+            case Event() | CommandReply() | Health():
+                self._add_report(message)
+
+    def _add_report(self, message: Event | CommandReply | Health) -> None:
+        match message:
             case Event():
                 self.events.append(message)
             case CommandReply():

@@ -13,7 +13,14 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from chaserdock_agents.router.acl_audit import MOST_NAMED, TARGET, TLS_TARGET, Account, Denial, Reader
+from chaserdock_agents.router.acl_audit import (
+    MAX_DISTINCT,
+    TARGET,
+    TLS_TARGET,
+    Denial,
+    DenialCounter,
+    DenialParser,
+)
 from chaserdock_protocol import codec
 from chaserdock_protocol.messages import Event
 from chaserdock_protocol.transport import Node, RawSample
@@ -29,8 +36,8 @@ OTHER = HEAD.replace("rx-1 ThreadId(10)", "rx-0 ThreadId(09)")
 
 
 def read(*lines: str) -> list[str]:
-    reader = Reader("rights")
-    return [str(denial) for line in lines if (denial := reader.read(line)) is not None]
+    reader = DenialParser("rights")
+    return [str(denial) for line in lines if (denial := reader.parse(line)) is not None]
 
 
 def test_a_decision_on_a_message_is_told_and_one_in_advance_is_not() -> None:
@@ -42,9 +49,9 @@ def test_a_decision_on_a_message_is_told_and_one_in_advance_is_not() -> None:
         f"{OTHER} 4fc8 {WHO} is unauthorized to Query (ingress) on rights/x",  # another thread, a real one
         f"{HEAD} 4fc8 {WHO} is unauthorized to Declare Liveliness Subscriber (ingress) on rights/world/tick",
     )
-    assert read(*in_advance) == ["chaser-1 may not ask x"]
+    assert read(*in_advance) == ["chaser-1 may not query x"]
     used = f"{HEAD} Using cached result: 4fc8 is unauthorized to Put (ingress) on rights/world/tick"
-    assert read(*in_advance, used) == ["chaser-1 may not ask x", "chaser-1 may not publish on world/tick"]
+    assert read(*in_advance, used) == ["chaser-1 may not query x", "chaser-1 may not publish on world/tick"]
 
 
 def test_what_is_allowed_or_goes_out_or_is_no_decision_is_not_told() -> None:
@@ -61,7 +68,7 @@ def test_a_client_without_a_role_is_told() -> None:
 @pytest.mark.parametrize("why", ["peer sent no certificates", "invalid peer certificate: BadSignature"])
 def test_who_has_no_certificate_is_told(why: str) -> None:
     line = f"2026-11-22T12:02:55Z  WARN acc-0 ThreadId(05) {TLS_TARGET}: {why}. Hint: increase the limit."
-    assert read(line) == [f"who has no certificate of this mission may not connect: {why}"]
+    assert read(line) == [f"a client without a certificate of this mission may not connect: {why}"]
     assert read(line.replace(why, "tls handshake eof")) == []  # somebody looked whether the port is open
 
 
@@ -72,13 +79,13 @@ def test_keys_of_any_length_and_character_are_told_in_one_short_line() -> None:
 
 
 def test_repetitions_are_told_ever_more_rarely_and_memory_is_bounded() -> None:
-    account, denial = Account(), Denial("chaser-1", "publish on", "world/tick")
+    account, denial = DenialCounter(), Denial("chaser-1", "publish on", "world/tick")
     told = [text for _ in range(1000) if (text := account.add(denial)) is not None]
     assert told == [str(denial), *(f"{denial}: {n} times" for n in (10, 100, 1000))]
-    for i in range(2 * MOST_NAMED):
+    for i in range(2 * MAX_DISTINCT):
         account.add(Denial("chaser-1", "publish on", f"k/{i}"))
-    assert len(account.counts) == MOST_NAMED
-    assert account.total == 1000 + 2 * MOST_NAMED
+    assert len(account.counts) == MAX_DISTINCT
+    assert account.total == 1000 + 2 * MAX_DISTINCT
 
 
 def test_the_log_is_read_however_it_is_cut_and_other_lines_are_passed_on() -> None:
@@ -101,7 +108,7 @@ def test_the_log_is_read_however_it_is_cut_and_other_lines_are_passed_on() -> No
         "    os.write(1, piece.encode())\n"
         "    time.sleep(0.1)\n"
         "log.close()\n"
-        "print(*log.take())\n"
+        "print(*log.take_denials())\n"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True, text=True).stdout
     assert out == "another line\nchaser-1 may not publish on real\n"
@@ -185,5 +192,5 @@ def test_a_client_without_a_certificate_is_refused_and_noted(
         zenoh.open(config).close()
     assert process.stderr is not None
     assert process.stderr.readline().decode() == (
-        "router: denied: who has no certificate of this mission may not connect: peer sent no certificates\n"
+        "router: denied: a client without a certificate of this mission may not connect: peer sent no certificates\n"
     )

@@ -79,7 +79,7 @@ def test_markers_as_plain_as_one_are_those_of_numpy(name: str) -> None:
         plain = inside & (size >= 0.6 * size[row]) & (cosines >= max(0.3, 0.7 * float(cosines[row])))
         plain[row] = False
         expected: tuple[int, Any] = int(plain.sum()), float(cosines[row])
-        assert views.plain_markers(CAMERA, table.surface, row, pose, MARGIN_PX) == expected
+        assert views.count_visible_markers(CAMERA, table.surface, row, pose, MARGIN_PX) == expected
         counts.add(expected[0])
     assert {0, 1} <= counts
 

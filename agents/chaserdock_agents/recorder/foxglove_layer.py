@@ -1,12 +1,12 @@
-"""The log's viewer layer: Foxglove's messages beside the verbatim ones. Rerun, Foxglove and Lichtblick open it as it is.
+"""Viewer layer of a log: Foxglove messages in addition to the verbatim ones, for Rerun, Foxglove and Lichtblick.
 
-Channels (all under ``/viewer/``) and what they show; times are simulated:
+Channels (all under ``/viewer/``); times are simulated:
 
-- ``tf``: frames ``target`` and ``chaser/N`` as they truly were in ``world`` (WRF), ``chaser/N/camera`` (IRF) on each
-  chaser, and ``target/estimate``, the fused estimate while there is one
-- ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: image, camera, corners that were used
+- ``tf``: true frames ``target`` and ``chaser/N`` in ``world`` (WRF), ``chaser/N/camera`` (IRF) on each chaser, and
+  ``target/estimate``, the fused estimate while available
+- ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: image, camera, used corners
 - ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in WRF): poses
-- ``scene``: the bodies as boxes in their true frames; ``events``: what processes told
+- ``scene``: the bodies as boxes in their true frames; ``events``: events of all processes
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
 SHOWN = frozenset(
     {topics.IMAGE, topics.TRUTH_BODY, topics.SIGHTING, topics.TARGET, topics.REFERENCE, topics.EVENT}
 )
-"""Topics whose messages the layer is made of."""
+"""Topics from which the layer is made."""
 
-_LATEST_NS = (2**32 - 1) * 1_000_000_000  # what a viewer's time stamp can hold
+_LATEST_NS = (2**32 - 1) * 1_000_000_000  # maximum of a viewer's time stamp
 
 _LEVELS = {"info": fox.LogLevel.Info, "warning": fox.LogLevel.Warning, "error": fox.LogLevel.Error}
 _CAMERA_COLOUR = fox.Color(r=0.35, g=0.86, b=0.35, a=1.0)
@@ -46,7 +46,7 @@ _CHASER_COLOUR = fox.Color(r=0.35, g=0.55, b=0.85, a=0.6)
 
 
 class ViewerLayer:
-    """Turns messages into the viewer layer of one file; each file of a rotated log needs its own."""
+    """Converts messages to the viewer layer of one file; every file of a rotated log has its own."""
 
     def __init__(self, scenario: Scenario, write: Write) -> None:
         self._write = write
@@ -64,16 +64,16 @@ class ViewerLayer:
             "R": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
             "P": [*matrix[0:3], 0.0, *matrix[3:6], 0.0, *matrix[6:9], 0.0],
         }
-        self._begun = False
+        self._started = False
 
-    def take(self, message: Any) -> None:
-        """Writes what there is to see of a message; nothing for those that are not ``SHOWN``."""
+    def write(self, message: Any) -> None:
+        """Write the view of a message; nothing for topics that are not ``SHOWN``."""
         time_ns = getattr(message, "sim_time_ns", 0)
         if time_ns > _LATEST_NS:
             return
-        if not self._begun:
-            self._begun = True
-            self._begin(time_ns)
+        if not self._started:
+            self._started = True
+            self._write_static(time_ns)
         for name, view in self._views(message, _time(time_ns)):
             self._put(name, view, time_ns)
 
@@ -84,8 +84,8 @@ class ViewerLayer:
             self._schemas[kind] = (schema.name, schema.encoding, schema.data)
         self._write(VIEWER_PREFIX + name, self._schemas[kind], view.encode(), time_ns)
 
-    def _begin(self, time_ns: int) -> None:
-        """What never changes: cameras on the chasers, and the bodies' shapes."""
+    def _write_static(self, time_ns: int) -> None:
+        """Write the static content: camera frames and the shapes of the bodies."""
         stamp = _time(time_ns)
         shapes = [("target", self._scenario.target_model().size_m, _TARGET_COLOUR)]
         for i in range(len(self._scenario.chasers)):
@@ -178,7 +178,7 @@ def _image(image: Image, stamp: fox.Timestamp) -> fox.CompressedImage | fox.RawI
 
 
 def _detections(sighting: Sighting, stamp: fox.Timestamp) -> fox.ImageAnnotations:
-    """Outlines of the markers that were used; viewers count pixels from the corner of the first, we from its centre."""
+    """Return the outlines of the used markers; a viewer's pixel origin is a corner of the first pixel, not its centre."""
     u, v = sighting.corners_px[0::2], sighting.corners_px[1::2]
     corners = [fox.Point2(x=a + 0.5, y=b + 0.5) for a, b in zip(u, v, strict=False)]
     outlines = [

@@ -1,7 +1,7 @@
-"""The recorder process: every message of the run, verbatim, into one MCAP file.
+"""The recorder process: writes every message of a run verbatim to MCAP.
 
-In lock-step it confirms each tick that it holds completely, which bounds how far the flight runs ahead; at
-the end it waits until it has all that the others say they published.
+In lock-step it acknowledges each tick that it has received completely, which bounds how far the flight runs ahead. At the
+end it waits until it has received as many messages as the other processes report to have published.
 """
 
 from __future__ import annotations
@@ -46,16 +46,16 @@ _MAPPED_FROM_BYTES = 1 << 18
 
 
 def main(options: ProcessOptions) -> int:
-    """Records into ``options.out``; 0 when complete, 1 when stopped early or messages are missing, 2 if it could not."""
-    _give_memory_back()
+    """Record to ``options.out``; return 0 if complete, 1 if stopped early or messages are missing, 2 on an error."""
+    _limit_heap()
     return run_member("recorder", "recorder", options, lambda *member: record(options, *member))
 
 
-def _give_memory_back() -> None:
-    """Large pieces (images, chunks, a part's index) go back to the system when they are done with, for days on end.
+def _limit_heap() -> None:
+    """Make glibc return large blocks (images, chunks, indices) to the system when they are freed.
 
-    Left to itself glibc keeps pieces as large as the largest one freed so far, in a heap for each thread, and a
-    recorder grows for hours (``benchmarks/endurance.py``). Elsewhere there is nothing to set.
+    By default glibc keeps blocks up to the largest one freed so far, in one heap per thread, and a recorder grows for hours
+    (``benchmarks/endurance.py``). No effect with other C libraries.
     """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -64,7 +64,7 @@ def _give_memory_back() -> None:
 
 
 def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
-    """Records until the mission is over and all that was published is in the file; the process' status."""
+    """Record until the mission has ended and all published messages are in the file; return the exit status."""
     source = "the world's scenario"
     scenario = scenario_from_json(mission.scenario_json, source) if options.viewer_layer else None
     out = options.out / run_name(mission) if options.by_run else options.out
@@ -76,68 +76,68 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
         recorder = Recorder(node, recording, faults)
         recorder.open(instance)
         if mission.mode == "realtime":
-            # Writing gives way to those who fly; what has been heard waits in the queue.
+            # Flight processes have priority; received messages wait in the queue.
             os.nice(_WRITING_NICE)
         while not recorder.finished() and not (stop() and recorder.idle()):
-            recorder.take_one(0.1)
+            recorder.write_next(0.1)
     finally:
         recording.close()
     if recorder.ended_s is None:
         print_status(
-            "recorder", f"stopped before the mission's end; {recording.path} holds what came until then"
+            "recorder", f"stopped before the mission's end; {recording.path} holds all messages up to then"
         )
         return 1
     missing = recorder.missing()
     for key, number in missing.items():
-        print_status("recorder", f"{number} messages of {key} never came")
-    # In real time images are dropped rather than waited for; anything else must be here.
+        print_status("recorder", f"{number} messages of {key} are missing")
+    # In real time images may be dropped; every other message must have arrived.
     excused = {k for k in missing if mission.mode == "realtime" and k.endswith("/image")}
     return 1 if missing.keys() - excused else 0
 
 
 @dataclass
 class Recorder:
-    """What has been recorded, and what the ends of the others say there should be."""
+    """Counts the recorded messages and those that the other processes report to have published."""
 
     node: Node
     recording: Recording
     faults: FaultLayer | None
     ended_s: float | None = None
-    _waiting: BoundedQueue[RawSample] = field(default_factory=BoundedQueue)
+    _queue: BoundedQueue[RawSample] = field(default_factory=BoundedQueue)
     _received: dict[str, int] = field(default_factory=dict)
-    _promised: dict[str, dict[str, int]] = field(default_factory=dict)
+    _published: dict[str, dict[str, int]] = field(default_factory=dict)
     _controllers: set[str] = field(default_factory=lambda: {"controller"})
     _expected: set[str] = field(default_factory=set)
     _latest: dict[str, int] = field(default_factory=dict)
     _acked: int = -1
 
     def open(self, instance: str) -> None:
-        """Subscribes everything, then tells its presence."""
+        """Subscribe to all topics, then start the heartbeat."""
         self.node.advertise(topics.ACK)
-        self.node.subscribe_raw("**", self._arrived)
+        self.node.subscribe_raw("**", self._enqueue)
         self.heartbeat = Heartbeat(self.node, instance)
 
-    def _arrived(self, raw: RawSample) -> None:
-        if not self._waiting.put(raw, len(raw.payload)):
+    def _enqueue(self, raw: RawSample) -> None:
+        if not self._queue.put(raw, len(raw.payload)):
             self.node.counts.rejected["queue full"] += 1
 
-    def take_one(self, timeout_s: float) -> None:
-        """Writes one message, if one comes in time."""
+    def write_next(self, timeout_s: float) -> None:
+        """Write one message, if one arrives in time."""
         while self.node.receive(0) is not None:
-            pass  # presence reaches the raw subscription, too; the typed one is only for the barrier
+            pass  # the raw subscription receives presence as well; the typed one only serves the join barrier
         try:
-            raw = self._waiting.get(timeout_s)
+            raw = self._queue.get(timeout_s)
         except queue.Empty:
             return
         found, message = topics.topic_of_key(raw.key), None
-        if found is not None and found[0] in _OPENED:
+        if found is not None and found[0] in _DECODED:
             with suppress(Rejected):
                 message = codec.decode(found[0].kind, raw.payload, raw.encoding)
         self.recording.write(raw, message)
         self._received[raw.key] = self._received.get(raw.key, 0) + 1
-        self._note(raw.key, message)
+        self._process(raw.key, message)
 
-    def _note(self, key: str, message: object) -> None:
+    def _process(self, key: str, message: object) -> None:
         match message:
             case Presence():
                 self.heartbeat.take(message)
@@ -150,16 +150,16 @@ class Recorder:
                 if tick.controller:
                     self._expected.add(topics.SOLVER.key_of())
                 self._latest[key] = tick.tick
-                self._confirm()
+                self._acknowledge()
             case ActuatorCommand() | SolverStatus():
                 self._latest[key] = message.tick
-                self._confirm()
+                self._acknowledge()
             case Farewell(process=process, published=published):
-                self._promised[process] = published
+                self._published[process] = published
             case MissionEnd():
                 self.ended_s = time.monotonic()
 
-    def _confirm(self) -> None:
+    def _acknowledge(self) -> None:
         keys = self._expected | {topics.TICK.key_of()}
         held = min(self._latest.get(key, -1) for key in keys)
         if held > self._acked:
@@ -169,36 +169,36 @@ class Recorder:
                 self.node.publish(topics.HEALTH, create_health(self.node, held, 0), "recorder")
 
     def missing(self) -> dict[str, int]:
-        """Messages that were published, by their publishers' own account, and never came."""
+        """Return the number of missing messages by key, according to the counts that publishers report."""
         # Several controllers publish on the same keys, one at a time.
-        promised: Counter[str] = Counter()
-        for published in self._promised.values():
-            promised.update(published)
+        total: Counter[str] = Counter()
+        for published in self._published.values():
+            total.update(published)
         return {
             key: number - self._received.get(key, 0)
-            for key, number in promised.items()
-            # Presence is told from before the recorder can hear it.
+            for key, number in total.items()
+            # Presence is published before the recorder has subscribed.
             if number > self._received.get(key, 0) and not key.endswith("/presence")
         }
 
     def idle(self) -> bool:
-        """Whether nothing waits to be written."""
-        return self._waiting.empty()
+        """Return whether all received messages are written."""
+        return self._queue.empty()
 
     def finished(self) -> bool:
-        """Whether the mission is over and all that was published is here, or has had its time to come."""
+        """Return whether the mission has ended and all published messages have arrived or timed out."""
         if self.ended_s is None:
             return False
-        everyone = {
+        publishers = {
             "world",
             *self._controllers,
             *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser")),
         }
-        complete = everyone <= self._promised.keys() and not self.missing() and self.idle()
+        complete = publishers <= self._published.keys() and not self.missing() and self.idle()
         return complete or time.monotonic() - self.ended_s > _DRAIN_S
 
 
-_OPENED = SHOWN | {
+_DECODED = SHOWN | {
     topics.TICK, topics.ACTUATORS, topics.SOLVER, topics.PRESENCE, topics.FAREWELL, topics.END
 }  # fmt: skip
-"""Topics whose messages are opened: those shown, and those that ``_note`` reads."""
+"""Topics whose messages are decoded: those of the viewer layer, and those that ``_process`` reads."""

@@ -1,4 +1,4 @@
-"""The files of one recording: verbatim and viewer layer together, a new file by size or time where that is asked for."""
+"""The files of one recording: verbatim and viewer layer, with rotation by size or time."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from .foxglove_layer import ViewerLayer
 
 
 class Recording:
-    """A mission's log in ``folder``, which is made; each of its files stands for itself.
+    """Writes a mission's log to ``folder``, which is created; every file is self-contained.
 
-    With ``scenario`` None there is no viewer layer. Raises LogError when a file cannot be created or written.
+    Without ``scenario`` there is no viewer layer. Raises LogError if a file cannot be created or written.
     """
 
     def __init__(
@@ -30,9 +30,9 @@ class Recording:
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise LogError(f"{folder}: cannot be made: {error.strerror or error}") from None
+            raise LogError(f"{folder}: cannot be created: {error.strerror or error}") from None
         if any(folder.glob("mission*.mcap")):
-            raise LogError(f"{folder}: holds a log already; a log is never overwritten")
+            raise LogError(f"{folder}: contains a log already; logs are not overwritten")
         self._open()
 
     @property
@@ -51,7 +51,7 @@ class Recording:
         self._from_ns = None
 
     def write(self, raw: RawSample, message: Any) -> None:
-        """Appends what came over the wire; ``message`` is the same opened, or None if nobody here needs it."""
+        """Append a sample; ``message``: the decoded sample, None if it is not needed."""
         if self._rotation.wanted and self._is_full():
             self._writer.close()
             self._part += 1
@@ -61,7 +61,7 @@ class Recording:
         if self._from_ns is None:
             self._from_ns = self._writer.last_time_ns
         if self._viewer is not None and message is not None:
-            self._viewer.take(message)
+            self._viewer.write(message)
 
     def _is_full(self) -> bool:
         size, seconds = self._rotation.size_bytes, self._rotation.seconds
@@ -72,5 +72,5 @@ class Recording:
         return self._writer.last_time_ns - self._from_ns >= seconds * 1e9
 
     def close(self) -> None:
-        """Ends the last file; raises LogError."""
+        """Close the last file; raises LogError."""
         self._writer.close()

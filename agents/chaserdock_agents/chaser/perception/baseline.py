@@ -1,8 +1,8 @@
-"""The paper's perception, as a baseline: undistort the image, ArUco, EPnP on all corners.
+"""The perception of the paper, as a baseline: undistort the image, ArUco, EPnP on all corners.
 
 Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC 2023, sec. 4.
 Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of the views of a single
-face; that is part of the baseline. Nothing is checked but that the result is a finite pose in front.
+face; that is part of the baseline. The only check is that the result is a finite pose in front of the camera.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .detect import NOTHING, Detections
 
 
 def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dictionary) -> Detections:
-    """Markers with OpenCV's default settings and sub-pixel corners, in ideal pixels."""
+    """Detect markers with OpenCV's default settings and sub-pixel corners, in ideal pixels."""
     if camera.distortion:
         matrix = camera.matrix()
         image = np.asarray(cv2.undistort(image, matrix, np.array(camera.distortion)), dtype=np.uint8)
@@ -34,11 +34,9 @@ def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dicti
 
 
 def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple[pnp.PoseSolution, ...]:
-    """EPnP on all corners (n, 4, 2), ideal pixels, of markers with corners at ``points_trf_m`` (n, 4, 3).
+    """Solve EPnP with all corners (n, 4, 2), ideal pixels, of markers with corners at ``points_trf_m`` (n, 4, 3).
 
-    One pose, or none when it is not finite or behind the camera.
-
-    Its covariance is the first-order one at that pose, from its own residuals.
+    Returns one pose, or none if it is not finite or behind the camera; its covariance is first-order, from its residuals.
     """
     if not len(points_trf_m):
         return ()

@@ -1,16 +1,14 @@
-"""Corners of markers from lines fitted to their sides, in undistorted coordinates.
+"""Marker corners from lines fitted to the sides, in undistorted coordinates.
 
-Contours and corner filters put the corners of a black square inwards of where they are; the centroid of the
-grey level's gradient across a side does not. In the distorted image a side is a curve, so samples are laid
-out on ideal pixels and looked up where the lens puts them.
+Contours and corner filters bias the corners of a black square inwards; the centroid of the grey-level gradient across a
+side is unbiased. Sides are curves in the distorted image, so samples are placed on ideal pixels and mapped through the lens.
 
-Where the white border is only a few pixels wide, blur mixes the side with the border's outer edge and draws
-the centroid inwards (0.2 px at 1.5 px of border). There the profile of a blurred strip of known width is
-fitted instead.
+Where the white border is only a few pixels wide, blur mixes the side with the border's outer edge and biases the centroid
+inwards (0.2 px at 1.5 px of border). There the profile of a blurred strip of known width is fitted instead.
 
-The arithmetic is a kernel (native/corners.c): a handful of markers is too little work for as many calls into NumPy.
-Grey levels are not looked up by cv2.remap: it takes coordinates in steps of 1/32 pixel, and the detector's corners are
-whole pixels, so that many points lie just where one step ends and the last bits of the arithmetic would decide.
+The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with NumPy. cv2.remap is not used
+for interpolation: it quantizes coordinates to 1/32 pixel, and the detector's corners are whole pixels, so many samples lie
+on the boundary of a step, where rounding errors would decide.
 """
 
 from __future__ import annotations
@@ -29,21 +27,21 @@ from .native import function
 
 
 class _Settings(Structure):
-    """native/corners.c: its fields in their order, with what is set and why."""
+    """native/corners.c: fields in the order of the C struct."""
 
     _fields_ = [
         *((name, c_double) for name in (
-            # The ends of a side are left out: there the neighbouring side's gradient leaks in.
+            # The ends of a side are excluded, as they contain the gradient of the neighbouring side.
             "first", "last",
-            # Reach across a side is bounded by this share of a cell, but is never less than so many pixels.
+            # Half length across a side: at most this share of a cell, at least so many pixels.
             "reach_cells", "reach_least_px",
-            # Grey levels over the side, for a row to count; share of the rows that must count; a corner's move.
+            # Minimum contrast of a row; minimum share of usable rows; maximum correction of a corner.
             "min_contrast", "min_rows_share", "max_move_px",
             # Strips: borders narrower than this; logarithm of an edge's sigma, pixels (pixel, lens and sampling together)
             # and how well that is known, a standard deviation; samples beyond the outer edge.
             "strip_px", "log_edge_sigma", "edge_sigma_spread", "strip_beyond_px",
-            # Corners of markers with cells or borders of few pixels are less certain: relative sigma
-            # sqrt(1 + (this / width)^2), from the errors found in rendered images.
+            # Corners of markers with cells or borders of few pixels are less accurate: relative sigma
+            # sqrt(1 + (this / width)^2), fitted to the errors in rendered images.
             "uncertain_px",
         )),
         *((name, c_double * 2) for name in ("rows", "taps", "reach_px", "reweighted")),
@@ -66,8 +64,8 @@ _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 
 @dataclass(frozen=True)
 class Refined:
-    """``corners_px`` (n, 4, 2), ideal pixels; ``good`` (n,): markers with four good sides (the corners of the
-    others are as they were); ``relative_sigma`` (n,): uncertainty against that of a large marker's, 1 or more.
+    """``corners_px`` (n, 4, 2), ideal pixels; ``good`` (n,): markers with four good sides (corners of the others are
+    unchanged); ``relative_sigma`` (n,): uncertainty relative to a large marker, at least 1.
     """
 
     corners_px: Array
@@ -75,19 +73,21 @@ class Refined:
     relative_sigma: Array
 
     def part(self, which: NDArray[np.bool_]) -> Refined:
-        """Those ``which`` (n,)."""
+        """Return the markers selected by ``which`` (n,)."""
         return Refined(self.corners_px[which], self.good[which], self.relative_sigma[which])
 
     def with_others(self, which: NDArray[np.bool_], others: Refined) -> Refined:
-        """These, with ``others`` in the place of the markers ``which`` (n,)."""
+        """Return a copy in which ``others`` replace the markers ``which`` (n,)."""
         corners, good, sigma = self.corners_px.copy(), self.good.copy(), self.relative_sigma.copy()
         corners[which], good[which], sigma[which] = others.corners_px, others.good, others.relative_sigma
         return Refined(corners, good, sigma)
 
 
 def inside_border(corners_px: Array, margin_share: Array) -> Array:
-    """Corners (n, 4, 2) of the black squares, where ``corners_px`` are the outer ones of their white borders,
-    ``margin_share`` (n,) of the squares' sides wide."""
+    """Return the corners (n, 4, 2) of the black squares, given the outer corners of their white borders.
+
+    ``margin_share`` (n,): width of the border over the side of the square.
+    """
     inner = [
         cv2.perspectiveTransform(
             _SQUARE[None] / (1.0 + 2.0 * share), cv2.getPerspectiveTransform(_SQUARE, quad.astype(np.float32))
@@ -100,10 +100,10 @@ def inside_border(corners_px: Array, margin_share: Array) -> Array:
 def refine(
     image: NDArray[np.uint8], camera: Camera, corners_ideal_px: Array, cells: int, margin_share: Array
 ) -> Refined:
-    """Corners from lines fitted along the sides of the black squares.
+    """Refine corners by lines fitted along the sides of the black squares.
 
-    ``image``: the grey image as taken, distorted. ``corners_ideal_px`` (n, 4, 2), ideal pixels: where they
-    are to within two pixels or so, clockwise as seen. ``cells``: number of cells along a side, the black
+    ``image``: the distorted grey image. ``corners_ideal_px`` (n, 4, 2), ideal pixels: initial corners to within
+    about two pixels, clockwise in the image. ``cells``: number of cells along a side, the black
     border included. ``margin_share`` (n,): width of the white border over the side of the marker.
     Raises ValueError for an image less than two pixels wide or high.
     """

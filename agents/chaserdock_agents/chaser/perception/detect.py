@@ -1,4 +1,4 @@
-"""Finding markers: OpenCV's ArUco detector with settings measured for this job."""
+"""Marker detection: OpenCV's ArUco detector with settings tuned by measurement."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel
 from numpy.typing import ArrayLike, NDArray
 
-# Shortest perimeter of a marker, pixels, that is worth looking at.
+# Minimum perimeter of a marker, pixels.
 _MIN_PERIMETER_PX = 40.0
-# A region of interest is grown by this share of its size and this much, for an uncertain prediction.
+# Margin of a region of interest: share of its size, and pixels.
 _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
-# Images, or regions, with a smaller side than this are not halved.
+# Images and regions with a shorter side are not halved.
 _HALVED_PX = 300
-# A larger share of the image than this is no saving.
+# A region with a larger share of the image is not used.
 _REGION_LIMIT = 0.7
 _CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
@@ -30,7 +30,7 @@ Region = tuple[int, int, int, int]
 
 @dataclass(frozen=True)
 class Detections:
-    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the given image: top left, top right, bottom right, bottom
+    """``ids`` (n,), ``corners_px`` (n, 4, 2) in the image: top left, top right, bottom right, bottom
     left of the upright marker. An id can occur more than once."""
 
     ids: NDArray[np.int64]
@@ -54,7 +54,7 @@ NOTHING = Detections(np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)))
 
 
 def dictionary_of(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's predefined dictionary of that name. Raises ValueError for a name that it does not have."""
+    """Return OpenCV's predefined dictionary of this name; raises ValueError for an unknown name."""
     code = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or code is None:
         raise ValueError(f"unknown ArUco dictionary {name!r}")
@@ -68,14 +68,13 @@ def detect(
     thorough: bool = False,
     enough: int | None = None,
 ) -> Detections:
-    """Markers of ``dictionary`` in a grey image, or in its ``region`` (left, top, right, bottom; pixels,
-    right and bottom excluded). Corners are where OpenCV's contours have them: good to about a pixel.
+    """Detect markers of ``dictionary`` in a grey image or its ``region`` (left, top, right, bottom; pixels,
+    right and bottom excluded). Corners are those of OpenCV's contours, accurate to about a pixel.
 
-    The threshold window of 7 px finds nearly all that 7 and 23 px together find, in half the time; the second
-    is used where the first leaves fewer than two markers. ``thorough`` looks with 3, 13 and 23 px, and keeps
-    apart what lies close together: slower, for images that show a narrow white border. Where ``enough`` is
-    given, a large image is looked at in half its size first, in a third of the time, and that has to do when it
-    shows so many markers.
+    A threshold window of 7 px detects nearly as many markers as 7 and 23 px together, in half the time; the second is used
+    if the first detects fewer than two. ``thorough`` uses 3, 13 and 23 px and separates adjacent candidates: slower, for
+    narrow white borders. With ``enough`` a large image is searched at half size first, in a third of the time; the result
+    is used if it has that many markers.
     """
     left, top, right, bottom = region or (0, 0, image.shape[1], image.shape[0])
     part = image[top:bottom, left:right]
@@ -96,15 +95,15 @@ def detect(
 
 @lru_cache(maxsize=4096)
 def _detector(dictionary: cv2.aruco.Dictionary, windows: _Windows, longer_px: int) -> cv2.aruco.ArucoDetector:
-    """OpenCV's detector for images whose longer side has so many pixels; kept, as a flight meets few sizes."""
+    """Return OpenCV's detector for images with this longer side; cached, as a flight uses few sizes."""
     parameters = cv2.aruco.DetectorParameters()
     parameters.adaptiveThreshWinSizeMin = windows.least_px
     parameters.adaptiveThreshWinSizeMax = windows.most_px
     parameters.adaptiveThreshWinSizeStep = windows.step_px
     parameters.minMarkerDistanceRate = windows.distance_rate
-    # A rate of the size of the image passed in, so it differs between a region and the whole.
+    # Relative to the size of the image passed in, which may be a region.
     parameters.minMarkerPerimeterRate = _MIN_PERIMETER_PX / longer_px
-    # The rate counts from the longer side too; a marker that fills the image must pass.
+    # Relative to the longer side; a marker that fills the image must be accepted.
     parameters.maxMarkerPerimeterRate = 8.0
     parameters.maxErroneousBitsInBorderRate = 0.15
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
@@ -122,10 +121,10 @@ def _detect(part: NDArray[np.uint8], dictionary: cv2.aruco.Dictionary, windows: 
 def region_of(
     camera: Camera, model: TargetModel, position_irf_m: ArrayLike, q_irf_trf_wxyz: ArrayLike
 ) -> Region | None:
-    """Where in the image a target with this predicted pose is; None for "look at all of it"."""
+    """Return the image region of a target with this predicted pose; None to search the whole image."""
     turn = rotations.to_matrix(q_irf_trf_wxyz)
     points = _box(model.size_m) @ turn.T + np.asarray(position_irf_m)
-    # Infinity or NaN anywhere makes the sum of all one of them.
+    # The sum is not finite if any coordinate is not.
     if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
         return None
     x_px, y_px = camera.project(points).T.tolist()
@@ -142,12 +141,12 @@ def region_of(
 
 @lru_cache
 def _box(size_m: tuple[float, float, float]) -> Array:
-    """Corners (8, 3) of a box about the origin."""
+    """Return the corners (8, 3) of a box about the origin."""
     return _CUBE * size_m
 
 
 def _grown(px: list[float], end: int) -> tuple[int, int] | None:
-    """Where along one axis of the image, ``end`` pixels long, these coordinates and a margin are; None for nowhere."""
+    """Return the interval of these coordinates with margins on an axis of ``end`` pixels; None if not finite."""
     low, high = min(px), max(px)
     grow = _REGION_SHARE * (high - low) + _REGION_MARGIN_PX
     if not math.isfinite(grow):

@@ -1,4 +1,4 @@
-"""From an image to the pose of the target: the entry to this package."""
+"""Perception pipeline from an image to the pose of the target; the entry point of this package."""
 
 from __future__ import annotations
 
@@ -16,19 +16,18 @@ from . import corners, detect, pnp
 from .pnp import PoseSolution
 
 _ENOUGH = 6
-"""So many markers make a pose to which further ones add little."""
+"""Number of markers beyond which further ones hardly improve the pose."""
 
 Method = Literal["default", "paper"]
 
 
 @dataclass(frozen=True)
 class Sighting:
-    """What one image tells of the target.
+    """Result for one image.
 
-    ``solutions``: best first, empty when nothing (or nothing trustworthy) is seen, two when a plane's tilt is
-    ambiguous. ``marker_ids`` (n,) and ``corners_px`` (n, 4, 2), in the image as taken, distorted: of the
-    markers used. ``rejected_ids``: detected but not used, in ascending order: not on this target, twice in
-    the image, contradicted by the others, or with a side that cannot be made out.
+    ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous. ``marker_ids`` (n,)
+    and ``corners_px`` (n, 4, 2), distorted image: the used markers. ``rejected_ids``: detected but not used, ascending: not
+    on this target, duplicate, inconsistent with the others, or with an unusable side.
     """
 
     solutions: tuple[PoseSolution, ...]
@@ -38,9 +37,9 @@ class Sighting:
 
 
 class Perception:
-    """Finds a target of one model in the images of one camera.
+    """Estimates the pose of one target model in the images of one camera.
 
-    Holds constants only: `estimate` depends on its arguments alone. ``method``: "default", or "paper" for
+    Stateless: `estimate` depends on its arguments only. ``method``: "default", or "paper" for
     the paper's baseline. Raises ValueError for another method, or for an unknown marker dictionary.
     """
 
@@ -52,18 +51,18 @@ class Perception:
         self.method: Method = method
         self._dictionary = detect.dictionary_of(model.dictionary)
         self._table = pnp.MarkerTable.of(model)
-        # Targets with many markers a face can spare the small ones that half an image does not show.
+        # Targets with many markers per face do not need the small ones that are lost at half size.
         self._enough = _ENOUGH if len(model.markers) >= 6 * _ENOUGH else None
         self._rows = {int(i): row for row, i in enumerate(self._table.ids)}
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> Sighting:
-        """The target's pose in a grey image (h, w), uint8.
+        """Estimate the target's pose in a grey image (h, w), uint8.
 
-        ``predicted``: position in IRF (3,), metres, and rotation TRF -> IRF (4,), where there is an idea
-        of them. It says where to look first and has no part in the result. Raises ValueError for a
-        image of another shape or type than the camera's.
+        ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; it selects the region that is
+        searched first and does not affect the result. Raises ValueError for an image of another shape or type than the
+        camera's.
         """
         shape = (self.camera.height_px, self.camera.width_px)
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
@@ -81,7 +80,7 @@ class Perception:
         rejected = sighting.rejected_ids
         if sighting.solutions or len(set(rejected)) < len(
             rejected
-        ):  # found, or two of one: not for want of looking
+        ):  # solved, or ambiguous by duplicates, which a thorough search cannot resolve
             return sighting
         again = self._estimate_in(image, None, thorough=True)
         return again if again.solutions else sighting
@@ -97,7 +96,7 @@ class Perception:
         margin = self._table.margin_share[rows]
         refined = corners.refine(image, self.camera, px, cells, margin)
         if not refined.good.all():
-            # The detector may have taken the outer edge of the white border for the marker's.
+            # The detector may have mistaken the outer edge of the white border for that of the marker.
             lost = ~refined.good
             inner = corners.inside_border(px[lost], margin[lost])
             refined = refined.with_others(

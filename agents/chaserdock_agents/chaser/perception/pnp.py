@@ -1,8 +1,8 @@
 """Pose of a target from the corners of its markers, in ideal (undistorted) pixels.
 
 Candidates from SQPnP (G. Terzakis, M. Lourakis, ECCV 2020) and IPPE (T. Collins, A. Bartoli, IJCV 2014), a
-consensus over markers against false ids, Gauss-Newton with Levenberg's damping on the reprojection error, and
-sigma^2 (J'J)^-1 as covariance. OpenCV's EPnP is left alone: it fails on coplanar points.
+consensus over markers against false ids, Levenberg-Marquardt on the reprojection error, and sigma^2 (J'J)^-1 as covariance.
+OpenCV's EPnP is not used, as it fails on coplanar points.
 """
 
 from __future__ import annotations
@@ -22,26 +22,26 @@ from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
 from .refine import Pose, refine, residual_of, rotation_matrix
-from .views import marker_errors, plain_markers, squared_errors
+from .views import count_visible_markers, marker_errors, squared_errors
 
 Indices = NDArray[np.intp]
 
-# Corner noise is never taken to be below this, pixels; a single marker leaves but two degrees of freedom.
+# Lower bound of the corner noise, pixels; a single marker leaves only two degrees of freedom.
 SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.1, 0.2
-# A single marker seen at a more grazing angle than this says too little of its tilt, and overrates it.
+# A single marker at a more grazing angle determines its tilt poorly, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
-# Worst corner of a marker that agrees with a coarse candidate, and with a refined pose.
+# Largest corner error of an inlier of a coarse candidate, and of a refined pose.
 _COARSE_GATE_PX, _FINE_GATE_PX = 6.0, 1.5
 _FINE_GATE_SIGMAS = 5.0
 MAX_RMS_PX = 2.0
-# The second solution of a plane is kept when its -2 log likelihood is no more than this above the first's.
+# The second solution of a plane is kept if its -2 log likelihood exceeds the first's by at most this.
 _AMBIGUITY_LIMIT = 25.0
 _CANDIDATE_MARKERS = 6
-# A plane's coarse pose that fits worse than this is none.
+# A coarse pose of a plane with a larger error is rejected.
 _PLANE_RMS_PX = 1.0
-# Of a plane's two coarse poses, one this much nearer to the refined pose than the other is that very pose.
+# Of a plane's two coarse poses, one whose angle to the refined pose is this share of the other's is the same pose.
 _SAME_POSE_SHARE = 0.25
-# A lone marker is a false id when this many others ought to be as plain to see and none is.
+# A single marker is a false id if this many others should be as visible and none is detected.
 _MAX_MISSING = 2
 _FRAME_MARGIN_PX = 8.0
 
@@ -52,7 +52,7 @@ class PoseSolution:
 
     ``position_irf_m`` (3,); ``q_irf_trf_wxyz`` (4,) rotates TRF -> IRF; ``covariance`` (6, 6): position in
     IRF axes (m), then dtheta (rad) in TRF axes with q_true = q (x) exp(dtheta); ``reprojection_rms_px``: root
-    of the mean squared distance between a corner found and the same corner projected.
+    of the mean squared distance between detected and projected corners.
     """
 
     position_irf_m: Array
@@ -79,12 +79,12 @@ class MarkerTable:
 
     @cached_property
     def surface(self) -> Array:
-        """Corners (4 m, 3), then origins (m, 3), then normals (m, 3): what a rotation turns at once."""
+        """Corners (4 m, 3), origins (m, 3) and normals (m, 3), to be rotated together."""
         return np.concatenate([self.corners.reshape(-1, 3), self.origins, self.normals])
 
     @classmethod
     def of(cls, model: TargetModel) -> MarkerTable:
-        """The table of a model's markers, in their order."""
+        """Return the table of a model's markers, in their order."""
         markers = model.markers
         return cls(
             np.array([m.id for m in markers], dtype=np.int64),
@@ -96,7 +96,7 @@ class MarkerTable:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _DetectedMarkers:
     """n detections: ``which`` marker of the table each is, ``points`` (n, 4, 3) in TRF, ``pixels`` (n, 4, 2) and
     ``sigma`` (n,), relative."""
 
@@ -114,18 +114,18 @@ class _Seen:
 
     @cached_property
     def weight(self) -> Array:
-        """Of each number (8 n,) among the pixels."""
+        """Weight of every pixel coordinate (8 n,)."""
         return np.repeat(1.0 / self.sigma, 8)
 
     @cached_property
     def plane_poses(self) -> list[Pose]:
-        """As `_plane_poses`, which of a lone marker are both its candidates and its two poses."""
+        """Cached `_plane_poses`: for a single marker both its candidates and its two poses."""
         return _plane_poses(self)
 
-    def part(self, of: list[int]) -> _Seen:
+    def part(self, of: list[int]) -> _DetectedMarkers:
         if len(of) == len(self.which):  # indices are ascending and distinct: all of them
             return self
-        return _Seen(
+        return _DetectedMarkers(
             self.camera, self.table, self.which[of], self.points[of], self.pixels[of], self.sigma[of]
         )
 
@@ -133,19 +133,18 @@ class _Seen:
 def solve(
     camera: Camera, table: MarkerTable, which: Indices, corners_ideal_px: Array, relative_sigma: Array
 ) -> tuple[tuple[PoseSolution, ...], Indices]:
-    """Poses, best first, that explain the detected markers, and the indices of the detections they rest on.
+    """Return the poses, best first, that explain the detected markers, and the indices of the detections used.
 
     ``which`` (n,): row of ``table`` of each detection, a row may occur more than once; ``corners_ideal_px``
-    (n, 4, 2); ``relative_sigma`` (n,): uncertainty of a detection's corners, over that of the best.
-    None (and no indices) when nothing is explained well, when a single marker is seen at a grazing angle or
-    without the many others that its pose would show, or when the detections fall into two camps of equal
-    strength that contradict each other. Two when the markers lie in one plane and its tilt cannot be told from
-    its mirror image.
+    (n, 4, 2); ``relative_sigma`` (n,): uncertainty of a detection's corners, relative to the best.
+    No pose (and no indices) if nothing is explained well, if a single marker is seen at a grazing angle or without others
+    that its pose would show, or if two equally large groups of detections contradict each other. Two poses if the markers
+    are coplanar and their tilt is ambiguous.
     """
     nothing: tuple[tuple[PoseSolution, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
     if not len(which):
         return nothing
-    seen = _Seen(
+    seen = _DetectedMarkers(
         camera,
         table,
         which,
@@ -165,7 +164,7 @@ def solve(
 
     seen = seen.part(used)
     poses = [pose]
-    # All in one plane, as those of one marker are: there may be a second pose.
+    # Coplanar corners, as those of a single marker, may have a second pose.
     if len(used) == 1 or np.ptp(seen.points @ seen.normals[0]) < 1e-6:
         poses += _other_than(pose, seen.plane_poses)
     floor = SIGMA_FLOOR_SINGLE_PX if len(used) == 1 else SIGMA_FLOOR_PX
@@ -174,7 +173,7 @@ def solve(
         return nothing
     if len(used) == 1:
         row = int(seen.which[0])
-        solutions = [s for s in solutions if _may_stand_alone(camera, table, row, s)]
+        solutions = [s for s in solutions if _is_single_marker_valid(camera, table, row, s)]
     return (tuple(solutions), np.array(used, dtype=np.intp)) if solutions else nothing
 
 
@@ -187,11 +186,11 @@ def pose_covariance(
     floor_px: float,
     sigma: Array,
 ) -> tuple[Array, float] | None:
-    """Covariance (6, 6), as in `PoseSolution`, and weighted sum of squared residuals of a pose.
+    """Return the covariance (6, 6), as in `PoseSolution`, and the weighted sum of squared residuals of a pose.
 
     The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma`` (n,). It is
-    s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``. None when the geometry leaves the pose
-    undetermined or has points behind the camera.
+    s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``. None if the pose is not
+    observable or has points behind the camera.
     """
     pose = Pose(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
@@ -199,13 +198,13 @@ def pose_covariance(
         return None
     residual, jacobian = found
     rss = float(residual @ residual)
-    # By position and dtheta: a turn phi in the camera's axes is R dtheta.
+    # By position and dtheta: a rotation phi in camera axes is R dtheta.
     jacobian = np.concatenate([jacobian[:, 3:], jacobian[:, :3] @ rotation], axis=1)
     information = jacobian.T @ jacobian
     if not (math.isfinite(rss) and math.isfinite(float(information.sum()))):
         return None
     variance = max(floor_px**2, rss / (len(residual) - 6))
-    # Metres and radians are scaled to comparable size before the condition is judged.
+    # Metres and radians are scaled to comparable size before the condition number is checked.
     each = [1.0 / math.sqrt(max(d, 1e-300)) for d in information.diagonal().tolist()]
     scale = np.array([[a * b for b in each] for a in each])
     values, vectors = np.linalg.eigh(information * scale)
@@ -219,18 +218,18 @@ def pose_covariance(
 def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
-    """Root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
+    """Return the root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
     squares = squared_errors(camera, points_trf_m, pixels, Pose(position, rotation))
     return math.sqrt(float(squares.sum()) / len(squares))
 
 
-def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
-    """The pose on which the most markers agree, refined, and which of ``seen`` these are, in ascending order."""
+def _consensus(seen: _DetectedMarkers) -> tuple[Pose, list[int]] | None:
+    """Return the refined pose with the most inliers, and their indices in ``seen``, ascending."""
     which: list[int] = seen.which.tolist()
     best: tuple[tuple[int, float], Pose, list[float]] | None = None
     for candidate in _candidates(seen):
         candidate_error = _marker_errors(seen, candidate)
-        # Not the number of detections: two of one id cannot both be right.
+        # Distinct ids: of two detections of one id at most one is right.
         near = [row for row, e in zip(which, candidate_error, strict=True) if e < _COARSE_GATE_PX]
         support = len(set(near))
         if support == 0:
@@ -239,7 +238,7 @@ def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
         if best is None or score > best[0]:
             best = score, candidate, candidate_error
         if support == len(which) and max(candidate_error) < _FINE_GATE_PX:
-            break  # all agree: no other candidate is needed
+            break  # all are inliers: no other candidate is needed
     if best is None:
         return None
     _, pose, error = best
@@ -262,8 +261,8 @@ def _consensus(seen: _Seen) -> tuple[Pose, list[int]] | None:
     return pose, used
 
 
-def _candidates(seen: _Seen) -> Iterator[Pose]:
-    """Coarse poses to choose from, the likeliest first."""
+def _candidates(seen: _DetectedMarkers) -> Iterator[Pose]:
+    """Yield coarse poses, the most likely first."""
     if len(seen.which) == 1:
         yield from seen.plane_poses
         return
@@ -281,21 +280,21 @@ def _candidates(seen: _Seen) -> Iterator[Pose]:
         yield from seen.part([i]).plane_poses
 
 
-def _refined(seen: _Seen, pose: Pose) -> Pose | None:
+def _refined(seen: _DetectedMarkers, pose: Pose) -> Pose | None:
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     return refine(seen.camera.matrix(), points, pixels, seen.weight, pose)
 
 
-def _plane_poses(seen: _Seen) -> list[Pose]:
-    """Both IPPE poses of the target from points in the plane of the first marker (or, where IPPE fails, SQPnP's one)."""
+def _plane_poses(seen: _DetectedMarkers) -> list[Pose]:
+    """Return both IPPE poses from points in the plane of the first marker, or SQPnP's pose where IPPE fails."""
     to_trf, origin = seen.table.rotations[seen.which[0]], seen.table.origins[seen.which[0]]
     flat = (seen.points.reshape(-1, 3) - origin) @ to_trf
-    flat[:, 2] = 0.0  # IPPE wants it exactly
+    flat[:, 2] = 0.0  # IPPE requires exactly zero
     pixels, matrix = seen.pixels.reshape(-1, 2), seen.camera.matrix()
     try:
         _, rvecs, tvecs, rms_px = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_IPPE)
         if not np.asarray(rms_px).min() < _PLANE_RMS_PX:
-            # Seen exactly from ahead, OpenCV's IPPE makes any rotation vector out of a turn by 180 degrees.
+            # Face-on, OpenCV's IPPE returns an arbitrary rotation vector for a rotation by 180 degrees.
             _, rvecs, tvecs, _ = cv2.solvePnPGeneric(flat, pixels, matrix, None, flags=cv2.SOLVEPNP_SQPNP)
     except cv2.error:  # degenerate corners
         return []
@@ -313,8 +312,7 @@ def _all_finite(values: Array) -> bool:
 
 
 def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:
-    """``candidates`` without the one that would be refined to ``pose``, which is refined, where that is plain:
-    of two, the one several times nearer to it than the other."""
+    """Return ``candidates`` without the one that converges to the refined ``pose``, if of two one is several times nearer."""
     if len(candidates) != 2:
         return candidates
     a, b = (_angle(candidate.rotation, pose.rotation) for candidate in candidates)
@@ -324,19 +322,19 @@ def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:
 
 
 def _angle(a: Array, b: Array) -> float:
-    """Angle, 0 to pi, between two rotation matrices (their distance by Frobenius is sqrt(8) sin(angle / 2))."""
+    """Return the angle, 0 to pi, between two rotation matrices (their Frobenius distance is sqrt(8) sin(angle / 2))."""
     difference = (a - b).ravel()
     return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
 
 
-def _solutions(seen: _Seen, poses: list[Pose], floor_px: float) -> list[PoseSolution]:
-    """Refined, distinct poses, best first, of which the later ones are about as likely as the first."""
+def _solutions(seen: _DetectedMarkers, poses: list[Pose], floor_px: float) -> list[PoseSolution]:
+    """Return refined, distinct poses, best first; later ones are about as likely as the first."""
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
     found: list[tuple[float, PoseSolution]] = []
     kept: list[Array] = []
     for number, pose in enumerate(poses):
-        refined = pose if number == 0 else _refined(seen, pose)  # the first one comes refined
+        refined = pose if number == 0 else _refined(seen, pose)  # the first one is refined already
         if refined is None or any(_angle(refined.rotation, other) < 1e-3 for other in kept):
             continue
         position, rotation = refined.position, refined.rotation
@@ -356,7 +354,7 @@ def _solutions(seen: _Seen, poses: list[Pose], floor_px: float) -> list[PoseSolu
 
 
 def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[int]:
-    """Indices, in order, of the detections within the gate: of several of one marker, that of least error."""
+    """Return the indices, ascending, of the detections within the gate, for each marker that of least error."""
     kept: dict[int, int] = {}
     for k in sorted(range(len(error)), key=error.__getitem__):
         if error[k] < gate_px:
@@ -364,12 +362,12 @@ def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[i
     return sorted(kept.values())
 
 
-def _marker_errors(seen: _Seen, pose: Pose) -> list[float]:
+def _marker_errors(seen: _DetectedMarkers, pose: Pose) -> list[float]:
     return marker_errors(seen.camera, seen.points, seen.normals, seen.pixels, pose)
 
 
-def _may_stand_alone(camera: Camera, table: MarkerTable, row: int, solution: PoseSolution) -> bool:
-    """Whether the pose of a single marker says enough, and shows that one alone."""
+def _is_single_marker_valid(camera: Camera, table: MarkerTable, row: int, solution: PoseSolution) -> bool:
+    """Return whether the pose of a single marker is observable and consistent with no other marker being detected."""
     pose = Pose(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
-    missing, cosine = plain_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)
+    missing, cosine = count_visible_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)
     return cosine >= MIN_SINGLE_COSINE and missing < _MAX_MISSING

@@ -1,4 +1,4 @@
-"""Gauss-Newton with Levenberg's damping on the weighted reprojection error of a pose."""
+"""Pose refinement: Levenberg-Marquardt on the weighted reprojection error."""
 
 from __future__ import annotations
 
@@ -17,37 +17,39 @@ _ZERO = np.zeros(3)
 
 @dataclass(frozen=True)
 class Pose:
-    """Where a target is in the camera: ``position`` (3,) in IRF, metres; ``rotation`` (3, 3), TRF -> IRF."""
+    """Pose of a target in the camera: ``position`` (3,) in IRF, metres; ``rotation`` (3, 3), TRF -> IRF."""
 
     position: Array
     rotation: Array
 
 
 def rotation_matrix(rotation_vector: object) -> Array:
-    """Rotation matrix (3, 3) of a rotation vector of three numbers, radians."""
+    """Return the rotation matrix (3, 3) of a rotation vector of three numbers, radians."""
     return np.asarray(cv2.Rodrigues(np.asarray(rotation_vector, dtype=float))[0], dtype=float)
 
 
 def residual_of(
     matrix: Array, points: Array, pixels: Array, weight: Array, pose: Pose
 ) -> tuple[Array, Array] | None:
-    """Weighted reprojection error (2n,) and its Jacobian (2n, 6) by a turn phi in the camera's axes and by
+    """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6) by a rotation phi in camera axes and by
     position, R_true = exp([phi]x) R; None for points behind the camera.
 
     ``matrix`` (3, 3) of the camera; ``points`` (n, 3) in TRF, metres; ``pixels`` (n, 2), ideal; ``weight``
-    (2n,): of each of their numbers.
+    (2n,): of each coordinate.
     """
     turned = points @ pose.rotation.T
     if not float(turned[:, 2].min()) + float(pose.position[2]) > 1e-6:
         return None
-    # Points turned beforehand: OpenCV's derivative by the rotation vector, taken at zero, is that by phi.
+    # With pre-rotated points OpenCV's derivative by the rotation vector at zero is that by phi.
     projected, jacobian = cv2.projectPoints(turned, _ZERO, pose.position, matrix, None)
     return (np.ravel(projected) - pixels.ravel()) * weight, jacobian[:, :6] * weight[:, None]
 
 
 def refine(matrix: Array, points: Array, pixels: Array, weight: Array, pose: Pose) -> Pose | None:
-    """The pose of least weighted squared error near ``pose``; None when that has points behind the camera.
-    Arguments as for `residual_of`; the arithmetic is a kernel (native/pose.c)."""
+    """Return the pose of minimum weighted squared error near ``pose``; None if points are behind the camera.
+
+    Arguments as for `residual_of`; implemented in native/pose.c.
+    """
     lens = (c_double * 4)(matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])
     given = [np.ascontiguousarray(a, dtype=float) for a in (points, pixels, weight)]
     out = np.empty(12)

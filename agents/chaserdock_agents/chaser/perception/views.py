@@ -1,6 +1,6 @@
-"""What the markers of a target look like from a pose. The arithmetic is a kernel (native/views.c).
+"""Projection of a target's markers for a pose, implemented in native/views.c.
 
-Points are turned here and not there: their bits are those of NumPy's matrix product, which no kernel repeats.
+Points are rotated here by NumPy's matrix product, whose rounding the C code would not reproduce.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from .refine import Pose
 def marker_errors(
     camera: Camera, points_trf_m: Array, normals_trf: Array, pixels: Array, pose: Pose
 ) -> list[float]:
-    """Distance (n,) in pixels of each marker's worst corner; infinite if behind or seen from behind.
+    """Return the largest corner error (n,) of each marker, pixels; infinite if behind the camera or facing away.
 
     ``points_trf_m`` (n, 4, 3): corners; ``normals_trf`` (n, 3); ``pixels`` (n, 4, 2): ideal.
     """
@@ -35,8 +35,8 @@ def marker_errors(
 
 
 def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: Pose) -> Array:
-    """Squared distance (n,), ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2); NaN for points not in
-    front of the camera."""
+    """Return squared distances (n,), ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2); NaN for points
+    behind the camera."""
     at, n = points_trf_m @ pose.rotation.T, len(points_trf_m)
     at += pose.position
     pixels, square = np.ascontiguousarray(pixels, dtype=float), np.empty(n)
@@ -44,20 +44,20 @@ def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: Pos
     return square
 
 
-def plain_markers(
+def count_visible_markers(
     camera: Camera, surface_trf: Array, row: int, pose: Pose, frame_margin_px: float
 ) -> tuple[int, float]:
-    """How many markers other than ``row`` should be as plain to see as that one if the pose is right, and the cosine of
-    the angle at which that one is seen: 1 from straight ahead, negative from behind.
+    """Return how many markers other than ``row`` should be at least as visible if the pose is right, and the cosine of the
+    viewing angle of that marker: 1 face-on, negative from behind.
 
-    ``surface_trf`` (6 m, 3): of m markers the 4 m corners, m centres and m normals. As plain: with all corners at least
-    ``frame_margin_px`` inside the image, about as large, and at about the same angle.
+    ``surface_trf`` (6 m, 3): 4 m corners, m centres and m normals of m markers. As visible: all corners at least
+    ``frame_margin_px`` inside the image, of about the same size, at about the same viewing angle.
     """
     markers = len(surface_trf) // 6
     surface, position = surface_trf @ pose.rotation.T, np.array(pose.position, dtype=float)
     right, bottom = camera.width_px - 1.0 - frame_margin_px, camera.height_px - 1.0 - frame_margin_px
     size, cosine = np.empty(markers), np.empty(markers)
-    count = function("plain_markers", c_int64)(
+    count = function("count_visible_markers", c_int64)(
         _lens(camera), (c_double * 3)(frame_margin_px, right, bottom),
         address(surface), address(position), c_int64(markers), c_int64(row), address(size), address(cosine),
     )  # fmt: skip

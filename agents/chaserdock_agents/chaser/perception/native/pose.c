@@ -1,17 +1,17 @@
-/* The pose of least weighted reprojection error: Gauss-Newton with Levenberg's damping. */
+/* Pose of minimum weighted reprojection error: Levenberg-Marquardt. */
 #include "base.h"
 
-/* A refinement ends when a step has lowered the squared error by no more than the first share of it, or promises to lower
- * it by no more than the second. */
-#define LEAST_GAIN 1e-5
-#define LEAST_PROMISE 2e-6
+/* Iteration ends when a step lowers the squared error by at most the first share of it, or the linear model predicts at most
+ * the second. */
+#define MIN_GAIN 1e-5
+#define MIN_PREDICTED_GAIN 2e-6
 
 typedef struct {
     double cost, gradient[6], information[36];
 } Normal;
 
-/* Squared weighted error of a pose (position (3), rotation (3, 3)), its gradient and Gauss-Newton's matrix by a turn phi in
- * the camera's axes, R_true = exp([phi]x) R, and by position; 0 for points behind the camera. */
+/* Compute squared weighted error, gradient and Gauss-Newton matrix of a pose (position (3), rotation (3, 3)) by a rotation phi
+ * in camera axes, R_true = exp([phi]x) R, and by position; return 0 for points behind the camera. */
 static int normal_of(const double *lens, const double *points, const double *pixels, const double *weight, int64_t n,
                      const double *pose, Normal *out) {
     out->cost = 0.0;
@@ -60,27 +60,26 @@ static void turned_by(const double *phi, const double *rotation, double *out) {
     }
 }
 
-/* Moves ``pose`` (position (3), then rotation (3, 3), TRF -> IRF) to the nearest least error. ``lens``: fx, fy, cx, cy;
- * ``points`` (n, 3) TRF, ``pixels`` (n, 2) ideal, ``weight`` (n, 2). 1 when it is there, 0 where there is none. */
+/* Move ``pose`` (position (3), rotation (3, 3), TRF to IRF) to the nearest minimum; return 0 if there is none. ``lens``: fx, fy, cx, cy;
+ * ``points`` (n, 3) TRF, ``pixels`` (n, 2) ideal, ``weight`` (n, 2). */
 EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const double *pixels, const double *weight,
                                 int64_t n, double *pose) {
     Normal now, then;
     if (!normal_of(lens, points, pixels, weight, n, pose, &now) || !finite(now.cost)) return 0;
     double damping = 1e-7;
-    for (int turn = 0; turn < 20; turn++) {
-        double matrix[36], step[6], trial[12], promise = 0.0;
+    for (int iteration = 0; iteration < 20; iteration++) {
+        double matrix[36], step[6], trial[12], predicted = 0.0;
         copy(now.information, matrix, 36);
         for (int i = 0; i < 6; i++) {
             matrix[7 * i] = matrix[7 * i] * (1.0 + damping) + 1e-12;
             step[i] = -now.gradient[i];
         }
         if (!solve_rows(matrix, step, 6)) return 0;
-        for (int i = 0; i < 6; i++) promise -= step[i] * now.gradient[i];
+        for (int i = 0; i < 6; i++) predicted -= step[i] * now.gradient[i];
         for (int i = 0; i < 3; i++) trial[i] = pose[i] + step[3 + i];
         turned_by(step, pose + 3, trial + 3);
-        /* The gain that the linear model promises. A step, not one shortened by damping, that promises next to nothing is
-         * the last one, and too short to be wrong: it need not be tried. */
-        if (damping < 1e-3 && promise <= LEAST_PROMISE * now.cost + 1e-12) {
+        /* An undamped step whose predicted gain is negligible is the last one and needs no check. */
+        if (damping < 1e-3 && predicted <= MIN_PREDICTED_GAIN * now.cost + 1e-12) {
             copy(trial, pose, 12);
             return 1;
         }
@@ -89,7 +88,7 @@ EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const
             copy(trial, pose, 12);
             now = then;
             damping = most(damping * 0.1, 1e-9);
-            if (gain <= LEAST_GAIN * now.cost + 1e-12) break;
+            if (gain <= MIN_GAIN * now.cost + 1e-12) break;
         } else {
             damping *= 100.0;
             if (damping > 1e9) break;

@@ -1,14 +1,14 @@
-/* What the markers of a target look like from a pose: how far from where they were seen, which ones are plain to see. */
+/* Projection of markers for a pose: distances from the detections, and which markers should be visible. */
 #include "base.h"
 
-/* Ideal pixel of a point in IRF; 0, and nothing written, for one that is not in front. ``lens``: fx, fy, cx, cy. */
+/* Project a point in IRF to an ideal pixel; return 0 without a result for a point behind the camera. ``lens``: fx, fy, cx, cy. */
 static inline int project(const double *lens, const double *at, double *px) {
     if (!(at[2] > 0.0)) return 0;
     for (int k = 0; k < 2; k++) px[k] = at[k] / at[2] * lens[k] + lens[2 + k];
     return 1;
 }
 
-/* Squared distance (n), pixels, of points ``at`` (n, 3) in IRF from ``pixels`` (n, 2), ideal; NaN for points not in front. */
+/* Squared distance (n), pixels, of points ``at`` (n, 3) in IRF from ``pixels`` (n, 2), ideal; NaN for points behind the camera. */
 EXPORT void NAME(squared_errors)(const double *lens, const double *at, const double *pixels, int64_t n, double *square) {
     for (int64_t i = 0; i < n; i++) {
         double px[2];
@@ -19,8 +19,8 @@ EXPORT void NAME(squared_errors)(const double *lens, const double *at, const dou
     }
 }
 
-/* Distance (n) in pixels of each marker's worst corner from ``pixels`` (n, 4, 2), ideal; infinite for a marker behind the
- * camera or seen from behind. ``at`` (n, 4, 3): corners in IRF, m; ``outwards`` (n, 3): normals in IRF. */
+/* Largest distance (n), pixels, of each marker's corners from ``pixels`` (n, 4, 2), ideal; infinite for a marker behind the
+ * camera or facing away. ``at`` (n, 4, 3): corners in IRF, m; ``outwards`` (n, 3): normals in IRF. */
 EXPORT void NAME(marker_errors)(const double *lens, const double *at, const double *pixels, const double *outwards, int64_t n,
                                double *error) {
     for (int64_t m = 0; m < n; m++) {
@@ -38,11 +38,11 @@ EXPORT void NAME(marker_errors)(const double *lens, const double *at, const doub
     }
 }
 
-/* ``surface`` (6 m, 3), turned into the axes of IRF: the 4 corners of each of m markers, then their centres, m, then their
- * normals; moved to ``position`` here, the normals left. Writes the cosine (m) of the angle at which each is seen: 1 from
- * straight ahead, negative from behind. Returns how many markers other than ``row`` are as plain to see as that one:
- * ``frame_px`` (left and top, right, bottom) around all corners, about its size, about its angle. */
-EXPORT int64_t NAME(plain_markers)(const double *lens, const double *frame_px, const double *surface, const double *position,
+/* Return how many markers other than ``row`` are at least as visible as that one: all corners within ``frame_px`` (left and
+ * top, right, bottom), of about its size and viewing angle. ``surface`` (6 m, 3), rotated into IRF axes: the 4 corners of each
+ * of m markers, their centres, m, and their normals; corners and centres are translated by ``position`` here. Output: cosine
+ * (m) of each viewing angle, 1 face-on, negative from behind. */
+EXPORT int64_t NAME(count_visible_markers)(const double *lens, const double *frame_px, const double *surface, const double *position,
                                   int64_t markers, int64_t row, double *size, double *cosine) {
     const double *centres = surface + 12 * markers, *normals = surface + 15 * markers;
     for (int64_t m = 0; m < markers; m++) {
@@ -55,7 +55,7 @@ EXPORT int64_t NAME(plain_markers)(const double *lens, const double *frame_px, c
             for (int k = 0; k < 3; k++) at[k] = surface[12 * m + 3 * i + k] + position[k];
             inside = project(lens, at, px[i]);
         }
-        /* Not in front: no size, which is no less and no more than any. */
+        /* Behind the camera: NaN compares false with every size. */
         size[m] = __builtin_nan("");
         if (!inside) continue;
         for (int i = 0; i < 4; i++) {

@@ -184,6 +184,7 @@ class ControllerCore:
         ids = tuple(sorted(inputs.odometry))
         effective_ns = self.scenario.timing.effective_ns(inputs.tick)
         known = fused.status in ("tracking", "predicting")
+        self._describe(ids if known else (), inputs, fused, out)
         plan: NmpcPlan | None = None
         took_s = 0.0
         # Who holds on to the target is planned for only where others have to fly around it.
@@ -195,7 +196,6 @@ class ControllerCore:
             problem = self._problem(planned, inputs, self.estimator.estimate_at(effective_ns), effective_ns)
             away = self.absent.away(inputs.time_ns)
             problem = with_lost_chasers(problem, away, effective_ns, self._parameters.dt_s)
-        self._describe(ids if known else (), inputs, fused, out)
         if problem is not None:
             begun_s = self._now_s()
             since_ns = 0 if self._last_solve_ns is None else inputs.time_ns - self._last_solve_ns
@@ -217,7 +217,7 @@ class ControllerCore:
                 self._send(i, inputs, effective_ns, "search", wrench, out)
                 continue
             row = rows.get(i, 0)
-            if i in held or self._is_held(i):
+            if i in held:
                 pull = (-self.guidance.pull_N(i, inputs.time_ns / 1e9), 0.0, 0.0, 0.0, 0.0, 0.0)
                 self._send(i, inputs, effective_ns, "pull" if pull[0] else "coast", np.array(pull), out)
                 continue

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector

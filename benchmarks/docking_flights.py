@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from chaserdock_controller.guidance.composite_body import target_body
+from chaserdock_controller.estimation.composite_body import target_body
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand, ProbeTouch

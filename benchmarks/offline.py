@@ -16,7 +16,8 @@ from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector

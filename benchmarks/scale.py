@@ -80,8 +80,8 @@ def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
     flight = Offline(scenario, seeing_eye(scenario))
     clock.wrap(flight, "fly", "physics")
     clock.wrap(flight.flight, "step", "guide")
-    clock.wrap(flight.flight, "fuse", "fuse")
-    clock.wrap(flight.flight._solver, "solve", "solve")
+    clock.wrap(flight.flight.estimation, "run", "fuse")
+    clock.wrap(flight.flight.planning.solver, "solve", "solve")
     rows = []
     for _ in range(WARM_TICKS + ticks):
         clock.spent.clear()

@@ -15,7 +15,8 @@ import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Image, OperatorCommand, Sighting
@@ -163,7 +164,7 @@ def fly(
             truth = states["target"]
             estimates.note(now_s, out.target, truth)
             for name, shadow in beside.items():
-                fused = shadow.flight.fuse(TickInputs(tick, now_ns, odometry, tuple(aside[name])))[1]
+                fused = shadow.flight.estimate(TickInputs(tick, now_ns, odometry, tuple(aside[name])))
                 shadow.estimates.note(now_s, fused, truth)
             events += [(now_s, e.level, e.what) for e in out.events]
             for i, r in out.references.items():

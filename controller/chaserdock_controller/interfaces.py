@@ -1,14 +1,17 @@
-"""What a tick of the controller takes and gives."""
+"""Inputs and outputs of a controller tick, and the results that its stages hand to each other."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import (
     CommandReply,
     DockingStatus,
     Event,
+    Latch,
     Odometry,
     OperatorCommand,
     Plan,
@@ -19,15 +22,25 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
     WrenchCommand,
 )
+from chaserdock_protocol.messages.fields import CameraCalibration, Level
+
+from .estimation.target_body import TargetBody
+from .estimation.types import TargetState
+from .guidance.phases import Phase
+from .nmpc.types import NmpcPlan
+
+LogEntry = tuple[Level, str]
+"""Level and text of an event."""
+Mode = Literal["nmpc", "brake", "coast", "pull", "search"]
 
 
 @dataclass(frozen=True)
 class TickInputs:
-    """What a tick brings. Sightings may belong to earlier ticks."""
+    """Messages of a tick. Sightings may belong to earlier ticks."""
 
     tick: int
     time_ns: int
-    odometry: dict[int, Odometry]
+    odometry: Mapping[int, Odometry]
     sightings: tuple[Sighting, ...]
     commands: tuple[OperatorCommand, ...] = ()
     thrusters: Mapping[int, ThrusterReport] = field(default_factory=dict)
@@ -36,7 +49,7 @@ class TickInputs:
 
 @dataclass
 class TickOutputs:
-    """What a tick yields; dictionaries by chaser."""
+    """Messages that a tick produces; dictionaries by chaser."""
 
     target: TargetEstimate
     wrenches: dict[int, WrenchCommand] = field(default_factory=dict)
@@ -45,3 +58,130 @@ class TickOutputs:
     solver: SolverStatus | None = None
     replies: list[CommandReply] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
+
+
+class AppliedImpulse(NamedTuple):
+    """Impulse (6,), N s and N m s, body axes, since the tick before: ``measured`` by thrusters, or commanded."""
+
+    impulse: Array
+    measured: bool
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Result of ingest: checked inputs and what follows from them about the chasers; mappings by chaser.
+
+    ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states; ``invalid``: why a state is not.
+    ``lost``: last odometry of chasers that are obstacles to the others. ``predicted``: own state (13,) at
+    ``effective_ns``: p, v (WRF), q_wxyz, omega (body). ``input_limits``: (6,) N and N m, body axes.
+    """
+
+    tick: int
+    time_ns: int
+    effective_ns: int
+    odometry: Mapping[int, Odometry]
+    invalid: Mapping[int, str]
+    lost: Mapping[int, Odometry]
+    sightings: tuple[Sighting, ...]
+    commands: tuple[OperatorCommand, ...]
+    docking: Mapping[int, DockingStatus]
+    impulses: Mapping[int, AppliedImpulse]
+    predicted: Mapping[int, Array]
+    input_limits: Mapping[int, Array]
+    events: tuple[LogEntry, ...]
+
+    @property
+    def time_s(self) -> float:
+        """Return the simulated time in seconds."""
+        return self.time_ns / 1e9
+
+
+@dataclass(frozen=True)
+class TargetEstimation:
+    """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose is known.
+
+    ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
+    target and these chasers as one rigid body.
+    """
+
+    target: TargetState
+    at_effect: TargetState | None
+    visible_to: frozenset[int]
+    cameras: tuple[CameraCalibration, ...]
+    latched: frozenset[int]
+    body: TargetBody
+    events: tuple[LogEntry, ...]
+
+    @property
+    def known(self) -> bool:
+        """Return whether the target's pose is known."""
+        return self.at_effect is not None
+
+
+@dataclass(frozen=True)
+class ReferencePose:
+    """Reference of one chaser now: position (3,) and attitude (4,) in WRF, ``offset_m`` (3,) in TRF."""
+
+    position_m: Array
+    q_wxyz: Array
+    offset_m: Array
+    min_distance_target_m: float
+
+
+@dataclass(frozen=True)
+class DirectCommand:
+    """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC."""
+
+    mode: Mode
+    wrench: Array
+
+
+@dataclass(frozen=True)
+class Directive:
+    """Guidance of one chaser. ``isolated`` and ``trusted``: thrusters, by operator command. ``reference`` is None while
+    the target or the chaser's own state is unknown."""
+
+    phase: Phase
+    phase_time_s: float
+    latch: Latch
+    free: bool
+    isolated: tuple[int, ...]
+    trusted: tuple[int, ...]
+    reference: ReferencePose | None
+    direct: DirectCommand | None
+
+
+@dataclass(frozen=True)
+class HorizonReference:
+    """References of N ``chasers`` over D stages: the guidance part of an ``NmpcInput`` (shapes there).
+
+    ``attached``: chasers whose latch holds the target; they are obstacles and follow its motion.
+    """
+
+    chasers: tuple[int, ...]
+    references: Array
+    u_ref: Array
+    target_positions: Array
+    min_distance_target_m: Array
+    corridors: Array | None
+    attached: frozenset[int]
+
+
+@dataclass(frozen=True)
+class GuidanceResult:
+    """Result of guidance. ``horizon`` is None when no chaser is planned for."""
+
+    directives: Mapping[int, Directive]
+    horizon: HorizonReference | None
+    replies: tuple[CommandReply, ...]
+    events: tuple[LogEntry, ...]
+
+
+@dataclass(frozen=True)
+class PlanResult:
+    """Result of planning: the plan of ``chasers``, row by row; None without a usable solve. ``wall_s``: time of the solve."""
+
+    chasers: tuple[int, ...]
+    plan: NmpcPlan | None
+    wall_s: float
+    events: tuple[LogEntry, ...]

@@ -1,4 +1,4 @@
-"""The controller again, on what it received in a recorded flight: its process' own code, with a tape for a network."""
+"""Replay of the controller process on the inputs recorded in a log."""
 
 from __future__ import annotations
 
@@ -12,33 +12,35 @@ from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbe
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
 
-from .core import ControllerCore, TickInputs, TickOutputs
+from .core import ControllerCore
+from .interfaces import TickInputs, TickOutputs
 from .process import Controller
 
 
-class _FusionAlone:
-    """A flight that estimates and commands nothing."""
+class _EstimationOnly:
+    """Processes ticks by ingest and estimation only."""
 
-    def __init__(self, flight: ControllerCore) -> None:
-        self._flight = flight
+    def __init__(self, core: ControllerCore) -> None:
+        self._core = core
 
     def step(self, inputs: TickInputs) -> TickOutputs:
-        return TickOutputs(target=self._flight.fuse(inputs)[1])
+        """Return outputs with the target's estimate and nothing else."""
+        return TickOutputs(target=self._core.estimate(inputs))
 
 
-def _flight_of(scenario: Scenario) -> ControllerCore:
+def _core_of(scenario: Scenario) -> ControllerCore:
     return ControllerCore(scenario, now_s=lambda: 0.0)
 
 
-def _named_once(recorded: Iterable[ReceivedMessage]) -> Iterator[tuple[str, list[ReceivedMessage]]]:
-    """Messages tick by tick, with who commanded at its end; a tick that was told again names that one from the start."""
+def _with_leader(recorded: Iterable[ReceivedMessage]) -> Iterator[tuple[str, list[ReceivedMessage]]]:
+    """Return the messages of each tick with its last leader, whom all revisions of the tick then name."""
     for _, group in groupby(recorded, key=lambda r: r.message.tick):
-        came = list(group)
-        told = [r.message for r in came if r.topic is topics.TICK]
-        if not told:
-            yield "", came
+        received = list(group)
+        ticks = [r.message for r in received if r.topic is topics.TICK]
+        if not ticks:
+            yield "", received
             continue
-        last = max(told, key=lambda tick: tick.revision)
+        last = max(ticks, key=lambda tick: tick.revision)
         names = {"term": last.term, "commander": last.commander, "instance": last.instance}
         yield (
             last.commander,
@@ -46,47 +48,47 @@ def _named_once(recorded: Iterable[ReceivedMessage]) -> Iterator[tuple[str, list
                 msgspec.structs.replace(r, message=msgspec.structs.replace(r.message, **names))
                 if r.topic is topics.TICK
                 else r
-                for r in came
+                for r in received
             ],
         )
 
 
 def _play(
-    scenario: Scenario, recorded: Iterable[ReceivedMessage], flight_of: Callable[[], Any]
+    scenario: Scenario, recorded: Iterable[ReceivedMessage], core_of: Callable[[], Any]
 ) -> Iterator[Published]:
-    """The answers of whoever commanded. One that takes over knows what the other knew; one started again does not."""
-    tape, controller, last_seq, last_commander = ReplayNode("controller"), None, -1, ""
-    for named, came in _named_once(recorded):
-        commander = named or last_commander
-        for received in came:
+    """Return the outputs of the leader. A new leader keeps the state of the one before; a restarted process does not."""
+    node, controller, last_seq, last_leader = ReplayNode("controller"), None, -1, ""
+    for named, messages in _with_leader(recorded):
+        leader = named or last_leader
+        for received in messages:
             is_target = received.topic is topics.TARGET
-            anew = is_target and received.message.seq < last_seq and commander == last_commander
-            if controller is None or anew:
-                tape = ReplayNode("controller")
-                controller = Controller(cast(Node, tape), scenario, flight_of(), replaying=True)
+            restarted = is_target and received.message.seq < last_seq and leader == last_leader
+            if controller is None or restarted:
+                node = ReplayNode("controller")
+                controller = Controller(cast(Node, node), scenario, core_of(), replaying=True)
                 controller.heartbeat = cast(Any, SilentHeartbeat())
             if is_target:
                 last_seq = received.message.seq
             if received.topic is topics.OPERATED:
                 controller.operate(received.message, lambda _: None)
             elif received.topic in _INPUTS:
-                tape.put(received)
+                node.put(received)
                 controller.listen()
-                # What a standby tells is on a branch of its own, which is not compared.
+                # Events of a standby are published on its own branch, which is not compared.
                 yield from (
-                    s for s in tape.take_published() if s[0] is not topics.EVENT or commander != "standby"
+                    s for s in node.take_published() if s[0] is not topics.EVENT or leader != "standby"
                 )
-        last_commander = commander
+        last_leader = leader
 
 
 def play_controller(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
-    """All that the controller publishes."""
-    return _play(scenario, recorded, lambda: _flight_of(scenario))
+    """Return everything that the controller publishes."""
+    return _play(scenario, recorded, lambda: _core_of(scenario))
 
 
 def play_fusion(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
-    """The target's estimate alone."""
-    return _play(scenario, recorded, lambda: _FusionAlone(_flight_of(scenario)))
+    """Return the target's estimates only."""
+    return _play(scenario, recorded, lambda: _EstimationOnly(_core_of(scenario)))
 
 
 _INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING, topics.THRUSTERS, topics.DOCKING)

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
-from chaserdock_controller.core import ControllerCore, TickInputs
-from chaserdock_controller.output.latency_compensation import (
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.guidance.thruster_commands import ThrusterCommandHandler
+from chaserdock_controller.ingest.latency_compensation import (
     CommandHistory,
     predict_state,
     predict_state_with_impulse,
 )
-from chaserdock_controller.output.thruster_state import ThrusterCommandHandler
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
 from closed_loop import fly

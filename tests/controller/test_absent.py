@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.ingest.lost_chasers import (
     ABSENT_S,
@@ -16,11 +16,11 @@ from chaserdock_controller.ingest.lost_chasers import (
     GROWTH_M_S,
     MOST_M,
     LostChasers,
-    coasting,
     margin_m,
-    with_lost_chasers,
 )
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_controller.nmpc import NmpcInput
+from chaserdock_controller.nmpc.lost_chasers import coasting, with_lost_chasers
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
@@ -66,27 +66,27 @@ def test_it_goes_on_as_it_moved_last() -> None:
 
 def test_who_is_away_is_told_once_and_so_is_the_end_of_it() -> None:
     absent = LostChasers()
-    assert absent.take({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
+    assert absent.update({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
     told = []
     for k in range(1, 200):
         now_s = 0.4 * k
         now = {0: odometry(0, now_s, Q[1:])}
-        told += [(round(now_s, 1), *event) for event in absent.take(now, round(now_s * 1e9))]
+        told += [(round(now_s, 1), *event) for event in absent.update(now, round(now_s * 1e9))]
     assert [(level, text.split(":")[0]) for _, level, text in told] == [("warning", "chaser 1")] * 2
-    assert "absent" in told[0][2]
+    assert "lost" in told[0][2]
     assert "no obstacle any more" in told[1][2]
     assert told[0][0] == pytest.approx(0.4)
     assert told[1][0] > FORGOTTEN_S
-    absent.take({}, round(81e9))
-    (back,) = absent.take({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
-    assert back == ("info", "chaser 0: is heard again")
+    absent.update({}, round(81e9))
+    (back,) = absent.update({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
+    assert back == ("info", "chaser 0: odometry received again")
 
 
 def test_a_moment_unheard_of_is_no_absence() -> None:
     absent = LostChasers()
-    absent.take({0: odometry(0, 1.0, Q[1:])}, 10**9)
-    assert absent.take({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
-    assert absent.away(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
+    absent.update({0: odometry(0, 1.0, Q[1:])}, 10**9)
+    assert absent.update({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
+    assert absent.obstacles(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
 
 
 def test_nobody_away_leaves_the_problem_as_it_is() -> None:
@@ -126,7 +126,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     """How near chaser 0, sent past it, comes to chaser 1, of which nothing is heard after a second; what is told."""
     flight = ControllerCore(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
     if blind:
-        flight.absent.away = lambda now_ns: {}  # type: ignore[method-assign]
+        flight.ingest.lost_chasers.obstacles = lambda now_ns: {}  # type: ignore[method-assign]
     timing, rate_hz = scenario.timing, scenario.time.rate_hz
     # In the way; the wrenches act at once, as the latency plays no part here.
     lost = np.array([0.0, -0.8, -0.1])
@@ -168,4 +168,4 @@ def test_the_others_fly_around_where_it_should_be() -> None:
     through_m, _ = nearest_m(scenario, blind=True)
     assert around_m > least_m
     assert through_m < 0.8 * least_m
-    assert any("chaser 1: absent" in text for text in told)
+    assert any("chaser 1: lost" in text for text in told)

@@ -8,10 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller import core as flight_module
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, make_solver
+from chaserdock_controller.nmpc import stage as planning
 from chaserdock_controller.nmpc.budget import SolveBudget
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import Scenario, ScenarioError
@@ -102,8 +103,8 @@ def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_neve
     mission = scenario(controller={"solve_budget_s": 3 * SLOW_S})
     slow = Slow(None)
     flight = ControllerCore(mission, lambda: slow.time_s, PerfectEstimator(mission.target), realtime)
-    slow.inner = flight._solver
-    flight._solver = slow  # type: ignore[assignment]
+    slow.inner = flight.planning.solver
+    flight.planning.solver = slow  # type: ignore[assignment]
     told = [far(mission, flight, tick).solver for tick in range(4)]
     used = [sum(s.iterations) for s in told if s is not None]
     assert used[0] > 3
@@ -119,7 +120,7 @@ def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_neve
 def test_seconds_go_with_a_solver_that_can_be_held_to_them(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ScenarioError, match=r"controller: solve_budget_s goes with the solver rti; ipopt"):
         scenario(controller={"solver": "ipopt", "solve_budget_s": 0.01})
-    monkeypatch.setattr(flight_module, "make_solver", lambda *_: object())
+    monkeypatch.setattr(planning, "make_solver", lambda *_: object())
     mission = scenario(controller={"solve_budget_s": 0.01})
     with pytest.raises(PluginError, match="has no max_iterations to set"):
         ControllerCore(mission, lambda: 0.0, realtime=True)

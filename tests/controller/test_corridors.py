@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.evaluation.closed_loop import fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.guidance.approach_cone import (
@@ -20,6 +20,7 @@ from chaserdock_controller.guidance.approach_cone import (
 )
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.phases import Phase
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario as capture_scenario

@@ -6,11 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller import core as flight_module
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.evaluation.closed_loop import fly_offline
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.guidance.phases import Phase
+from chaserdock_controller.ingest import stage as ingest
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.nmpc import stage as planning
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import DockingStatus
 from chaserdock_protocol.scenario import Scenario, load_scenario, parse_scenario
@@ -49,7 +51,7 @@ def test_who_comes_and_goes_costs_nobody_a_tick(monkeypatch: pytest.MonkeyPatch)
     """Everyone who is there has a plan in every tick, the first after a change included, and no solver is built anew."""
     mission = three()
     flight, alone = (ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2))
-    monkeypatch.setattr(flight_module, "make_solver", lambda *_: pytest.fail("a solver was built in flight"))
+    monkeypatch.setattr(planning, "make_solver", lambda *_: pytest.fail("a solver was built in flight"))
     steady: dict[int, list[Array]] = {}
     for tick, there in enumerate([(0, 1, 2)] * 4 + [(0, 2)] * 4 + [(2,)] * 4 + [(0, 1, 2)] * 4):
         out = step(flight, tick, there)
@@ -108,7 +110,7 @@ def test_the_state_is_predicted_to_when_the_command_acts(monkeypatch: pytest.Mon
     def at_exposure(told, history, until_ns, body):  # type: ignore[no-untyped-def]
         return np.array([*told.position_m, *told.velocity_m_s, *told.q_wxyz, *told.omega_rad_s])
 
-    monkeypatch.setattr(flight_module, "predict_state", at_exposure)
+    monkeypatch.setattr(ingest, "predict_state", at_exposure)
     assert late_error_m() > 5e-4
 
 

@@ -8,7 +8,7 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.phases import (
     TRANSITIONS,
@@ -17,6 +17,7 @@ from chaserdock_controller.guidance.phases import (
     next_phase,
     permitted_commands,
 )
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand

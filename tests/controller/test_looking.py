@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import CameraPose, Measurement, Mekf, MekfParameters, PoseHypothesis
 from chaserdock_controller.estimation.camera_calibration import seen_by
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
@@ -19,6 +19,7 @@ from chaserdock_controller.guidance.pointing import (
     search_angles,
     search_wrench,
 )
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
 from chaserdock_models.rigid_body import propagate

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_controller.output.latency_compensation import CommandHistory, predict_state
+from chaserdock_controller.ingest.latency_compensation import CommandHistory, predict_state
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import propagate

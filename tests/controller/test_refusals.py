@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_protocol import codec
 from chaserdock_protocol.codec import Rejected
@@ -97,7 +98,7 @@ def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
     for tick in (1, 2):
         out = step(flight, tick, **changes)
         errors = [e.what for e in out.events if e.level == "error"]
-        assert errors == ([f"chaser 0: odometry refused, coasting: {told}"] if tick == 1 else [])
+        assert errors == ([f"chaser 0: invalid odometry, coasting: {told}"] if tick == 1 else [])
         assert out.wrenches[0].mode == "coast"
         assert not any([*out.wrenches[0].force_N, *out.wrenches[0].torque_N_m])
         assert out.wrenches[1].mode == "nmpc"

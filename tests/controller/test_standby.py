@@ -53,7 +53,7 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
 def member(scenario: Scenario, name: str, instance: str) -> Controller:
     made = Controller(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
     made.heartbeat = cast(Any, SilentHeartbeat())
-    made.shadow.instance = instance
+    made.standby.instance = instance
     return made
 
 
@@ -63,8 +63,8 @@ def hear(process: Controller, *messages: ReceivedMessage) -> list[tuple[Any, Any
     for message in messages:
         tape.put(message)
     before = None
-    while tape._pending or before != (process.done_tick, len(process.shadow._held)):
-        before = process.done_tick, len(process.shadow._held)
+    while tape._pending or before != (process.done_tick, len(process.standby._held)):
+        before = process.done_tick, len(process.standby._held)
         process.listen()
     return [(t, m) for t, _, m in tape.take_published()]
 
@@ -139,7 +139,7 @@ def test_who_comes_late_takes_the_state_over_and_goes_on_alike(scenario: Scenari
     state = None
     for tick in list(ticks)[:14]:
         if tick == 10:
-            first._given_state_to = {}  # it has heard of the other one just now
+            first.standby._state_sent_to = {}  # it has heard of the other one just now
         said = hear(first, *ticks[tick])
         if tick >= 9:
             hear(late, *ticks[tick], *words(said))
@@ -162,7 +162,7 @@ def test_who_is_named_before_any_state_came_begins_anew_and_says_so(scenario: Sc
     late = member(scenario, "standby", "s")
     assert not flown(hear(late, *ticks[9]))
     said = hear(late, named(ticks[9], "standby", "s", 2))
-    assert any(t is topics.EVENT and m.what.startswith("begins anew") for t, m in said)
+    assert any(t is topics.EVENT and m.what.startswith("takes over without any state") for t, m in said)
     assert [m.tick for t, m in said if t is topics.WRENCH] == [9, 9]
 
 
@@ -177,7 +177,7 @@ def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Sc
         said = hear(first, *ticks[tick])
         hear(second, *ticks[tick], *words(said))
     assert [a.accepted for a in answers] == [True]
-    assert second.flight.guidance.chasers[0].phase == first.flight.guidance.chasers[0].phase == "goto"
+    assert second.core.guidance.chasers[0].phase == first.core.guidance.chasers[0].phase == "goto"
 
 
 # -- the state ----------------------------------------------------------------------------------------------
@@ -185,7 +185,7 @@ def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Sc
 
 def memory(scenario: Scenario) -> tuple[Controller, Checkpoint]:
     one = member(scenario, "controller", "c")
-    return one, one._memory
+    return one, one.checkpoint
 
 
 def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(scenario: Scenario, ticks: Any) -> None:
@@ -197,8 +197,8 @@ def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(scenario: Sce
     assert 1000 < len(state) < 200_000
     restored.restore(state)
     assert msgspec.msgpack.decode(restored.save()) == msgspec.msgpack.decode(state)
-    assert isinstance(other.flight.guidance.chasers[0].phase, Phase)
-    one.flight.guidance.chasers[0] = other.flight.guidance.chasers[1]
+    assert isinstance(other.core.guidance.chasers[0].phase, Phase)
+    one.core.guidance.chasers[0] = other.core.guidance.chasers[1]
     assert saved.save() != state
 
 
@@ -211,10 +211,10 @@ def test_an_invalid_checkpoint_is_refused_completely(scenario: Scenario, ticks: 
         hear(one, *ticks[tick])
     state = saved.save()
     values = msgspec.msgpack.decode(state)
-    array = values["captures"]["body"]["inertia_kg_m2"]
+    array = values["composite"]["body"]["inertia_kg_m2"]
     match spoil:
         case "unknown":
-            values["core"]["Popen"] = {"args": "true"}
+            values["planning"]["Popen"] = {"args": "true"}
         case "missing":
             del values["history"]
         case "chasers":
@@ -286,37 +286,37 @@ def tick(number: int, commander: str, instance: str, term: int, revision: int = 
 
 
 def test_the_command_is_of_the_very_start_that_is_named() -> None:
-    shadow = HotStandby("standby", instance="s2")
-    shadow.note(tick(0, "standby", "s1", 1))
-    assert not shadow.commands
-    shadow.note(tick(0, "standby", "s2", 2, 1))
-    assert shadow.commands
-    assert shadow.commands_at(0)
-    shadow.note(tick(0, "controller", "c", 1))  # late: it is of before
-    assert shadow.commands
-    shadow.note(tick(1, "controller", "c", 3))
-    assert not shadow.commands_at(0)
+    standby = HotStandby("standby", instance="s2")
+    standby.update(tick(0, "standby", "s1", 1))
+    assert not standby.leads
+    standby.update(tick(0, "standby", "s2", 2, 1))
+    assert standby.leads
+    assert standby.leads_at(0)
+    standby.update(tick(0, "controller", "c", 1))  # late: it is of before
+    assert standby.leads
+    standby.update(tick(1, "controller", "c", 3))
+    assert not standby.leads_at(0)
 
 
 def test_missed_ticks_make_a_follower_ask_for_the_state() -> None:
     for realtime, missed in ((False, 1), (True, 11)):
-        shadow = HotStandby("standby", realtime=realtime, instance="s")
+        standby = HotStandby("standby", realtime=realtime, instance="s")
         for number in range(3):
-            shadow.note(tick(number, "controller", "c", 1))
-        assert not shadow.wants_state(2, 2)
-        shadow.note(tick(3 + missed, "controller", "c", 1))
-        assert shadow.wants_state(3 + missed, 2)
-        shadow.caught_up(3 + missed)
-        assert not shadow.wants_state(4 + missed, 3 + missed)
+            standby.update(tick(number, "controller", "c", 1))
+        assert not standby.needs_state(2, 2)
+        standby.update(tick(3 + missed, "controller", "c", 1))
+        assert standby.needs_state(3 + missed, 2)
+        standby.state_restored(3 + missed)
+        assert not standby.needs_state(4 + missed, 3 + missed)
 
 
 def test_words_are_of_one_tick_in_lockstep_and_of_all_in_real_time() -> None:
     hold = OperatorCommand(command="hold", chaser=0)
     for realtime, expected in ((False, ()), (True, (hold,))):
-        shadow = HotStandby("standby", realtime=realtime)
-        shadow.words = {3: (hold,), 4: ()}
-        assert shadow.operated(4) == expected
-        assert not shadow.operated(5)
+        standby = HotStandby("standby", realtime=realtime)
+        standby.leader_commands = {3: (hold,), 4: ()}
+        assert standby.take_leader_commands(4) == expected
+        assert not standby.take_leader_commands(5)
 
 
 def test_a_word_is_a_message_like_any_other() -> None:

@@ -13,7 +13,8 @@ import pytest
 from chaserdock_agents.chaser.command_gate import passed_on, refusal
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look, prediction_from
-from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     Image,

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_controller.core import ControllerCore, TickInputs
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.estimation.composite_body import target_body
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.reference import predict_target
 from chaserdock_controller.nmpc import kernels
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_models import rotations
 from chaserdock_models.attitude_reference import facing_attitudes
-from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
 from hypothesis import given, settings
@@ -33,7 +32,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     if seed:
         omega = rotations.rotate(rotations.normalize(rng.normal(size=4)), omega)
     flight = ControllerCore(scenario, lambda: 0.0)
-    flight.guidance.target_acquired(0.0)
+    flight.guidance.machine.target_acquired(0.0)
     states = np.zeros((n, 13))
     for i in range(n):
         p, q = scenario.start_pose(i)
@@ -44,26 +43,16 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
     at = np.zeros(3)
     for tick in range(round(time_s / TICK_S)):
         now_s = tick * TICK_S
-        due = flight.guidance.due_commands(now_s)
-        flight.guidance.set_pending_goals(due)
-        assert all(flight.guidance.command(c, now_s).accepted for c in due)
+        due = flight.guidance.machine.due_commands(now_s)
+        flight.guidance.machine.set_pending_goals(due)
+        assert all(flight.guidance.machine.command(c, now_s).accepted for c in due)
         p, q = (a[0] for a in predict_target(at, velocity, [1.0, 0, 0, 0], omega, [now_s]))
         exact = TargetState(round(now_s * 1e9), p, velocity, q, omega, np.zeros((12, 12)), "tracking", n, ())
-        seen = {
-            i: Odometry(
-                tick=tick,
-                sim_time_ns=exact.time_ns,
-                chaser=i,
-                position_m=vector(x[:3]),
-                velocity_m_s=vector(x[3:6]),
-                q_wxyz=vector(x[6:10]),
-                omega_rad_s=vector(x[10:]),
-            )
-            for i, x in enumerate(states)
-        }
         ids = tuple(range(n))
-        problem = flight._problem(ids, TickInputs(tick, exact.time_ns, seen, ()), exact, exact.time_ns)
-        plan = flight._solver.solve(problem, TICK_S if tick else 0.0, ids)
+        horizon = flight.guidance.references.horizon(ids, exact, target_body(scenario), frozenset())
+        limits = dict.fromkeys(ids, nmpc_parameters(scenario).input_limits())
+        problem = flight.planning.problem(horizon, dict(enumerate(states)), limits)
+        plan = flight.planning.solver.solve(problem, TICK_S if tick else 0.0, ids)
         assert "failed" not in plan.status
         x = np.empty((n, 5, 13))
         x[:, 0] = states
@@ -75,7 +64,7 @@ def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
         least = min(least, float(gaps.min()))
         nearest = min(nearest, float(np.linalg.norm(states[:, :3] - p, axis=-1).min()))
     for i in range(n):
-        flight.guidance.update_tracking(i, time_s, 0.0, 0.0)
+        flight.guidance.machine.update_tracking(i, time_s, 0.0, 0.0)
         assert flight.guidance.chasers[i].phase == "hold"
     return least, nearest, float(np.linalg.norm(states[:, :3] - ends, axis=-1).max())
 

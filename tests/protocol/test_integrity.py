@@ -47,7 +47,7 @@ def lying(odometry: Odometry, off_m: tuple[float, float, float], turn_rad: float
 def test_honest_odometry_is_handed_on_as_it_is() -> None:
     watch = OdometryValidation(SCENARIO)
     for tick in [*range(50), *range(53, 60), 90]:  # some are missing
-        assert watch.believed(flown(tick)) == (flown(tick), [])
+        assert watch.update(flown(tick)) == (flown(tick), [])
 
 
 def test_noise_that_the_scenario_admits_is_no_jump() -> None:
@@ -55,7 +55,7 @@ def test_noise_that_the_scenario_admits_is_no_jump() -> None:
         update={"odometry": SCENARIO.odometry.model_copy(update={"position_noise_m": 0.02})}
     )
     watch = OdometryValidation(noisy)
-    assert [watch.believed(flown(tick, 0.02))[1] for tick in range(200)] == [[]] * 200
+    assert [watch.update(flown(tick, 0.02))[1] for tick in range(200)] == [[]] * 200
 
 
 @given(
@@ -69,7 +69,7 @@ def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
     watch, events_at = OdometryValidation(SCENARIO), []
     for tick in range(60):
         lie = 20 <= tick < 40
-        given_, events = watch.believed(lying(flown(tick), off, turn) if lie else flown(tick))
+        given_, events = watch.update(lying(flown(tick), off, turn) if lie else flown(tick))
         events_at += [(tick, level) for level, _ in events]
         assert math.dist(given_.position_m, flown(tick).position_m) < 0.005
         assert float(rotations.angle_between(given_.q_wxyz, flown(tick).q_wxyz)) < math.radians(0.5)
@@ -80,9 +80,9 @@ def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
 
 def test_after_long_silence_anything_is_believed() -> None:
     watch = OdometryValidation(SCENARIO)
-    watch.believed(flown(0))
+    watch.update(flown(0))
     far = lying(flown(30), (3.0, 0.0, 0.0), 0.0)
-    assert watch.believed(far) == (far, [])
+    assert watch.update(far) == (far, [])
 
 
 def test_agreement() -> None:
@@ -91,13 +91,13 @@ def test_agreement() -> None:
         now_s = tick / 16  # exact
         rejected = {2} if 30 <= tick < 60 or tick in (10, 12, 80) else set()
         seen = {0, 1, 2} if tick % 3 else {0, 2}
-        events_at += [(tick, level) for level, _ in agreement.observe(now_s, seen - rejected, rejected)]
+        events_at += [(tick, level) for level, _ in agreement.update(now_s, seen - rejected, rejected)]
     assert events_at == [(40, "warning"), (70, "info")]
 
 
 def test_who_sees_nothing_does_not_disagree() -> None:
     agreement = SensorConsistency()
-    assert [agreement.observe(t / 10, (), ()) for t in range(50)] == [[]] * 50
+    assert [agreement.update(t / 10, (), ()) for t in range(50)] == [[]] * 50
 
 
 @pytest.mark.parametrize("gap", [1, 2, 5])
@@ -107,9 +107,9 @@ def test_the_limit_grows_with_the_time_between(gap: int) -> None:
     dt = gap / SCENARIO.time.rate_hz
     watch = OdometryValidation(SCENARIO)
     first = flown(0)
-    watch.believed(first)
+    watch.update(first)
     moved = 0.5 * body.force_max_N / body.mass_kg * dt**2
     later = msgspec.structs.replace(
         flown(gap), position_m=vector(np.add(first.position_m, [0.03 * dt + moved, moved, moved]))
     )
-    assert watch.believed(later)[1] == []
+    assert watch.update(later)[1] == []

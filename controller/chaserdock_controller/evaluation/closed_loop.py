@@ -18,7 +18,8 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import Scenario
 
-from chaserdock_controller.core import ControllerCore, TickInputs, TickOutputs
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 
 from .perfect_knowledge import PerfectEstimator
 

@@ -1,7 +1,7 @@
-"""A chaser's odometry that jumps farther than it can have moved: the jump is taken out again, and told. No I/O.
+"""Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have made. No I/O.
 
-Relative motion keeps a mission safe: whoever believes that it is suddenly somewhere else flies there, into the target if
-that lies between. So the controller goes on from where the chaser must be; a jump back takes the correction away.
+A chaser that suddenly believes to be somewhere else would fly there, through the target if that lies between. A jump is
+therefore removed and the state before it continued; a jump back removes the correction.
 """
 
 from __future__ import annotations
@@ -22,83 +22,92 @@ from chaserdock_protocol.scenario import Scenario
 PLAUSIBLE_M = 0.02
 PLAUSIBLE_RAD = math.radians(2.0)
 LONGEST_S = 1.0
-"""After longer silence anything is believed."""
+"""After a longer gap every state is accepted."""
+_UNIT_WITHIN = 0.1
+
+
+def why_invalid(odometry: Odometry) -> str:
+    """Return why an odometry is not the state of a rigid body, or an empty string."""
+    for name in ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s"):
+        if not all(map(math.isfinite, getattr(odometry, name))):
+            return f"{name} holds a value that is not finite"
+    length = math.hypot(*odometry.q_wxyz)
+    return f"q_wxyz has length {length:.3g}, not 1" if abs(length - 1.0) > _UNIT_WITHIN else ""
 
 
 @dataclass
 class Known:
+    """The last corrected odometry of a chaser, and the correction: offset (3,) in WRF, rotation (4,) in CRF."""
+
     last: Odometry
-    """As corrected."""
-    off_m: Array = field(default_factory=lambda: np.zeros(3))
-    turn: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    offset_m: Array = field(default_factory=lambda: np.zeros(3))
+    rotation: Array = field(default_factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
 
     @property
     def corrected(self) -> bool:
-        return bool(np.any(self.off_m)) or bool(self.turn[0] != 1.0)
+        """Return whether there is a correction."""
+        return bool(np.any(self.offset_m)) or bool(self.rotation[0] != 1.0)
 
 
 class OdometryValidation:
-    """The odometry of all chasers, each as far as it can be believed."""
+    """Removes jumps from the odometry of all chasers."""
 
     def __init__(self, scenario: Scenario) -> None:
         body, o = scenario.chaser, scenario.odometry
         # Six sigma of the difference of two.
         self._noise_m = 6 * math.sqrt(2.0) * o.position_noise_m
         self._noise_rad = 6 * math.sqrt(2.0) * math.radians(o.attitude_noise_deg)
-        self._slip_m_s = 6 * o.velocity_noise_m_s
+        self._velocity_noise_m_s = 6 * o.velocity_noise_m_s
         self._acceleration_m_s2 = math.sqrt(3.0) * body.force_max_N / body.mass_kg
         self._alpha_rad_s2 = math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia)
         self._known: dict[int, Known] = {}
 
-    def believed(self, odometry: Odometry) -> tuple[Odometry, list[tuple[Level, str]]]:
-        """A chaser's next odometry, without jumps; what is to be told of it."""
-        known = self._known.get(odometry.chaser)
-        after_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
-        if known is None or not 0.0 < after_s <= LONGEST_S:
-            self._known[odometry.chaser] = Known(odometry)
+    def update(self, odometry: Odometry) -> tuple[Odometry, list[tuple[Level, str]]]:
+        """Return a chaser's next odometry without jumps, and the events to log."""
+        i, known = odometry.chaser, self._known.get(odometry.chaser)
+        gap_s = 0.0 if known is None else (odometry.sim_time_ns - known.last.sim_time_ns) / 1e9
+        if known is None or not 0.0 < gap_s <= LONGEST_S:
+            self._known[i] = Known(odometry)
             return odometry, []
-        ahead = extrapolate(known.last, odometry.tick, odometry.sim_time_ns)
+        expected = extrapolate(known.last, odometry.tick, odometry.sim_time_ns)
+        corrected = _remove(odometry, known.offset_m, known.rotation)
+        if self._is_plausible(corrected, expected, gap_s):
+            known.last = corrected
+            return corrected, []
+        if known.corrected and self._is_plausible(odometry, expected, gap_s):
+            self._known[i] = Known(odometry)
+            return odometry, [("info", f"chaser {i}: odometry jumped back; correction removed")]
+        jump_m, jump_rad = _distance(corrected, expected)
+        offset = np.subtract(odometry.position_m, expected.position_m)
+        rotation = rotations.multiply(rotations.conjugate(expected.q_wxyz), odometry.q_wxyz)
+        self._known[i] = Known(_remove(odometry, offset, rotation), offset, rotation)
+        jump = f"{jump_m * 1e3:.0f} mm, {math.degrees(jump_rad):.1f} deg"
+        text = f"chaser {i}: odometry jumped by {jump}, more than the chaser can have moved; jump removed"
+        return self._known[i].last, [("warning", text)]
+
+    def _is_plausible(self, odometry: Odometry, expected: Odometry, gap_s: float) -> bool:
         limit_m = (
-            PLAUSIBLE_M + self._noise_m + self._slip_m_s * after_s + self._acceleration_m_s2 * after_s**2
+            PLAUSIBLE_M
+            + self._noise_m
+            + self._velocity_noise_m_s * gap_s
+            + self._acceleration_m_s2 * gap_s**2
         )
-        limit_rad = PLAUSIBLE_RAD + self._noise_rad + self._alpha_rad_s2 * after_s**2
-
-        def far(told: Odometry) -> tuple[float, float]:
-            return math.dist(told.position_m, ahead.position_m), float(
-                rotations.angle_between(told.q_wxyz, ahead.q_wxyz)
-            )
-
-        def plausible(told: Odometry) -> bool:
-            off_m, off_rad = far(told)
-            return off_m <= limit_m and off_rad <= limit_rad
-
-        told: list[tuple[Level, str]] = []
-        now = _without(odometry, known.off_m, known.turn)
-        if plausible(now):
-            known.last = now
-            return now, told
-        if known.corrected and plausible(odometry):
-            self._known[odometry.chaser] = Known(odometry)
-            return odometry, [
-                ("info", f"chaser {odometry.chaser}: its odometry has jumped back, and is believed again")
-            ]
-        off_m, off_rad = far(now)
-        text = f"its odometry jumped by {off_m * 1e3:.0f} mm, {math.degrees(off_rad):.1f} deg, which it cannot have moved"
-        off = np.subtract(odometry.position_m, ahead.position_m)
-        turn = rotations.multiply(rotations.conjugate(ahead.q_wxyz), odometry.q_wxyz)
-        self._known[odometry.chaser] = Known(_without(odometry, off, turn), off, turn)
-        return self._known[odometry.chaser].last, [
-            ("warning", f"chaser {odometry.chaser}: {text}; taken out")
-        ]
+        limit_rad = PLAUSIBLE_RAD + self._noise_rad + self._alpha_rad_s2 * gap_s**2
+        jump_m, jump_rad = _distance(odometry, expected)
+        return jump_m <= limit_m and jump_rad <= limit_rad
 
 
-def _without(odometry: Odometry, off_m: Array, turn: Array) -> Odometry:
-    """Odometry less an offset (WRF) and a turn (4,) (CRF); the very same when there is neither."""
-    if not off_m.any() and turn[0] == 1.0:
+def _distance(a: Odometry, b: Odometry) -> tuple[float, float]:
+    return math.dist(a.position_m, b.position_m), float(rotations.angle_between(a.q_wxyz, b.q_wxyz))
+
+
+def _remove(odometry: Odometry, offset_m: Array, rotation: Array) -> Odometry:
+    """Return odometry less an offset (WRF) and a rotation (4,) (CRF); the same object when there is neither."""
+    if not offset_m.any() and rotation[0] == 1.0:
         return odometry
-    q = rotations.multiply(odometry.q_wxyz, rotations.conjugate(turn))
+    q = rotations.multiply(odometry.q_wxyz, rotations.conjugate(rotation))
     return msgspec.structs.replace(
         odometry,
-        position_m=vector(np.subtract(odometry.position_m, off_m)),
+        position_m=vector(np.subtract(odometry.position_m, offset_m)),
         q_wxyz=vector(rotations.normalize(q)),
     )

@@ -1,4 +1,4 @@
-"""Whether what each chaser sees agrees with what all see together: who does not is named. No I/O."""
+"""Consistency of each chaser's sightings with the fused estimate. No I/O."""
 
 from __future__ import annotations
 
@@ -9,37 +9,32 @@ from dataclasses import dataclass, field
 from chaserdock_protocol.messages.fields import Level
 
 DISAGREES_S = 0.6
-"""A chaser whose sightings have all been refused for so long disagrees."""
+"""A chaser whose sightings were all rejected for this long is inconsistent."""
 AGREES_S = 0.6
 
 
 @dataclass
 class SensorConsistency:
-    """Which chasers' sightings the estimator has refused for how long. A lying camera or odometry shows in this."""
+    """Chasers whose sightings the estimator keeps rejecting, by a fault of camera or odometry."""
 
-    disagreeing: set[int] = field(default_factory=set)
+    inconsistent: set[int] = field(default_factory=set)
     _since_s: dict[int, tuple[bool, float]] = field(default_factory=lambda: defaultdict(lambda: (True, 0.0)))
 
-    def observe(
+    def update(
         self, now_s: float, accepted: Iterable[int], rejected: Iterable[int]
     ) -> list[tuple[Level, str]]:
-        """Takes a tick's verdicts; what changed: level and text, for the log."""
-        told: list[tuple[Level, str]] = []
+        """Add a tick's accepted and rejected chasers; return the events to log."""
+        events: list[tuple[Level, str]] = []
         for agrees, chasers in ((True, accepted), (False, rejected)):
             for i in chasers:
                 before, since_s = self._since_s[i]
                 if before != agrees:
                     self._since_s[i] = (agrees, now_s)
-                    continue
-                if not agrees and i not in self.disagreeing and now_s - since_s >= DISAGREES_S:
-                    self.disagreeing.add(i)
-                    told.append(
-                        (
-                            "warning",
-                            f"chaser {i}: what it sees disagrees with the others: its camera or odometry lies",
-                        )
-                    )
-                elif agrees and i in self.disagreeing and now_s - since_s >= AGREES_S:
-                    self.disagreeing.discard(i)
-                    told.append(("info", f"chaser {i}: what it sees agrees with the others again"))
-        return told
+                elif not agrees and i not in self.inconsistent and now_s - since_s >= DISAGREES_S:
+                    self.inconsistent.add(i)
+                    text = f"chaser {i}: sightings disagree with the other chasers: camera or odometry fault"
+                    events.append(("warning", text))
+                elif agrees and i in self.inconsistent and now_s - since_s >= AGREES_S:
+                    self.inconsistent.discard(i)
+                    events.append(("info", f"chaser {i}: sightings agree with the other chasers again"))
+        return events

@@ -1,24 +1,28 @@
-"""What the controller knows, as messages and in words."""
+"""Messages built from the results of a tick."""
 
 from __future__ import annotations
 
-import numpy as np
-from chaserdock_models import rotations
-from chaserdock_models.camera import Camera
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Plan, TargetEstimate, Tick, WrenchCommand
-from chaserdock_protocol.messages.fields import CameraCalibration
+from chaserdock_protocol.messages import (
+    Event,
+    Plan,
+    Reference,
+    SolverStatus,
+    TargetEstimate,
+    Tick,
+    WrenchCommand,
+)
+from chaserdock_protocol.messages.fields import Level
 
-from chaserdock_controller.estimation import Mekf
-from chaserdock_controller.estimation.types import Estimator, TargetState
-from chaserdock_controller.nmpc import NmpcPlan
+from chaserdock_controller.interfaces import Directive, Observation, PlanResult, TargetEstimation
+from chaserdock_controller.nmpc.types import NmpcPlan
 
 
-def plan_message(chaser: int, tick: int, effective_ns: int, step_s: float, plan: NmpcPlan, row: int) -> Plan:
-    """The plan of one chaser, which is in a row of the solver's."""
+def plan_message(chaser: int, observation: Observation, step_s: float, plan: NmpcPlan, row: int) -> Plan:
+    """Return the plan of one chaser, in ``row`` of the solver's."""
     return Plan(
-        tick=tick,
-        sim_time_ns=effective_ns,
+        tick=observation.tick,
+        sim_time_ns=observation.effective_ns,
         chaser=chaser,
         step_s=step_s,
         positions_m=vector(plan.states[row, :, :3]),
@@ -27,55 +31,79 @@ def plan_message(chaser: int, tick: int, effective_ns: int, step_s: float, plan:
     )
 
 
-def target_message(
-    tick: int, time_ns: int, fused: TargetState, seen: set[int], estimator: Estimator, camera: Camera
-) -> TargetEstimate:
-    """The fused state; ``seen``: chasers whose sightings of the target came for this tick."""
+def target_message(observation: Observation, estimation: TargetEstimation) -> TargetEstimate:
+    """Return the target's estimate."""
+    target = estimation.target
     return TargetEstimate(
-        tick=tick,
-        sim_time_ns=time_ns,
-        status=fused.status,  # type: ignore[arg-type]
-        position_m=vector(fused.position_m),
-        velocity_m_s=vector(fused.velocity_m_s),
-        q_wxyz=vector(fused.q_wxyz),
-        omega_rad_s=vector(fused.omega_rad_s),
-        covariance=vector(fused.covariance),
-        accepted=tuple(sorted(seen - set(fused.rejected))),
-        rejected=tuple(sorted(fused.rejected)),
-        cameras=calibrations(estimator, camera),
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        status=target.status,  # type: ignore[arg-type]
+        position_m=vector(target.position_m),
+        velocity_m_s=vector(target.velocity_m_s),
+        q_wxyz=vector(target.q_wxyz),
+        omega_rad_s=vector(target.omega_rad_s),
+        covariance=vector(target.covariance),
+        accepted=tuple(sorted(estimation.visible_to - set(target.rejected))),
+        rejected=tuple(sorted(target.rejected)),
+        cameras=estimation.cameras,
     )
 
 
-def calibrations(estimator: Estimator, camera: Camera) -> tuple[CameraCalibration, ...]:
-    """Of every camera seen so far, if this estimator finds them out; ``camera``: as all are told to be."""
-    if not isinstance(estimator, Mekf):
-        return ()
-    axes = rotations.to_matrix(camera.q_crf_irf_wxyz)
-    found = []
-    for e in estimator.cameras():
-        turn, shift = (axes @ e.covariance[i : i + 3, i : i + 3] @ axes.T for i in (0, 3))
-        found.append(
-            CameraCalibration(
-                chaser=e.chaser,
-                turn_rad=vector(axes @ e.turn_rad),
-                turn_sigma_rad=vector(np.sqrt(np.diag(turn))),
-                shift_m=vector(axes @ e.shift_m),
-                shift_sigma_m=vector(np.sqrt(np.diag(shift))),
-                focal_share=e.focal_share,
-                focal_sigma_share=float(np.sqrt(e.covariance[6, 6])),
-            )
+def reference_message(chaser: int, observation: Observation, directive: Directive) -> Reference:
+    """Return the reference of one chaser, which must have one."""
+    reference = directive.reference
+    assert reference is not None
+    return Reference(
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        chaser=chaser,
+        phase=directive.phase.value,
+        phase_time_s=directive.phase_time_s,
+        position_m=vector(reference.position_m),
+        q_wxyz=vector(reference.q_wxyz),
+        offset_m=vector(reference.offset_m),
+        min_distance_target_m=reference.min_distance_target_m,
+    )
+
+
+def solver_message(observation: Observation, solver: str, result: PlanResult) -> SolverStatus:
+    """Return the solver's status; without a plan it lists no chasers."""
+    head = {"tick": observation.tick, "sim_time_ns": observation.time_ns, "solver": solver}
+    plan, n = result.plan, len(result.chasers)
+    if plan is None:
+        return SolverStatus(
+            **head,
+            chasers=(),
+            status=(),
+            iterations=(),
+            cost=(),
+            max_violation_m=(),
+            wall_solve_s=result.wall_s,
         )
-    return tuple(found)
+    return SolverStatus(
+        **head,
+        chasers=result.chasers,
+        status=plan.status[:n],
+        iterations=tuple(int(k) for k in plan.iterations[:n]),
+        cost=vector(plan.cost[:n]),
+        max_violation_m=vector(plan.max_violation_m[:n]),
+        wall_solve_s=result.wall_s,
+    )
 
 
-def in_words(c: CameraCalibration) -> str:
-    """One line for the log."""
-    turn, sigma = (", ".join(f"{np.degrees(v):.3f}" for v in x) for x in (c.turn_rad, c.turn_sigma_rad))
-    return f"camera calibrated: turned by ({turn}) deg in CRF, sigma ({sigma}) deg"
+def event_message(observation: Observation, level: Level, text: str) -> Event:
+    """Return an event of the controller."""
+    return Event(
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        process="controller",
+        level=level,
+        what=text,
+    )
 
 
 def no_command(chaser: int, tick: Tick) -> WrenchCommand:
-    """Tells a chaser, that may be waiting for it, that there is no command for this tick."""
+    """Return a message that tells a waiting chaser that there is no command for a tick."""
     zero = (0.0, 0.0, 0.0)
     return WrenchCommand(
         tick=tick.tick,

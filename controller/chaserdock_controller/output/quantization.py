@@ -1,4 +1,4 @@
-"""What a command can carry: finite steps, within limits."""
+"""Quantization of commands: finite steps, within limits."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from chaserdock_models.arrays import Array
 COMMAND_STEP = np.array([2.0**-16] * 3 + [2.0**-22] * 3)
 """Resolution of commands: 15 uN and 0.24 uN m, 17 and 18 bits of the paper's actuators.
 
-A command word is finite anyway. Here it also swallows what another SIMD level or BLAS changes in the last bits, which
-images in whole grey levels would otherwise blow up to their own noise.
+It also removes differences in the last bits between SIMD levels or BLAS versions, which images in whole grey levels would
+amplify to their own noise.
 """
 
 
 def in_steps(wrench: Array, limits: Array) -> Array:
-    """The nearest wrench (6,) that a command can carry, within ``limits`` (6,)."""
+    """Return the nearest wrench (6,) that a command can carry, within ``limits`` (6,)."""
     return np.clip(np.rint(wrench / COMMAND_STEP) * COMMAND_STEP, -limits, limits)

@@ -24,7 +24,6 @@ from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
-from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 
 from .serialization import decode, encode
 
@@ -38,10 +37,16 @@ class CheckpointError(ValueError):
 # The fields of each part are the attributes of the object that it is taken from.
 
 
-class CoreState(Struct, forbid_unknown_fields=True):
+class SightingState(Struct, forbid_unknown_fields=True):
     _odometry: dict[tuple[int, int], Odometry]
+
+
+class PlanningState(Struct, forbid_unknown_fields=True):
     _last_solve_ns: int | None
-    _troubled: set[int]
+
+
+class OutputState(Struct, forbid_unknown_fields=True):
+    _without_plan: set[int]
 
 
 class GuidanceState(Struct, forbid_unknown_fields=True):
@@ -54,14 +59,17 @@ class GuidanceState(Struct, forbid_unknown_fields=True):
     _interrupted: set[int]
 
 
-class ThrusterCommandState(Struct, forbid_unknown_fields=True):
+class ThrusterReportState(Struct, forbid_unknown_fields=True):
     _reports: dict[int, ThrusterReport]
+
+
+class ThrusterCommandState(Struct, forbid_unknown_fields=True):
     _isolated: dict[int, set[int]]
     _trusted: dict[int, set[int]]
-    _done: dict[tuple[int, int], tuple[float, OperatorCommand]]
+    _last_commands: dict[tuple[int, int], tuple[float, OperatorCommand]]
 
 
-class CaptureState(Struct, forbid_unknown_fields=True):
+class CompositeState(Struct, forbid_unknown_fields=True):
     body: TargetBody
     latched: frozenset[int]
     _changed: bool
@@ -72,12 +80,12 @@ class CommandHistoryState(Struct, forbid_unknown_fields=True):
 
 
 class SearchState(Struct, forbid_unknown_fields=True):
-    _from: dict[int, tuple[float, Array]]
+    _starts: dict[int, tuple[float, Array]]
 
 
 class LostChaserState(Struct, forbid_unknown_fields=True):
-    known: dict[int, Odometry]
-    told: set[int]
+    last: dict[int, Odometry]
+    reported: set[int]
 
 
 class OdometryState(Struct, forbid_unknown_fields=True):
@@ -85,7 +93,7 @@ class OdometryState(Struct, forbid_unknown_fields=True):
 
 
 class ConsistencyState(Struct, forbid_unknown_fields=True):
-    disagreeing: set[int]
+    inconsistent: set[int]
     _since_s: dict[int, tuple[bool, float]]
 
 
@@ -126,11 +134,14 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline that are not yet due.
     ``plans``: warm starts of the NMPC solver, inputs by chaser."""
 
-    core: CoreState
+    sightings: SightingState
+    planning: PlanningState
+    output: OutputState
     guidance: GuidanceState
     timeline_left: int
-    thrusters: ThrusterCommandState
-    captures: CaptureState
+    thruster_reports: ThrusterReportState
+    thruster_commands: ThrusterCommandState
+    composite: CompositeState
     history: CommandHistoryState
     searches: SearchState
     lost_chasers: LostChaserState
@@ -143,25 +154,25 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
 class Checkpoint:
     """Saves and restores the state of one controller."""
 
-    def __init__(
-        self, core: ControllerCore, odometry: OdometryValidation, consistency: SensorConsistency
-    ) -> None:
-        self._core, self._odometry, self._consistency = core, odometry, consistency
+    def __init__(self, core: ControllerCore, odometry: OdometryValidation) -> None:
+        self._core, self._odometry = core, odometry
 
     def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
         """Return the objects whose attributes are copied, and what is copied of them, by field of the checkpoint."""
         core = self._core
-        attributes = vars(core)
         return {
-            "core": (core, CoreState),
-            "guidance": (core.guidance, GuidanceState),
-            "thrusters": (attributes["_thrusters"], ThrusterCommandState),
-            "captures": (attributes["_captures"], CaptureState),
-            "history": (attributes["_history"], CommandHistoryState),
-            "searches": (attributes["_searches"], SearchState),
-            "lost_chasers": (core.absent, LostChaserState),
+            "sightings": (vars(core.estimation)["_converter"], SightingState),
+            "planning": (core.planning, PlanningState),
+            "output": (core.output, OutputState),
+            "guidance": (core.guidance.machine, GuidanceState),
+            "thruster_reports": (core.ingest.thrusters, ThrusterReportState),
+            "thruster_commands": (core.guidance.thrusters, ThrusterCommandState),
+            "composite": (core.estimation.composite, CompositeState),
+            "history": (core.output.history, CommandHistoryState),
+            "searches": (core.guidance.search, SearchState),
+            "lost_chasers": (core.ingest.lost_chasers, LostChaserState),
             "odometry": (self._odometry, OdometryState),
-            "consistency": (self._consistency, ConsistencyState),
+            "consistency": (core.estimation.consistency, ConsistencyState),
         }
 
     def save(self) -> bytes:
@@ -172,7 +183,7 @@ class Checkpoint:
             return encode(
                 ControllerCheckpoint(
                     **parts,
-                    timeline_left=len(vars(self._core.guidance)["_timeline"]),
+                    timeline_left=len(vars(self._core.guidance.machine)["_timeline"]),
                     estimator=_estimator_state(self._core.estimator),
                     plans=dict(frame.plans) if frame is not None else {},
                 )
@@ -192,7 +203,7 @@ class Checkpoint:
             raise CheckpointError("the state is of another mission")
         for name, (owner, _) in self._parts().items():
             _write(owner, getattr(state, name))
-        vars(self._core.guidance)["_timeline"] = timeline[len(timeline) - state.timeline_left :]
+        vars(self._core.guidance.machine)["_timeline"] = timeline[len(timeline) - state.timeline_left :]
         if state.estimator is not None and type(state.estimator) is _estimator_kind(self._core.estimator):
             _write(self._core.estimator, state.estimator)
         frame = self._warm_starts()
@@ -201,7 +212,7 @@ class Checkpoint:
 
     def _warm_starts(self) -> Any:
         """Return the object that holds the solver's warm starts; None for an installed solver."""
-        return vars(vars(self._core)["_solver"]).get("_frame")
+        return vars(self._core.planning.solver).get("_frame")
 
 
 def _read(owner: Any, kind: type[Part]) -> Part:

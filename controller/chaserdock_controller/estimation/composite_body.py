@@ -1,0 +1,107 @@
+"""The target and the chasers whose latch holds it, as one rigid body."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import DockingStatus, Odometry
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.bodies import cuboid_inertia
+
+from chaserdock_controller.interfaces import AppliedImpulse
+
+from .target_body import TargetBody, attach_bodies
+from .types import Estimator, Shock, TargetState
+
+_TOUCH = Shock(0.005, 0.01)
+"""One sigma of the rate changes by a touch or a capture at the limits' speed (m/s, rad/s)."""
+_COMMANDED_UNKNOWN = 0.1
+"""Share of a commanded impulse's effect that is unknown."""
+_MEASURED_UNKNOWN = 1.0
+"""Share of a measured impulse that may act in any other direction: an undetected thruster failure."""
+
+
+def target_body(scenario: Scenario) -> TargetBody:
+    """Return the scenario's target without any chaser."""
+    target = scenario.target
+    inertia = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
+    return TargetBody(target.mass_kg, np.diag(inertia), np.zeros(3))
+
+
+def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Array]:
+    """Return a chaser's estimated centre (3,) and attitude (4,) in TRF."""
+    centre = rotations.rotate_inverse(target.q_wxyz, np.array(odometry.position_m) - target.position_m)
+    return centre, rotations.multiply(rotations.conjugate(target.q_wxyz), odometry.q_wxyz)
+
+
+class CompositeBody:
+    """Chasers whose latch holds the target (``latched``), and the body that they form with it."""
+
+    def __init__(self, scenario: Scenario, estimator: Estimator) -> None:
+        self._scenario = scenario
+        self._estimator = estimator
+        self._target_alone = target_body(scenario)
+        self.body = self._target_alone
+        self.latched: frozenset[int] = frozenset()
+        self._changed = False
+
+    def disturb(
+        self,
+        docking: Mapping[int, DockingStatus],
+        odometry: Mapping[int, Odometry],
+        impulses: Mapping[int, AppliedImpulse],
+        now_ns: int,
+    ) -> None:
+        """Inform the estimator of contacts, latch changes and impulses of latched chasers, before a tick's sightings."""
+        latched = self.latched - docking.keys() | {i for i, status in docking.items() if status.latched}
+        changed = latched != self.latched
+        if changed or any(s.contact and not s.latched for s in docking.values()):
+            self._estimator.disturb(_TOUCH)
+        else:
+            for i in sorted(latched & odometry.keys()):
+                self._push(odometry[i], impulses[i], now_ns)
+        self._changed |= changed
+        self.latched = latched
+
+    def _push(self, odometry: Odometry, applied: AppliedImpulse, now_ns: int) -> None:
+        impulse = applied.impulse
+        if not impulse.any():
+            return
+        before = self._estimator.estimate_at(now_ns)
+        centre, q = pose_in_target(before, odometry)
+        force, torque = rotations.rotate(q, impulse[:3]), rotations.rotate(q, impulse[3:])
+        torque = torque + rotations.cross(centre - self.body.centre_trf_m, force)
+        omega = np.asarray(np.linalg.solve(self.body.inertia_kg_m2, torque), dtype=np.float64)
+        moved = force / self.body.mass_kg - rotations.cross(omega, self.body.centre_trf_m)
+        velocity = rotations.rotate(before.q_wxyz, moved)
+        sigmas = [_COMMANDED_UNKNOWN * float(np.linalg.norm(v)) for v in (velocity, omega)]
+        if applied.measured:
+            other = _MEASURED_UNKNOWN * float(np.linalg.norm(force))
+            arm_m = float(np.linalg.norm(centre - self.body.centre_trf_m))
+            turned = other * arm_m / float(np.linalg.eigvalsh(self.body.inertia_kg_m2)[-1])
+            origin_m = float(np.linalg.norm(self.body.centre_trf_m))
+            sigmas[0] = math.hypot(sigmas[0], other / self.body.mass_kg, turned * origin_m)
+            sigmas[1] = math.hypot(sigmas[1], turned)
+        self._estimator.disturb(Shock(sigmas[0], sigmas[1], velocity, omega))
+
+    def update_body(self, target: TargetState, odometry: Mapping[int, Odometry]) -> None:
+        """Recompute the body after a latch change, after a tick's sightings.
+
+        Masses are the scenario's; the poses of the latched chasers are estimated.
+        """
+        if not self._changed or not self.latched <= odometry.keys():
+            return
+        chaser = self._scenario.chaser
+        parts = []
+        for i in sorted(self.latched):
+            centre, attitude = pose_in_target(target, odometry[i])
+            parts.append((chaser.mass_kg, np.asarray(chaser.inertia), centre, attitude))
+        self.body = attach_bodies(self._target_alone, parts)
+        rows = self.body.inertia_kg_m2.tolist()
+        centre = self.body.centre_trf_m.tolist()
+        self._estimator.change_body((tuple(rows[0]), tuple(rows[1]), tuple(rows[2])), tuple(centre))
+        self._changed = False

@@ -1,0 +1,115 @@
+"""References of the chasers, now and over the NMPC horizon."""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_protocol.scenario import Scenario
+
+from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, predict_path
+from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.interfaces import HorizonReference, ReferencePose
+
+from . import reference
+from .approach_cone import corridor_rows
+from .phase_machine import PhaseMachine
+
+_GREATEST_MARGIN_M = 0.1
+
+
+def target_path(
+    body: TargetBody, torque_free: bool, start: TargetState, step_s: float, steps: int
+) -> tuple[TargetPath, TargetPath]:
+    """Return the target's predicted motion at 0, step_s, ... steps * step_s, and in the middles between."""
+    state = (start.position_m, start.velocity_m_s, start.q_wxyz, start.omega_rad_s)
+    if torque_free:
+        path = predict_path(body, *state, step_s / 2, 2 * steps)
+        return path.every_second(0), path.every_second(1)
+    times_s = np.arange(steps + 1) * step_s
+    both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
+    positions, attitudes = reference.predict_target(*state, both_s)
+    zeros = np.zeros((steps + 1, 3))
+    rates, k = zeros + start.omega_rad_s, steps + 1
+    nodes = TargetPath(positions[:k], attitudes[:k], rates, zeros, zeros)
+    return nodes, TargetPath(positions[k:], attitudes[k:], rates[1:], zeros[1:], zeros[1:])
+
+
+class ReferenceBuilder:
+    """Computes references from the moves and phases of a phase machine."""
+
+    def __init__(self, scenario: Scenario, machine: PhaseMachine) -> None:
+        self._scenario, self._machine = scenario, machine
+        self._step_s = scenario.controller.dt_s
+        self._stages = round(scenario.controller.horizon_s / scenario.controller.dt_s)
+
+    def pose(self, i: int, target: TargetState, now_s: float) -> tuple[Array, Array, Array]:
+        """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in TRF."""
+        offset = self._machine.chasers[i].move.at(np.array([now_s]))[0][0]
+        position = target.position_m + rotations.rotate(target.q_wxyz, offset)
+        q_off = self._attitudes(i, offset[None], np.array([now_s])).reshape(4)
+        return position, rotations.multiply(target.q_wxyz, q_off), offset
+
+    def reference(self, i: int, pose: tuple[Array, Array, Array]) -> ReferencePose:
+        """Return a reference pose with the distance that the chaser keeps from the target."""
+        return ReferencePose(*pose, self._machine.min_distance_target_m(i))
+
+    def horizon(
+        self,
+        chasers: tuple[int, ...],
+        start: TargetState,
+        body: TargetBody,
+        attached: frozenset[int],
+    ) -> HorizonReference:
+        """Return the references of ``chasers`` from the time of ``start`` on."""
+        s, step_s = self._scenario, self._step_s
+        torque_free = s.target.motion == "torque_free"
+        nodes, middles = target_path(body, torque_free, start, step_s, self._stages)
+        times_s = start.time_ns / 1e9 + np.arange(self._stages + 1, dtype=float) * step_s
+        (offsets, _, _), q_off = self._offsets(chasers, times_s)
+        u_ref = np.zeros((len(chasers), self._stages, 6))
+        if s.controller.feed_forward:
+            motion, q_middle = self._offsets(chasers, times_s[:-1] + step_s / 2)
+            u_ref = reference.feed_forward(
+                middles.omega_rad_s,
+                *motion,
+                q_middle,
+                s.chaser.mass_kg,
+                np.diag(s.chaser.inertia),
+                middles.alpha_rad_s2,
+                middles.acceleration_m_s2,
+            )
+        distances = np.array([self._machine.min_distance_target_m(i) for i in chasers])
+        return HorizonReference(
+            chasers=chasers,
+            references=reference.references_on(nodes.positions_m, nodes.q_wxyz, offsets, q_off),
+            u_ref=u_ref,
+            target_positions=nodes.positions_m,
+            min_distance_target_m=distances + self._margin_m(start),
+            corridors=corridor_rows([self._machine.corridor(i) for i in chasers], nodes.q_wxyz),
+            attached=attached,
+        )
+
+    def _offsets(self, chasers: tuple[int, ...], times_s: Array) -> tuple[tuple[Array, Array, Array], Array]:
+        """Return offsets, their velocities and accelerations in TRF, each (N, K, 3), and attitudes, body to TRF,
+        (N, K, 4), at times (K,)."""
+        moves = [self._machine.chasers[i].move.at(times_s) for i in chasers]
+        q_off = np.empty((len(chasers), len(times_s), 4))
+        for row, i in enumerate(chasers):
+            q_off[row] = rotations.normalize(self._attitudes(i, moves[row][0], times_s))
+        positions, velocities, accelerations = (np.array(part) for part in zip(*moves, strict=True))
+        return (positions, velocities, accelerations), q_off
+
+    def _attitudes(self, i: int, offsets: Array, times_s: Array) -> Array:
+        """Return reference attitudes, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or (4,) if constant."""
+        c, q = self._scenario.chasers[i], np.array(self._scenario.chasers[i].q_wxyz)
+        if self._scenario.approach.face_target or self._machine.chasers[i].faces:
+            q = facing_attitudes(c.position_m, c.q_wxyz, offsets)
+        turns = self._machine.body_rotations(i, times_s)
+        return q if turns is None else rotations.multiply(q, turns)
+
+    def _margin_m(self, target: TargetState) -> float:
+        """Return the addition to the distance from the target for the uncertainty of its position."""
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(target.covariance[:3, :3])[-1]))
+        return min(self._scenario.limits.estimate_margin_sigmas * sigma_m, _GREATEST_MARGIN_M)

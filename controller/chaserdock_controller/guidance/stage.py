@@ -1,0 +1,178 @@
+"""Third stage of a tick: apply commands, advance the phases, and compute the references."""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.docking_geometry import view_of
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_protocol.messages import CommandReply, Odometry
+from chaserdock_protocol.messages.fields import CameraCalibration
+from chaserdock_protocol.scenario import Scenario
+
+from chaserdock_controller.estimation.composite_body import pose_in_target
+from chaserdock_controller.interfaces import (
+    DirectCommand,
+    Directive,
+    GuidanceResult,
+    LogEntry,
+    Observation,
+    ReferencePose,
+    TargetEstimation,
+)
+
+from .chaser_state import ChaserGuidance
+from .docking import DockingObservation
+from .horizon import ReferenceBuilder
+from .phase_machine import PhaseMachine
+from .phases import Phase
+from .target_search import TargetSearch, is_settled
+from .thruster_commands import THRUSTER_COMMANDS, ThrusterCommandHandler
+
+
+class GuidanceStage:
+    """Phases, thruster commands and searches of all chasers."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._scenario = scenario
+        self.machine = PhaseMachine(scenario)
+        self.thrusters = ThrusterCommandHandler(scenario)
+        self.search = TargetSearch(scenario.chaser, scenario.camera_model())
+        self.references = ReferenceBuilder(scenario, self.machine)
+
+    @property
+    def chasers(self) -> list[ChaserGuidance]:
+        """Return the guidance state of every chaser."""
+        return self.machine.chasers
+
+    def run(self, observation: Observation, estimation: TargetEstimation) -> GuidanceResult:
+        """Return what every chaser is to do in this tick."""
+        self._follow_estimate(observation, estimation)
+        replies = self._apply_commands(observation)
+        references: dict[int, ReferencePose] = {}
+        if estimation.known:
+            for i in sorted(observation.odometry):
+                references[i] = self._update_chaser(i, observation, estimation)
+        ids, attached = sorted(observation.odometry), self._attached(observation, estimation)
+        planned = tuple(i for i in ids if self.chasers[i].phase is not Phase.SEARCHING)
+        horizon = None
+        # Latched chasers are planned for only where others have to fly around them.
+        if estimation.at_effect is not None and planned and attached != set(ids):
+            horizon = self.references.horizon(planned, estimation.at_effect, estimation.body, attached)
+        directives = {}
+        for i, c in enumerate(self.chasers):
+            directives[i] = Directive(
+                phase=c.phase,
+                phase_time_s=observation.time_s - c.since_s,
+                latch=self.machine.latch(i),
+                free=self.machine.is_free(i),
+                isolated=self.thrusters.isolated(i),
+                trusted=self.thrusters.trusted(i),
+                reference=references.get(i),
+                direct=self._direct_command(i, observation, estimation, i in attached),
+            )
+        return GuidanceResult(directives, horizon, tuple(replies), tuple(self._events(estimation)))
+
+    def _follow_estimate(self, observation: Observation, estimation: TargetEstimation) -> None:
+        target, now_s = estimation.target, observation.time_s
+        if not estimation.known:
+            if target.status == "lost":
+                self.machine.target_lost(now_s)
+            self.machine.target_unknown(now_s)
+            return
+        self.machine.update_visibility(now_s, visible=target.status == "tracking")
+        self.machine.target_acquired(now_s)
+        if is_settled(target):
+            for i, odometry in observation.odometry.items():
+                self.machine.target_settled(i, now_s, pose_in_target(target, odometry)[0])
+
+    def _apply_commands(self, observation: Observation) -> list[CommandReply]:
+        now_s = observation.time_s
+        commands = (*self.machine.due_commands(now_s), *observation.commands)
+        self.machine.set_pending_goals(commands)
+        replies = []
+        for command in commands:
+            handler = self.thrusters if command.command in THRUSTER_COMMANDS else self.machine
+            result = handler.command(command, now_s)
+            replies.append(
+                CommandReply(
+                    tick=observation.tick,
+                    sim_time_ns=observation.time_ns,
+                    command=command.command,
+                    chaser=command.chaser,
+                    accepted=result.accepted,
+                    reason=result.reason,
+                    operator=command.operator,
+                )
+            )
+        return replies
+
+    def _update_chaser(self, i: int, observation: Observation, estimation: TargetEstimation) -> ReferencePose:
+        """Advance a chaser's phase by its errors and its docking sensor; return its reference at the start of the tick."""
+        target, odometry, now_s = estimation.target, observation.odometry[i], observation.time_s
+        pose = self.references.pose(i, target, now_s)
+        error_m = float(np.linalg.norm(pose[0] - odometry.position_m))
+        error_rad = float(rotations.angle_between(pose[1], odometry.q_wxyz))
+        self.machine.set_position(i, pose_in_target(target, odometry)[0])
+        self.machine.update_tracking(i, now_s, error_m, error_rad)
+        observed = self._observe_docking(i, odometry, observation, estimation)
+        if observed is not None:
+            self.machine.update_docking(i, now_s, observed)
+        return self.references.reference(i, pose)
+
+    def _observe_docking(
+        self, i: int, odometry: Odometry, observation: Observation, estimation: TargetEstimation
+    ) -> DockingObservation | None:
+        """Return what is known of a chaser at its port; None where it has none."""
+        s, target = self._scenario, estimation.target
+        port = s.docking.port_of(i)
+        if port is None:
+            return None
+        chaser = BodyState(
+            np.array(odometry.position_m),
+            np.array(odometry.velocity_m_s),
+            np.array(odometry.q_wxyz),
+            np.array(odometry.omega_rad_s),
+        )
+        moving = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+        view = view_of(port, s.chaser.probe_reach_m, np.asarray(s.chasers[i].q_wxyz), chaser, moving)
+        status = observation.docking.get(i)
+        contact = status is not None and status.contact
+        return DockingObservation(view, contact, i in estimation.latched, *pose_in_target(target, odometry))
+
+    def _attached(self, observation: Observation, estimation: TargetEstimation) -> frozenset[int]:
+        """Return the latched chasers that are to stay; their actuators are off but for the latch test."""
+        backing_out = (Phase.RETREAT, Phase.ABORT)
+        latched = estimation.latched & observation.odometry.keys()
+        return frozenset(i for i in latched if self.chasers[i].phase not in backing_out)
+
+    def _direct_command(
+        self, i: int, observation: Observation, estimation: TargetEstimation, attached: bool
+    ) -> DirectCommand | None:
+        c = self.chasers[i]
+        if i in observation.invalid:
+            return DirectCommand("coast", np.zeros(6))
+        if i not in observation.odometry:
+            return None
+        if c.phase is Phase.SEARCHING:
+            wrench = self.search.wrench(observation.odometry[i], c.since_s, estimation.target)
+            return DirectCommand("search", wrench)
+        if attached:
+            pull_N = self.machine.pull_N(i, observation.time_s)
+            wrench = np.array([-pull_N, 0.0, 0.0, 0.0, 0.0, 0.0])
+            return DirectCommand("pull" if pull_N else "coast", wrench)
+        return None
+
+    def _events(self, estimation: TargetEstimation) -> list[LogEntry]:
+        changes = self.machine.drain_changes()
+        events: list[LogEntry] = [("info", f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in changes]
+        for change in changes:
+            camera = next((c for c in estimation.cameras if c.chaser == change.chaser), None)
+            if change.calibration_complete and camera is not None:
+                events.append(("info", f"chaser {change.chaser}: {_describe(camera)}"))
+        return events
+
+
+def _describe(c: CameraCalibration) -> str:
+    turn, sigma = (", ".join(f"{np.degrees(v):.3f}" for v in x) for x in (c.turn_rad, c.turn_sigma_rad))
+    return f"camera calibrated: turned by ({turn}) deg in CRF, sigma ({sigma}) deg"

@@ -1,0 +1,63 @@
+"""Obstacle rows of lost chasers in the NMPC problem. Pure functions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.extrapolation import extrapolate
+from chaserdock_protocol.messages import Odometry
+
+from chaserdock_controller.ingest.lost_chasers import margin_m
+
+from .types import NmpcInput
+
+_LIMIT = 1e-3
+"""Input limit (N, N m) of a lost chaser's row: the solver needs some, and this much moves it by a millimetre."""
+
+
+def coasting(last: Odometry, from_ns: int, times_s: Array) -> Array:
+    """Return positions (K, 3), WRF, extrapolated from a last odometry to ``times_s`` (K,) after ``from_ns``."""
+    ahead = extrapolate(last, last.tick, from_ns)
+    return np.asarray(ahead.position_m) + times_s[:, None] * np.asarray(ahead.velocity_m_s)
+
+
+def with_lost_chasers(
+    problem: NmpcInput, lost: Mapping[int, Odometry], from_ns: int, step_s: float
+) -> NmpcInput:
+    """Return the problem with a row for each lost chaser after the others: it coasts, and only the others avoid it.
+
+    ``from_ns``: the time of stage 0. The margin is that of the end of the horizon.
+    """
+    if not lost:
+        return problem
+    n, nodes = problem.references.shape[:2]
+    times_s = step_s * np.arange(nodes)
+    states, references = [], []
+    for last in lost.values():
+        places, q = coasting(last, from_ns, times_s), np.asarray(last.q_wxyz)
+        states.append(np.concatenate([places[0], last.velocity_m_s, q, np.zeros(3)]))
+        references.append(np.concatenate([places, np.tile(q, (nodes, 1))], axis=1))
+    total = n + len(lost)
+    between = np.zeros((total, total))
+    between[:n, :n] = problem.min_distance_chasers_m
+    least_m = float(np.max(problem.min_distance_chasers_m))
+    for row, last in enumerate(lost.values(), start=n):
+        lost_s = (from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1])
+        between[row, :n] = between[:n, row] = least_m + margin_m(lost_s)
+    to_target = problem.min_distance_target_m
+    corridors = problem.corridors
+    if corridors is not None:
+        corridors = np.concatenate([corridors, np.zeros((len(lost), *corridors.shape[1:]))])
+    return replace(
+        problem,
+        states=np.concatenate([problem.states, states]),
+        references=np.concatenate([problem.references, references]),
+        u_ref=np.concatenate([problem.u_ref, np.zeros((len(lost), *problem.u_ref.shape[1:]))]),
+        min_distance_target_m=np.concatenate([to_target, np.zeros((len(lost), *to_target.shape[1:]))]),
+        min_distance_chasers_m=between,
+        input_max=np.concatenate([problem.input_max, np.full((len(lost), 6), _LIMIT)]),
+        corridors=corridors,
+    )

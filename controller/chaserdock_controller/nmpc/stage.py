@@ -1,0 +1,94 @@
+"""Fourth stage of a tick: build the NMPC problem and solve it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import cast
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.plugins import PluginError
+from chaserdock_protocol.scenario import Scenario
+
+from chaserdock_controller.interfaces import (
+    GuidanceResult,
+    HorizonReference,
+    LogEntry,
+    Observation,
+    PlanResult,
+)
+
+from . import make_solver
+from .budget import Bounded, SolveBudget
+from .lost_chasers import with_lost_chasers
+from .types import NmpcInput, NmpcParameters, NmpcPlan
+
+_ATTACHED_FACTOR, _ATTACHED_MARGIN = 1.2, 1e-3
+
+
+class PlanningStage:
+    """The solver with its warm starts, and in real time its budget.
+
+    Raises PluginError for an installed solver that cannot be held to a budget when there is one.
+    """
+
+    def __init__(
+        self, scenario: Scenario, parameters: NmpcParameters, now_s: Callable[[], float], realtime: bool
+    ) -> None:
+        c = scenario.controller
+        self._parameters, self._now_s = parameters, now_s
+        self._min_distance_chasers_m = scenario.limits.min_distance_chasers_m
+        self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
+        self._last_solve_ns: int | None = None
+        self._budget: SolveBudget | None = None
+        if realtime and c.solve_budget_s is not None:
+            self._budget = SolveBudget(c.solve_budget_s, c.max_iterations)
+            if not hasattr(self.solver, "max_iterations"):
+                raise PluginError(
+                    f"controller.solve_budget_s: solver {c.solver!r} has no max_iterations to set"
+                )
+
+    def run(self, observation: Observation, guidance: GuidanceResult) -> PlanResult:
+        """Plan for the chasers of the guidance horizon; lost chasers are obstacles."""
+        horizon = guidance.horizon
+        if horizon is None:
+            return PlanResult((), None, 0.0, ())
+        problem = self.problem(horizon, observation.predicted, observation.input_limits)
+        problem = with_lost_chasers(
+            problem, observation.lost, observation.effective_ns, self._parameters.dt_s
+        )
+        since_ns = 0 if self._last_solve_ns is None else observation.time_ns - self._last_solve_ns
+        if self._budget is not None:
+            cast(Bounded, self.solver).max_iterations = self._budget.iterations()
+        plan: NmpcPlan | None = None
+        events: tuple[LogEntry, ...] = ()
+        start_s = self._now_s()
+        try:
+            plan = self.solver.solve(problem, since_ns / 1e9, (*horizon.chasers, *observation.lost))
+            self._last_solve_ns = observation.time_ns
+        except (ValueError, ArithmeticError, RuntimeError) as error:
+            events = (("error", f"solver error: {error}"),)
+        wall_s = self._now_s() - start_s
+        if self._budget is not None and plan is not None:
+            self._budget.note(wall_s, int(plan.iterations.sum()))
+        return PlanResult(horizon.chasers, plan, wall_s, events)
+
+    def problem(
+        self, horizon: HorizonReference, states: Mapping[int, Array], input_limits: Mapping[int, Array]
+    ) -> NmpcInput:
+        """Return the problem at the time when the commands take effect, without lost chasers."""
+        limits = np.array([input_limits[i] for i in horizon.chasers])
+        for row, i in enumerate(horizon.chasers):
+            if i in horizon.attached:  # it cannot yield: its inputs only follow the target's motion
+                following = np.abs(horizon.u_ref[row]).max(axis=0)
+                limits[row] = np.minimum(limits[row], _ATTACHED_FACTOR * following + _ATTACHED_MARGIN)
+        return NmpcInput(
+            states=np.array([states[i] for i in horizon.chasers]),
+            references=horizon.references,
+            u_ref=horizon.u_ref,
+            target_positions=horizon.target_positions,
+            min_distance_target_m=horizon.min_distance_target_m,
+            min_distance_chasers_m=self._min_distance_chasers_m,
+            input_max=limits,
+            corridors=horizon.corridors,
+        )

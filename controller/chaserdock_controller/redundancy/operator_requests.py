@@ -1,0 +1,45 @@
+"""Operator commands that wait for the next tick. Thread-safe; no I/O."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+
+from chaserdock_protocol.messages import CommandReply, OperatorCommand, Tick
+
+Reply = Callable[[CommandReply], None]
+
+
+class OperatorRequests:
+    """Requests with the functions that send their replies."""
+
+    def __init__(self) -> None:
+        self._requests: list[tuple[OperatorCommand, Reply]] = []
+        self._lock = threading.Lock()
+
+    def add(self, command: OperatorCommand, reply: Reply) -> None:
+        """Add a request; may be called on any thread."""
+        with self._lock:
+            self._requests.append((command, reply))
+
+    def take(self) -> list[tuple[OperatorCommand, Reply]]:
+        """Return and remove all requests."""
+        with self._lock:
+            requests, self._requests = self._requests, []
+        return requests
+
+    def refuse(self, tick: Tick) -> None:
+        """Refuse all requests: another controller commands."""
+        reason = f"{tick.commander or 'no controller'} commands now: repeat the command"
+        for command, reply in self.take():
+            reply(
+                CommandReply(
+                    tick=tick.tick,
+                    sim_time_ns=tick.sim_time_ns,
+                    command=command.command,
+                    chaser=command.chaser,
+                    operator=command.operator,
+                    accepted=False,
+                    reason=reason,
+                )
+            )

@@ -1,4 +1,4 @@
-"""From the scenario to the parameters of estimator and NMPC."""
+"""Parameters of estimator and NMPC from the scenario."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from .nmpc import NmpcParameters
 
 
 def nmpc_parameters(scenario: Scenario) -> NmpcParameters:
-    """The NMPC's parameters; the scenario has checked them."""
+    """Return the NMPC's parameters, which the scenario has validated."""
     c, body = scenario.controller, scenario.chaser
     ix, iy, iz = body.inertia
     return NmpcParameters(
@@ -39,8 +39,8 @@ def nmpc_parameters(scenario: Scenario) -> NmpcParameters:
 
 
 def estimator_of(scenario: Scenario) -> Estimator:
-    """The estimator that the scenario names: one of ours, or an installed ``chaserdock.estimators`` entry point, a
-    function of the scenario. Raises PluginError when there is no such thing here."""
+    """Return the estimator that the scenario names: a built-in one, or an installed ``chaserdock.estimators`` entry point,
+    called with the scenario. Raises PluginError if there is none of that name."""
     if scenario.estimator.name == "paper":
         return make_estimator("paper")
     if scenario.estimator.name != "mekf":

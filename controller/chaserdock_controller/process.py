@@ -164,12 +164,7 @@ class Controller:
                     self._process(self.tick)
                 self.tick, self._deadline_s = tick, self.now_s() + self._patience_s
             case Odometry() as odometry:
-                late = self._open_tick()
-                if late is not None and odometry.tick > late.tick:
-                    self._process(late)  # while its own odometry is still the newest
-                for level, text in self.inputs.add_odometry(odometry):
-                    if self.standby.leads:
-                        self._publish_event(level, text, odometry)
+                self._add_odometry(odometry)
             case DockingStatus() as docking:
                 self.inputs.add_docking(docking)
             case Sighting() as sighting:
@@ -182,6 +177,14 @@ class Controller:
                 self.ended = True
             case LostMessage(tick=tick):
                 self.inputs.add_lost(received.topic, int(received.place or 0), tick)
+
+    def _add_odometry(self, odometry: Odometry) -> None:
+        late = self._open_tick()
+        if late is not None and odometry.tick > late.tick:
+            self._process(late)  # while its own odometry is still the newest
+        for level, text in self.inputs.add_odometry(odometry):
+            if self.standby.leads:
+                self._publish_event(level, text, odometry)
 
     # -- processing ------------------------------------------------------------------------------------------
 

@@ -67,16 +67,16 @@ def test_it_goes_on_as_it_moved_last() -> None:
 def test_who_is_away_is_told_once_and_so_is_the_end_of_it() -> None:
     absent = LostChasers()
     assert absent.update({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
-    told = []
+    events = []
     for k in range(1, 200):
         now_s = 0.4 * k
         now = {0: odometry(0, now_s, Q[1:])}
-        told += [(round(now_s, 1), *event) for event in absent.update(now, round(now_s * 1e9))]
-    assert [(level, text.split(":")[0]) for _, level, text in told] == [("warning", "chaser 1")] * 2
-    assert "lost" in told[0][2]
-    assert "no obstacle any more" in told[1][2]
-    assert told[0][0] == pytest.approx(0.4)
-    assert told[1][0] > FORGOTTEN_S
+        events += [(round(now_s, 1), *event) for event in absent.update(now, round(now_s * 1e9))]
+    assert [(level, text.split(":")[0]) for _, level, text in events] == [("warning", "chaser 1")] * 2
+    assert "lost" in events[0][2]
+    assert "no obstacle any more" in events[1][2]
+    assert events[0][0] == pytest.approx(0.4)
+    assert events[1][0] > FORGOTTEN_S
     absent.update({}, round(81e9))
     (back,) = absent.update({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
     assert back == ("info", "chaser 0: odometry received again")
@@ -123,7 +123,7 @@ def test_an_absent_chaser_is_a_row_that_keeps_nothing_itself(between: Any) -> No
 
 
 def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
-    """How near chaser 0, sent past it, comes to chaser 1, of which nothing is heard after a second; what is told."""
+    """How near chaser 0, sent past it, comes to chaser 1, of which nothing is heard after a second; what is events."""
     flight = ControllerCore(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
     if blind:
         flight.ingest.lost_chasers.obstacles = lambda now_ns: {}  # type: ignore[method-assign]
@@ -131,7 +131,7 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     # In the way; the wrenches act at once, as the latency plays no part here.
     lost = np.array([0.0, -0.8, -0.1])
     x: Array = np.array([-1.0, 0.0, 0.0, *np.zeros(3), *Q, *np.zeros(3)])
-    near_m, told = np.inf, []
+    near_m, events = np.inf, []
     for tick in range(25 * rate_hz):
         now_ns = timing.tick_time_ns(tick)
         mine = Odometry(
@@ -154,18 +154,18 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
         assert out.solver is not None
         assert len(out.solver.status) == len(out.solver.chasers) == len(here)
         assert [r.accepted for r in out.replies] == [True] * len(commands)
-        told += [e.what for e in out.events]
+        events += [e.what for e in out.events]
         wrench = np.array([*out.wrenches[0].force_N, *out.wrenches[0].torque_N_m])
         x = propagate(x, wrench, scenario.chaser, 1.0 / rate_hz)
         near_m = min(near_m, float(np.linalg.norm(x[:3] - lost)))
-    return near_m, told
+    return near_m, events
 
 
 def test_the_others_fly_around_where_it_should_be() -> None:
     scenario = load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]"))
     least_m = scenario.limits.min_distance_chasers_m
-    around_m, told = nearest_m(scenario, blind=False)
+    around_m, events = nearest_m(scenario, blind=False)
     through_m, _ = nearest_m(scenario, blind=True)
     assert around_m > least_m
     assert through_m < 0.8 * least_m
-    assert any("chaser 1: lost" in text for text in told)
+    assert any("chaser 1: lost" in text for text in events)

@@ -80,7 +80,7 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changes", "told"),
+    ("changes", "message"),
     [
         ({"docking": {"ports": []}}, "kind capture needs at least one of"),
         ({"docking": {"ports": [PORTS[0], PORTS[0]]}}, "chaser 0 has more than one"),
@@ -94,7 +94,7 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
         ({"docking": {"kind": "held"}, "success": {"latched": [0]}}, "chaser 0 has no port"),
     ],
 )
-def test_a_docking_section_that_cannot_be_flown_is_refused(changes: dict, told: str) -> None:
+def test_a_docking_section_that_cannot_be_flown_is_refused(changes: dict, message: str) -> None:
     with pytest.raises(ScenarioError) as error:
         parse_scenario(values(**changes), "test")
-    assert told in str(error.value)
+    assert message in str(error.value)

@@ -15,13 +15,13 @@ DT_S = 0.1
 
 
 class Pilot:
-    """Guidance with chasers that are always where their references are, unless told otherwise."""
+    """Guidance with chasers that are always where their references are, unless stated otherwise."""
 
     def __init__(self, chasers: int = 1, **changes: Any) -> None:
         self.scenario = scenario(chasers, **changes)
         self.guidance = PhaseMachine(self.scenario)
         self.now_s = 0.0
-        self.told: dict[int, dict[str, Any]] = {}
+        self.observed: dict[int, dict[str, Any]] = {}
         self.guidance.target_acquired(0.0)
         self.fly(DT_S)
 
@@ -39,16 +39,16 @@ class Pilot:
             for i in range(len(self.scenario.chasers)):
                 position = at(self.guidance.chasers[i].move, self.now_s)[0]
                 self.guidance.update_tracking(i, self.now_s, 0.0, 0.0)
-                self.guidance.update_docking(i, self.now_s, senses(position, **self.told.get(i, {})))
+                self.guidance.update_docking(i, self.now_s, senses(position, **self.observed.get(i, {})))
 
     def fly_to(self, phase: str, i: int = 0, limit_s: float = 80.0) -> None:
         begun_s = self.now_s
         while self.phase(i) != phase:
             assert self.now_s - begun_s < limit_s, f"still in phase {self.phase(i)}"
             if phase == "contact" and self.phase(i) == "final":
-                self.told[i] = {"contact": True}
+                self.observed[i] = {"contact": True}
             if phase in ("latched", "verified") and self.phase(i) == "final":
-                self.told[i] = {"latched": True}
+                self.observed[i] = {"latched": True}
             self.fly(DT_S)
 
 
@@ -59,7 +59,7 @@ def test_all_phases_in_order_and_the_latch_armed_only_where_it_should_be() -> No
     for phase in ("align", "approach", "final", "contact"):
         pilot.fly_to(phase)
         seen.append((pilot.phase(), pilot.guidance.latch(0)))
-    pilot.told[0] = {"latched": True}
+    pilot.observed[0] = {"latched": True}
     for phase in ("latched", "verified"):
         pilot.fly_to(phase)
         seen.append((pilot.phase(), pilot.guidance.latch(0)))
@@ -72,8 +72,8 @@ def test_all_phases_in_order_and_the_latch_armed_only_where_it_should_be() -> No
         ("latched", "arm"),
         ("verified", "arm"),
     ]
-    told = [what for _, what, _ in drain(pilot.guidance)]
-    assert told == ["hold", "align", "approach", "final", "contact", "latched", "verified"]
+    observed = [what for _, what, _ in drain(pilot.guidance)]
+    assert observed == ["hold", "align", "approach", "final", "contact", "latched", "verified"]
 
 
 def test_the_approach_tapers_and_stays_on_the_axis() -> None:
@@ -97,7 +97,7 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "told", "why"),
+    ("phase", "observed", "why"),
     [
         ("approach", {"lateral_m": 0.04}, "left the corridor: lateral 40.00 mm"),
         ("approach", {"closing_m_s": 0.05}, "left the corridor: closing speed"),
@@ -107,19 +107,19 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
     ],
 )
 def test_a_broken_limit_leads_back_out_and_to_another_attempt(
-    phase: str, told: dict[str, float], why: str
+    phase: str, observed: dict[str, float], why: str
 ) -> None:
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to(phase)
     drain(pilot.guidance)
-    pilot.told[0] = told
+    pilot.observed[0] = observed
     pilot.fly(2 * DT_S)
     assert pilot.phase() == "retreat"
     (event,) = drain(pilot.guidance)
     assert why in event[2]
     assert pilot.guidance.latch(0) == "release"
-    pilot.told[0] = {}
+    pilot.observed[0] = {}
     pilot.fly_to("verified")
     assert pilot.guidance.chasers[0].attempt == 2
 
@@ -128,9 +128,9 @@ def test_after_the_last_attempt_it_holds_at_its_nominal_place() -> None:
     pilot = Pilot(docking={"attempts": 2})
     pilot.ask("approach")
     for _ in range(2):
-        pilot.told[0] = {}
+        pilot.observed[0] = {}
         pilot.fly_to("final")
-        pilot.told[0] = {"lateral_m": 0.02}
+        pilot.observed[0] = {"lateral_m": 0.02}
         pilot.fly_to("retreat")
     pilot.fly_to("hold")
     np.testing.assert_allclose(
@@ -139,18 +139,18 @@ def test_after_the_last_attempt_it_holds_at_its_nominal_place() -> None:
 
 
 @pytest.mark.parametrize(
-    ("phase", "told", "within_s"),
+    ("phase", "observed", "within_s"),
     [
         ("align", {"lateral_m": 0.2}, 61.0),
         ("final", {}, 31.0),
         ("contact", {"contact": True}, 6.0),
     ],
 )
-def test_nothing_lasts_for_ever(phase: str, told: dict[str, Any], within_s: float) -> None:
+def test_nothing_lasts_for_ever(phase: str, observed: dict[str, Any], within_s: float) -> None:
     pilot = Pilot()
     pilot.ask("approach")
     pilot.fly_to(phase)
-    pilot.told[0] = told
+    pilot.observed[0] = observed
     pilot.fly_to("retreat", limit_s=within_s)
 
 
@@ -189,7 +189,7 @@ def test_from_every_phase_there_is_a_way_out_along_the_axis_and_in_again(phase: 
     pilot.fly(0.0 if phase == "contact" else DT_S)
     assert pilot.ask(what) == (True, f"phase {what}")
     assert pilot.ask(what) == (True, f"already in phase {what}")
-    pilot.told[0] = {}
+    pilot.observed[0] = {}
     assert pilot.guidance.latch(0) == "release"
     gap = -1.0
     while pilot.phase() == what:
@@ -249,7 +249,7 @@ def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
     pilot.fly(DT_S)
     assert pilot.phase(2) == "wait"
     assert pilot.phase(3) == "align"
-    pilot.told[0] = {}
+    pilot.observed[0] = {}
     pilot.ask("retreat", 0)
     pilot.fly_to("align", 2, limit_s=120.0)
 

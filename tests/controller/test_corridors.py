@@ -143,7 +143,7 @@ def test_by_capture_the_corridor_is_there_in_the_corridor_and_gone_when_latched(
 
 
 def step(flight: ControllerCore, tick: int, **changes: Any) -> TickOutputs:
-    """One tick with chaser 0 as told and chaser 1 at its place."""
+    """One tick with chaser 0 as given and chaser 1 at its place."""
     timing = flight.scenario.timing
     here = {
         0: odometry(0, tick, timing.tick_time_ns(tick), **changes),

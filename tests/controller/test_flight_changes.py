@@ -48,7 +48,7 @@ def step(flight: ControllerCore, tick: int, there: tuple[int, ...], **more: obje
 
 
 def test_who_comes_and_goes_costs_nobody_a_tick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everyone who is there has a plan in every tick, the first after a change included, and no solver is built anew."""
+    """Everyone who is there has a plan in every tick, the first after a change included, and no solver is rebuilt."""
     mission = three()
     flight, alone = (ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2))
     monkeypatch.setattr(planning, "make_solver", lambda *_: pytest.fail("a solver was built in flight"))
@@ -107,8 +107,10 @@ def test_the_state_is_predicted_to_when_the_command_acts(monkeypatch: pytest.Mon
     """With 0.2 s of latency it tracks as without; the same code on the state at exposure does not."""
     assert late_error_m() < 5e-5
 
-    def at_exposure(told, history, until_ns, body):  # type: ignore[no-untyped-def]
-        return np.array([*told.position_m, *told.velocity_m_s, *told.q_wxyz, *told.omega_rad_s])
+    def at_exposure(odometry, history, until_ns, body):  # type: ignore[no-untyped-def]
+        return np.array(
+            [*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s]
+        )
 
     monkeypatch.setattr(ingest, "predict_state", at_exposure)
     assert late_error_m() > 5e-4

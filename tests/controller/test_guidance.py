@@ -1,4 +1,4 @@
-"""What chasers are told to do: phases, operator's commands, and what happens without a target."""
+"""Phases, operator commands, and behaviour without a target."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_commands_are_idempotent() -> None:
     before = guidance.chasers[0]
     again = guidance.command(operator("approach"), 20.0)
     assert (again.accepted, again.reason) == (True, "already in phase approach")
-    assert guidance.chasers[0] is before  # neither the move nor the clock begins anew
+    assert guidance.chasers[0] is before  # neither the move nor the clock restarts
     end = 10.0 + before.move.duration_s
     guidance.update_tracking(0, end, 0.0, 0.0)
     guidance.update_tracking(0, end + 5.0, 0.0, 0.0)
@@ -313,8 +313,8 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
             assert speed < 0.0
         assert out.solver is not None
         assert out.solver.chasers == ()
-        told = [(r.accepted, r.reason) for r in out.replies]
-        assert told == ([(False, "the target has not been found yet")] if tick == 0 else [])
+        events = [(r.accepted, r.reason) for r in out.replies]
+        assert events == ([(False, "the target has not been found yet")] if tick == 0 else [])
     assert flight.step(TickInputs(4, timing.tick_time_ns(4), {1: odometry(1, 4)}, ())).wrenches.keys() == {1}
 
 
@@ -322,7 +322,7 @@ def test_without_a_target_everyone_brakes_and_every_tick_is_answered() -> None:
 
 
 def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple[float, str, str]]:
-    """Phases of chaser 0, told to approach at 0 s, with their reasons; ``command`` at 10 s."""
+    """Phases of chaser 0, commanded to approach at 0 s, with their reasons; ``command`` at 10 s."""
     guidance, out = PhaseMachine(scenario()), []
     guidance.target_acquired(0.0)
     for k in range(300):
@@ -337,15 +337,15 @@ def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple
 
 
 def test_an_approach_holds_while_nobody_sees_and_then_goes_on() -> None:
-    told = blind_phases(lambda s: not 5.0 < s < 15.0)
-    assert [(what, why.partition(": ")[2]) for _, what, why in told] == [
+    events = blind_phases(lambda s: not 5.0 < s < 15.0)
+    assert [(what, why.partition(": ")[2]) for _, what, why in events] == [
         ("hold", ""),
         ("approach", ""),
         ("hold", "no chaser has seen the target for 3 s"),
         ("approach", "the target is in sight again"),
     ]
-    assert told[2][0] == pytest.approx(8.0, abs=0.11)
-    assert told[3][0] == pytest.approx(15.0, abs=0.11)
+    assert events[2][0] == pytest.approx(8.0, abs=0.11)
+    assert events[3][0] == pytest.approx(15.0, abs=0.11)
 
 
 def test_a_moment_without_sight_changes_nothing() -> None:

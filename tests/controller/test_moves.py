@@ -1,4 +1,4 @@
-"""Moves: smooth from any state to rest, on a line, no faster than told."""
+"""Moves: smooth from any state to rest, on a line, within the speed limit."""
 
 from __future__ import annotations
 
@@ -103,8 +103,8 @@ def test_one_that_has_ended_is_where_one_about_to_end_goes() -> None:
         later = np.linspace(1e-6, 5.0, count) + end_s
         # One time on the way: then nothing is taken from what a part remembers.
         both = [part[1:] for part in move.at(np.array([end_s - 1.0, *later]))]
-        for held, told in zip(move.at(later), both, strict=True):
-            np.testing.assert_allclose(held, told, rtol=0, atol=1e-15)
+        for held, expected in zip(move.at(later), both, strict=True):
+            np.testing.assert_allclose(held, expected, rtol=0, atol=1e-15)
 
 
 def test_moves_take_their_time() -> None:

@@ -69,15 +69,15 @@ def test_history_gives_what_acts_between_two_times() -> None:
     history.add(0, 200, wrench(2.0))
     history.add(1, 150, wrench(9.0))
 
-    def told(begin: int, end: int) -> list[tuple[int, int, float]]:
+    def segments_of(begin: int, end: int) -> list[tuple[int, int, float]]:
         return [(a, b, float(w[0])) for a, b, w in history.segments(0, begin, end)]
 
-    assert told(0, 50) == [(0, 50, 0.0)]
-    assert told(0, 300) == [(0, 100, 0.0), (100, 200, 1.0), (200, 300, 2.0)]
-    assert told(100, 200) == [(100, 200, 1.0)]
-    assert told(150, 250) == [(150, 200, 1.0), (200, 250, 2.0)]
-    assert told(200, 250) == [(200, 250, 2.0)]
-    assert told(500, 501) == [(500, 501, 2.0)]
+    assert segments_of(0, 50) == [(0, 50, 0.0)]
+    assert segments_of(0, 300) == [(0, 100, 0.0), (100, 200, 1.0), (200, 300, 2.0)]
+    assert segments_of(100, 200) == [(100, 200, 1.0)]
+    assert segments_of(150, 250) == [(150, 200, 1.0), (200, 250, 2.0)]
+    assert segments_of(200, 250) == [(200, 250, 2.0)]
+    assert segments_of(500, 501) == [(500, 501, 2.0)]
     assert [float(w[0]) for _, _, w in history.segments(7, 0, 10)] == [0.0]
 
 
@@ -114,11 +114,11 @@ def test_forgetting_the_past_changes_nothing_from_then_on(
         short.add(0, t, wrench(float(k + 1)))
     short.forget_before(now)
 
-    def told(history: CommandHistory) -> list[tuple[int, int, float]]:
+    def segments_of(history: CommandHistory) -> list[tuple[int, int, float]]:
         begin = now + later
         return [(a, b, float(w[0])) for a, b, w in history.segments(0, begin, begin + span)]
 
-    assert told(short) == told(whole)
+    assert segments_of(short) == segments_of(whole)
     kept = [float(w[0]) for _, _, w in short.segments(0, 0, 2000)]
     assert len(kept) <= 2 + sum(t > now for t in times)
 

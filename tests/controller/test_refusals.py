@@ -38,13 +38,13 @@ AT_START = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "told"), AT_START)
-def test_what_cannot_be_flown_is_one_clear_error_at_the_start(changes: dict[str, Any], told: str) -> None:
+@pytest.mark.parametrize(("changes", "message"), AT_START)
+def test_what_cannot_be_flown_is_one_clear_error_at_the_start(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ScenarioError) as error:
         scenario(**changes)
     (line,) = str(error.value).splitlines()
     assert line.startswith("test: ")
-    assert told in line
+    assert message in line
 
 
 def test_a_quaternion_that_is_none_is_an_error_at_the_start() -> None:
@@ -68,7 +68,7 @@ def flying(mission: Scenario) -> ControllerCore:
 
 
 def step(flight: ControllerCore, tick: int, *commands: OperatorCommand, **changes: Any) -> TickOutputs:
-    """Chaser 0 as told, chaser 1 at its place."""
+    """Chaser 0 as given, chaser 1 at its place."""
     now_ns = flight.scenario.timing.tick_time_ns(tick)
     here = {
         0: odometry(
@@ -88,9 +88,9 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "told"), BAD)
+@pytest.mark.parametrize(("changes", "message"), BAD)
 def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
-    changes: dict[str, Any], told: str
+    changes: dict[str, Any], message: str
 ) -> None:
     """It cannot come over the network (below); should it come about all the same, that chaser coasts, and only it."""
     flight = flying(scenario())
@@ -98,7 +98,7 @@ def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
     for tick in (1, 2):
         out = step(flight, tick, **changes)
         errors = [e.what for e in out.events if e.level == "error"]
-        assert errors == ([f"chaser 0: invalid odometry, coasting: {told}"] if tick == 1 else [])
+        assert errors == ([f"chaser 0: invalid odometry, coasting: {message}"] if tick == 1 else [])
         assert out.wrenches[0].mode == "coast"
         assert not any([*out.wrenches[0].force_N, *out.wrenches[0].torque_N_m])
         assert out.wrenches[1].mode == "nmpc"
@@ -127,13 +127,13 @@ def test_a_bad_state_does_not_come_over_the_network(changes: dict[str, Any]) -> 
 def test_a_reference_out_of_reach_is_refused_by_name_and_the_flight_goes_on() -> None:
     flight = flying(scenario())
     step(flight, 0)
-    for offset, told in (
+    for offset, message in (
         ((30.0, 0.0, 0.0), "30 m from the target"),
         ((0.1, 0.0, 0.0), "0.1 m from the target"),
     ):
         out = step(flight, 1, OperatorCommand(command="goto", chaser=0, offset_m=offset))
         (reply,) = out.replies
         assert not reply.accepted
-        assert told in reply.reason
+        assert message in reply.reason
         assert out.wrenches[0].mode == "nmpc"
         assert out.references[0].phase == "hold"

@@ -1,4 +1,4 @@
-"""The way in to a dock as the NMPC has it: a cone about an axis through the target's centre. Pure functions."""
+"""Approach corridor of the NMPC: a cone about an axis through the target's centre. Pure functions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from .docking import dock_of
 
 BESIDE_LINE_M = 0.1
-"""How far beside its line an approach to a docking distance may begin, and so how wide its corridor is at the end."""
+"""Greatest distance from its line at which an approach to a docking distance may begin; radius of its corridor's inner end."""
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Cone:
     apex_m: float
 
     def room_m(self, offset_m: ArrayLike) -> float:
-        """Distance of ``offset_m`` (3,), TRF, from the cone's surface, positive inside (beside the apex, of its plane)."""
+        """Return the distance of ``offset_m`` (3,), TRF, from the cone's surface (from the apex plane beside it), positive inside."""
         offset = np.asarray(offset_m, dtype=float)
         along = float(offset @ self.axis)
         aside = float(np.linalg.norm(offset - along * self.axis))
@@ -35,8 +35,8 @@ class Cone:
 
 
 def cone_about(axis: ArrayLike, innermost_m: float, aside_m: float, half_angle_rad: float) -> Cone:
-    """The cone that is ``aside_m`` wide (radius) where a way in along ``axis`` (3,), TRF, ends, ``innermost_m`` from the
-    target's centre along it. Raises ValueError for an axis that is no unit vector or an angle that opens no cone."""
+    """Return the cone about ``axis`` (3,), TRF, with radius ``aside_m`` at the distance ``innermost_m`` from the target's
+    centre. Raises ValueError for an axis that is not a unit vector or an angle outside 0 to pi / 2."""
     direction = np.asarray(axis, dtype=float)
     if abs(float(np.linalg.norm(direction)) - 1.0) > 1e-6:
         raise ValueError(f"axis must be a unit vector, not {direction.tolist()}")
@@ -46,8 +46,8 @@ def cone_about(axis: ArrayLike, innermost_m: float, aside_m: float, half_angle_r
 
 
 def cone_of(scenario: Scenario, chaser: int) -> Cone:
-    """A chaser's corridor: about its port's axis, or about its nominal direction where it docks at a distance; wide
-    enough at the inner end for the way in, and for what the chaser may be beside it."""
+    """Return a chaser's corridor: about its port's axis, or about its nominal direction if it docks at a distance. The inner
+    end is wide enough for the path and for the permitted lateral error."""
     docking, dock = scenario.docking, dock_of(scenario, chaser)
     angle = math.radians(docking.corridor_angle_deg)
     if dock is None:
@@ -62,7 +62,7 @@ def cone_of(scenario: Scenario, chaser: int) -> Cone:
 
 
 def corridor_rows(cones: Sequence[Cone | None], q_target_wxyz: Array) -> Array | None:
-    """`NmpcInput.corridors` (N, K, 5) along the target's attitudes (K, 4), TRF to WRF; None if nobody has one."""
+    """Return `NmpcInput.corridors` (N, K, 5) for the target's attitudes (K, 4), TRF to WRF; None without any cone."""
     if not any(cones):
         return None
     rows = np.zeros((len(cones), len(q_target_wxyz), 5))

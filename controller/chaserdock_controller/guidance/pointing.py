@@ -1,5 +1,5 @@
-"""Where a chaser looks when it does not just face the target: the search for it, and the manoeuvre that shows how its
-camera is mounted. Pure functions of time; SI units, radians.
+"""Pointing: the search pattern for the target, and the manoeuvre that makes camera errors observable. Pure functions of
+time; SI units, radians.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _RING_SHARE = 0.9
 _WIDEST_RAD = math.radians(170.0)
 
 CALIBRATION_S = 30.0
-"""How long the calibration manoeuvre takes."""
+"""Duration of the calibration manoeuvre."""
 _RAMP_S = 6.0
 _ROLL, _YAW, _PITCH = math.radians(70.0), math.radians(12.0), math.radians(6.0)
 
@@ -32,7 +32,7 @@ _STEP_S = 0.02
 
 
 def field_of_view(camera: Camera) -> tuple[float, float]:
-    """Width and height of the image as angles, rad."""
+    """Return width and height of the field of view, rad."""
     return (
         2.0 * math.atan(camera.width_px / 2.0 / camera.fx_px),
         2.0 * math.atan(camera.height_px / 2.0 / camera.fy_px),
@@ -40,10 +40,10 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
 
 
 def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[float, float]:
-    """Yaw and pitch (about Z and Y of the body as the search found it) of the line of sight, ``time_s`` into a search.
+    """Return yaw and pitch of the line of sight (about Z and Y of the body at the start) at ``time_s`` of a search.
 
-    Ellipses about the first line of sight. After the k-th all within height/2 + k 0.9 height of it has been in the
-    image, in every direction. The last one is repeated.
+    The pattern is ellipses about the first line of sight. After the k-th, everything within height/2 + k 0.9 height of it
+    has been in the image. The last ellipse is repeated.
     """
     before, left_s, k = (0.0, 0.0), max(time_s, 0.0), 1
     while True:
@@ -67,13 +67,13 @@ def search_angles(time_s: float, width_rad: float, height_rad: float) -> tuple[f
 
 
 def search_attitude(q_start_wxyz: ArrayLike, camera: Camera, time_s: float) -> Array:
-    """Attitude (4,), CRF to WRF, ``time_s`` into a search that began at ``q_start_wxyz``."""
+    """Return the attitude (4,), CRF to WRF, at ``time_s`` of a search that began at ``q_start_wxyz``."""
     yaw, pitch = search_angles(time_s, *field_of_view(camera))
     return rotations.multiply(q_start_wxyz, rotations.exp([0.0, pitch, yaw]))
 
 
 def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
-    """The attitude (4,) nearest to ``q_wxyz``, CRF to WRF, that has +X along ``direction_w`` (3,), which is not zero."""
+    """Return the attitude (4,) nearest to ``q_wxyz``, CRF to WRF, with +X along ``direction_w`` (3,), which is not zero."""
     a = rotations.rotate(q_wxyz, [1.0, 0.0, 0.0])
     b = np.asarray(direction_w, dtype=float) / np.linalg.norm(np.asarray(direction_w, dtype=float))
     axis, cosine = np.cross(a, b), float(a @ b)
@@ -85,8 +85,8 @@ def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
 
 
 def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: Array) -> Array:
-    """Force and torque (6,), body axes: comes to rest in place and turns to ``q_wxyz`` (4,), which is at ``q_soon_wxyz``
-    0.02 s later."""
+    """Return force and torque (6,), body axes, that brake and turn to ``q_wxyz`` (4,), which moves to ``q_soon_wxyz`` in
+    0.02 s."""
     wrench = brake_wrench(odometry, body)
     error = rotations.log(rotations.multiply(rotations.conjugate(odometry.q_wxyz), q_wxyz))
     ahead = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), q_soon_wxyz)) / _STEP_S
@@ -99,17 +99,17 @@ def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: A
 def search_wrench(
     odometry: Odometry, body: Body, camera: Camera, q_start_wxyz: Array, time_s: float
 ) -> Array:
-    """Force and torque (6,), body axes, of a chaser that has been searching for ``time_s``."""
+    """Return force and torque (6,), body axes, of a chaser at ``time_s`` of its search."""
     now, soon = (search_attitude(q_start_wxyz, camera, time_s + dt) for dt in (0.0, _STEP_S))
     return turning_wrench(odometry, body, now, soon)
 
 
 def calibration_turns(times_s: ArrayLike) -> Array:
-    """Rotations (K, 4) of the body away from facing the target at times (K,) of the calibration manoeuvre; none before and
-    after it.
+    """Return rotations (K, 4) of the body from its reference attitude at times (K,) of the calibration manoeuvre; identity
+    before and after it.
 
-    To either side about the line of sight, which shows the mounting's yaw and pitch, and a little about the other axes,
-    which shows its roll: three sines of one, two and three periods, with smooth ends (fifth-degree polynomials).
+    Rotation about the line of sight makes the mounting's yaw and pitch observable, small rotations about the other axes its
+    roll: three sines of one, two and three periods, with smooth ends (fifth-degree polynomials).
     """
     t = np.clip(np.asarray(times_s, dtype=float), 0.0, CALIBRATION_S)
     x = np.clip(np.minimum(t, CALIBRATION_S - t) / _RAMP_S, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Where the chasers should be: the target's predicted motion, reference poses and the feed-forward.
+"""Predicted motion of the target, reference poses and feed-forward wrenches.
 
 The target moves at constant velocity (WRF) and constant body rate. Pure functions; SI units, radians.
 """
@@ -18,7 +18,7 @@ def predict_target(
     omega_rad_s: ArrayLike,
     times_s: ArrayLike,
 ) -> tuple[Array, Array]:
-    """Target positions (K, 3) in WRF and attitudes (K, 4) body to world at ``times_s`` (K,) from now.
+    """Return target positions (K, 3) in WRF and attitudes (K, 4) body to world at ``times_s`` (K,) from now.
 
     position and velocity (3,) in WRF, q_wxyz (4,), omega (3,) in TRF. Exact for constant velocity and body rate:
     q(t) = q (x) exp(omega t). Raises ValueError for a zero quaternion.
@@ -38,7 +38,7 @@ def reference_trajectory(
     q_off_wxyz: ArrayLike,
     times_s: ArrayLike,
 ) -> Array:
-    """Reference poses (K, 7): p (WRF, m), q_wxyz (chaser body to world) at ``times_s`` (K,).
+    """Return reference poses (K, 7): p (WRF, m), q_wxyz (chaser body to world) at ``times_s`` (K,).
 
     Target arguments as in `predict_target`; offset_position_m (K, 3) or (3,) in TRF, q_off_wxyz (4,) or (K, 4) chaser
     body to TRF. p_ref = p_tar + q_tar p_off q_tar*, q_ref = q_tar q_off (paper, section 4.1).
@@ -50,7 +50,7 @@ def reference_trajectory(
 def references_on(
     positions_m: Array, attitudes_wxyz: Array, offset_position_m: ArrayLike, q_off_wxyz: ArrayLike
 ) -> Array:
-    """Reference poses (..., K, 7) on a target at ``positions_m`` (K, 3), WRF, and ``attitudes_wxyz`` (K, 4).
+    """Return reference poses (..., K, 7) for a target at ``positions_m`` (K, 3), WRF, and ``attitudes_wxyz`` (K, 4).
 
     As `reference_trajectory`, for any motion of the target and, with leading axes, for several chasers; ``q_off_wxyz``
     is of unit length.
@@ -70,7 +70,7 @@ def reference_state(
     offset_velocity_m_s: ArrayLike,
     q_off_wxyz: ArrayLike,
 ) -> Array:
-    """State (13,) of a chaser exactly on its reference now: p, v (WRF), q_wxyz, omega (chaser body).
+    """Return the state (13,) of a chaser exactly on its reference: p, v (WRF), q_wxyz, omega (chaser body).
 
     Target arguments as in `predict_target`; offset position and velocity (3,) in TRF.
     """
@@ -98,12 +98,12 @@ def feed_forward(
     alpha_rad_s2: ArrayLike = (0.0, 0.0, 0.0),
     origin_acceleration_m_s2: ArrayLike = (0.0, 0.0, 0.0),
 ) -> Array:
-    """Force and torque (..., K, 6), N and N m in chaser body axes, that following the reference takes.
+    """Return the force and torque (..., K, 6), N and N m in chaser body axes, needed to follow the reference.
 
     omega, alpha (its derivative) and the acceleration of TRF's origin: each (3,) or (K, 3), in TRF axes. Offset
     position, velocity and acceleration (..., K, 3) in TRF, one row per instant (for an input held over a stage, give the
     stage's middle), leading axes for several chasers; q_off_wxyz, unit, (4,) or (..., K, 4) chaser body to TRF, whose
-    own turning is taken as slow: it adds no torque.
+    own rotation is neglected.
     Acceleration in a rotating frame, a = a_0 + p'' + alpha x p + 2 omega x p' + omega x (omega x p) (Goldstein,
     "Classical Mechanics", eq. 4.91), turned into body axes; torque I alpha_b + omega_b x I omega_b. The
     target's position, velocity and attitude do not enter: in body axes the wrench is the same anywhere.

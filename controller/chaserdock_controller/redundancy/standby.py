@@ -101,7 +101,7 @@ class HotStandby:
     def on_idle(self, open_tick: int) -> bool:
         """Return whether to process the open tick although no more messages arrive.
 
-        The flight has gone on without them. A standby has lost track then, and waits for the leader's state instead.
+        The world has published a later tick. A standby has lost track then, and waits for the leader's state instead.
         """
         if self.newest is None or self.newest.tick <= open_tick:
             return False

@@ -145,7 +145,7 @@ def test_our_own_process_conforms(process: str) -> None:
     words = [sys.executable, "-m", "chaserdock", *process.split("/")]
     status, out = check(process, *words, "-e", "{endpoint}", "--namespace", "{namespace}", ticks=100)
     assert status == 0, out
-    assert "keeps the protocol; 18 ticks" in out
+    assert "conforms to the protocol; 18 ticks" in out
 
 
 def foreign(path: Path, old: str = "", new: str = "") -> tuple[int, str]:

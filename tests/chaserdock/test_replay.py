@@ -164,11 +164,11 @@ def test_replay_command(tmp_path: Path) -> None:
     for arguments, words in (
         (
             ["replay", log, "--through", "thought"],
-            "--through thought: must be one of controller, fusion, perception",
+            "'--through': 'thought' is not one of 'perception', 'fusion', 'controller'",
         ),
         (
             ["replay", log, "--through", "fusion", "--set", "limits.nonsense=1"],
-            "limits.nonsense: is not a key",
+            "unknown key limits.nonsense",
         ),
         (["replay", str(tmp_path), "--through", "fusion"], "holds no log"),
     ):

@@ -100,10 +100,10 @@ SECOND = '[[markers]]\nid = 1\nside_m = 0.06\nface = "-x"\ncuboid = 1\n'
     [
         (('"DICT_4X4_50"', '"DICT_4X5_50"'), "unknown ArUco dictionary"),
         (("id = 1", "id = 50"), "markers 0 to 49"),
-        (("id = 1", "id = 0"), "also that of"),
+        (("id = 1", "id = 0"), "already used by"),
         (("cuboid = 1", "cuboid = 2"), "no cuboid 2"),
         (("at_m = [0.03, 0.02]", "at_m = [0.1, 0.02]"), "beyond its face"),
-        (('face = "-x"\nat_m = [0.03, 0.02]', "side = 3"), "not a key"),
+        (('face = "-x"\nat_m = [0.03, 0.02]', "side = 3"), "unknown key markers.0.side"),
         (("side_m = 0.06", "side_m = -1"), "greater than 0"),
         (("cuboid = 1", ""), "overlaps"),
         (('face = "-x"\nat_m = [0.03, 0.02]', "position_m = [0.0, 0.0, 0.0]"), "go together"),

@@ -12,107 +12,23 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import subprocess
+import sys
 import time
-import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from chaserdock_protocol.recording.log import LogError, read_log
-from results import options_of, write_json
+from chaserdock_protocol.recording.log import read_log
+from results import ROOT, options_of, write_json
 
-ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT / "tests"))
+
+from compose_project import Project, compose_command, docker
+
 SMALL = "camera.width_px=640 camera.height_px=480 settling_s=10.0"
 LOOSE = "success.steady_position_rms_m=0.5 success.steady_orientation_rms_deg=20.0"
 FLYING_TICKS = 60
-_MISSION_S = 900.0
-
-
-def compose_command() -> list[str]:
-    """The Compose that is here: version 2 as Docker's plugin, or docker-compose. Raises SystemExit without any."""
-    for command in (["docker", "compose"], ["docker-compose"]):
-        try:
-            if subprocess.run([*command, "version"], capture_output=True, check=False).returncode == 0:
-                return command
-        except FileNotFoundError:
-            continue
-    raise SystemExit("neither `docker compose` nor `docker-compose` is here")
-
-
-class Project:
-    """A mission in containers, under a project name of its own."""
-
-    def __init__(self, scenario: str, overrides: str, folder: Path = ROOT) -> None:
-        self.name = f"chaserdock-{uuid.uuid4().hex[:8]}"
-        self.folder = folder
-        self._environment = {**os.environ, "SCENARIO": scenario, "SET": overrides}
-        self._command = [*compose_command(), "-p", self.name]
-        self._before = set(folder.glob("runs/*/mission.mcap"))
-
-    def compose(self, *arguments: str, timeout_s: float = _MISSION_S) -> subprocess.CompletedProcess[str]:
-        """Runs Compose in the project; what it said is in the result."""
-        return subprocess.run(
-            [*self._command, *arguments],
-            cwd=self.folder,
-            env=self._environment,
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=timeout_s,
-        )
-
-    def container(self, service: str) -> str:
-        """The id of a service's container."""
-        found = self.compose("ps", "-q", service).stdout.split()
-        if not found:
-            raise SystemExit(f"{self.name}: no container of {service}")
-        return found[0]
-
-    def network(self) -> str:
-        return f"{self.name}_default"
-
-    def log(self, timeout_s: float = 300.0) -> Path:
-        """The mission's log, once it is there: that which holds this project's containers' run."""
-        deadline = time.monotonic() + timeout_s
-        while time.monotonic() < deadline:
-            new = set(self.folder.glob("runs/*/mission.mcap")) - self._before
-            if new:
-                return new.pop()
-            time.sleep(0.2)
-        raise SystemExit(f"{self.name}: no log after {timeout_s:g} s:\n{self.compose('logs').stdout[-3000:]}")
-
-    def wait_for_tick(self, log: Path, tick: int, timeout_s: float = 300.0) -> None:
-        """Waits until a tick has been recorded."""
-        deadline = time.monotonic() + timeout_s
-        while last_tick(log) < tick:
-            if time.monotonic() > deadline:
-                raise SystemExit(f"{self.name}: tick {tick} was not recorded within {timeout_s:g} s")
-            time.sleep(0.5)
-
-    def wait(self) -> int:
-        """Waits for the mission's end; its status."""
-        done = docker("wait", self.container("mission"), timeout_s=_MISSION_S)
-        return int(done.stdout.strip())
-
-    def down(self) -> None:
-        self.compose("down", "--volumes", "--timeout", "5")
-
-
-def last_tick(log: Path) -> int:
-    """The newest tick in a log that is being written; -1 before there is any."""
-    try:
-        return max((r.message.tick for r in read_log(log, ["world/tick"])), default=-1)
-    except LogError:  # created, and not yet flushed for the first time
-        return -1
-
-
-def docker(*arguments: str, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
-    """Runs docker; raises CalledProcessError when it fails."""
-    return subprocess.run(
-        ["docker", *arguments], capture_output=True, text=True, check=True, timeout=timeout_s
-    )
 
 
 def crash(container: str) -> None:

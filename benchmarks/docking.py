@@ -1,15 +1,16 @@
-"""Does it dock? ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--seen N] [--aborts N]
-[--aborts-seen N] [--failures N] [--results FILE]``.
+"""Docking success: ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--images N] [--aborts N]
+[--aborts-images N] [--failures N] [--results FILE]``.
 
 Flies ``docking-contact`` many times in one process: from seeded starts, at target rates from zero to three times the
-paper's about any axis. ``--flights`` with a statistical eye (2 mm and 0.1 degrees of white noise, every tenth image
-blind), ``--seen`` with rendered images and the real perception, ``--aborts`` aborted at a random time (``--aborts-seen``
-with images), with a second approach after every fifth; ``--failures`` with a thruster that sticks open, and as many with
-one that sticks shut, untold, thruster after thruster: at ``--failed-at``, or at a random time between 2 and 24 s. The approach is
-commanded at ``--approach-at``. ``--first`` is the first seed. Prints outcomes by cause, and figures at contact.
+paper's about any axis. ``--flights`` with a measurement model (2 mm and 0.1 degrees of white noise, no detection in every
+tenth image), ``--images`` with rendered images and the real perception, ``--aborts`` aborted at a random time
+(``--aborts-images`` with images), with a second approach after every fifth. ``--failures`` with a thruster that sticks
+open, and as many with one that sticks shut, not reported, thruster after thruster: at ``--failed-at``, or at a random
+time between 2 and 24 s. The approach is commanded at ``--approach-at``; ``--first`` is the first seed. Prints outcomes by
+cause, and figures at contact.
 
-``--results FILE`` appends every flight to FILE (JSON lines) and takes what is there already: a batch that was stopped
-goes on where it was.
+``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it, so that an
+interrupted batch continues.
 """
 
 from __future__ import annotations
@@ -26,15 +27,23 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from docking_flights import APPROACH_AT_S, Failure, Outcome, abort, dock, mission
-from offline import CameraPose, seeing_eye, statistical_eye
-from results import options_of, write_json
+from results import options_of, print_figures, write_json
+
+from chaserdock.evaluation.docking_flights import (
+    APPROACH_AT_S,
+    Failure,
+    Outcome,
+    abort,
+    dock,
+    docking_scenario,
+)
+from chaserdock.evaluation.perception import Perception, RenderedImages, measurement_model
 
 KINDS = ("stuck_on", "stuck_off")
 
 
 class Row(msgspec.Struct, frozen=True):
-    """A flight in the results' file: of which part, with what settings, flown by which commit."""
+    """One flight in the results file: part, settings, commit and outcome."""
 
     part: str
     settings: str
@@ -44,7 +53,7 @@ class Row(msgspec.Struct, frozen=True):
 
 @dataclass
 class Batch:
-    """Flights that are flown once each, and kept in ``path``, if there is one."""
+    """Flights, each flown once; with a ``path``, results are kept there."""
 
     path: Path | None
     settings: str
@@ -53,10 +62,10 @@ class Batch:
         self._known: dict[tuple[str, int], Outcome] = {}
         self.commits: set[str] = set()
         here = Path(__file__).parent
-        told = subprocess.run(
+        described = subprocess.run(
             ["git", "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True, check=False
         )
-        self._commit = told.stdout.strip()
+        self._commit = described.stdout.strip()
         if self.path is None or not self.path.exists():
             return
         for line in self.path.read_bytes().splitlines():
@@ -66,7 +75,7 @@ class Batch:
                 self.commits.add(row.commit)
 
     def fly(self, part: str, seed: int, flight: Callable[[], Outcome]) -> Outcome:
-        """The outcome of a flight: as it is known, or flown now."""
+        """Return the outcome of a flight from the results file, or fly it."""
         known = self._known.get((part, seed))
         if known is not None:
             return known
@@ -80,25 +89,25 @@ class Batch:
 
 
 def figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
-    """What docking flights showed, by figure."""
+    """Return the figures of docking flights by name."""
     touches = [o.touch for o in outcomes if o.touch is not None]
     out: dict[str, float] = {
         f"{name}_flights": len(outcomes),
         f"{name}_verified": sum(o.verified for o in outcomes),
-        f"{name}_collisions": sum(bool(o.touched) for o in outcomes),
+        f"{name}_collisions": sum(bool(o.contacts) for o in outcomes),
         f"{name}_false_alarms": sum(o.false_alarms() for o in outcomes),
     }
     if any(o.failure for o in outcomes):
-        out[f"{name}_found"] = sum(o.found_s() is not None for o in outcomes)
+        out[f"{name}_detected"] = sum(o.detection_delay_s() is not None for o in outcomes)
     for key, values in {
         "contact_lateral_m": [t.lateral_m for t in touches],
         "contact_angle_rad": [t.angle_rad for t in touches],
         "contact_closing_m_s": [t.closing_m_s for t in touches],
         "contact_lateral_speed_m_s": [t.lateral_speed_m_s for t in touches],
-        "momentum_error": [o.linear for o in outcomes if o.linear is not None],
-        "angular_momentum_error": [o.angular for o in outcomes if o.angular is not None],
+        "momentum_error": [o.linear_error for o in outcomes if o.linear_error is not None],
+        "angular_momentum_error": [o.angular_error for o in outcomes if o.angular_error is not None],
         "verified_s": [o.verified_s for o in outcomes if o.verified_s is not None],
-        "time_to_find_s": [t for o in outcomes if (t := o.found_s()) is not None],
+        "detection_delay_s": [t for o in outcomes if (t := o.detection_delay_s()) is not None],
         "peak_error_m": [o.peak_m for o in outcomes if o.peak_m is not None],
         "propellant_kg": [o.propellant_kg for o in outcomes if o.verified and o.propellant_kg],
     }.items():
@@ -117,69 +126,73 @@ def table(name: str, outcomes: list[Outcome]) -> None:
 
 
 def abort_figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
-    """What aborts showed, by figure."""
+    """Return the figures of aborted flights by name."""
     opened = [o.opened_s for o in outcomes if o.opened_s is not None]
     return {
         name: len(outcomes),
         f"{name}_opened": len(opened),
         f"{name}_opened_max_s": max(opened, default=math.nan),
-        f"{name}_collisions": sum(bool(o.touched) for o in outcomes),
-        f"{name}_tried_again": sum(o.again is not None for o in outcomes),
-        f"{name}_verified_again": sum(o.again is True for o in outcomes),
+        f"{name}_collisions": sum(bool(o.contacts) for o in outcomes),
+        f"{name}_second_approaches": sum(o.verified_again is not None for o in outcomes),
+        f"{name}_verified_again": sum(o.verified_again is True for o in outcomes),
     }
 
 
-def noisy(scenario: Scenario) -> CameraPose:
-    """Sees the target's true pose with 2 mm and 0.1 degrees of noise, and in every tenth image nothing."""
-    return statistical_eye(scenario, scenario.seed, 0.002, math.radians(0.1), blind=0.1)
+def noisy(scenario: Scenario) -> Perception:
+    """Return a measurement model with 2 mm and 0.1 degrees of noise, and no detection in every tenth image."""
+    return measurement_model(scenario, scenario.seed, 0.002, math.radians(0.1), dropout=0.1)
 
 
 def main() -> None:
     parser = options_of(__doc__)
     parser.add_argument("--flights", type=int, default=100)
-    parser.add_argument("--seen", type=int, default=100)
+    parser.add_argument("--images", type=int, default=100)
     parser.add_argument("--aborts", type=int, default=50)
-    parser.add_argument("--aborts-seen", type=int, default=10)
+    parser.add_argument("--aborts-images", type=int, default=10)
     parser.add_argument("--failures", type=int, default=12)
-    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="of failures")
-    parser.add_argument("--failed-at", type=float, help="s; at random by default")
+    parser.add_argument("--kinds", nargs="+", choices=KINDS, default=KINDS, help="kinds of failure")
+    parser.add_argument("--failed-at", type=float, help="s; default: random")
     parser.add_argument("--approach-at", type=float, default=APPROACH_AT_S, help="s; not for aborts")
     parser.add_argument("--actuation", choices=("thrusters", "ideal"), default="thrusters")
-    parser.add_argument("--rate", type=int, help="Hz, of control and images; the scenario's by default")
-    parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="changes the scenario"
-    )
+    parser.add_argument("--rate", type=int, help="Hz, of control and images; default: the scenario's")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument(
-        "--results", type=Path, metavar="FILE", help="appended to; what is in it is not flown again"
+        "--results", type=Path, metavar="FILE", help="append flights; flights in it are not repeated"
     )
     o = parser.parse_args()
     numbers = {
         "flights": (o.flights, 4),
-        "seen": (o.seen, 1),
+        "images": (o.images, 1),
         "aborts": (o.aborts, 4),
-        "aborts_seen": (o.aborts_seen, 0),
+        "aborts_images": (o.aborts_images, 0),
     }
-    flights, seen, aborts, aborts_seen = (quick if o.quick else n for n, quick in numbers.values())
+    flights, images, aborts, aborts_images = (quick if o.quick else n for n, quick in numbers.values())
     failures = 0 if o.actuation == "ideal" else min(o.failures, 2) if o.quick else o.failures
     settings = (
         f"{o.actuation} rate={o.rate} approach={o.approach_at:g} failed={o.failed_at} set={sorted(o.set)}"
     )
     batch = Batch(o.results, settings)
     result: dict[str, float] = {}
-    begun_s = time.perf_counter()
-    seeds = range(o.first, o.first + max(flights, seen, aborts, aborts_seen, failures))
+    begin_s = time.perf_counter()
+    seeds = range(o.first, o.first + max(flights, images, aborts, aborts_images, failures))
 
     def scenario_of(seed: int, failure: Failure | None = None) -> Scenario:
-        return mission(seed, o.actuation, o.rate, failure, tuple(o.set))
+        return docking_scenario(seed, o.actuation, o.rate, failure, tuple(o.set))
 
     def failure_of(kind: str, seed: int) -> Failure:
         at_s = o.failed_at or float(np.random.default_rng([seed, 0xFA1]).uniform(2.0, 24.0))
         return kind, seed % 12, at_s
 
-    for part, number, eye in (("noise", flights, noisy), ("vision", seen, seeing_eye)):
+    for part, number, perception_of in (("noise", flights, noisy), ("vision", images, RenderedImages)):
         outcomes = [
-            batch.fly(part, k, lambda k=k, eye=eye: dock(k, scenario_of(k), eye, approach_at_s=o.approach_at))
+            batch.fly(
+                part,
+                k,
+                lambda k=k, perception_of=perception_of: dock(
+                    k, scenario_of(k), perception_of, approach_at_s=o.approach_at
+                ),
+            )
             for k in seeds[:number]
         ]
         if outcomes:
@@ -194,19 +207,26 @@ def main() -> None:
         if outcomes:
             table(kind, outcomes)
             result |= figures(kind, outcomes)
-    for part, number, eye in (("aborts", aborts, noisy), ("aborts_seen", aborts_seen, seeing_eye)):
+    for part, number, perception_of in (
+        ("aborts", aborts, noisy),
+        ("aborts_images", aborts_images, RenderedImages),
+    ):
         outcomes = [
-            batch.fly(part, k, lambda k=k, eye=eye: abort(k, scenario_of(k), eye, again=k % 5 == 0))
+            batch.fly(
+                part,
+                k,
+                lambda k=k, perception_of=perception_of: abort(
+                    k, scenario_of(k), perception_of, again=k % 5 == 0
+                ),
+            )
             for k in seeds[:number]
         ]
         if outcomes:
             table(part, outcomes)
             result |= abort_figures(part, outcomes)
-    width = max(map(len, result), default=0)
-    for name, value in result.items():
-        print(f"{name:{width}}  {value:.5g}")
+    print_figures(result)
     print(
-        f"{time.perf_counter() - begun_s:.0f} s, flown by {', '.join(sorted(batch.commits))}", file=sys.stderr
+        f"{time.perf_counter() - begin_s:.0f} s, flown by {', '.join(sorted(batch.commits))}", file=sys.stderr
     )
     write_json(o.json, result)
 

@@ -1,4 +1,4 @@
-"""What every benchmark does with its figures: the options ``--quick`` and ``--json``, and the file they ask for."""
+"""Options and output that all benchmarks share: ``--quick``, ``--json``, printed figures, and the JSON file."""
 
 from __future__ import annotations
 
@@ -11,21 +11,32 @@ from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
 
+ROOT = Path(__file__).resolve().parents[1]
 
-def options_of(about: str | None) -> argparse.ArgumentParser:
-    """A parser with the options that all benchmarks take."""
-    parser = argparse.ArgumentParser(description=about)
+
+def options_of(description: str | None) -> argparse.ArgumentParser:
+    """Return a parser with the options of all benchmarks; the description keeps its line breaks."""
+    parser = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--quick", action="store_true", help="fewer or shorter runs")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="writes the figures to FILE as well")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures to FILE, too")
     return parser
 
 
+def print_figures(figures: Mapping[str, float]) -> None:
+    """Print one figure per line, aligned."""
+    width = max(map(len, figures), default=0)
+    for name, value in figures.items():
+        print(f"{name:{width}}  {value:.5g}", flush=True)
+
+
 def write_json(path: Path | None, figures: Mapping[str, object]) -> None:
-    """The figures as a flat object with the command, commit and machine beside them; nothing without a ``path``."""
+    """Write the figures as a flat object, with command, commit and machine under ``about``; nothing without a path."""
     if path is None:
         return
     commit = subprocess.run(
-        ["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True, check=False
+        ["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
     )
     about = {
         "command": " ".join(sys.argv),

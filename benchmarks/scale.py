@@ -1,11 +1,11 @@
-"""What a tick costs with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json FILE]``.
+"""Cost of a tick with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json FILE]``.
 
-``sixteen-chasers``, or its first N. In one process (``offline.py``) the parts are timed one by one, by the thread's
-processor time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction, messages).
-Then the same mission is flown in lock-step as ``chaserdock run`` flies it: wall time a tick, and what its processes
-use of the processors. ``record`` is the recorder's; ``transport`` is what world, chasers and controller use beyond the
-parts: encoding, Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chasers`` (repeatable) chooses;
-``--parts-only`` leaves out the flights in processes.
+The first N chasers of ``sixteen-chasers``. In one process (``chaserdock.evaluation.in_process``) each part is timed by
+the thread's processor time, medians over ticks: render, physics, perceive, fuse, solve, guide (references, prediction,
+messages). Then ``chaserdock run`` flies the same mission in lock-step: wall time per tick, and processor time of its
+processes. ``record`` is the recorder's; ``transport`` is what world, chasers and controller use beyond the parts:
+encoding, Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chasers`` (repeatable) chooses;
+``--parts-only`` omits the lock-step missions.
 """
 
 from __future__ import annotations
@@ -23,34 +23,37 @@ import numpy as np
 import psutil
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from offline import Offline, seeing_eye
+from chaserdock_world.rendering.cameras import Cameras
 from results import options_of, write_json
 
+from chaserdock.evaluation import perception
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import RenderedImages
 from chaserdock.logs import open_log
 
 ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
 WARM_TICKS = 15
-"""Left out of every figure: until the first sightings have come and every kernel has run."""
+"""Excluded from every figure: first calls and the estimator's start."""
 SAMPLE_S = 0.2
 PARTS = ("render", "physics", "perceive", "fuse", "solve", "guide")
 
 
 def first(n: int) -> str:
-    """The scenario's text with its first ``n`` chasers."""
+    """Return the scenario's text with its first ``n`` chasers."""
     head, *chasers = SCENARIO.read_text(encoding="utf-8").split("[[chasers]]")
     return "[[chasers]]".join([head, *chasers[:n]])
 
 
 class Clock:
-    """Processor time of this thread spent in wrapped functions, by part; what a part calls of another counts there."""
+    """Processor time of this thread in wrapped functions, by part; nested parts are not counted twice."""
 
     def __init__(self) -> None:
         self.spent: dict[str, float] = defaultdict(float)
         self._inside: list[float] = []
 
     def wrap(self, owner: Any, name: str, part: str) -> None:
-        """Replaces ``owner.name`` by itself, timed."""
+        """Replace ``owner.name`` by a timed version."""
         work: Callable[..., Any] = getattr(owner, name)
 
         def timed(*args: Any, **more: Any) -> Any:
@@ -68,33 +71,30 @@ class Clock:
 
 
 def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
-    """Seconds of processor time a tick by part, in one process; medians."""
-    import chaserdock_world.rendering.cameras
-    import offline
-
+    """Return median seconds of processor time per tick by part, in one process."""
     clock = Clock()
-    kept = [(offline, "look"), (chaserdock_world.rendering.cameras.Cameras, "image")]
+    kept = [(perception, "look"), (Cameras, "image")]
     before = [getattr(owner, name) for owner, name in kept]
     for (owner, name), part in zip(kept, ("perceive", "render"), strict=True):
         clock.wrap(owner, name, part)
-    flight = Offline(scenario, seeing_eye(scenario))
-    clock.wrap(flight, "fly", "physics")
-    clock.wrap(flight.flight, "step", "guide")
-    clock.wrap(flight.flight.estimation, "run", "fuse")
-    clock.wrap(flight.flight.planning.solver, "solve", "solve")
+    mission = InProcessMission(scenario, RenderedImages(scenario))
+    clock.wrap(mission, "advance", "physics")
+    clock.wrap(mission.controller, "step", "guide")
+    clock.wrap(mission.controller.estimation, "run", "fuse")
+    clock.wrap(mission.controller.planning.solver, "solve", "solve")
     rows = []
     for _ in range(WARM_TICKS + ticks):
         clock.spent.clear()
-        flight.step()
+        mission.step()
         rows.append([clock.spent[part] for part in PARTS])
-    flight.close()
+    mission.close()
     for (owner, name), work in zip(kept, before, strict=True):
         setattr(owner, name, work)
     return dict(zip(PARTS, np.median(rows[WARM_TICKS:], axis=0).tolist(), strict=True))
 
 
 def processes_of(launcher: psutil.Process) -> dict[str, float]:
-    """Processor time, s, that the mission's processes have used so far."""
+    """Return the processor time, s, of the mission's processes so far."""
     used: dict[str, float] = {}
     for child in launcher.children():
         try:
@@ -108,9 +108,9 @@ def processes_of(launcher: psutil.Process) -> dict[str, float]:
 
 
 def fly(n: int, flown_s: float) -> dict[str, float]:
-    """The mission with ``n`` chasers in its own processes: seconds a tick of wall time, and of processor time by kind.
+    """Run the mission with ``n`` chasers: seconds of wall time per tick, and of processor time by kind of process.
 
-    Raises SystemExit when it was no success.
+    Raises SystemExit if it fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / f"{n}-chasers.toml", Path(folder) / "run"
@@ -140,7 +140,7 @@ def fly(n: int, flown_s: float) -> dict[str, float]:
     figures = {"wall": (ended - begun) / 1e9 / ticks}
     at = np.array([t for t, _ in samples], dtype=float)
     for kind in ("world", "chaser", "controller", "record"):
-        # A process is gone at the end: what it had used when last seen.
+        # Processes that have ended keep their last sample.
         used = np.maximum.accumulate([s.get(kind, 0.0) for _, s in samples])
         from_s, to_s = np.interp([begun, ended], at, used)
         figures[kind] = float(to_s - from_s) / ticks
@@ -148,7 +148,7 @@ def fly(n: int, flown_s: float) -> dict[str, float]:
 
 
 def measure(n: int, ticks: int, flown_s: float | None) -> dict[str, float]:
-    """Seconds a tick with ``n`` chasers, by part; in one process alone if ``flown_s`` is None."""
+    """Return seconds per tick with ``n`` chasers by part; without lock-step mission if ``flown_s`` is None."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.toml"
         path.write_text(first(n), encoding="utf-8")
@@ -168,18 +168,16 @@ def main() -> None:
     parser = options_of(__doc__)
     parser.add_argument("--chasers", type=int, action="append", choices=range(1, 17), metavar="N")
     parser.add_argument("--ticks", type=int, default=60, help="ticks timed in one process")
-    parser.add_argument("--seconds", type=float, default=12.0, help="simulated time flown in processes")
-    parser.add_argument("--parts-only", action="store_true", help="no flights in processes")
+    parser.add_argument(
+        "--seconds", type=float, default=12.0, help="simulated time of the lock-step missions"
+    )
+    parser.add_argument("--parts-only", action="store_true", help="no lock-step missions")
     options = parser.parse_args()
     sizes = options.chasers or ([1, 2, 4] if options.quick else [1, 2, 4, 8, 16])
     flown_s = None if options.parts_only else options.seconds
     names = (*PARTS, *(("sum",) if flown_s is None else ("transport", "record", "cpu", "wall")))
-    told = (
-        ""
-        if flown_s is None
-        else "; cpu: processor time of all processes; wall: in lock-step, on this machine"
-    )
-    print(f"ms a tick{told}")
+    legend = "; cpu: all processes; wall: in lock-step, on this machine"
+    print("ms per tick" + ("" if flown_s is None else legend))
     print(f"{'N':>3}" + "".join(f"{name:>11}" for name in names))
     result: dict[str, float] = {}
     for n in sizes:

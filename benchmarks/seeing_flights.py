@@ -1,11 +1,12 @@
-"""What flights with images show of the target's estimate: ``python benchmarks/seeing_flights.py PART [--json FILE]``.
+"""Target estimation with rendered images: ``python benchmarks/seeing_flights.py PART [--quick] [--json FILE]``.
 
-Parts: ``exact`` (all effects, cameras as calibrated; both targets, one and two chasers; the paper's perception and
-estimator on the same images), ``errors`` (calibration errors drawn for each seed, heavy noise), ``calibrate`` (the
-manoeuvre that finds a camera's mounting), ``acquire`` (starts off the reference, the target often out of view), ``faults``.
+Parts: ``exact`` (all image effects, cameras as calibrated; both targets, one and two chasers; the paper's perception and
+estimator on the same images), ``errors`` (calibration errors drawn from each seed, heavy noise), ``calibrate`` (the
+manoeuvre that estimates a camera's mounting), ``acquire`` (starts off the reference, the target often out of view),
+``faults`` (blind cameras, glare, a chaser that reports wrong poses).
 
-One line of JSON a flight goes to ``--flights FILE``; flights that are there already are not flown again, so that a run
-that was stopped goes on where it was.
+Every flight is one line of JSON in ``--flights FILE``; flights that are in the file are not repeated, so that an
+interrupted run continues.
 """
 
 from __future__ import annotations
@@ -13,29 +14,37 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
+from chaserdock_agents.chaser.perception import make_perception
+from chaserdock_agents.chaser.sighting import look
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
-from chaserdock_protocol.messages import Image, Sighting
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Image, Sighting, TargetEstimate
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.sensors.errors import true_camera
-from results import options_of, write_json
-from seen_loop import Estimates, Flown, changed, fly
+from results import options_of, print_figures, write_json
+
+from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.evaluation.perception import RenderedImages, States
 
 Row = dict[str, Any]
-DEG = math.degrees(1.0)
 SIDES = (((-1.0, 0.0, 0.0), 0.0), ((0.0, -1.0, 0.0), 90.0), ((1.0, 0.0, 0.0), 180.0))
-"""Reference places (TRF, m) of chasers round the target, and the yaw (degrees) with which each faces it."""
+"""Reference positions (TRF, m) of the chasers, and the yaw (degrees) with which each faces the target."""
 SETTLED_S = 6.0
 
 
 def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: Any) -> Scenario:
-    """A flight in which all effects are on; the sun, the target's attitude and the starts are drawn from the seed."""
+    """Return a scenario with all image effects; sun, target attitude and starts are drawn from the seed."""
     rng = np.random.default_rng([seed, 4])
     sun = rotations.rotate(
         rotations.exp([0.0, 0.0, rng.uniform(-math.pi, math.pi)]), [1.0, 0.0, rng.uniform(-0.6, 0.9)]
@@ -76,6 +85,152 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
     )  # fmt: skip
 
 
+@dataclass
+class EstimatorErrors:
+    """An estimator's errors against ground truth by tick: position (m), angle (rad), velocity (m/s), rate (rad/s), NEES of
+    the pose (6 degrees of freedom), the share of its six components inside 3 sigma, and the status."""
+
+    time_s: list[float] = field(default_factory=list)
+    position_m: list[float] = field(default_factory=list)
+    angle_rad: list[float] = field(default_factory=list)
+    velocity_m_s: list[float] = field(default_factory=list)
+    omega_rad_s: list[float] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    inside: list[float] = field(default_factory=list)
+    status: list[str] = field(default_factory=list)
+
+    def add(self, now_s: float, message: TargetEstimate, truth: BodyState) -> None:
+        """Append one estimate."""
+        covariance = np.reshape(message.covariance, (12, 12))
+        dp = truth.position_m - message.position_m
+        dtheta = rotations.log(rotations.multiply(rotations.conjugate(message.q_wxyz), truth.q_wxyz))
+        pose = np.concatenate([dp, dtheta])
+        i = [0, 1, 2, 6, 7, 8]
+        pose_covariance = covariance[np.ix_(i, i)]
+        self.time_s.append(now_s)
+        self.position_m.append(float(np.linalg.norm(dp)))
+        self.angle_rad.append(float(np.linalg.norm(dtheta)))
+        self.velocity_m_s.append(float(np.linalg.norm(truth.velocity_m_s - message.velocity_m_s)))
+        self.omega_rad_s.append(float(np.linalg.norm(truth.omega_rad_s - message.omega_rad_s)))
+        self.nees.append(float(pose @ np.linalg.solve(pose_covariance, pose)))
+        self.inside.append(float(np.mean(np.abs(pose) <= 3.0 * np.sqrt(np.diag(pose_covariance)))))
+        self.status.append(message.status)
+
+    def array(self, name: str, from_s: float = 0.0, to_s: float = np.inf) -> Array:
+        """Return one of the lists over a time span."""
+        t = np.array(self.time_s)
+        return np.array(getattr(self, name))[(t >= from_s - 1e-9) & (t < to_s)]
+
+    def largest(self, name: str, from_s: float) -> float:
+        """Return the largest value of a list from a time on, while there is an estimate."""
+        known = self.array("status", from_s) != "none"
+        return float(self.array(name, from_s)[known].max())
+
+    def rms(self, name: str, from_s: float = 0.0, to_s: float = np.inf) -> float:
+        """Return the root mean square of a list over a time span."""
+        return float(np.sqrt(np.mean(np.square(self.array(name, from_s, to_s)))))
+
+
+@dataclass
+class Flight:
+    """A flight: errors of its estimator and of the shadows, tracking errors as (time s, m, rad) of all chasers, events as
+    (time s, level, text), whether each image had a detection by chaser, the last outputs, and reinitializations."""
+
+    estimates: EstimatorErrors
+    shadows: dict[str, EstimatorErrors]
+    tracking: list[tuple[float, float, float]]
+    events: list[tuple[float, str, str]]
+    detections: dict[int, list[bool]]
+    last: TickOutputs
+    reinitialisations: int
+
+    def tracking_rms(self, from_s: float) -> tuple[float, float]:
+        """Return the RMS tracking errors (m, rad) of all chasers from a time on."""
+        errors = np.array([(m, rad) for time_s, m, rad in self.tracking if time_s >= from_s])
+        m, rad = np.sqrt(np.mean(errors**2, axis=0)).tolist()
+        return m, rad
+
+
+class Shadow:
+    """Perception and estimator of another scenario on the images of a flight, without influence on it."""
+
+    def __init__(self, scenario: Scenario, own_perception: bool) -> None:
+        self.errors = EstimatorErrors()
+        self._perceptions = [make_perception(scenario) for _ in scenario.chasers] if own_perception else []
+        self._core = ControllerCore(scenario, time.perf_counter)
+
+    def update(self, record: TickRecord, images: dict[int, Image]) -> None:
+        """Estimate the target from a tick's images and odometry."""
+        sightings = record.sightings
+        if self._perceptions and sightings:
+            sightings = tuple(look(self._perceptions[i], image, None) for i, image in images.items())
+        inputs = TickInputs(record.tick, record.time_ns, record.odometry, sightings)
+        estimate = self._core.estimate(inputs)
+        self.errors.add(record.time_s, estimate, record.states["target"])
+
+
+def fly(
+    scenario: Scenario,
+    shadows: Mapping[str, Scenario] | None = None,
+    on_image: Callable[[Image], Image] = lambda image: image,
+    on_sighting: Callable[[Sighting], Sighting] = lambda sighting: sighting,
+    until: Callable[[EstimatorErrors], bool] = lambda errors: False,
+) -> Flight:
+    """Fly a scenario with rendered images to its end, or ``until`` the errors so far satisfy a condition.
+
+    ``on_image`` changes an image before perception, ``on_sighting`` what a chaser reports of it.
+    """
+    images: dict[int, Image] = {}
+
+    def keep_image(image: Image) -> Image:
+        images[image.chaser] = on_image(image)
+        return images[image.chaser]
+
+    rendered = RenderedImages(scenario, keep_image)
+
+    def perception(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        return on_sighting(rendered(chaser, tick, time_ns, states))
+
+    beside = {
+        name: Shadow(s, own_perception=s.perception.name != scenario.perception.name)
+        for name, s in (shadows or {}).items()
+    }
+    errors, tracking = EstimatorErrors(), []
+    detections: dict[int, list[bool]] = {i: [] for i in range(len(scenario.chasers))}
+    outputs: TickOutputs | None = None
+    with InProcessMission(scenario, perception) as mission:
+        for record in mission.ticks():
+            outputs = record.outputs
+            assert outputs is not None
+            errors.add(record.time_s, outputs.target, record.states["target"])
+            for shadow in beside.values():
+                shadow.update(record, images)
+            for sighting in record.sightings:
+                detections[sighting.chaser].append(bool(sighting.solutions))
+            tracking += [(record.time_s, *record.tracking_errors[i]) for i in outputs.references]
+            if until(errors):
+                break
+        assert outputs is not None
+        return Flight(
+            errors,
+            {name: shadow.errors for name, shadow in beside.items()},
+            tracking,
+            mission.events,
+            detections,
+            outputs,
+            mission.controller.estimator.reinitialisations,
+        )
+
+
+def changed(scenario: Scenario, **sections: Any) -> Scenario:
+    """Return a scenario with some fields replaced and validated; dictionaries are merged into their sections."""
+    values = scenario.model_dump()
+    for name, value in sections.items():
+        merge = isinstance(value, dict) and isinstance(values[name], dict)
+        values[name] = values[name] | value if merge else value
+    return Scenario.model_validate(values)
+
+
 ERRORS = {"focal_length_share": 1e-3, "centre_px": 0.5, "mounting_deg": 0.3}
 HEAVY = {
     "exposure_s": 0.003,
@@ -85,17 +240,21 @@ HEAVY = {
     "point_spread_px": 0.9,
     "jpeg_quality": 75,
 }
-TOLD = {"camera_bias_attitude_deg": 0.3, "camera_bias_focal_share": 1e-3, "camera_bias_position_m": 5e-4}
+BIAS_SIGMAS = {
+    "camera_bias_attitude_deg": 0.3,
+    "camera_bias_focal_share": 1e-3,
+    "camera_bias_position_m": 5e-4,
+}
 
 
 def with_errors(scenario: Scenario) -> Scenario:
-    """Calibration errors and heavy noise; the filter is told their size."""
+    """Return the scenario with calibration errors and heavy noise, whose sigmas the filter has as parameters."""
     camera = scenario.camera.model_dump() | {"calibration_error": ERRORS, "effects": HEAVY}
-    return changed(scenario, camera=camera, estimator=TOLD)
+    return changed(scenario, camera=camera, estimator=BIAS_SIGMAS)
 
 
-def figures(flown: Flown, from_s: float) -> Row:
-    """What is told of a flight."""
+def figures(flown: Flight, from_s: float) -> Row:
+    """Return the figures of a flight."""
     e = flown.estimates
     m, rad = flown.tracking_rms(from_s)
     row: Row = {
@@ -108,7 +267,7 @@ def figures(flown: Flown, from_s: float) -> Row:
         "tracking_m": m,
         "tracking_rad": rad,
         "reinitialisations": flown.reinitialisations,
-        "seen": float(np.mean([v for seen in flown.seen.values() for v in seen])),
+        "seen": float(np.mean([v for each in flown.detections.values() for v in each])),
         "events": [f"{t:.2f} {text}" for t, _, text in flown.events][:40],
     }
     for name, shadow in flown.shadows.items():
@@ -119,7 +278,7 @@ def figures(flown: Flown, from_s: float) -> Row:
 
 
 def paper_of(scenario: Scenario) -> dict[str, Scenario]:
-    """The paper's perception and estimator on the same images."""
+    """Return, as shadow, the paper's perception and estimator."""
     return {"paper": changed(scenario, perception={"name": "paper"}, estimator={"name": "paper"})}
 
 
@@ -129,14 +288,14 @@ def exact(target: str, chasers: int, seed: int) -> Row:
 
 
 def errors(target: str, chasers: int, seed: int) -> Row:
-    """Beside it: the same filter that is not told of the errors (``naive``)."""
+    """Fly with errors; ``naive`` is the same filter with zero calibration sigmas."""
     scenario = with_errors(scenario_of(target, chasers, seed, 12.0))
-    naive = changed(scenario, estimator=dict.fromkeys(TOLD, 0.0))
+    naive = changed(scenario, estimator=dict.fromkeys(BIAS_SIGMAS, 0.0))
     return figures(fly(scenario, {"naive": naive}), SETTLED_S)
 
 
 def calibrate(target: str, seed: int) -> Row:
-    """One chaser whose camera is turned by 0.3 degrees (one sigma, each axis) turns about from 5 s on, for 30 s."""
+    """Fly one chaser with a mounting error of 0.3 degrees (one sigma, each axis); it calibrates from 5 s on, for 30 s."""
     scenario = scenario_of(target, 1, seed, 46.0)
     camera = scenario.camera.model_dump() | {"calibration_error": {"mounting_deg": 0.3}}
     scenario = changed(
@@ -146,14 +305,14 @@ def calibrate(target: str, seed: int) -> Row:
         timeline=[{"at_s": 5.0, "command": "calibrate", "chasers": (0,)}],
     )
     flown = fly(scenario)
-    told, true = scenario.camera_model(), true_camera(scenario, 0)
-    turn = rotations.multiply(true.q_crf_irf_wxyz, rotations.conjugate(told.q_crf_irf_wxyz))
-    found = flown.last.target.cameras[0]
-    left = float(rotations.angle_between(rotations.exp(found.turn_rad), turn))
+    nominal, true = scenario.camera_model(), true_camera(scenario, 0)
+    turn = rotations.multiply(true.q_crf_irf_wxyz, rotations.conjugate(nominal.q_crf_irf_wxyz))
+    estimate = flown.last.target.cameras[0]
+    left = float(rotations.angle_between(rotations.exp(estimate.turn_rad), turn))
     return figures(flown, 39.0) | {
         "mounting_error_before_rad": float(np.linalg.norm(rotations.log(turn))),
         "mounting_error_after_rad": left,
-        "mounting_sigma_rad": float(np.linalg.norm(found.turn_sigma_rad)),
+        "mounting_sigma_rad": float(np.linalg.norm(estimate.turn_sigma_rad)),
         "before_fused_m": flown.estimates.rms("position_m", 3.0, 5.0),
         "before_fused_rad": flown.estimates.rms("angle_rad", 3.0, 5.0),
         "good": float(left <= math.radians(0.05)),
@@ -164,7 +323,7 @@ LOCKED_S = 3.0
 
 
 def acquire(seed: int) -> Row:
-    """One chaser that starts up to 0.5 m and 20 degrees off; until the estimate has been right for 3 s, or 30 s."""
+    """Fly one chaser that starts up to 0.5 m and 20 degrees off, until the estimate is right for 3 s, at most 30 s."""
     rng = np.random.default_rng([seed, 11])
     offset, turn = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     start = {
@@ -176,59 +335,60 @@ def acquire(seed: int) -> Row:
     target = ("servicer", "paper")[seed % 2]
     scenario = scenario_of(target, 1, seed, 30.0, chasers=[start])
 
-    def locked(now_s: float, e: Estimates) -> bool:
+    def locked(e: EstimatorErrors) -> bool:
         n = round(LOCKED_S * scenario.time.rate_hz)
         right = np.array(e.position_m[-n:]) < 0.02, np.array(e.angle_rad[-n:]) < math.radians(3.0)
         return len(e.status) >= n and set(e.status[-n:]) == {"tracking"} and bool((right[0] & right[1]).all())
 
     flown = fly(scenario, until=locked)
     e = flown.estimates
-    done = locked(0.0, e)
+    done = locked(e)
     off = (np.array(e.position_m) > 0.1) | (np.array(e.angle_rad) > math.radians(10.0))
     wrong = off & (np.array(e.status) == "tracking") & (np.array(e.nees) > 40.0)
     return {
         "found": float(done),
         "locked_s": e.time_s[-1] - LOCKED_S if done else 99.0,
         "wrong_lock_ticks": int(wrong.sum()),
-        "in_view_at_start": float(flown.seen[0][0]),
+        "in_view_at_start": float(flown.detections[0][0]),
         "searched": float(any(text.endswith("searching (from acquire)") for _, _, text in flown.events)),
         "lost": float("lost" in e.status),
         "events": [f"{t:.2f} {text}" for t, _, text in flown.events][:20],
     }
 
 
-LIE_IRF_M, LIE_RAD = (0.2, 0.0, 0.0), (0.0, 0.0, math.radians(15.0))
+WRONG_IRF_M, WRONG_RAD = (0.2, 0.0, 0.0), (0.0, 0.0, math.radians(15.0))
 
 
 def fault(which: str, seed: int) -> Row:
-    """A fault between 8 s and 28 s (both cameras blind: 8 s to 13 s); the liar lies from the start."""
-    n = 3 if which == "liar" else 2
-    scenario = scenario_of("servicer", n, seed, 14.0 if which == "liar" else 32.0)
+    """Fly with a fault from 8 s to 28 s (both cameras blind: to 13 s); wrong poses are reported from the start."""
+    n = 3 if which == "wrong_poses" else 2
+    scenario = scenario_of("servicer", n, seed, 14.0 if which == "wrong_poses" else 32.0)
     if which == "sun":
         camera = scenario.camera.model_dump()
         # Chaser 0 looks along +X of the target, which is nearly that of the world.
         camera |= {"sun_direction": (1.0, -0.1, 0.12), "effects": camera["effects"] | {"glare": 3000.0}}
         scenario = changed(scenario, camera=camera)
 
-    def on_image(image: Image) -> Image | None:
+    def on_image(image: Image) -> Image:
         t = image.sim_time_ns / 1e9
         dark = (which == "one_blind" and image.chaser == 1 and 8.0 <= t < 28.0) or (
             which == "both_blind" and 8.0 <= t < 13.0
         )
-        return None if dark else image
+        black = bytes(image.width_px * image.height_px)
+        return msgspec.structs.replace(image, encoding="mono8", data=black) if dark else image
 
     def on_sighting(s: Sighting) -> Sighting:
-        if which != "liar" or s.chaser != 2:
+        if which != "wrong_poses" or s.chaser != 2:
             return s
-        lies = tuple(
+        wrong = tuple(
             msgspec.structs.replace(
                 x,
-                position_m=tuple((np.array(x.position_m) + LIE_IRF_M).tolist()),
-                q_wxyz=tuple(rotations.multiply(x.q_wxyz, rotations.exp(LIE_RAD)).tolist()),
+                position_m=tuple((np.array(x.position_m) + WRONG_IRF_M).tolist()),
+                q_wxyz=tuple(rotations.multiply(x.q_wxyz, rotations.exp(WRONG_RAD)).tolist()),
             )
             for x in s.solutions
         )
-        return msgspec.structs.replace(s, solutions=lies)
+        return msgspec.structs.replace(s, solutions=wrong)
 
     flown = fly(scenario, on_image=on_image, on_sighting=on_sighting)
     named = any(level == "warning" and "chaser 2" in text for _, level, text in flown.events)
@@ -254,13 +414,13 @@ def _jobs(part: str, seeds: range) -> list[tuple[str, Callable[[], Row]]]:
             case "acquire":
                 jobs.append((f"acquire {seed}", lambda seed=seed: acquire(seed)))
             case _:
-                for which in ("one_blind", "both_blind", "sun", "liar"):
+                for which in ("one_blind", "both_blind", "sun", "wrong_poses"):
                     jobs.append((f"faults {which} {seed}", lambda a=(which, seed): fault(*a)))
     return jobs
 
 
-def _told(part: str, rows: dict[str, Row]) -> dict[str, float]:
-    """The flat figures of a part: for each kind of flight, medians and the worst of all seeds."""
+def _figures(part: str, rows: dict[str, Row]) -> dict[str, float]:
+    """Return the figures of a part: for each kind of flight, mean and worst of all seeds."""
     out: dict[str, float] = {}
     kinds = sorted({name.rsplit(" ", 1)[0] for name in rows if name.startswith(part)})
     for kind in kinds:
@@ -283,9 +443,11 @@ def _told(part: str, rows: dict[str, Row]) -> dict[str, float]:
 def main() -> None:
     parser = options_of(__doc__)
     parser.add_argument("part", choices=("exact", "errors", "calibrate", "acquire", "faults"))
-    parser.add_argument("--flights", type=Path, default=None, help="JSON lines, one a flight; is added to")
-    parser.add_argument("--seeds", type=int, default=None, help="so many")
-    parser.add_argument("--first", type=int, default=0, help="from this seed on")
+    parser.add_argument(
+        "--flights", type=Path, default=None, help="append flights; flights in it are not repeated"
+    )
+    parser.add_argument("--seeds", type=int, default=None, help="number of seeds")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
     options = parser.parse_args()
     cv2.setNumThreads(1)
     most, few = {"acquire": (200, 8), "faults": (1, 1)}.get(options.part, (20, 2))
@@ -300,16 +462,15 @@ def main() -> None:
     for name, job in wanted:
         if name in rows:
             continue
-        begun = time.monotonic()
+        begin = time.monotonic()
         rows[name] = job()
         shown = {k: round(v, 6) for k, v in rows[name].items() if isinstance(v, float)}
-        print(f"{name}  ({time.monotonic() - begun:.0f} s wall) {shown}", flush=True)
+        print(f"{name}  ({time.monotonic() - begin:.0f} s wall) {shown}", flush=True)
         if flights is not None:
             with flights.open("a", encoding="utf-8") as file:
                 file.write(json.dumps({"flight": name} | rows[name]) + "\n")
-    result = _told(options.part, {name: rows[name] for name, _ in wanted})
-    for key, value in result.items():
-        print(f"{key:62}  {value:.4g}", flush=True)
+    result = _figures(options.part, {name: rows[name] for name, _ in wanted})
+    print_figures(result)
     write_json(options.json, result)
 
 

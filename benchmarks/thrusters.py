@@ -1,8 +1,9 @@
-"""Thrusters measured: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART ...]``.
+"""Thruster performance: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART ...]``.
 
-Parts: ``allocation`` (random wrenches), ``pulses`` (given against asked for), ``tracking`` (perfect state, the paper's
-rates), ``failures`` (every thruster of tetra12 stuck on, and stuck off, untold, at 30 s), ``healthy`` (false alarms).
-Flights are those of ``closed_loop``: everything that flies, without images. ``--quick``: fewer and shorter.
+Parts: ``allocation`` (random wrenches), ``pulses`` (delivered against commanded impulse), ``tracking`` (measurements
+without noise, the paper's rates), ``failures`` (every thruster of tetra12 stuck on, and stuck off, not reported, at 30 s),
+``healthy`` (false alarms). Missions fly in one process with a measurement model in place of images. ``--quick``: fewer
+and shorter.
 """
 
 from __future__ import annotations
@@ -12,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,11 +23,12 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_protocol.scenario.thrusters import thrusts_max
-from closed_loop import Record, fly
-from results import options_of, write_json
+from results import options_of, print_figures, write_json
 
-ROOT = Path(__file__).resolve().parents[1]
-FAILED_AT_S = 30.01  # just after a tick: the longest until two whole ticks are seen
+from chaserdock.evaluation.flight_record import FlightRecord, record_flight
+from chaserdock.evaluation.perception import measurement_model
+
+FAILED_AT_S = 30.01  # just after a tick: the longest time until two whole ticks are observed
 PAPER_RATES = {"velocity_m_s": (0.015, 0.0075, 0.03), "omega_rad_s": (0.015, 0.045, 0.03)}
 
 
@@ -36,11 +37,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "carrier_15_hz": {"modulation": {"carrier_hz": 15}},
     "schmitt": {"modulation": {"modulator": "schmitt"}},
 }
-"""Of the chasers, at 15 Hz: without test burns, with a period a tick, with a Schmitt trigger instead of pulse widths."""
+"""At 15 Hz: without test burns; one carrier period per tick; a Schmitt trigger instead of pulse-width modulation."""
 
 
 def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **changes: Any) -> Scenario:
-    """One chaser a metre from the target, with thrusters unless said otherwise."""
+    """Return a scenario with one chaser a metre from the target, with thrusters by default."""
     chaser = {"body": body, "actuation": "thrusters", **changes.pop("chaser", {})}
     start = {
         "start_offset_m": [-0.1, 0.02, 0.0],
@@ -57,8 +58,13 @@ def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **chan
     return parse_scenario(values | changes, "benchmark")
 
 
+def fly(s: Scenario) -> FlightRecord:
+    """Fly a scenario with measurements without noise."""
+    return record_flight(s, measurement_model(s, 0))
+
+
 def allocation(quick: bool) -> dict[str, float]:
-    """Wrenches that thrusters can give, up to full thrust of all, reproduced; and how long that takes."""
+    """Accuracy and time of the allocation of random feasible wrenches, up to full thrust."""
     out: dict[str, float] = {}
     for body in ("tetra12", "slider"):
         rng = np.random.default_rng(1)
@@ -68,9 +74,9 @@ def allocation(quick: bool) -> dict[str, float]:
         worst, over, inexact, took = 0.0, 0.0, 0, []
         for _ in range(1000 if quick else 10_000):
             wrench = allocator.matrix @ (full * rng.uniform(0.0, 1.0, len(full)))
-            begun = time.perf_counter()
+            begin = time.perf_counter()
             got = allocator.allocate(wrench, full)
-            took.append(time.perf_counter() - begun)
+            took.append(time.perf_counter() - begin)
             error = np.abs((allocator.matrix @ got.thrusts_N - wrench) / box).max()
             worst = max(worst, error / np.abs(wrench / box).max())
             over = max(over, float((got.thrusts_N - full).max()), float(-got.thrusts_N.min()))
@@ -85,11 +91,10 @@ def allocation(quick: bool) -> dict[str, float]:
 
 
 def pulses(quick: bool) -> dict[str, float]:
-    """Thrusts asked for at random, new every tick: greatest difference of impulse given and asked for, over any whole
-    number of carrier periods that makes a second, in minimum pulses of the thruster.
+    """Largest difference of delivered and commanded impulse over a second of random thrusts, in minimum pulses.
 
-    ``less_late``: without what was asked for within a period after its pulse had been sent. Where every tick begins a
-    period there is none.
+    ``less_late``: without what was commanded within a carrier period after its pulse had been sent, which is zero where
+    every tick begins a period.
     """
     out: dict[str, float] = {}
     for rate_hz, carrier_hz in ((10, 10), (15, 10), (30, 10), (15, 15)):
@@ -98,20 +103,20 @@ def pulses(quick: bool) -> dict[str, float]:
         full = thrusts_max(b.thrusters)
         modulator, valves = Modulator(b.thrusters, b.modulation, timing), Valves(b.thrusters)
         ticks, level = (20 if quick else 200) * rate_hz, full
-        asked = [np.zeros(len(full))]
+        commanded = [np.zeros(len(full))]
         for tick in range(ticks):
-            # Held for a second at most a third, so that small and large thrusts, and steps between, all come.
+            # The cube makes small thrusts frequent; steps come every second.
             if tick % rate_hz == 0:
                 level = full * rng.uniform(0.0, 0.8, len(full)) ** 3
             thrusts = level * rng.uniform(0.9, 1.1, len(full))
             begin, end = timing.effective_ns(tick), timing.effective_ns(tick + 1)
-            asked.append(asked[-1] + thrusts * (end - begin) * 1e-9)
+            commanded.append(commanded[-1] + thrusts * (end - begin) * 1e-9)
             for p in modulator.pulses(thrusts, full, begin, end):
                 valves.pulse(p.thruster, p.open_ns, p.close_ns)
-        # Where periods and ticks begin together, every whole second of the carrier is one of the ticks, too.
+        # Every second tick-aligned: whole seconds hold whole periods.
         edges = np.array([timing.effective_ns(k * rate_hz) for k in range(1, ticks // rate_hz)], dtype=float)
-        total = Asked(
-            np.array([timing.effective_ns(k) for k in range(ticks + 1)], dtype=float), np.array(asked)
+        total = CommandedImpulse(
+            np.array([timing.effective_ns(k) for k in range(ticks + 1)], dtype=float), np.array(commanded)
         )
         off = valves.impulses(edges) - np.diff(total.until(edges), axis=0)
         late = np.diff(total.late(edges, 1e9 / carrier_hz), axis=0)
@@ -123,68 +128,69 @@ def pulses(quick: bool) -> dict[str, float]:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """Impulse asked for up to times (K,) ns: (K, n) N s, growing evenly in between."""
+class CommandedImpulse:
+    """Commanded impulse (K, n) N s up to times (K,) ns, linear in between."""
 
     times_ns: Array
     total_N_s: Array
 
     def until(self, times_ns: Array) -> Array:
-        """Asked for up to times (M,) ns: (M, n) N s."""
+        """Return the impulse up to times (M,) ns: (M, n) N s."""
         return np.array([np.interp(times_ns, self.times_ns, column) for column in self.total_N_s.T]).T
 
     def late(self, ends_ns: Array, period_ns: float) -> Array:
-        """Of the periods that end at times (M,): asked for less what the thrust at their begin would make, (M, n)."""
+        """Return, per period that ends at times (M,), the impulse less that of the thrust at its begin, (M, n)."""
         begins = ends_ns - period_ns
         first = self.until(begins + 1e-3 * period_ns) - self.until(begins)
         return self.until(ends_ns) - self.until(begins) - 1e3 * first
 
 
 def tracking(quick: bool) -> dict[str, float]:
-    """Steady errors with thrusters, perfect state, and what that costs beside ideal actuation."""
+    """Steady errors and impulse with thrusters, beside ideal actuation."""
     out: dict[str, float] = {}
     duration_s = 40.0 if quick else 120.0
     for body in ("tetra12", "slider"):
-        ideal = fly(scenario(duration_s, body, chaser={"actuation": "ideal"}))[0]
+        ideal = fly(scenario(duration_s, body, chaser={"actuation": "ideal"}))
         out[f"tracking_{body}_ideal_position_rms_m"] = ideal.rms(20.0)[0]
-        out[f"tracking_{body}_ideal_absolute_impulse_N_s"] = ideal.absolute_impulse_N_s
+        out[f"tracking_{body}_ideal_absolute_impulse_N_s"] = float(ideal.absolute_impulse_N_s[0])
         rates: list[tuple[str, int, dict[str, Any]]] = [(f"{hz}_hz", hz, {}) for hz in (15, 10, 30)]
         rates += [(name, 15, chaser) for name, chaser in VARIANTS.items()]
         for variant, rate_hz, chaser in rates[:1] if quick else rates:
-            record = fly(scenario(duration_s, body, rate_hz, chaser=chaser))[0]
+            record = fly(scenario(duration_s, body, rate_hz, chaser=chaser))
             position, angle = record.rms(20.0)
             name = f"tracking_{body}_{variant}"
             out |= {
                 f"{name}_position_rms_m": position,
                 f"{name}_orientation_rms_deg": math.degrees(angle),
-                f"{name}_thruster_impulse_N_s": record.thruster_impulse_N_s(),
-                f"{name}_propellant_kg": record.propellant_kg,
+                f"{name}_thruster_impulse_N_s": float(record.thruster_impulse_N_s[0]),
+                f"{name}_propellant_kg": float(record.propellant_kg[0]),
             }
     return out
 
 
-def _isolated_s(record: Record, thruster: int) -> float:
-    """When a thruster's shut-off valve was closed after its failure, s from then; infinite if never."""
-    times = [c.effective_time_ns / 1e9 - FAILED_AT_S for c in record.commands if thruster in c.isolated]
+def _isolated_s(record: FlightRecord, thruster: int) -> float:
+    """Return the time from a thruster's failure to the closing of its shut-off valve; infinite if never."""
+    times = [c.effective_time_ns / 1e9 - FAILED_AT_S for c in record.commands_of(0) if thruster in c.isolated]
     return times[0] if times else math.inf
 
 
 def failures(quick: bool) -> dict[str, float]:
-    """Every thruster fails untold at 30 s: when the right one is shut off, how many wrong ones are, the errors after."""
+    """Every thruster fails at 30 s, not reported: time to isolation, wrongly isolated thrusters, errors afterwards."""
     out: dict[str, float] = {}
     thrusters = (0, 5, 10) if quick else range(12)
     for kind in ("stuck_on", "stuck_off"):
         delays, wrong, peaks, final = [], 0, [], []
         for thruster in thrusters:
             failure = {"chaser": 0, "thruster": thruster, "at_s": FAILED_AT_S, "kind": kind}
-            record = fly(scenario(80.0 if kind == "stuck_off" else 60.0, thruster_failure=[failure]))[0]
+            record = fly(scenario(80.0 if kind == "stuck_off" else 60.0, thruster_failure=[failure]))
             delays.append(_isolated_s(record, thruster))
-            wrong += len({j for c in record.commands for j in c.isolated} - {thruster})
-            late = np.array(record.time_s) >= FAILED_AT_S
-            peaks.append((max(np.array(record.position_m)[late]), max(np.array(record.angle_rad)[late])))
+            wrong += len({j for c in record.commands_of(0) for j in c.isolated} - {thruster})
+            late = record.time_s >= FAILED_AT_S
+            errors = record.position_error_m[late, 0], record.orientation_error_rad[late, 0]
+            peaks.append((float(errors[0].max()), float(errors[1].max())))
             final.append(record.rms(record.time_s[-1] - 10.0)[0])
             print(f"  {kind} thruster {thruster}: isolated after {delays[-1]:.3f} s, peak {peaks[-1][0] * 1e3:.1f} mm, "
-                  f"{math.degrees(peaks[-1][1]):.2f} deg; {record.events}", file=sys.stderr)  # fmt: skip
+                  f"{math.degrees(peaks[-1][1]):.2f} deg; {record.thruster_events}", file=sys.stderr)  # fmt: skip
         out |= {
             f"failures_{kind}_flights": float(len(delays)),
             f"failures_{kind}_isolated": float(np.isfinite(delays).sum()),
@@ -199,7 +205,7 @@ def failures(quick: bool) -> dict[str, float]:
 
 
 def healthy(quick: bool) -> dict[str, float]:
-    """Flights with nothing wrong: random starts, tumbles up to three times the paper's, noisy sightings, both bodies."""
+    """False alarms without failures: random starts, up to three times the paper's rates, noisy measurements, both bodies."""
     alarms, flights = 0, 4 if quick else 20
     for seed in range(flights):
         rng = np.random.default_rng(100 + seed)
@@ -209,17 +215,17 @@ def healthy(quick: bool) -> dict[str, float]:
             "start_rotation_rad": rng.uniform(-0.2, 0.2, 3).tolist(),
             "start_velocity_m_s": rng.uniform(-0.02, 0.02, 3).tolist(),
         }
-        target = {key: _turned(rng, np.array(v) * times) for key, v in PAPER_RATES.items()}
+        target = {key: _randomly_rotated(rng, np.array(v) * times) for key, v in PAPER_RATES.items()}
         s = scenario(40.0 if quick else 60.0, ("tetra12", "slider")[seed % 2], (15, 10, 30)[seed % 3], start=start,
                      target=target)  # fmt: skip
-        record = fly(s, seed, noise_m=0.002, noise_rad=math.radians(0.1))[0]
-        alarms += len(record.events)
-        for event in record.events:
+        record = record_flight(s, measurement_model(s, seed, 0.002, math.radians(0.1)))
+        alarms += len(record.thruster_events)
+        for event in record.thruster_events:
             print(f"  healthy flight {seed}: {event}", file=sys.stderr)
     return {"healthy_flights": float(flights), "healthy_false_alarms": float(alarms)}
 
 
-def _turned(rng: np.random.Generator, vector: Array) -> list[float]:
+def _randomly_rotated(rng: np.random.Generator, vector: Array) -> list[float]:
     return rotations.rotate(rotations.normalize(rng.normal(size=4)), vector).tolist()
 
 
@@ -239,9 +245,7 @@ def main() -> None:
     result: dict[str, float] = {}
     for part in options.only:
         figures = PARTS[part](options.quick)
-        width = max(map(len, figures))
-        for name, value in figures.items():
-            print(f"{name:{width}}  {value:.5g}", flush=True)
+        print_figures(figures)
         result |= figures
     write_json(options.json, result)
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Annotated
 
@@ -33,14 +31,15 @@ def reproduce(
 def study(
     cases: Annotated[
         Path,
-        typer.Argument(help="cases, one JSON object per line (StudyCase in chaserdock_protocol/study.py)"),
+        typer.Argument(
+            help="cases, one JSON object per line (StudyCase in chaserdock/evaluation/study_cases.py)"
+        ),
     ],
     out: Annotated[Path, typer.Option(help="results are appended to this file")],
 ) -> None:
-    """Fly the controller alone, on perfect knowledge and without images: a file of cases."""
-    installed = [e for e in entry_points(group="chaserdock.studies") if e.name == "controller"]
-    if not installed:
-        raise fail("no study of the controller is installed")
+    """Fly a file of cases in one process, with perfect knowledge of the target and without images."""
     if not cases.is_file():
         raise fail(f"{cases}: no such file")
-    sys.exit(installed[0].load()(cases, out))
+    from chaserdock.evaluation.study import main as fly_cases
+
+    raise typer.Exit(fly_cases(cases, out))

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from chaserdock_protocol.study import StudyResult
+from chaserdock.evaluation.study_cases import StudyResult
 
 from .page import Section, Table
 from .paper import PAPER_S, ROWS, Row

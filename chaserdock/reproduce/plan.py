@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from chaserdock_protocol.study import StudyCase
+from chaserdock.evaluation.study_cases import StudyCase
 
 from .paper import PAPER_S, ROWS
 

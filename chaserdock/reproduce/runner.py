@@ -17,12 +17,12 @@ from typing import Any
 from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
-from chaserdock_protocol.study import StudyCase, StudyResult, line_of, read_lines
 
 from chaserdock.campaign.plan import Campaign, Run, make_run
 from chaserdock.campaign.scheduler import Progress
 from chaserdock.campaign.table import rows_of, write_table
 from chaserdock.campaign.worker import CampaignError, Result, fly_campaign, read_result, result_path
+from chaserdock.evaluation.study_cases import StudyCase, StudyResult, line_of, read_lines
 
 from .plan import SCENARIO, Mission, Plan
 

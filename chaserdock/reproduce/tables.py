@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from chaserdock_protocol.study import StudyResult
+from chaserdock.evaluation.study_cases import StudyResult
 
 from .paper import PAPER_S, ROWS
 from .plan import INFERRED, Mission, Plan, table_group

@@ -13,8 +13,10 @@ from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.self_test import ThrusterSelfTest
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario.thrusters import thrusts_max
-from closed_loop import fly
 from thruster_cases import at_rest, mission, wrench
+
+from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.evaluation.perception import measurement_model
 
 PERIOD_S, S = 0.1, 1_000_000_000
 
@@ -121,7 +123,8 @@ def test_who_is_about_to_touch_or_is_held_tests_nothing() -> None:
 def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
     """Thruster 11 of tetra12 is not used at the paper's rates: without tests nobody learns that it is gone."""
     failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
-    record = fly(mission(duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure]))[0]
-    reports = [what for _, what in record.events if "limits" not in what]
+    scenario = mission(duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure])
+    record = record_flight(scenario, measurement_model(scenario, 0))
+    reports = [what for _, _, what in record.thruster_events if "limits" not in what]
     assert reports == (["thruster 11 stuck off: detected, isolated"] if finds else [])
-    assert max(np.array(record.position_m)[np.array(record.time_s) > 8.0]) < 0.05
+    assert record.position_error_m[record.time_s > 8.0].max() < 0.05

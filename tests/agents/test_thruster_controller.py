@@ -19,9 +19,11 @@ from chaserdock_controller.ingest.latency_compensation import (
 from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
-from closed_loop import fly
 from flight_cases import odometry
 from thruster_cases import at_rest, box, mission, wrench
+
+from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.evaluation.perception import measurement_model
 
 
 def limits(report: ThrusterReport) -> np.ndarray:
@@ -206,11 +208,12 @@ def test_operators_commands_reach_the_chaser_and_stay() -> None:
 def test_a_stuck_thruster_is_isolated_in_flight_within_half_a_second(thruster: int) -> None:
     """The closed loop, without images: found, shut off, and back on the reference."""
     failure = {"chaser": 0, "thruster": thruster, "at_s": 8.0, "kind": "stuck_on"}
-    record = fly(mission(duration_s=18.0, thruster_failure=[failure]))[0]
-    shut_s = [c.effective_time_ns / 1e9 - 8.0 for c in record.commands if c.isolated == (thruster,)]
+    scenario = mission(duration_s=18.0, thruster_failure=[failure])
+    record = record_flight(scenario, measurement_model(scenario, 0))
+    shut_s = [c.effective_time_ns / 1e9 - 8.0 for c in record.commands_of(0) if c.isolated == (thruster,)]
     assert 0.0 < shut_s[0] <= 0.5
-    assert not [c for c in record.commands if c.isolated not in ((), (thruster,))]
-    late = np.array(record.time_s) >= 8.0
-    assert np.array(record.position_m)[late].max() < 0.05
+    assert not [c for c in record.commands_of(0) if c.isolated not in ((), (thruster,))]
+    late = record.time_s >= 8.0
+    assert record.position_error_m[late, 0].max() < 0.05
     assert record.rms(16.0)[0] < 0.01
     assert math.degrees(record.rms(16.0)[1]) < 2.0

@@ -7,16 +7,12 @@ import os
 import re
 import shutil
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from chaserdock_protocol.transport.access_control import identities
+from compose_project import Project, compose_command, docker
 from harness import ROOT, SHORT
-
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-from containers import Project, compose_command, docker
 
 
 def why_no_docker() -> str:

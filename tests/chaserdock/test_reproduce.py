@@ -12,13 +12,13 @@ import msgspec
 import pyarrow.parquet as pq
 import pytest
 from chaserdock_protocol.scenario import load_scenario
-from chaserdock_protocol.study import StudyCase, StudyError, StudyResult, line_of, read_lines
 from harness import finished
 from hypothesis import given
 from hypothesis import strategies as st
 
 from chaserdock.campaign.plan import Run
 from chaserdock.campaign.worker import CampaignError, Result
+from chaserdock.evaluation.study_cases import StudyCase, StudyError, StudyResult, line_of, read_lines
 from chaserdock.reproduce.content import sections
 from chaserdock.reproduce.main import fly_plan
 from chaserdock.reproduce.page import Section, Table, html, markdown

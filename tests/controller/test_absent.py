@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.ingest.lost_chasers import (
     ABSENT_S,
     FIRST_M,
@@ -26,6 +25,8 @@ from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, load_scenario
+
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 ROOT = Path(__file__).resolve().parents[2]
 Q = (1.0, 0.0, 0.0, 0.0)

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.nmpc import NmpcInput, NmpcPlan, make_solver
 from chaserdock_controller.nmpc import stage as planning
@@ -18,6 +17,8 @@ from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import Scenario, ScenarioError
 from flight_cases import odometry, scenario
 from nmpc_cases import PARAMS, far_start, swap
+
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 SLOW_S = 0.01
 

@@ -1,4 +1,4 @@
-"""Capture from start to end, with the controller and the world that fly, in one process (``benchmarks/offline.py``)."""
+"""Capture from start to end in one process, and docking sections that are refused."""
 
 from __future__ import annotations
 
@@ -7,18 +7,20 @@ import math
 import numpy as np
 import pytest
 from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario
+from chaserdock_protocol.scenario import ScenarioError, parse_scenario
 from chaserdock_world.physics.simulation import TARGET
 from docking_cases import PORTS, values
-from docking_flights import ROOT, Conservation, dock, mission
-from offline import Offline, statistical_eye
+
+from chaserdock.evaluation.docking_flights import ConservationMission, dock, docking_scenario
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import measurement_model
+from chaserdock.evaluation.transfers import load_shipped
 
 
 def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
     """A seed with fast rates, noise of 2 mm and 0.1 degrees: 5 mm, 1.5 degrees, 1.2 cm/s; momentum to 1e-4."""
-    scenario = mission(1)
-    flight = Offline(scenario, statistical_eye(scenario, 1, 0.002, math.radians(0.1)))
-    conservation = Conservation(flight)
+    scenario = docking_scenario(1)
+    flight = ConservationMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1)))
     for what, until, limit_s in (("approach", "verified", 60.0), ("abort", "hold", 30.0)):
         while flight.time_s < 4.0:
             flight.step()
@@ -26,21 +28,22 @@ def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
         flight.step((OperatorCommand(command=what, chaser=0),))  # type: ignore[arg-type]
         while flight.phase(0) != until:
             assert flight.time_s - begun_s < limit_s, flight.events
-            out = flight.step()
+            out = flight.step().outputs
+            assert out is not None
             if flight.phase(0) == "verified":
                 assert out.wrenches[0].mode in ("coast", "pull")
                 assert out.target.status == "tracking"
                 truth = flight.physics.state(TARGET)
                 assert np.linalg.norm(np.array(out.target.velocity_m_s) - truth.velocity_m_s) < 0.005
     flight.close()
-    assert flight.touched == set()
+    assert flight.contacts == set()
     (touch,) = [t for t in flight.touches if t.latched]
     assert touch.lateral_m <= 0.005
     assert touch.angle_rad <= math.radians(1.5)
     assert touch.closing_m_s <= 0.012
-    assert conservation.linear is not None
-    assert conservation.angular is not None
-    assert max(conservation.linear, conservation.angular) <= 1e-4
+    assert flight.linear_error is not None
+    assert flight.angular_error is not None
+    assert max(flight.linear_error, flight.angular_error) <= 1e-4
     assert not flight.physics.latches["chaser/0"].latched
 
 
@@ -48,17 +51,17 @@ def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
 def test_a_thruster_that_failed_unknown_to_all_is_not_taken_for_a_latch_that_slips() -> None:
     """Thruster 10 pulls, sticks shut and is not tested: the common body turns by another push than the one commanded."""
     failure = ("stuck_off", 10, 16.38)
-    scenario = mission(10, failure=failure, changes=("chaser.thruster_test_s=0",))
-    outcome = dock(10, scenario, lambda s: statistical_eye(s, 10, 0.002, math.radians(0.1), 0.1), failure)
-    assert outcome.found_s() is None  # or the test tests nothing
+    scenario = docking_scenario(10, failure=failure, changes=("chaser.thruster_test_s=0",))
+    outcome = dock(10, scenario, lambda s: measurement_model(s, 10, 0.002, math.radians(0.1), 0.1), failure)
+    assert outcome.detection_delay_s() is None  # or the test tests nothing
     assert outcome.cause == "verified at the first attempt"
 
 
 @pytest.mark.slow
 def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
     """The scenario as shipped, with noise in place of images."""
-    scenario = load_scenario(ROOT / "scenarios" / "four-chaser-capture.toml")
-    flight = Offline(scenario, statistical_eye(scenario, 1, 0.002, math.radians(0.1), 0.1))
+    scenario = load_shipped("four-chaser-capture")
+    flight = InProcessMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1), 0.1))
     holding_on: dict[int, float] = {}
     while flight.time_s < scenario.duration_s and len(holding_on) < 3:
         flight.step()
@@ -66,12 +69,12 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
             if flight.phase(i) == "verified":
                 holding_on[i] = flight.time_s
     flight.close()
-    assert flight.touched == set()
+    assert flight.contacts == set()
     assert sorted(holding_on) == [0, 1, 3]
     assert abs(holding_on[0] - holding_on[3]) < 5.0
-    assert "chaser 1: wait (from hold: 2 are docking already)" in [what for _, what in flight.events]
-    first_latch = min(t for t, what in flight.events if ": latched" in what)
-    (its_turn,) = [t for t, what in flight.events if what.startswith("chaser 1: align")]
+    assert "chaser 1: wait (from hold: 2 are docking already)" in [what for _, _, what in flight.events]
+    first_latch = min(t for t, _, what in flight.events if ": latched" in what)
+    (its_turn,) = [t for t, _, what in flight.events if what.startswith("chaser 1: align")]
     assert its_turn == pytest.approx(first_latch, abs=0.1)
     for touch in (t for t in flight.touches if t.latched):
         assert touch.lateral_m <= 0.01

@@ -10,27 +10,31 @@ from typing import Any
 import pytest
 from chaserdock_protocol.messages import OperatorCommand
 from docking_cases import scenario
-from offline import Offline, statistical_eye
+
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import measurement_model
 
 V = (0.0, 2.0, 0.0)
 
 
 @pytest.fixture
-def flight() -> Iterator[Offline]:
+def flight() -> Iterator[InProcessMission]:
     """A chaser with thrusters that holds before its port, two seconds into the mission."""
     s = scenario(chaser={"body": "tetra12", "actuation": "thrusters", "torque_max_N_m": 0.15})
-    out = Offline(s, statistical_eye(s, 1, 0.002, math.radians(0.1)))
+    out = InProcessMission(s, measurement_model(s, 1, 0.002, math.radians(0.1)))
     while out.time_s < 2.0:
         out.step()
     yield out
     out.close()
 
 
-def ask(flight: Offline, *wishes: dict[str, Any]) -> list[tuple[bool, str]]:
+def ask(flight: InProcessMission, *wishes: dict[str, Any]) -> list[tuple[bool, str]]:
     """The answers to what operators ask for in one tick."""
     nobody: dict[str, Any] = {"chaser": 0}
     commands = [OperatorCommand(**(nobody | w)) for w in wishes]
-    replies = flight.step(tuple(commands)).replies
+    outputs = flight.step(tuple(commands)).outputs
+    assert outputs is not None
+    replies = outputs.replies
     assert [(r.command, r.chaser, r.operator) for r in replies] == [
         (c.command, c.chaser, c.operator) for c in commands
     ]
@@ -50,26 +54,27 @@ def ask(flight: Offline, *wishes: dict[str, Any]) -> list[tuple[bool, str]]:
         ({"command": "goto", "offset_m": (0.1, 0.0, 0.0)}, "the offset is 0.1 m from the target"),
     ],
 )
-def test_what_cannot_be_is_refused(flight: Offline, wish: dict[str, Any], reason: str) -> None:
+def test_what_cannot_be_is_refused(flight: InProcessMission, wish: dict[str, Any], reason: str) -> None:
     ((accepted, why),) = ask(flight, wish)
     assert not accepted
     assert why.startswith(reason)
     assert flight.phase(0) == "hold"
-    assert flight.last is not None
-    assert flight.last.wrenches[0].isolated == ()
+    outputs = flight.step().outputs
+    assert outputs is not None
+    assert outputs.wrenches[0].isolated == ()
 
 
-def test_twice_is_once(flight: Offline) -> None:
+def test_twice_is_once(flight: InProcessMission) -> None:
     for what in ({"command": "approach"}, {"command": "isolate", "thruster": 3}):
         assert ask(flight, what)[0][0]
-        since = flight.flight.guidance.chasers[0].since_s
+        since = flight.controller.guidance.chasers[0].since_s
         (again,) = ask(flight, what)
         assert again[0]
         assert "already" in again[1]
-        assert flight.flight.guidance.chasers[0].since_s == since
+        assert flight.controller.guidance.chasers[0].since_s == since
 
 
-def test_in_a_wrong_phase(flight: Offline) -> None:
+def test_in_a_wrong_phase(flight: InProcessMission) -> None:
     ask(flight, {"command": "approach"})
     while flight.phase(0) != "approach":
         flight.step()
@@ -88,14 +93,14 @@ def test_in_a_wrong_phase(flight: Offline) -> None:
     ],
 )
 def test_of_two_operators_at_once_the_first_counts(
-    flight: Offline, first: dict[str, Any], second: dict[str, Any]
+    flight: InProcessMission, first: dict[str, Any], second: dict[str, Any]
 ) -> None:
     answers = ask(flight, {**first, "operator": "ann"}, {**second, "operator": "bob"})
     assert answers[0][0]
     assert answers[1] == (False, f"{first['command']} by ann came first in this tick")
 
 
-def test_but_an_abort_always_does(flight: Offline) -> None:
+def test_but_an_abort_always_does(flight: InProcessMission) -> None:
     answers = ask(flight, {"command": "approach", "operator": "ann"}, {"command": "abort", "operator": "bob"})
     assert [accepted for accepted, _ in answers] == [True, True]
     assert flight.phase(0) == "abort"

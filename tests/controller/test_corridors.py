@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.evaluation.closed_loop import fly_offline
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.guidance.approach_cone import (
     BESIDE_LINE_M,
     Cone,
@@ -29,6 +27,9 @@ from flight_cases import odometry, quick, scenario
 from hypothesis import given
 from hypothesis import strategies as st
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
+
+from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 LIMIT_M = 0.35
 NEAR = {"approach": {"dock_distance_m": 0.25, "max_speed_m_s": 0.03}}
@@ -179,7 +180,7 @@ def test_a_chaser_docks_nearer_than_the_others_may_come() -> None:
     """The docking distance lies within the ball that everybody keeps; only the way in along the corridor leads there."""
     timeline = [{"at_s": 1.0, "command": "approach", "chasers": [0]}]
     mission = scenario(duration_s=60.0, settling_s=1.0, timeline=timeline, **NEAR)
-    trace = fly_offline(mission)
+    trace = record_flight(mission)
     truth = PerfectEstimator(mission.target)
     there = [truth.estimate_at(round(t * 1e9)) for t in trace.time_s]
     own, other = (

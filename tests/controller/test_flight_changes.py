@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.evaluation.closed_loop import fly_offline
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.ingest import stage as ingest
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
@@ -19,6 +17,9 @@ from chaserdock_protocol.scenario import Scenario, load_scenario, parse_scenario
 from docking_cases import scenario as capture_scenario
 from flight_cases import odometry
 from harness import ROOT
+
+from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 
 def three() -> Scenario:
@@ -99,7 +100,7 @@ def late_error_m() -> float:
     mission = load_scenario(
         ROOT / "scenarios/single.toml", (*LATE, "chasers.0.start_offset_m=[-0.1,0.0,0.0]")
     )
-    trace = fly_offline(mission)
+    trace = record_flight(mission)
     return float(np.sqrt(np.mean(trace.position_error_m[trace.time_s >= 40.0] ** 2)))
 
 
@@ -136,7 +137,7 @@ def test_who_starts_where_nobody_may_be_comes_out_and_hurts_nobody() -> None:
         },
         "test",
     )
-    trace = fly_offline(mission)
+    trace = record_flight(mission)
     truth = PerfectEstimator(mission.target)
     there = np.array([truth.estimate_at(round(t * 1e9)).position_m for t in trace.time_s])
     own = np.linalg.norm(trace.states[:, 0, :3] - there, axis=1)

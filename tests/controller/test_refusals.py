@@ -6,7 +6,6 @@ from typing import Any
 
 import pytest
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_protocol import codec
@@ -14,6 +13,8 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.messages import Odometry, OperatorCommand, encoding_of
 from chaserdock_protocol.scenario import Scenario, ScenarioError, parse_scenario
 from flight_cases import odometry, scenario
+
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 AT_START = [
     ({"controller": {"weight_position": -65.0}}, "controller.weight_position: "),

@@ -1,4 +1,4 @@
-"""The boundaries under mutated input, a quick version of benchmarks/fuzz.py; and that the judge sees garbage."""
+"""Decoders under mutated input (a short benchmarks/fuzz.py), and the check of what they accept."""
 
 from __future__ import annotations
 
@@ -10,29 +10,28 @@ import pytest
 from chaserdock_protocol import codec
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.messages.fields import MAX_COUNT
-from fuzz import boundaries, fuzz_logs, fuzz_messages, fuzz_scenarios
+from fuzzing import boundaries, fuzz_logs, fuzz_messages, fuzz_scenarios, garbage_in, mutate
 from message_samples import BY_TYPE
-from mutations import garbage_in, mutate
 
 KINDS = sorted(set(boundaries().values()), key=lambda kind: kind.__name__)
 
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: kind.__name__)
-def test_mutated_messages_are_refused_or_sound(kind: type[msgspec.Struct]) -> None:
+def test_mutated_messages_are_rejected_or_valid(kind: type[msgspec.Struct]) -> None:
     out = fuzz_messages(kind, 2000, seed=7)
     assert (out.crashes, out.garbage) == ([], [])
     assert sum(out.refused.values()) > 1000
-    assert out.accepted > 20  # the mutator is not so rough that nothing is ever left to judge
+    assert out.accepted > 20  # mutations are mild enough that some inputs stay valid
 
 
-def test_mutated_scenarios_have_one_kind_of_error() -> None:
+def test_mutated_scenarios_raise_scenario_error_only() -> None:
     out = fuzz_scenarios(120, seed=7)
     assert (out.crashes, out.garbage) == ([], [])
     assert out.refused["ScenarioError"] > 60
     assert out.accepted > 3
 
 
-def test_mutated_logs_have_one_kind_of_error() -> None:
+def test_mutated_logs_raise_log_error_only() -> None:
     out = fuzz_logs(15, seed=7)
     assert (out.crashes, out.garbage) == ([], [])
     assert out.refused["LogError"] > 5
@@ -44,8 +43,8 @@ def test_equal_seed_makes_equal_mutations() -> None:
     assert [mutate(payload, one) for _ in range(200)] == [mutate(payload, other) for _ in range(200)]
 
 
-def test_the_judge_sees_garbage() -> None:
-    """It must not lean on the codec: messages made past it are judged, too."""
+def test_check_finds_invalid_messages() -> None:
+    """The check does not depend on the codec: it also finds messages that the codec would reject."""
     odometry = BY_TYPE[m.Odometry]
     assert garbage_in(odometry) is None
     for name, bad in (
@@ -75,7 +74,7 @@ def test_the_judge_sees_garbage() -> None:
         (m.TargetEstimate, "covariance", [-1.0] + [0.0] * 143, "not_a_covariance"),
     ],
 )
-def test_what_fuzzing_found_is_refused(
+def test_inputs_found_by_fuzzing_are_rejected(
     kind: type[msgspec.Struct], field: str, bad: object, reason: str
 ) -> None:
     values = msgpack.unpackb(codec.encode(BY_TYPE[kind])) | {field: bad}

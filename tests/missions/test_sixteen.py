@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from chaserdock_controller.evaluation.closed_loop import fly_offline
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT
+
+from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 PATH = ROOT / "scenarios" / "sixteen-chasers.toml"
 
@@ -22,7 +23,7 @@ def test_two_rings_of_eight_as_the_file_says() -> None:
 def test_the_first_seconds_on_perfect_knowledge() -> None:
     """From their scattered starts all come nearer to their places, and nobody to anybody."""
     mission = load_scenario(PATH, ("duration_s=8.0", "settling_s=1.0"))
-    trace, truth = fly_offline(mission), PerfectEstimator(mission.target)
+    trace, truth = record_flight(mission), PerfectEstimator(mission.target)
     there = np.array([truth.estimate_at(round(t * 1e9)).position_m for t in trace.time_s])
     places = trace.states[:, :, :3]
     gaps = np.linalg.norm(places[:, :, None] - places[:, None], axis=-1) + 9.0 * np.eye(16)

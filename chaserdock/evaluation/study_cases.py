@@ -1,4 +1,4 @@
-"""Studies of the controller by itself: what is asked, and what comes back. One case a line, as JSON."""
+"""Cases and results of ``chaserdock study``: JSON, one per line."""
 
 from __future__ import annotations
 
@@ -6,21 +6,20 @@ from pathlib import Path
 from typing import TypeVar
 
 import msgspec
+from chaserdock_protocol.errors import ChaserdockError
 from msgspec import Struct
-
-from .errors import ChaserdockError
 
 
 class StudyError(ChaserdockError):
-    """A file of study cases or results that cannot be read."""
+    """A file of study cases or results is not readable, or a case is not valid."""
 
 
 class StudyCase(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scenario (path) with overrides, flown on perfect knowledge.
+    """A scenario (path) with overrides, flown with perfect knowledge of the target.
 
-    ``delay_s``: the command acts so long after its tick, unknown to the controller, which skips the ticks meanwhile.
-    ``delay_measured``: the same with the wall-clock time that the solve took. ``floor``: also the least possible
-    mean square position error of a chaser that turns as this one did.
+    ``delay_s``: time from a tick to its command's effect, unknown to the controller, which skips the ticks meanwhile.
+    ``delay_measured``: the wall-clock time of each solve as delay. ``floor``: compute the lower bound of the squared
+    position error, too, for a chaser that turns as this one did.
     """
 
     name: str
@@ -50,11 +49,11 @@ _Kind = TypeVar("_Kind", bound=Struct)
 
 
 def read_lines(path: Path, kind: type[_Kind]) -> list[_Kind]:
-    """One Struct of ``kind`` a line; raises StudyError, naming file and line."""
+    """Decode one Struct of ``kind`` per line; raises StudyError, naming file and line."""
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path}: cannot be read: {error}") from None
+        raise StudyError(f"{path}: not readable: {error}") from None
     out = []
     for number, line in enumerate(lines, start=1):
         try:
@@ -65,5 +64,5 @@ def read_lines(path: Path, kind: type[_Kind]) -> list[_Kind]:
 
 
 def line_of(item: Struct) -> str:
-    """The line that ``read_lines`` reads."""
+    """Encode one line for ``read_lines``."""
     return msgspec.json.encode(item).decode() + "\n"

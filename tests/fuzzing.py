@@ -1,7 +1,8 @@
-"""Seeded mutations of messages, scenarios and logs, and a check of what got through that shares nothing with the codec.
+"""Seeded mutations of messages, scenarios and logs at their decoders, and an independent check of what is accepted.
 
-``mutate`` works on bytes (flips, cuts, splices, lying lengths), ``mutate_values`` on the decoded map (other types, huge
-and not finite numbers, deep nesting). Equal seed, equal mutations, on any machine.
+``mutate`` works on bytes (bit flips, cuts, splices, wrong lengths), ``value_mutator`` on the decoded map (other types,
+huge and non-finite numbers, deep nesting). Equal seeds make equal mutations. ``garbage_in`` checks accepted messages by
+their type annotations alone and shares no code with the codec.
 """
 
 from __future__ import annotations
@@ -9,20 +10,32 @@ from __future__ import annotations
 import copy
 import math
 import random
+import tempfile
 import types
 import typing
+from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import msgpack
 import msgspec
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.messages import JoinReply, JoinRequest
+from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.scenario.errors import ScenarioError
+from message_samples import BY_TYPE
 
+ROOT = Path(__file__).resolve().parents[1]
 GREATEST_INT = 2**53
 GREATEST_FLOAT = 1e15
 MOST_ITEMS = 16_000
 MOST_BYTES = 16_000_000
 
-# Headers of msgpack that claim more than there is, or begin something else (msgpack specification, "Formats").
+# msgpack headers with too large lengths, or of other formats (msgpack specification, "Formats").
 _HEADERS = (
     b"\xdd\xff\xff\xff\xff",
     b"\xdf\xff\xff\xff\xff",
@@ -71,7 +84,7 @@ _ODD_VALUES: tuple[Any, ...] = (
 
 
 def mutate(payload: bytes, rng: random.Random) -> bytes:
-    """The bytes with one to four small damages."""
+    """Return the bytes with one to four small changes."""
     data = bytearray(payload)
     for _ in range(1 + int(rng.random() * 4)):
         kind, n = int(rng.random() * 8), len(data)
@@ -95,13 +108,13 @@ def mutate(payload: bytes, rng: random.Random) -> bytes:
 
 def _places(value: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    found = [(*path, key) for key, _ in items]
+    places = [(*path, key) for key, _ in items]
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    return found + [place for key, item in items for place in _places(item, (*path, key))]
+    return places + [place for key, item in items for place in _places(item, (*path, key))]
 
 
 def value_mutator(payload: bytes) -> Callable[[random.Random], bytes]:
-    """A function that makes well-formed msgpack of the same map with one or two values changed."""
+    """Return a function that makes well-formed msgpack of the same map with one or two values changed."""
     places = _places(msgpack.unpackb(payload))
 
     def mutated(rng: random.Random) -> bytes:
@@ -122,7 +135,7 @@ def value_mutator(payload: bytes) -> Callable[[random.Random], bytes]:
                 else:
                     place[path[-1]] = copy.copy(_ODD_VALUES[int(rng.random() * len(_ODD_VALUES))])
             except (LookupError, TypeError):
-                continue  # the first change took the second's place away
+                continue  # the first change removed the second's place
         packed = msgpack.packb(values)
         assert isinstance(packed, bytes)
         return packed
@@ -130,11 +143,11 @@ def value_mutator(payload: bytes) -> Callable[[random.Random], bytes]:
     return mutated
 
 
-# -- what may get through -----------------------------------------------------------------------------------
+# -- check of accepted messages ------------------------------------------------------------------------------
 
 
 def garbage_in(message: msgspec.Struct) -> str | None:
-    """What is wrong with a message that passed the decoder, by its type annotations alone; None if nothing is."""
+    """Return what is wrong with an accepted message by its type annotations; None if it is valid."""
     hints = _hints(type(message))
     for name, kind in hints.items():
         value = getattr(message, name)
@@ -167,7 +180,7 @@ def _wrong(value: Any, kind: Any) -> str | None:
             value, [m for m in metas if isinstance(m, msgspec.Meta)]
         )
     if origin is Literal:
-        return None if value in get_args(kind) else f"{value!r} is none of {get_args(kind)}"
+        return None if value in get_args(kind) else f"{value!r} is not in {get_args(kind)}"
     if origin in (types.UnionType, typing.Union):
         wrongs = [_wrong(value, k) for k in get_args(kind)]
         return None if None in wrongs else str(wrongs[0])
@@ -203,7 +216,7 @@ def _wrong_tuple(value: Any, kinds: tuple[Any, ...]) -> str | None:
 
 def _wrong_dict(value: Any, kinds: tuple[Any, ...]) -> str | None:
     if type(value) is not dict or len(value) > MOST_ITEMS:
-        return "no dictionary, or a huge one"
+        return "no dictionary, or too large"
     return next(
         (w for k, v in value.items() if (w := _wrong(k, kinds[0]) or _wrong(v, kinds[1])) is not None), None
     )
@@ -220,3 +233,116 @@ def _out_of_bounds(value: Any, metas: list[msgspec.Meta]) -> str | None:
         if meta.min_length is not None and len(value) < meta.min_length:
             return f"{len(value)} long, at least {meta.min_length}"
     return None
+
+
+# -- the boundaries --------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Outcome:
+    """Counts of mutated inputs; every crash and every accepted invalid message (``garbage``) with its input."""
+
+    total: int = 0
+    accepted: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    crashes: list[str] = field(default_factory=list)
+    garbage: list[str] = field(default_factory=list)
+
+
+def boundaries() -> dict[str, type[msgspec.Struct]]:
+    """Return every key that carries messages, and its type."""
+    keys = {topic.key: topic.kind for topic in topics.TOPICS}
+    return keys | {f"{topics.JOIN_KEY} (query)": JoinRequest, f"{topics.JOIN_KEY} (reply)": JoinReply}
+
+
+def fuzz_messages(kind: type[msgspec.Struct], number: int, seed: int) -> Outcome:
+    """Decode ``number`` mutated messages of ``kind``."""
+    out = Outcome(total=number)
+    rng = random.Random(f"{seed}/{kind.__name__}")
+    sample = codec.encode(BY_TYPE[kind])
+    by_value = value_mutator(sample)
+    for _ in range(number):
+        payload = by_value(rng) if rng.random() < 0.3 else mutate(sample, rng)
+        try:
+            message = codec.decode(kind, payload)
+        except Rejected as refusal:
+            out.refused[refusal.reason] += 1
+            continue
+        except Exception as error:
+            out.crashes.append(f"{type(error).__name__}: {error}: {payload[:200].hex()}")
+            continue
+        out.accepted += 1
+        wrong = garbage_in(message)
+        if wrong is not None:
+            out.garbage.append(f"{wrong}: {payload[:200].hex()}")
+    return out
+
+
+def fuzz_scenarios(number: int, seed: int) -> Outcome:
+    """Load ``number`` mutated scenario files; accepted ones must survive a JSON round trip."""
+    out, rng = Outcome(total=number), random.Random(f"{seed}/scenarios")
+    texts = [path.read_bytes() for path in sorted((ROOT / "scenarios").glob("*.toml"))]
+    values = (
+        b"nan",
+        b"inf",
+        b"-1",
+        b"0",
+        b"1e308",
+        b"[]",
+        b'""',
+        b"{}",
+        b"true",
+        b"99999999999999999999",
+        b"[" * 2000,
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mutated.toml"
+        for _ in range(number):
+            text = texts[int(rng.random() * len(texts))]
+            if rng.random() < 0.7:  # replace a whole value, so that it stays TOML
+                lines = text.split(b"\n")
+                places = [k for k, line in enumerate(lines) if b" = " in line]
+                at = places[int(rng.random() * len(places))]
+                key = lines[at].partition(b" = ")[0]
+                lines[at] = key + b" = " + values[int(rng.random() * len(values))]
+                text = b"\n".join(lines)
+            else:
+                text = mutate(text, rng)
+            path.write_bytes(text)
+            try:
+                scenario = load_scenario(path)
+                text_of = scenario.model_dump_json()
+                if type(scenario).model_validate_json(text_of).model_dump_json() != text_of:
+                    out.garbage.append(f"not the same after a round trip: {text[:200]!r}")
+                out.accepted += 1
+            except ScenarioError as refusal:
+                out.refused["ScenarioError"] += 1
+                if len(str(refusal)) > 20_000:
+                    out.garbage.append(f"an error of {len(str(refusal))} characters")
+            except Exception as error:
+                out.crashes.append(f"{type(error).__name__}: {error}: {text[:200]!r}")
+    return out
+
+
+def fuzz_logs(number: int, seed: int) -> Outcome:
+    """Read ``number`` mutated logs; every message of a readable one is checked."""
+    out, rng = Outcome(total=number), random.Random(f"{seed}/logs")
+    good = (ROOT / "tests" / "golden" / "two-chasers.mcap").read_bytes()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "mutated.mcap"
+        for _ in range(number):
+            data = mutate(good, rng)
+            path.write_bytes(data)
+            try:
+                rejected: Counter[str] = Counter()
+                for record in read_log(path, rejected=rejected):
+                    wrong = garbage_in(record.message)
+                    if wrong is not None:
+                        out.garbage.append(wrong)
+                read_scenario(path)
+                out.accepted += 1
+            except LogError:
+                out.refused["LogError"] += 1
+            except Exception as error:
+                out.crashes.append(f"{type(error).__name__}: {error}")
+    return out

@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_controller.evaluation.closed_loop import fly_offline
-from chaserdock_controller.evaluation.least_transient import gauss_times, least_square_integral
-from chaserdock_controller.evaluation.perfect_knowledge import PerfectEstimator
-from chaserdock_controller.evaluation.process import fly_case
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.study import StudyCase, StudyError, StudyResult
 from chaserdock_world.physics.simulation import prescribed_state
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
+from chaserdock.evaluation.flight_record import record_flight
+from chaserdock.evaluation.least_transient import gauss_times, least_square_integral
+from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
+from chaserdock.evaluation.study import fly_case
+from chaserdock.evaluation.study_cases import StudyCase, StudyError, StudyResult
 
 SCENARIOS = Path(__file__).resolve().parents[2] / "scenarios"
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -158,7 +159,7 @@ def test_delay_makes_long_horizons_fail_first() -> None:
 
     def worst(horizon_s: float, delay_s: float) -> float:
         s = scenario("paper-single", "duration_s=40.0", f"controller.horizon_s={horizon_s}")
-        return float(fly_offline(s, lambda _: delay_s).position_error_m[-150:].max())
+        return float(record_flight(s, solve_delay_s=lambda _: delay_s).position_error_m[-150:].max())
 
     assert worst(10.0, 0.1) < 0.02
     assert worst(3.0, 0.5) < 0.05
@@ -185,13 +186,13 @@ def test_bad_cases_are_named(changed: dict[str, Any], said: str) -> None:
 
 def test_delay_counts_missed_ticks() -> None:
     s = scenario("paper-single", "duration_s=3.0")
-    assert len(fly_offline(s).solve_s) == 90
-    assert len(fly_offline(s, lambda _: 0.1).solve_s) == 30
+    assert len(record_flight(s).solve_s) == 90
+    assert len(record_flight(s, solve_delay_s=lambda _: 0.1).solve_s) == 30
 
 
 def test_collision_avoidance_keeps_away_from_the_target() -> None:
     """From exact symmetry: the straight way leads through the centre."""
-    trace = fly_offline(scenario("collision-avoidance"))
+    trace = record_flight(scenario("collision-avoidance"))
     positions = trace.states[:, :, :3]
     assert np.linalg.norm(positions[:, 0], axis=1).min() >= 0.35
     assert np.linalg.norm(positions[:, 0] - positions[:, 1], axis=1).min() >= 0.35

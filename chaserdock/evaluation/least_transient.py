@@ -1,4 +1,4 @@
-"""The least possible transient: what no controller can go below under the actuators' limits."""
+"""Lower bound of the transient tracking error: the optimum under the actuators' limits, for any controller."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def least_square_integral(
     step_s: float,
     acceleration_max_m_s2: float,
 ) -> float:
-    """The least integral of |p - p_ref|^2 over the references' time, m^2 s.
+    """Return the least integral of |p - p_ref|^2 over the references' time, m^2 s.
 
-    A point starts at ``position_m`` with ``velocity_m_s`` (3,), WRF. ``references_m`` (3 K + 1, 3), WRF: p_ref at the three
-    Gauss points of each of K steps of ``step_s``, then at the end. Each step's acceleration is constant and bounded
-    by ``acceleration_max_m_s2`` along each of the body axes that ``q_wxyz`` (K, 4), body to world, gives: a convex quadratic
-    programme, solved by ipopt. Raises ValueError for shapes that do not fit, RuntimeError if it is not solved.
+    A point mass starts at ``position_m`` with ``velocity_m_s`` (3,), WRF. ``references_m`` (3 K + 1, 3), WRF: p_ref at the
+    three Gauss points of each of K steps of ``step_s``, then at the end. The acceleration is constant in each step and
+    bounded by ``acceleration_max_m_s2`` along each body axis; ``q_wxyz`` (K, 4): body to world. This is a convex quadratic
+    program, solved with ipopt. Raises ValueError for shapes that do not match, RuntimeError if it is not solved.
     """
     steps = len(q_wxyz)
     if references_m.shape != (3 * steps + 1, 3):
@@ -36,8 +36,8 @@ def least_square_integral(
     total: ca.MX | int = 0
     for k, (at, weight) in enumerate(_GAUSS):
         t = at * step_s
-        there = p[:, :-1] + t * v[:, :-1] + t * t / 2 * a
-        total += weight * step_s * ca.sumsqr(there - references_m[k:-1:3].T)
+        position = p[:, :-1] + t * v[:, :-1] + t * t / 2 * a
+        total += weight * step_s * ca.sumsqr(position - references_m[k:-1:3].T)
     motion = ca.horzcat(
         p[:, 1:] - p[:, :-1] - step_s * v[:, :-1] - step_s**2 / 2 * a,
         v[:, 1:] - v[:, :-1] - step_s * a,
@@ -45,17 +45,22 @@ def least_square_integral(
         v[:, 0] - velocity_m_s,
     )
     variables = ca.vertcat(ca.vec(p), ca.vec(v), ca.vec(u))
-    quiet = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.hessian_constant": "yes"}
-    solver = ca.nlpsol("floor", "ipopt", {"x": variables, "f": total, "g": ca.vec(motion)}, quiet)
+    options = {
+        "print_time": False,
+        "ipopt.print_level": 0,
+        "ipopt.sb": "yes",
+        "ipopt.hessian_constant": "yes",
+    }
+    solver = ca.nlpsol("floor", "ipopt", {"x": variables, "f": total, "g": ca.vec(motion)}, options)
     bound = np.full(variables.shape[0], np.inf)
     bound[-3 * steps :] = acceleration_max_m_s2
-    answer = solver(lbx=-bound, ubx=bound, lbg=0, ubg=0)
+    solution = solver(lbx=-bound, ubx=bound, lbg=0, ubg=0)
     if not solver.stats()["success"]:
-        raise RuntimeError(f"the floor's programme was not solved: {solver.stats()['return_status']}")
-    return float(answer["f"])
+        raise RuntimeError(f"the quadratic program was not solved: {solver.stats()['return_status']}")
+    return float(solution["f"])
 
 
 def gauss_times(steps: int, step_s: float) -> Array:
-    """The times (3 K + 1,) at which `least_square_integral` wants the references."""
+    """Return the times (3 K + 1,) of the references of ``least_square_integral``."""
     inside = (np.arange(steps)[:, None] + np.array([at for at, _ in _GAUSS])) * step_s
     return np.append(inside.ravel(), steps * step_s)

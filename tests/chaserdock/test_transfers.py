@@ -1,4 +1,4 @@
-"""What ``benchmarks/missions.py`` flies and how it keeps account: its figures are only as good as that."""
+"""Seeded variations of ``collision-avoidance`` and ``swap``, and the figures of a flight."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import math
 import numpy as np
 import pytest
 from chaserdock_models import rotations
-from missions import SYMMETRIC_EVERY, avoidance, fly, noisy, swap
+
+from chaserdock.evaluation.perception import measurement_model
+from chaserdock.evaluation.transfers import SYMMETRIC_EVERY, avoidance, fly_transfer, swap
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_variations_are_what_they_are_said_to_be(seed: int) -> None:
+def test_every_fourth_variation_is_symmetric_and_starts_are_safe(seed: int) -> None:
     scenario = avoidance(seed)
     own, watcher = scenario.chasers
     goal = np.array(scenario.timeline[0].offset_m)
@@ -31,7 +33,7 @@ def test_variations_are_what_they_are_said_to_be(seed: int) -> None:
     assert avoidance(seed) == scenario
 
 
-def test_swaps_differ_by_seed_and_the_first_is_exactly_head_on() -> None:
+def test_swaps_differ_by_seed_and_seed_zero_is_exactly_head_on() -> None:
     assert all(c.start_offset_m == (0.0, 0.0, 0.0) for c in swap(0).chasers)
     assert swap(1) == swap(1)
     assert swap(1).chasers != swap(2).chasers
@@ -39,18 +41,18 @@ def test_swaps_differ_by_seed_and_the_first_is_exactly_head_on() -> None:
 
 
 @pytest.mark.parametrize(("within_m", "reached"), [(0.02, True), (1e-6, False)])
-def test_the_account_of_a_flight(within_m: float, reached: bool) -> None:
-    """A short hop of 5 cm: least distances as laid out, there when it is over; a goal never met is not reached."""
+def test_figures_of_a_short_transfer(within_m: float, reached: bool) -> None:
+    """A transfer of 5 cm: least distances as in the scenario, reached at the end; an unmet tolerance is not reached."""
     scenario = avoidance(0)
     (entry,) = scenario.timeline
     entry = entry.model_copy(update={"at_s": 1.0, "offset_m": (-1.05, 0.0, 0.0)})
     success = scenario.success.model_copy(update={"reached_position_m": within_m})
     short = {"duration_s": 9.0, "timeline": (entry,), "success": success}
     scenario = scenario.model_copy(update=short)
-    flown = fly(0, scenario, noisy(scenario))
+    flown = fly_transfer(0, scenario, measurement_model(scenario, 0, 0.002, math.radians(0.1)))
     assert flown.to_target_m == pytest.approx(1.0, abs=0.01)
     assert flown.between_m == pytest.approx(math.sqrt(2.0), abs=0.02)
-    assert flown.failed == flown.touched == 0
+    assert flown.failed == flown.contacts == 0
     assert flown.end_m < 0.02
     assert math.isnan(flown.reached_s) != reached
     if reached:

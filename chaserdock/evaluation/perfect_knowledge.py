@@ -1,20 +1,21 @@
-"""An estimator that knows the prescribed target exactly: what is left of an error then is the controller's."""
+"""An estimator that knows a prescribed target exactly, so that the errors that remain are the controller's."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-from chaserdock_protocol.scenario.bodies import Target
-
 from chaserdock_controller.estimation.types import EstimatorEvent, Matrix3, Measurement, Shock, TargetState
 from chaserdock_controller.guidance.reference import predict_target
+from chaserdock_protocol.scenario.bodies import Target
+
+_VARIANCE = 1e-12
 
 
 class PerfectEstimator:
-    """The `fusion.types.Estimator` of a target with prescribed motion, without any measurement.
+    """The ``Estimator`` of a target with prescribed motion; it ignores measurements.
 
-    Raises ValueError for a ``torque_free`` target, whose motion has no closed form here.
+    Raises ValueError for a ``torque_free`` target, whose motion has no closed form.
     """
 
     accepted = gated = late_dropped = reinitialisations = 0
@@ -29,31 +30,24 @@ class PerfectEstimator:
         self._omega = np.array(target.omega_rad_s) if moves else still
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """The state at any time, with a covariance of 1e-12 (SI units) on the diagonal."""
+        """Return the state at any time, with a variance of 1e-12 (SI units) of every number."""
         position, q = self._start
         positions, attitudes = predict_target(position, self._velocity, q, self._omega, [time_ns / 1e9])
+        covariance = _VARIANCE * np.eye(12)
         return TargetState(
-            time_ns,
-            positions[0],
-            self._velocity,
-            attitudes[0],
-            self._omega,
-            1e-12 * np.eye(12),
-            "tracking",
-            0,
-            (),
+            time_ns, positions[0], self._velocity, attitudes[0], self._omega, covariance, "tracking", 0, ()
         )
 
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
-        """The state now; measurements are not needed."""
+        """Return the state now."""
         return self.estimate_at(now_ns)
 
     def disturb(self, shock: Shock) -> None:
-        """Nothing to do: a prescribed target is not moved by a push."""
+        """Do nothing: a push does not move a prescribed target."""
 
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
-        """Nothing to do: a prescribed target moves the same whoever holds on to it."""
+        """Do nothing: a prescribed target moves the same with chasers attached."""
 
     def drain_events(self) -> list[EstimatorEvent]:
-        """None, ever."""
+        """Return no events."""
         return []

@@ -1,0 +1,1 @@
+"""Evaluation of missions in one process, against ground truth: no code here flies."""

@@ -1,0 +1,85 @@
+"""What the chasers see of the target in an in-process mission: rendered images, or a statistical measurement model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from chaserdock_agents.chaser.perception import make_perception
+from chaserdock_agents.chaser.sighting import look, prediction_from
+from chaserdock_models import rotations
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import Image, PoseSolution, Sighting
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.physics.simulation import TARGET, BodyState
+from chaserdock_world.rendering.cameras import Cameras
+
+States = dict[str, BodyState]
+Perception = Callable[[int, int, int, States], Sighting]
+"""Maps chaser, tick, time (ns) and the true states of all bodies to the chaser's sighting."""
+
+_LEAST_SIGMA = 1e-4
+"""m and rad: the covariance of a measurement without noise must be positive definite, too."""
+
+
+class RenderedImages:
+    """Render each chaser's image, with the scenario's camera errors and effects, and run its perception on it.
+
+    ``on_image`` sees every image, and returns the one that perception gets.
+    """
+
+    def __init__(self, scenario: Scenario, on_image: Callable[[Image], Image] = lambda image: image) -> None:
+        self._ticks_per_image = scenario.timing.ticks_per_image
+        self._cameras = Cameras(scenario)
+        self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
+        self._last: dict[int, Sighting] = {}
+        self._on_image = on_image
+
+    def __call__(self, chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        image = self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
+        predicted = prediction_from(self._last.get(chaser))
+        self._last[chaser] = look(self._perceptions[chaser], self._on_image(image), predicted)
+        return self._last[chaser]
+
+
+def measurement_model(
+    scenario: Scenario,
+    seed: int,
+    position_sigma_m: float = 0.0,
+    attitude_sigma_rad: float = 0.0,
+    dropout: float = 0.0,
+) -> Perception:
+    """Return a perception that measures the target's true pose with white noise of these sigmas per axis.
+
+    ``dropout``: the share of images without a detection. Of the scenario's camera only the nominal mounting counts.
+    """
+    rng = np.random.default_rng([seed, 0xE1E])
+    camera = scenario.camera_model()
+    sigmas = [max(position_sigma_m, _LEAST_SIGMA)] * 3 + [max(attitude_sigma_rad, _LEAST_SIGMA)] * 3
+    covariance = vector(np.diag(np.square(sigmas)))
+
+    def measure(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        own, target = states[f"chaser/{chaser}"], states[TARGET]
+        eye, attitude = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
+        position = rotations.rotate_inverse(attitude, target.position_m - eye)
+        position = position + rng.normal(0.0, position_sigma_m, 3)
+        q_world = rotations.multiply(target.q_wxyz, rotations.exp(rng.normal(0.0, attitude_sigma_rad, 3)))
+        solution = PoseSolution(
+            position_m=vector(position),
+            q_wxyz=vector(rotations.multiply(rotations.conjugate(attitude), q_world)),
+            covariance=covariance,
+            reprojection_rms_px=0.1,
+        )
+        missed = rng.random() < dropout
+        return Sighting(
+            tick=tick,
+            sim_time_ns=time_ns,
+            chaser=chaser,
+            status="nothing" if missed else "seen",
+            solutions=() if missed else (solution,),
+            marker_ids=() if missed else (0, 1, 2, 3),
+            corners_px=(),
+            rejected_ids=(),
+        )
+
+    return measure

@@ -1,0 +1,100 @@
+"""The in-process mission moves the bodies exactly as a lock-step mission in separate processes does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chaserdock_protocol import topics
+from chaserdock_protocol.scenario import load_scenario, parse_scenario
+from harness import ROOT, run
+
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import RenderedImages, measurement_model
+from chaserdock.logs import open_log
+
+SMALL = (
+    "camera.width_px=480",
+    "camera.height_px=270",
+    "settling_s=1.0",
+    "success.steady_position_rms_m=9.0",
+    "success.steady_orientation_rms_deg=180.0",
+)
+ODOMETRY = "odometry={position_noise_m=0.001,velocity_noise_m_s=0.0005,attitude_noise_deg=0.05,position_bias_m=0.002}"
+CASES = {
+    "ideal": ("two-chaser-tracking", ("duration_s=2.0",)),
+    "errors": (
+        "two-chaser-tracking",
+        (
+            "duration_s=3.0",
+            "chaser.actuation='thrusters'",
+            "chaser.body='tetra12'",
+            "thruster_failure=[{chaser=0,thruster=4,at_s=0.5,kind='stuck_on'}]",
+            "camera.calibration_error={focal_length_share=0.001,mounting_deg=0.3}",
+            "camera.effects={read_noise=3.0,jpeg_quality=80}",
+            ODOMETRY,
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_truth_equals_that_of_a_lockstep_mission(case: str, tmp_path: Path) -> None:
+    name, overrides = CASES[case][0], (*CASES[case][1], *SMALL)
+    _, text = run(name, tmp_path / "run", *overrides)
+    log = open_log(tmp_path / "run")
+    logged = {(m.body, m.tick): m for m in (r.message for r in log.records(topics.TRUTH_BODY))}
+    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
+    assert len(logged) == 3 * (scenario.ticks + 1), text
+    with InProcessMission(scenario, RenderedImages(scenario)) as mission:
+        for record in mission.ticks():
+            for body, state in record.states.items():
+                message = logged[body, record.tick]
+                for field in ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s"):
+                    logged_value = np.array(getattr(message, field))
+                    np.testing.assert_array_equal(
+                        getattr(state, field), logged_value, f"{body} {record.tick} {field}"
+                    )
+            for i, delivered in record.delivered.items():
+                message = logged[f"chaser/{i}", record.tick + 1]
+                assert delivered.thruster_impulse_N_s == message.thruster_impulse_N_s
+                np.testing.assert_array_equal(delivered.impulse[:3], message.impulse_N_s)
+
+
+def mission(**changes: object) -> dict[str, object]:
+    still = {"motion": "static"}
+    chasers = [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}]
+    return {"name": "test", "duration_s": 2.0, "target": still, "chasers": chasers, **changes}
+
+
+def test_odometry_errors_of_the_scenario_apply() -> None:
+    scenario = parse_scenario(
+        mission(odometry={"position_bias_m": 0.01, "velocity_noise_m_s": 0.001}), "test"
+    )
+    with InProcessMission(scenario) as flight:
+        records = list(flight.ticks())
+    offsets = [np.array(r.odometry[0].position_m) - r.states["chaser/0"].position_m for r in records]
+    assert np.linalg.norm(offsets[0]) > 1e-3
+    np.testing.assert_allclose(offsets, np.tile(offsets[0], (len(offsets), 1)), atol=1e-12)
+    assert (
+        np.std([r.odometry[0].velocity_m_s[0] - r.states["chaser/0"].velocity_m_s[0] for r in records]) > 5e-4
+    )
+
+
+def test_equal_seeds_make_equal_flights() -> None:
+    scenario = parse_scenario(mission(), "test")
+    ends = []
+    for _ in range(2):
+        with InProcessMission(scenario, measurement_model(scenario, 1, 0.002, 0.002, dropout=0.1)) as flight:
+            records = list(flight.ticks())
+            ends.append(flight.states()["chaser/0"].position_m)
+            assert {len(r.sightings[0].solutions) for r in records} == {0, 1}
+    np.testing.assert_array_equal(*ends)
+
+
+@pytest.mark.parametrize("option", [{"actuator_gain": 1.05}, {"solve_delay_s": lambda _: 0.1}])
+def test_gain_and_delay_are_refused_with_thrusters(option: dict) -> None:
+    chaser = {"body": "tetra12", "actuation": "thrusters"}
+    with pytest.raises(ValueError, match=r"need chaser\.actuation"):
+        InProcessMission(parse_scenario(mission(chaser=chaser), "test"), **option)

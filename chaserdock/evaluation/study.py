@@ -32,7 +32,7 @@ def main(cases: Path, results: Path) -> int:
             with results.open("a", encoding="utf-8") as file:
                 file.write(line_of(result))
         except OSError as error:
-            raise StudyError(f"{results}: not writable: {error.strerror or error}") from None
+            raise StudyError(f"{results}: cannot be written: {error.strerror or error}") from None
     return 0
 
 

@@ -53,7 +53,7 @@ def read_lines(path: Path, kind: type[_Kind]) -> list[_Kind]:
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
-        raise StudyError(f"{path}: not readable: {error}") from None
+        raise StudyError(f"{path}: cannot be read: {error}") from None
     out = []
     for number, line in enumerate(lines, start=1):
         try:

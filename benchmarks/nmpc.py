@@ -39,10 +39,12 @@ from chaserdock_controller.nmpc import (
     make_solver,
     native,
 )
+from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.native.build import compile_kernels
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
+from chaserdock_protocol.scenario.schema import Controller, Limits
 from results import options_of, write_json
 
 TICK_S = 0.1
@@ -53,7 +55,7 @@ SIZE_M = (0.25, 0.25, 0.05)
 def parameters(mass_kg: float, force_N: float, torque_N_m: float) -> NmpcParameters:
     x, y, z = cuboid_inertia(mass_kg, SIZE_M)
     inertia = ((x, 0.0, 0.0), (0.0, y, 0.0), (0.0, 0.0, z))
-    return NmpcParameters(mass_kg, inertia, force_N, torque_N_m)
+    return NmpcParameters(mass_kg, inertia, force_N, torque_N_m, **nmpc_settings(Controller(), Limits()))
 
 
 HARD = parameters(10.0, 3.0, 0.3)

@@ -14,14 +14,19 @@ from chaserdock_controller.guidance.reference import (
     reference_trajectory,
 )
 from chaserdock_controller.nmpc import NmpcInput, NmpcParameters, NmpcPlan, NmpcSolver, kernels, make_solver
+from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.scenario.schema import Controller, Limits
 
 # The paper's chaser and tumble (paper/reference.toml).
 MASS_KG = 30.0
 _LONG, _FLAT = MASS_KG / 12 * (0.25**2 + 0.25**2), MASS_KG / 12 * (0.25**2 + 0.05**2)
 INERTIA = ((_FLAT, 0.0, 0.0), (0.0, _FLAT, 0.0), (0.0, 0.0, _LONG))
-PARAMS = NmpcParameters(mass_kg=MASS_KG, inertia_kg_m2=INERTIA, force_max_N=2.0, torque_max_N_m=0.05)
+SETTINGS = nmpc_settings(Controller(), Limits())
+PARAMS = NmpcParameters(
+    mass_kg=MASS_KG, inertia_kg_m2=INERTIA, force_max_N=2.0, torque_max_N_m=0.05, **SETTINGS
+)
 V_TARGET = np.array([1.5e-2, 0.75e-2, 3e-2])
 W_TARGET = np.array([1.5e-2, 4.5e-2, 3e-2])
 HALF = np.sqrt(0.5)

@@ -13,7 +13,7 @@ from typer.exceptions import TyperException
 
 from chaserdock.exit_codes import FAILED
 
-from . import keys, logs
+from . import keys, logs, scenario
 from .analysis import figures, report, snapshot, summary, video
 from .calibration import calibrate, markers
 from .campaign import campaign
@@ -29,6 +29,7 @@ from .view import view
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Fly": (run, campaign),
+    "Scenarios": (scenario.app,),
     "Processes": (world, chaser, controller, record, router),
     "Operate": (command, thruster_fault, status, view, judge),
     "Look at a flight": (summary, report, figures, video, snapshot),

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import ESTIMATORS, Scenario
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
+from chaserdock_protocol.scenario.schema import Controller, Limits
 
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.types import Estimator
@@ -17,25 +19,23 @@ from .nmpc import NmpcParameters
 
 def nmpc_parameters(scenario: Scenario) -> NmpcParameters:
     """Return the NMPC's parameters, which the scenario has validated."""
-    c, body = scenario.controller, scenario.chaser
+    body = scenario.chaser
     ix, iy, iz = body.inertia
     return NmpcParameters(
         mass_kg=body.mass_kg,
         inertia_kg_m2=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
-        horizon_s=c.horizon_s,
-        dt_s=c.dt_s,
-        falloff=c.falloff,
-        weight_position=c.weight_position,
-        weight_orientation=c.weight_orientation,
-        weight_force=c.weight_force,
-        weight_torque=c.weight_torque,
-        weight_final_position=c.weight_final_position,
-        weight_final_orientation=c.weight_final_orientation,
-        max_reference_distance_m=scenario.limits.max_reference_distance_m,
-        integrator=c.integrator,
+        **nmpc_settings(scenario.controller, scenario.limits),
     )
+
+
+def nmpc_settings(controller: Controller, limits: Limits) -> dict[str, Any]:
+    """Return the parameters of the NMPC that do not depend on the body."""
+    names = ("horizon_s", "dt_s", "falloff", "integrator", "weight_position", "weight_orientation", "weight_force",
+             "weight_torque", "weight_final_position", "weight_final_orientation")  # fmt: skip
+    settings = {name: getattr(controller, name) for name in names}
+    return {**settings, "max_reference_distance_m": limits.max_reference_distance_m}
 
 
 def estimator_of(scenario: Scenario) -> Estimator:

@@ -18,6 +18,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from nmpc_cases import SETTINGS
 
 MASS_KG = 30.0
 INERTIA = ((0.9, 0.02, -0.03), (0.02, 1.3, 0.05), (-0.03, 0.05, 1.7))
@@ -30,8 +31,7 @@ def params(integrator: str = "rk4", dt_s: float = 0.1) -> NmpcParameters:
         inertia_kg_m2=INERTIA,
         force_max_N=2.0,
         torque_max_N_m=0.05,
-        dt_s=dt_s,
-        integrator=integrator,
+        **{**SETTINGS, "dt_s": dt_s, "integrator": integrator},
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcParameters
 from chaserdock_controller.nmpc.problem import dynamics
+from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics, prescribed_state
@@ -206,7 +207,7 @@ def test_controller_model_matches_the_simulation(
             inertia_kg_m2=((b.inertia[0], 0.0, 0.0), (0.0, b.inertia[1], 0.0), (0.0, 0.0, b.inertia[2])),
             force_max_N=b.force_max_N,
             torque_max_N_m=b.torque_max_N_m,
-            dt_s=0.1,
+            **nmpc_settings(physics._scenario.controller, physics._scenario.limits),
         )
     )
     x = state13(physics.state("chaser/0"))

@@ -34,17 +34,17 @@ class NmpcParameters:
     inertia_kg_m2: Matrix3
     force_max_N: float
     torque_max_N_m: float
-    horizon_s: float = 3.0
-    dt_s: float = 0.1
-    falloff: float = 0.0
-    weight_position: float = 65.0
-    weight_orientation: float = 35.0
-    weight_force: float = 3.5
-    weight_torque: float = 40.0
-    weight_final_position: float = 3250.0
-    weight_final_orientation: float = 1750.0
-    max_reference_distance_m: float = 25.0
-    integrator: str = "rk4"
+    horizon_s: float
+    dt_s: float
+    falloff: float
+    weight_position: float
+    weight_orientation: float
+    weight_force: float
+    weight_torque: float
+    weight_final_position: float
+    weight_final_orientation: float
+    max_reference_distance_m: float
+    integrator: str
 
     def __post_init__(self) -> None:
         for name in ("mass_kg", "dt_s", "weight_force", "weight_torque", "max_reference_distance_m"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Iterator, Sequence
 from functools import cache
 from typing import Any
@@ -145,6 +146,11 @@ def editor_schema(model: type[BaseModel]) -> Node:
         "anyOf": [{"required": ["extends"]}, {"required": required}],
         "definitions": definitions,
     }
+
+
+def editor_schema_text(model: type[BaseModel]) -> str:
+    """Return the schema for editors as JSON text."""
+    return json.dumps(editor_schema(model), indent=2, ensure_ascii=False) + "\n"
 
 
 def _simplified(node: Any) -> Any:

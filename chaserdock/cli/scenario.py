@@ -1,0 +1,192 @@
+"""Commands for scenario files: ``chaserdock scenario …``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+import typer
+from chaserdock_protocol.errors import ChaserdockError
+
+from chaserdock.exit_codes import BAD_INPUT
+
+from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .options import JsonOpt, ScenarioArg, SetOpt, fail
+
+if TYPE_CHECKING:
+    from chaserdock_protocol.scenario import Scenario
+
+app = typer.Typer(
+    name="scenario",
+    cls=GroupedHelp,
+    context_settings=HELP_OPTIONS,
+    rich_markup_mode=None,
+    help="List, check, show and create scenarios.",
+    no_args_is_help=True,
+)
+
+_NEW = """\
+# A scenario: what flies, and when a mission is a success. Every key: docs/scenario.md, or for editors
+# `chaserdock scenario schema`. Check it with
+#   chaserdock scenario validate {file}
+# and run it with
+#   chaserdock run {file}
+format = 2
+name = "{name}"
+description = "One chaser synchronizes with the tumbling target."
+duration_s = 40.0
+# The steady interval, which the errors under [success] refer to, begins here.
+settling_s = 20.0
+
+# Initial motion of the target, in m/s and rad/s. `model` is `paper`, `servicer`, or the path of a target file.
+[target]
+model = "paper"
+velocity_m_s = [0.015, 0.0075, 0.03]
+omega_rad_s = [0.015, 0.045, 0.03]
+
+[camera]
+width_px = 960
+height_px = 540
+
+# One table per chaser: its place relative to the target, and where it starts relative to that place.
+[[chasers]]
+position_m = [-1.0, 0.0, 0.0]
+look_at = "target"
+start_offset_m = [-0.15, 0.03, 0.0]
+
+[success]
+steady_position_rms_m = 0.01
+steady_orientation_rms_deg = 0.5
+"""
+
+
+@app.command("list", cls=FiniteCommand, context_settings=HELP_OPTIONS)
+def list_scenarios(as_json: JsonOpt = False) -> None:
+    """List the shipped scenarios with their duration and number of chasers."""
+    import json
+
+    from chaserdock_protocol.scenario import load_scenario
+    from chaserdock_protocol.shipped_scenarios import shipped_names, shipped_scenario
+
+    scenarios = [load_scenario(shipped_scenario(name)) for name in shipped_names()]
+    if as_json:
+        rows = [
+            {
+                "name": s.name,
+                "chasers": len(s.chasers),
+                "duration_s": s.duration_s,
+                "description": s.description,
+            }
+            for s in scenarios
+        ]
+        print(json.dumps(rows, indent=2))
+        return
+    width = max(len(s.name) for s in scenarios)
+    print(f"{'name':{width}}  chasers  duration  description")
+    for s in scenarios:
+        print(f"{s.name:{width}}  {len(s.chasers):7}  {s.duration_s:6.0f} s  {s.description}")
+
+
+@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
+def validate(
+    files: Annotated[list[str], typer.Argument(help="scenario files, or names of shipped scenarios")],
+) -> None:
+    """Check scenario files. Status 2 if one is not valid, with one line per error."""
+    from chaserdock_protocol.scenario import load_scenario
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    failed = False
+    for file in files:
+        try:
+            scenario = load_scenario(find_scenario(file))
+        except ChaserdockError as error:
+            fail(str(error))
+            failed = True
+        else:
+            print(
+                f"{file}: valid: {scenario.name}, {len(scenario.chasers)} chasers, {scenario.duration_s:g} s"
+            )
+    if failed:
+        raise typer.Exit(BAD_INPUT)
+
+
+@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
+def show(
+    scenario: ScenarioArg,
+    overrides: SetOpt = None,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="only values that differ from the default")
+    ] = False,
+) -> None:
+    """Print the resolved scenario as TOML: with its base, its overrides and all defaults."""
+    from chaserdock_protocol.scenario import load_scenario
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    print(as_toml(load_scenario(find_scenario(scenario), tuple(overrides or ())), changes), end="")
+
+
+@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
+def schema() -> None:
+    """Print the JSON schema of scenario files, for editors (taplo, Even Better TOML)."""
+    from chaserdock_protocol.scenario import Scenario
+    from chaserdock_protocol.scenario.json_schema import editor_schema_text
+
+    print(editor_schema_text(Scenario), end="")
+
+
+@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="name of the scenario, or path of its file")],
+) -> None:
+    """Write a short commented scenario file that can be run, and changed."""
+    import tomllib
+
+    from chaserdock_protocol.scenario import parse_scenario
+
+    path = Path(name if name.endswith(".toml") else f"{name}.toml")
+    example = tomllib.loads(_NEW.format(name="example", file="example.toml"))
+    parse_scenario(example | {"name": path.stem}, name)
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(_NEW.format(name=path.stem, file=path))
+    except FileExistsError:
+        raise fail(f"{path}: exists already") from None
+    except OSError as error:
+        raise fail(f"{path}: cannot be written: {error.strerror or error}") from None
+    print(f"{path}: run it with: chaserdock run {path}")
+
+
+def as_toml(scenario: Scenario, changes: bool = False) -> str:
+    """Return a scenario in TOML's notation; ``changes``: without values that equal the default."""
+    values = scenario.model_dump(mode="json", exclude_none=True, exclude_defaults=changes)
+    if changes:
+        values = {"format": scenario.format, **values, "chaser": _changed_body(scenario)}
+    return "\n".join(_table(values, ())).lstrip("\n") + "\n"
+
+
+def _changed_body(scenario: Scenario) -> dict[str, Any]:
+    """Return the values of ``[chaser]`` that differ from the defaults of its predefined body."""
+    predefined = type(scenario.chaser)(body=scenario.chaser.body).model_dump(mode="json")
+    values = scenario.chaser.model_dump(mode="json", exclude_none=True)
+    changed = {k: v for k, v in values.items() if v != predefined[k]}
+    return {"body": scenario.chaser.body, **changed} if scenario.chaser.body else changed
+
+
+def _table(values: dict[str, Any], path: tuple[str, ...]) -> list[str]:
+    """Return the lines of a table: plain values first, then tables and arrays of tables."""
+    from chaserdock.campaign.plan import toml_value
+
+    lines: list[str] = []
+    below: list[str] = []
+    for key, value in values.items():
+        name = ".".join((*path, key))
+        tables = cast("list[Any]", value) if isinstance(value, list) else []
+        if isinstance(value, dict):
+            inner = cast("dict[str, Any]", value)
+            below += ["", f"[{name}]", *_table(inner, (*path, key))] if inner else []
+        elif tables and isinstance(tables[0], dict):
+            for item in tables:
+                below += ["", f"[[{name}]]", *_table(item, (*path, key))]
+        else:
+            lines.append(f"{key} = {toml_value(value)}")
+    return [*lines, *below]

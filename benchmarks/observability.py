@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from chaserdock_controller.estimation.camera_calibration import ERRORS, NO_ERROR, seen_by
+from chaserdock_controller.estimation.camera_calibration import ERRORS, NO_ERROR, predict_measurement
 from chaserdock_controller.estimation.motion_models import constant_rates
 from chaserdock_controller.estimation.types import CameraPose
 from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_turns
@@ -44,7 +44,7 @@ def jacobian(chasers: int, omega: Array, numbers: int, manoeuvre: bool) -> Array
             if manoeuvre and c == 0:
                 attitude = rotations.multiply(attitude, calibration_turns([t / LAST_S * CALIBRATION_S])[0])
             eye = CameraPose(place, rotations.multiply(attitude, Q_CRF_IRF_FORWARD_WXYZ))
-            seen = seen_by(eye, np.zeros(3), q, NO_ERROR)
+            seen = predict_measurement(eye, np.zeros(3), q, NO_ERROR)
             by_target = np.zeros((6, 12))
             by_target[:3, 0:3], by_target[3:, 6:9] = seen.by_position, np.eye(3)
             row = np.zeros((6, 12 + numbers * chasers))

@@ -14,7 +14,7 @@ from chaserdock_controller.estimation import (
     PoseHypothesis,
     TargetState,
 )
-from chaserdock_controller.estimation.camera_calibration import seen_by
+from chaserdock_controller.estimation.camera_calibration import predict_measurement
 from chaserdock_models import rotations as rot
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
 from hypothesis import settings
@@ -31,7 +31,7 @@ NO_BIAS = MekfParameters(
     bias_focal_share=0.0,
     floor_position_m=0.0,
     floor_attitude_rad=0.0,
-    frozen_share=0.0,
+    considered_ratio=0.0,
 )
 Q0 = rot.normalize([0.4, -0.5, 0.6, 0.2])
 
@@ -77,7 +77,7 @@ def see(
     p, q = truth(time_ns)
     eye = eye_of(chaser, time_ns)
     if camera is not None:
-        p, q, _, _ = seen_by(eye, p, q, camera)
+        p, q, _, _ = predict_measurement(eye, p, q, camera)
     p = p + rng.normal(size=3) * SIGMA_P
     if shift is not None:
         p = p + rot.rotate(q, shift)

@@ -1,4 +1,4 @@
-"""The attitude of a reference that turns with its offset, so that a chaser sent elsewhere goes on facing the target."""
+"""Reference attitudes that keep a chaser facing the target when its offset differs from the nominal one."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from .rotations import multiply, normalize
 
 
 def facing_attitudes(nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike) -> Array:
-    """Attitudes (K, 4), chaser body to TRF, at offsets (K, 3) in TRF.
+    """Return the attitudes (K, 4), chaser body to TRF, at offsets (K, 3) in TRF.
 
-    The nominal attitude (4,), which belongs to the nominal offset (3,), is turned by the shortest rotation that takes
-    the nominal direction into the offset's, q = normalize([1 + a . b, a x b]) for unit vectors a, b. An offset
-    opposite to the nominal one leaves the axis open; then it is the one at right angles to the nominal direction
-    that is nearest to z (to x, where that is z). At the target's centre the attitude is the nominal one.
+    The nominal attitude (4,) belongs to the nominal offset (3,). It is rotated by the shortest rotation from the nominal
+    direction a to the direction b of the offset, q = normalize([1 + a . b, a x b]). For an offset opposite to the nominal
+    one the axis is not unique: the axis perpendicular to a that is closest to z (to x if a is along z) is used. At the
+    target's centre the attitude is the nominal one.
     """
     offsets = np.atleast_2d(np.asarray(offsets_m, dtype=float))
     a = np.asarray(nominal_m, dtype=float) / np.linalg.norm(nominal_m)

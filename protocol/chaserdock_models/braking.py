@@ -1,4 +1,4 @@
-"""The safe command that everyone may fall back on: come to rest, within the actuators' limits."""
+"""Safe fallback command: brake to rest within the actuator limits."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from . import rotations
 from .arrays import Array
 
 BRAKE_TIME_S = 3.0
-"""Time constant with which velocity and rate decay while the limits allow."""
+"""Time constant of the decay of velocity and angular rate while the limits allow it."""
 
 
 class MovingBody(Protocol):
-    """Velocity (3,) in WRF, attitude (4,) body to WRF, and rate (3,) in body axes."""
+    """Velocity (3,) in WRF, attitude (4,) body to WRF, and angular rate (3,) in body axes."""
 
     @property
     def velocity_m_s(self) -> ArrayLike: ...
@@ -26,7 +26,7 @@ class MovingBody(Protocol):
 
 
 class ActuatedBody(Protocol):
-    """Mass, inertia (3, 3) or its diagonal (3,), and the limits per axis of an actuated body."""
+    """Mass, principal moments of inertia (3,), and the limits per axis of an actuated body."""
 
     @property
     def mass_kg(self) -> float: ...
@@ -39,7 +39,7 @@ class ActuatedBody(Protocol):
 
 
 def brake_wrench(odometry: MovingBody, body: ActuatedBody) -> Array:
-    """Force and torque (6,), body axes, that bring a chaser to rest in WRF."""
+    """Return the force and torque (6,), body axes, that bring a chaser to rest in WRF."""
     velocity = rotations.rotate_inverse(odometry.q_wxyz, odometry.velocity_m_s)
     force = np.clip(-body.mass_kg / BRAKE_TIME_S * velocity, -body.force_max_N, body.force_max_N)
     torque = -np.asarray(body.inertia) / BRAKE_TIME_S * np.asarray(odometry.omega_rad_s)

@@ -1,8 +1,8 @@
-"""Pinhole camera with Brown-Conrady lens distortion, and where it is mounted on the chaser.
+"""Pinhole camera with Brown-Conrady lens distortion, and its mounting on the chaser.
 
 Pixel centres lie at integer coordinates: the image covers (-0.5, width - 0.5) x (-0.5, height - 0.5).
-"Ideal" pixels are those of the same camera matrix without lens distortion. Distortion model and order
-of its coefficients as in OpenCV: D. C. Brown, "Decentering distortion of lenses", 1966.
+"Ideal" pixels belong to the same camera matrix without lens distortion. The distortion model and the order of its
+coefficients are those of OpenCV: D. C. Brown, "Decentering distortion of lenses", 1966.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Camera:
         position_crf_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
         distortion: tuple[float, ...] = (),
     ) -> Camera:
-        """Forward-looking camera with square pixels and a horizontal field of view ``hfov_rad``.
+        """Create a forward-looking camera with square pixels and a horizontal field of view ``hfov_rad``.
 
         Raises ValueError for a field of view outside (0, pi).
         """
@@ -69,7 +69,7 @@ class Camera:
         return cls(width_px, height_px, f, f, cx, cy, tuple(distortion), position_crf_m)
 
     def matrix(self) -> Array:
-        """Camera matrix (3, 3)."""
+        """Return the camera matrix (3, 3)."""
         return self._matrix.copy()
 
     @cached_property
@@ -85,17 +85,17 @@ class Camera:
         return np.array([self.cx_px, self.cy_px])
 
     def project(self, points_irf_m: ArrayLike) -> Array:
-        """Pixels (..., 2), with lens distortion, of points (..., 3) in IRF; NaN for points not in front."""
+        """Project to pixels (..., 2), with lens distortion, points (..., 3) in IRF; NaN for points not in front."""
         return self.distort(self.project_ideal(points_irf_m))
 
     def project_ideal(self, points_irf_m: ArrayLike) -> Array:
-        """Ideal pixels (..., 2) of points (..., 3) in IRF; NaN for points not in front of the camera."""
+        """Project to ideal pixels (..., 2) points (..., 3) in IRF; NaN for points not in front of the camera."""
         points = np.asarray(points_irf_m, dtype=float)
         z = np.where(points[..., 2:] > 0.0, points[..., 2:], np.nan)
         return points[..., :2] / z * self._focal + self._centre
 
     def distort(self, ideal_px: ArrayLike) -> Array:
-        """Ideal pixels (..., 2) to pixels in the distorted image (..., 2)."""
+        """Convert ideal pixels (..., 2) to pixels in the distorted image (..., 2)."""
         ideal_px = np.asarray(ideal_px, dtype=float)
         if not self.distortion:
             return ideal_px.copy()
@@ -103,32 +103,32 @@ class Camera:
         return self._distort_normalized((ideal_px - centre) / focal) * focal + centre
 
     def undistort(self, px: ArrayLike) -> Array:
-        """Pixels in the distorted image (..., 2) to ideal pixels (..., 2).
+        """Convert pixels in the distorted image (..., 2) to ideal pixels (..., 2).
 
-        Fixed-point iteration to convergence (1e-9 px); NaN where there is none, i.e. outside the part of
-        the image in which the distortion can be inverted.
+        Fixed-point iteration to convergence (1e-9 px). NaN where it does not converge, i.e. outside the part of the
+        image in which the distortion is invertible.
         """
         px = np.asarray(px, dtype=float)
         if not self.distortion:
             return px.copy()
         focal, centre = self._focal, self._centre
-        goal = (px - centre) / focal
-        x = goal.copy()
+        distorted = (px - centre) / focal
+        x = distorted.copy()
         tolerance = 1e-9 / self.fx_px
         with np.errstate(over="ignore", invalid="ignore"):
             for _ in range(100):
-                error = goal - self._distort_normalized(x)
+                error = distorted - self._distort_normalized(x)
                 x = x + error
                 if not np.any(np.abs(error) > tolerance):
                     break
-            lost = ~np.all(np.abs(goal - self._distort_normalized(x)) < 1e3 * tolerance, axis=-1)
-        x[lost] = np.nan
+            diverged = ~np.all(np.abs(distorted - self._distort_normalized(x)) < 1e3 * tolerance, axis=-1)
+        x[diverged] = np.nan
         return x * focal + centre
 
     def irf_pose_in_world(
         self, chaser_position_w_m: ArrayLike, chaser_q_w_crf_wxyz: ArrayLike
     ) -> tuple[Array, Array]:
-        """Optical centre (3,) in WRF and rotation IRF -> WRF (4,) of the camera on a chaser of this pose."""
+        """Return the optical centre (3,) in WRF and the rotation IRF -> WRF (4,) of the camera on a chaser at this pose."""
         q_w_crf = np.asarray(chaser_q_w_crf_wxyz, dtype=float)
         position = np.asarray(chaser_position_w_m, dtype=float) + rotations.rotate(
             q_w_crf, self.position_crf_m

@@ -1,4 +1,4 @@
-"""Simulated time: whole physics steps, so that nothing is ever rounded twice."""
+"""Simulated time in whole physics steps, which avoids accumulated rounding."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class Timing:
     """Physics steps, ticks and latencies of a mission.
 
-    ``rate_hz`` ticks a second and ``image_hz`` images a second, both whole divisors of ``physics_hz`` (images
-    of ticks, too). ``latency_steps`` is the time from exposure to actuation in physics steps.
+    ``rate_hz``: ticks per second, a divisor of ``physics_hz``. ``image_hz``: images per second, a divisor of
+    ``rate_hz``. ``latency_steps``: time from exposure to actuation in physics steps.
     """
 
     physics_hz: int
@@ -30,18 +30,18 @@ class Timing:
         return tick * self.steps_per_tick
 
     def time_ns(self, step: int) -> int:
-        """Simulated time of a physics step, nanoseconds, rounded down."""
+        """Return the simulated time of a physics step, nanoseconds, rounded down."""
         return step * 1_000_000_000 // self.physics_hz
 
     def tick_time_ns(self, tick: int) -> int:
         return self.time_ns(self.step_of_tick(tick))
 
     def effective_ns(self, tick: int) -> int:
-        """When a command that answers ``tick`` takes effect."""
+        """Return the simulated time, nanoseconds, at which a command for ``tick`` takes effect."""
         return self.time_ns(self.step_of_tick(tick) + self.latency_steps)
 
     def step_of_time(self, time_ns: int) -> int:
-        """The first physics step at or after a simulated time."""
+        """Return the first physics step at or after a simulated time."""
         return -(-time_ns * self.physics_hz // 1_000_000_000)
 
     def ticks_in(self, duration_s: float) -> int:

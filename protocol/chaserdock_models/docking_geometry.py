@@ -1,4 +1,4 @@
-"""A probe before its port: the geometry that the flying side steers by and the world judges by. Pure functions."""
+"""Geometry of a probe relative to its docking port, shared by guidance and simulator. Pure functions."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ class PoseLimits(Protocol):
 
 @dataclass(frozen=True)
 class PortView:
-    """A probe's tip relative to its port, in the port's moving frame.
+    """State of a probe's tip relative to its port, in the port's rotating frame.
 
-    ``gap_m`` along the axis, positive outside; ``lateral_m`` off the axis; ``closing_m_s`` towards the port;
-    ``lateral_speed_m_s``; ``angle_rad`` between the chaser's attitude and the one it is to dock in.
+    ``gap_m``: along the axis, positive outside. ``lateral_m``: distance from the axis. ``closing_m_s``: speed towards the
+    port. ``angle_rad``: between the chaser's attitude and its docked attitude.
     """
 
     gap_m: float
@@ -49,56 +49,59 @@ class PortView:
     lateral_speed_m_s: float
 
     def fault(self, limits: PoseLimits, closing_m_s: float = math.inf) -> str:
-        """Which of the limits does not hold, in words with the figures; empty when all do."""
-        for what, value, most, unit in (
+        """Describe the first violated limit with its values; empty if all hold."""
+        for name, value, limit, unit in (
             ("lateral", self.lateral_m * 1e3, limits.lateral_m * 1e3, "mm"),
             ("angle", math.degrees(self.angle_rad), limits.angle_deg, "deg"),
             ("lateral speed", self.lateral_speed_m_s * 1e3, limits.lateral_speed_m_s * 1e3, "mm/s"),
             ("closing speed", self.closing_m_s * 1e3, closing_m_s * 1e3, "mm/s"),
         ):
-            if value > most:
-                return f"{what} {value:.2f} {unit}, at most {most:g}"
+            if value > limit:
+                return f"{name} {value:.2f} {unit}, at most {limit:g}"
         return ""
 
 
 def centre_offset(port: Port, reach_m: float, gap_m: float) -> Array:
-    """Where in TRF a chaser's centre (3,) is with its tip ``gap_m`` before the port; its +X is along -axis."""
+    """Return a chaser's centre (3,) in TRF when its tip is ``gap_m`` in front of the port and its +X along -axis."""
     return np.asarray(port.position_m) + np.asarray(port.axis) * (reach_m + gap_m)
 
 
 def axis_error_deg(port: Port, q_off_wxyz: Array) -> float:
-    """Angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,) CRF to TRF."""
+    """Return the angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,) CRF to TRF."""
     ahead = rotations.rotate(q_off_wxyz, (1.0, 0.0, 0.0))
     return math.degrees(math.acos(min(1.0, max(-1.0, -float(ahead @ np.asarray(port.axis))))))
 
 
 def view_of(port: Port, reach_m: float, q_off_wxyz: Array, chaser: BodyState, target: BodyState) -> PortView:
-    """Tip relative to port. ``reach_m``: tip from the chaser's centre along +X; ``q_off_wxyz`` (4,) CRF to TRF docked.
+    """Return the state of the tip relative to the port.
 
-    Velocities are relative to the target as it turns: what an observer on the port sees.
+    ``reach_m``: distance of the tip from the chaser's centre along +X. ``q_off_wxyz`` (4,): docked attitude, CRF to TRF.
+    Velocities are relative to the rotating target, as seen by an observer on the port.
     """
     tip = rotations.rotate(chaser.q_wxyz, (reach_m, 0.0, 0.0))
     position = rotations.rotate_inverse(target.q_wxyz, chaser.position_m + tip - target.position_m)
-    tip_turn = rotations.rotate(
+    tip_velocity = rotations.rotate(
         chaser.q_wxyz, rotations.cross(chaser.omega_rad_s, np.array([reach_m, 0.0, 0.0]))
     )
-    moving = rotations.rotate_inverse(target.q_wxyz, chaser.velocity_m_s + tip_turn - target.velocity_m_s)
-    moving = moving - rotations.cross(target.omega_rad_s, position)
+    velocity = rotations.rotate_inverse(
+        target.q_wxyz, chaser.velocity_m_s + tip_velocity - target.velocity_m_s
+    )
+    velocity = velocity - rotations.cross(target.omega_rad_s, position)
     axis = np.asarray(port.axis)
     off = position - np.asarray(port.position_m)
-    gap, speed = float(off @ axis), float(moving @ axis)
+    gap, speed = float(off @ axis), float(velocity @ axis)
     attitude = rotations.multiply(target.q_wxyz, q_off_wxyz)
     return PortView(
         gap_m=gap,
         lateral_m=float(np.linalg.norm(off - gap * axis)),
         angle_rad=float(rotations.angle_between(attitude, chaser.q_wxyz)),
         closing_m_s=-speed,
-        lateral_speed_m_s=float(np.linalg.norm(moving - speed * axis)),
+        lateral_speed_m_s=float(np.linalg.norm(velocity - speed * axis)),
     )
 
 
 def segments_apart(a: Array, b: Array, c: Array, d: Array) -> float:
-    """Least distance between the segments a-b and c-d, each end (3,).
+    """Return the smallest distance between the segments a-b and c-d, each end (3,).
 
     Source: C. Ericson, "Real-Time Collision Detection", 2005, section 5.1.9.
     """

@@ -1,8 +1,9 @@
 """Rotations: Hamilton quaternions, scalar first, unit length, body to world.
 
 ``q_wxyz`` rotates a vector given in body axes into world axes: ``v_world = rotate(q, v_body)``.
-Every function takes arrays whose last axis is the quaternion (4) or vector (3) and broadcasts over
-the leading axes. Formulae: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
+Every function takes arrays whose last axis is the quaternion (4) or vector (3) and broadcasts over the leading axes.
+A single quaternion gives the same bits as an array of them. ``scalar_rotations`` is faster for single quaternions in
+inner loops. Formulas: J. Sola, "Quaternion kinematics for the error-state Kalman filter", 2017.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ _CONJUGATED: Array = np.array([1.0, -1.0, -1.0, -1.0])
 
 
 def normalize(q: ArrayLike) -> Array:
-    """Unit quaternion (..., 4) along ``q`` (..., 4). Raises ValueError for a zero or non-finite one."""
+    """Return the unit quaternion (..., 4) along ``q`` (..., 4). Raises ValueError for a zero or non-finite one."""
     q = np.asarray(q, dtype=float)
     if q.ndim == 1:
         length = math.hypot(*q.tolist())
@@ -35,20 +36,20 @@ def normalize(q: ArrayLike) -> Array:
 
 
 def conjugate(q: ArrayLike) -> Array:
-    """Conjugate (..., 4): the inverse of a unit quaternion."""
+    """Return the conjugate (..., 4), the inverse of a unit quaternion."""
     return np.asarray(q, dtype=float) * _CONJUGATED
 
 
 def multiply(a: ArrayLike, b: ArrayLike) -> Array:
-    """Hamilton product (..., 4): the rotation ``b`` followed by ``a`` (Sola eq. 12)."""
+    """Return the Hamilton product (..., 4): the rotation ``b`` followed by ``a`` (Sola eq. 12)."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:  # Python floats: several times faster than NumPy on so few numbers
         return np.array(product_components(*a.tolist(), *b.tolist()))
-    return _joined(product_components(*(a[..., i] for i in range(4)), *(b[..., i] for i in range(4))))
+    return _stack_last(product_components(*(a[..., i] for i in range(4)), *(b[..., i] for i in range(4))))
 
 
-def _joined(parts: list[Array]) -> Array:
-    """Arrays of one shape (...), as the last axis of one (..., n): ``np.stack``, in a third of its time."""
+def _stack_last(parts: list[Array]) -> Array:
+    """Stack arrays of one shape (...) along a new last axis, in a third of the time of ``np.stack``."""
     whole = np.empty((*parts[0].shape, len(parts)))
     for k, part in enumerate(parts):
         whole[..., k] = part
@@ -56,57 +57,57 @@ def _joined(parts: list[Array]) -> Array:
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
-    """Vector ``v`` (..., 3) in body axes, given in world axes (..., 3)."""
+    """Return the body-axes vector ``v`` (..., 3) in world axes."""
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     if q.ndim == v.ndim == 1:
         return np.array(rotated_components(*q.tolist(), *v.tolist()))
-    return _joined(rotated_components(*(q[..., i] for i in range(4)), *(v[..., i] for i in range(3))))
+    return _stack_last(rotated_components(*(q[..., i] for i in range(4)), *(v[..., i] for i in range(3))))
 
 
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
-    """Cross product (..., 3); as np.cross, but quick on single vectors."""
+    """Return the cross product (..., 3); faster than np.cross on single vectors."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
         return np.array(cross_components(*a.tolist(), *b.tolist()))
-    return _joined(cross_components(*(a[..., i] for i in range(3)), *(b[..., i] for i in range(3))))
+    return _stack_last(cross_components(*(a[..., i] for i in range(3)), *(b[..., i] for i in range(3))))
 
 
 def rotate_inverse(q: ArrayLike, v: ArrayLike) -> Array:
-    """Vector ``v`` (..., 3) in world axes, given in body axes (..., 3)."""
+    """Return the world-axes vector ``v`` (..., 3) in body axes."""
     return rotate(conjugate(q), v)
 
 
 def exp(phi: ArrayLike) -> Array:
-    """Rotation vector (..., 3) in radians to unit quaternion (..., 4) (Sola eq. 101)."""
+    """Return the unit quaternion (..., 4) of a rotation vector (..., 3), rad (Sola eq. 101)."""
     phi = np.asarray(phi, dtype=float)
     if phi.ndim == 1:
-        # The very numbers of the other branch: its operations one by one, with NumPy's sine and cosine.
+        # Repeats the operations of np.sinc below with NumPy's sine and cosine, for equal bits.
         x, y, z = phi.tolist()
         angle = math.sqrt(x * x + y * y + z * z)
-        around = math.pi * (angle / (2.0 * math.pi) or 1e-20)
-        share = 0.5 * (float(np.sin(around)) / around)
-        return np.array([float(np.cos(angle / 2.0)), share * x, share * y, share * z])
+        half = math.pi * (angle / (2.0 * math.pi) or 1e-20)
+        scale = 0.5 * (float(np.sin(half)) / half)
+        return np.array([float(np.cos(angle / 2.0)), scale * x, scale * y, scale * z])
     angle = np.linalg.norm(phi, axis=-1, keepdims=True)
-    # np.sinc(x) = sin(pi x) / (pi x): half the angle's sine over the angle, also at zero.
+    # np.sinc(x) = sin(pi x) / (pi x) gives sin(angle / 2) / angle, also at zero.
     return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * phi], axis=-1)
 
 
 def log(q: ArrayLike) -> Array:
-    """Unit quaternion (..., 4) to the shortest rotation vector (..., 3), radians (Sola eq. 105)."""
+    """Return the shortest rotation vector (..., 3), rad, of a unit quaternion (..., 4) (Sola eq. 105)."""
     q = np.asarray(q, dtype=float)
     if q.ndim == 1:
-        return np.array(_logarithm(*q.tolist()))
+        return np.array(_log_components(*q.tolist()))
     q = np.where(q[..., :1] < 0.0, -q, q)
     n = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
     half = np.arctan2(n, q[..., :1])
-    # Near the identity 2 half / n tends to 2 / w; both divisors are kept off zero, as np.where evaluates both.
+    # Near the identity 2 half / n tends to 2 / w. np.where evaluates both branches, so both divisors are kept nonzero.
     small = n <= 1e-9
     scale = np.where(small, 2.0 / np.where(small, q[..., :1], 1.0), 2.0 * half / np.where(small, 1.0, n))
     return scale * q[..., 1:]
 
 
-def _logarithm(w: float, x: float, y: float, z: float) -> list[float]:
-    """As ``log`` of many, to the bit; NumPy's arc tangent is not always math's."""
+def _log_components(w: float, x: float, y: float, z: float) -> list[float]:
+    """Return ``log`` of one quaternion with the bits of the array branch: NumPy's arctan2 differs from math's."""
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
     n = math.sqrt(x * x + y * y + z * z)
@@ -115,17 +116,17 @@ def _logarithm(w: float, x: float, y: float, z: float) -> list[float]:
 
 
 def angle_between(a: ArrayLike, b: ArrayLike) -> Array:
-    """Angle (...) in radians, 0 to pi, of the rotation that takes attitude ``a`` to ``b``."""
-    turned = log(multiply(conjugate(a), b))
-    if turned.ndim == 1:
-        x, y, z = turned.tolist()
+    """Return the angle (...), 0 to pi rad, of the rotation that takes attitude ``a`` to ``b``."""
+    phi = log(multiply(conjugate(a), b))
+    if phi.ndim == 1:
+        x, y, z = phi.tolist()
         angle: Any = np.float64(math.sqrt(x * x + y * y + z * z))
         return angle
-    return np.linalg.norm(turned, axis=-1)
+    return np.linalg.norm(phi, axis=-1)
 
 
 def to_matrix(q: ArrayLike) -> Array:
-    """Rotation matrix (..., 3, 3), body to world, of unit quaternion ``q`` (..., 4)."""
+    """Return the rotation matrix (..., 3, 3), body to world, of a unit quaternion (..., 4)."""
     q = np.asarray(q, dtype=float)
     if q.ndim == 1:
         return np.array(matrix_components(*q.tolist()))
@@ -134,7 +135,7 @@ def to_matrix(q: ArrayLike) -> Array:
 
 
 def from_matrix(r: ArrayLike) -> Array:
-    """Unit quaternion (4,), scalar part not negative, of a rotation matrix (3, 3), body to world.
+    """Return the unit quaternion (4,), scalar part not negative, of a rotation matrix (3, 3), body to world.
 
     Shepperd's method: the largest of the four squared components is the pivot.
     """
@@ -159,12 +160,12 @@ def from_matrix(r: ArrayLike) -> Array:
 
 
 def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float) -> Array:
-    """Attitude (..., 4) after ``dt_s`` at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
+    """Return the attitude (..., 4) after ``dt_s`` at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
     return multiply(q, exp(np.asarray(omega_body, dtype=float) * dt_s))
 
 
 def skew(v: ArrayLike) -> Array:
-    """Matrix (..., 3, 3) with ``skew(v) @ w == cross(v, w)``."""
+    """Return the matrix (..., 3, 3) with ``skew(v) @ w == cross(v, w)``."""
     v = np.asarray(v, dtype=float)
     zero = np.zeros_like(v[..., 0])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]

@@ -1,4 +1,4 @@
-"""The targets that can be docked with: their boxes and the ArUco markers on them.
+"""Docking targets: their boxes and ArUco markers.
 
 Marker axes: x to the marker's right, y up, z out of the face, origin at the marker's centre.
 """
@@ -13,7 +13,7 @@ import numpy as np
 from . import rotations
 from .arrays import Array, Quaternion, Vector3
 
-# The six faces of a box in the order of the marker ids: outward normal, and "up" of what is printed on it.
+# The six faces of a box in the order of the marker ids: outward normal, and up direction of the markers.
 FACES: tuple[tuple[Vector3, Vector3], ...] = (
     ((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
     ((-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)),
@@ -47,13 +47,13 @@ class Marker:
     q_trf_marker_wxyz: Quaternion
 
     def corners_trf_m(self) -> Array:
-        """Corners (4, 3) in TRF: top left, top right, bottom right, bottom left of the upright marker."""
+        """Return the corners (4, 3) in TRF: top left, top right, bottom right, bottom left of the upright marker."""
         h = self.side_m / 2.0
         corners = np.array([[-h, h, 0.0], [h, h, 0.0], [h, -h, 0.0], [-h, -h, 0.0]])
         return rotations.rotate(self.q_trf_marker_wxyz, corners) + self.position_trf_m
 
     def normal_trf(self) -> Array:
-        """Unit vector (3,) in TRF, out of the marked face."""
+        """Return the outward unit normal (3,) of the marker in TRF."""
         return rotations.rotate(self.q_trf_marker_wxyz, (0.0, 0.0, 1.0))
 
 
@@ -61,9 +61,9 @@ class Marker:
 class TargetModel:
     """A target: ``boxes`` in TRF, ``markers`` of the OpenCV ``dictionary``, overall ``size_m``.
 
-    ``white_margin_m``: width of the white border printed round every marker, under its neighbours.
-    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws in the place of the boxes, times
-    ``mesh_scale``; empty for none. What is collided with are the boxes.
+    ``white_margin_m``: width of the white border printed around every marker, under its neighbours.
+    ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws instead of the boxes, scaled by ``mesh_scale``;
+    empty for none. Collisions always use the boxes.
     """
 
     name: str
@@ -76,18 +76,18 @@ class TargetModel:
     mesh_scale: float = 1.0
 
     def marker(self, marker_id: int) -> Marker | None:
-        """The marker of that id, or None when this target has none."""
+        """Return the marker with that id, or None."""
         return next((m for m in self.markers if m.id == marker_id), None)
 
 
 def face_rotation(face: int) -> Array:
-    """Rotation (4,) from the axes of face ``face`` (0..5; x right, y up, z outward) to the box's axes."""
+    """Return the rotation (4,) from the axes of face ``face`` (0..5; x right, y up, z outward) to the box's axes."""
     normal, up = (np.array(v) for v in FACES[face])
     return rotations.from_matrix(np.stack([np.cross(up, normal), up, normal], axis=-1))
 
 
 def face_extent(size_m: Vector3, face: int) -> tuple[float, float, float]:
-    """Width (right), height (up) and distance from the box's centre of face ``face``, metres."""
+    """Return width (right), height (up) and distance from the box's centre of face ``face``, metres."""
     right, up, out = (np.abs(axis) @ np.array(size_m) for axis in rotations.to_matrix(face_rotation(face)).T)
     return float(right), float(up), float(out) / 2.0
 
@@ -105,7 +105,7 @@ def _paper() -> TargetModel:
     return TargetModel("paper", (Box(size, shade=0.6),), markers, "DICT_5X5_50", size, 0.005)
 
 
-# Side, right and up of the centre, of the twelve markers on a face of the servicer (shared notes, vision).
+# Edge length, and right and up coordinate of the centre, of the twelve markers on a face of the servicer.
 _SERVICER_LAYOUT: tuple[Vector3, ...] = (
     (0.108, -0.086, 0.086),
     (0.108, 0.086, 0.086),
@@ -136,20 +136,22 @@ _MODELS: dict[str, Callable[[], TargetModel]] = {"paper": _paper, "servicer": _s
 
 
 def target_names() -> tuple[str, ...]:
-    """The names of the targets that are known."""
+    """Return the names of the built-in targets."""
     return tuple(sorted(_MODELS))
 
 
 def target_model(name: str) -> TargetModel:
-    """The target of that name. Raises ValueError, naming the known ones, for an unknown name."""
+    """Return the built-in target ``name``. Raises ValueError, listing the known names, for any other."""
     if name not in _MODELS:
         raise ValueError(f"unknown target {name!r}; known: {', '.join(sorted(_MODELS))}")
     return _MODELS[name]()
 
 
 def clear_margin_m(model: TargetModel, marker: Marker) -> float:
-    """Width of the plain white border along the sides of a marker: up to its nearest neighbour, the end of the
-    white paint or the edge of its face, whichever comes first."""
+    """Return the width of the white border along the sides of a marker.
+
+    It ends at the nearest of neighbouring marker, white paint and edge of the face.
+    """
     q_marker_trf = rotations.conjugate(marker.q_trf_marker_wxyz)
     half = marker.side_m / 2.0
     clear = model.white_margin_m
@@ -160,7 +162,7 @@ def clear_margin_m(model: TargetModel, marker: Marker) -> float:
         corners = rotations.rotate(q_marker_trf, other.corners_trf_m() - np.array(marker.position_trf_m))
         if other.id != marker.id and np.all(np.abs(corners[:, 2]) < 1e-6):
             gaps = np.maximum(corners[:, :2].min(axis=0) - half, -half - corners[:, :2].max(axis=0))
-            if gaps.min() < 0.0:  # beside one of the sides, and not off a corner
+            if gaps.min() < 0.0:  # beside a side, not diagonally off a corner
                 clear = min(clear, float(gaps.max()))
     for box in model.boxes:
         q_marker_box = rotations.multiply(q_marker_trf, box.q_wxyz)

@@ -1,29 +1,29 @@
-"""The bodies that are shipped with thrusters, as data: defaults of the scenario's section ``chaser``."""
+"""Built-in chaser bodies with thrusters: defaults of the scenario's section ``chaser``."""
 
 from __future__ import annotations
 
 import math
 from typing import Any
 
-_TURNS = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
+_CYCLIC_AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
 _FAST = {"min_on_s": 0.005, "rise_s": 0.001, "fall_s": 0.001}
 _HALF_TURNS = ((1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1))
 
 
 def _tetra12() -> dict[str, Any]:
-    """Three 1.5 N thrusters on each of four corners of a cube: one thruster under the 12 rotations of the tetrahedron.
+    """Return a cube with three 1.5 N thrusters on each of four corners: one thruster under the 12 tetrahedral rotations.
 
-    Any one thruster can be lost, stuck off or on, and all six degrees of freedom stay controllable.
+    With any one thruster stuck off or stuck on, all six degrees of freedom stay controllable.
     """
     arm_m, direction = 0.163, (-0.525, -0.525, 0.669)
     length = math.hypot(*direction)
     thrusters = [
         {
             "position_m": tuple(arm_m * sign for sign in signs),
-            "direction": tuple(s * direction[axis] / length for s, axis in zip(signs, turn, strict=True)),
+            "direction": tuple(s * direction[axis] / length for s, axis in zip(signs, axes, strict=True)),
             "thrust_N": 1.5,
         }
-        for turn in _TURNS
+        for axes in _CYCLIC_AXES
         for signs in _HALF_TURNS
     ]
     return {
@@ -37,9 +37,9 @@ def _tetra12() -> dict[str, Any]:
 
 
 def _slider() -> dict[str, Any]:
-    """The paper's body with four 2.3 N thrusters on each corner of its plate: two inward in the plane, one up, one down.
+    """Return the paper's body with four 2.3 N thrusters on each corner of its plate: two in the plane, one up, one down.
 
-    The paper's 2 N and 0.05 N m on all axes at once are kept with any one thruster lost.
+    The paper's 2 N and 0.05 N m on all axes at once stay available with any one thruster lost.
     """
     arm_m = 0.125
     thrusters = [

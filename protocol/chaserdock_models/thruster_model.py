@@ -1,9 +1,9 @@
-"""What a body's thrusters give, from when their valves open and close: the world's thrusters, and a chaser's idea of its own.
+"""Impulse of thrusters from the opening times of their valves; used by the simulator and by a chaser's own model.
 
-Times are whole nanoseconds of simulated time. A valve is open where a pulse, or a failure, opens it and its shut-off
+Times are integer nanoseconds of simulated time. A valve is open where a pulse or a failure opens it and its shut-off
 valve is not closed. Thrust rises linearly within ``rise_s`` of the opening and falls linearly within ``fall_s`` of the
-closing; a gap no longer than the fall is none, and a pulse shorter than the minimum on-time does not open the valve.
-What is given between two times is exact, so that no splitting of time into steps changes it.
+closing. A gap no longer than the fall time does not close the valve, and a pulse shorter than the minimum on-time does
+not open it. Impulses between two times are exact, so they do not depend on the step size.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from .arrays import Array
 
 FailureKind = Literal["stuck_off", "stuck_on", "weak"]
-"""How a thruster fails: never opens, never closes, or gives a fraction of its thrust."""
+"""Failure modes of a thruster: never opens, never closes, or delivers a fraction of its thrust."""
 
 
 class Thruster(Protocol):
@@ -37,18 +37,18 @@ class Thruster(Protocol):
 
 
 G0_M_S2 = 9.80665
-"""Standard gravity, by which specific impulse is defined."""
+"""Standard gravity, which defines specific impulse."""
 
 Span = tuple[float, float]
-"""From, to: nanoseconds; the end may be infinite."""
+"""Start and end, nanoseconds; the end may be infinite."""
 
 
 def _ns(time_s: float) -> int:
     return round(time_s * 1e9)
 
 
-def joined(spans: Sequence[Span], gap_ns: int) -> list[Span]:
-    """Sorted spans, those that overlap or lie at most ``gap_ns`` apart made one."""
+def merge_spans(spans: Sequence[Span], gap_ns: int) -> list[Span]:
+    """Return the spans sorted, merging those that overlap or lie at most ``gap_ns`` apart."""
     out: list[Span] = []
     for begin, end in sorted(spans):
         if out and begin - out[-1][1] <= gap_ns:
@@ -58,8 +58,8 @@ def joined(spans: Sequence[Span], gap_ns: int) -> list[Span]:
     return out
 
 
-def without(spans: Sequence[Span], cut: Span) -> list[Span]:
-    """Spans less what lies in ``cut``."""
+def subtract_span(spans: Sequence[Span], cut: Span) -> list[Span]:
+    """Return the spans without the parts inside ``cut``."""
     out = []
     for begin, end in spans:
         out += [(b, e) for b, e in ((begin, min(end, cut[0])), (max(begin, cut[1]), end)) if e > b]
@@ -67,7 +67,7 @@ def without(spans: Sequence[Span], cut: Span) -> list[Span]:
 
 
 class _Thruster:
-    """One thruster: pulses asked for, how it has failed, when its shut-off valve was closed."""
+    """One thruster: commanded pulses, failure, and the times its shut-off valve is closed."""
 
     def __init__(self, thruster: Thruster) -> None:
         self.rise_ns, self.fall_ns = _ns(thruster.rise_s), _ns(thruster.fall_s)
@@ -77,25 +77,25 @@ class _Thruster:
         self.failure: tuple[FailureKind, int, float] | None = None
 
     def open_spans(self) -> list[Span]:
-        """When the thruster's valves are open."""
-        spans = joined(self.pulses, self.fall_ns)
+        """Return the spans in which thrust is commanded or forced: the valve is open and not shut off."""
+        spans = merge_spans(self.pulses, self.fall_ns)
         if self.failure is not None:
             kind, at_ns, _ = self.failure
             if kind == "stuck_off":
-                spans = without(spans, (at_ns, math.inf))
+                spans = subtract_span(spans, (at_ns, math.inf))
             elif kind == "stuck_on":
-                spans = joined([*spans, (at_ns, math.inf)], self.fall_ns)
+                spans = merge_spans([*spans, (at_ns, math.inf)], self.fall_ns)
         for cut in self.shut:
-            spans = without(spans, cut)
+            spans = subtract_span(spans, cut)
         return spans
 
     def factor(self, begin_ns: float) -> float:
-        """Of its thrust, when opened at that time."""
+        """Return the fraction of the nominal thrust for an opening at ``begin_ns``."""
         weak = self.failure is not None and self.failure[0] == "weak" and begin_ns >= self.failure[1]
         return self.failure[2] if weak and self.failure is not None else 1.0
 
     def forget_before(self, time_ns: int) -> None:
-        # What ended is over for good only after its fall; a pulse that is still open may be joined.
+        # A span that has ended still acts during its fall, and a later pulse may merge with it.
         old = time_ns - 10 * (self.fall_ns + self.rise_ns) - self.shortest_ns
         self.pulses = [s for s in self.pulses if s[1] >= old]
         if self.failure is None or self.failure[0] != "stuck_on":
@@ -103,7 +103,7 @@ class _Thruster:
 
 
 class Valves:
-    """All thrusters of one body, by their number."""
+    """All thrusters of one body, by number."""
 
     def __init__(self, thrusters: Sequence[Thruster]) -> None:
         self._thrusters = [_Thruster(t) for t in thrusters]
@@ -112,7 +112,7 @@ class Valves:
         self._table: tuple[Array, ...] | None = None
 
     def pulse(self, thruster: int, open_ns: int, close_ns: int) -> bool:
-        """Opens a thruster's valve for a while; False where that cannot be: no such thruster, or too short a time."""
+        """Open a thruster's valve for a span. Return False for an unknown thruster or a span below the minimum on-time."""
         if (
             not 0 <= thruster < len(self._thrusters)
             or close_ns - open_ns < self._thrusters[thruster].shortest_ns
@@ -123,13 +123,13 @@ class Valves:
         return True
 
     def stop(self, at_ns: int) -> None:
-        """No pulse lasts longer than until ``at_ns``."""
+        """Cut all pulses at ``at_ns``."""
         for thruster in self._thrusters:
-            thruster.pulses = without(thruster.pulses, (at_ns, math.inf))
+            thruster.pulses = subtract_span(thruster.pulses, (at_ns, math.inf))
         self._table = None
 
     def set_shut(self, thrusters: Sequence[int], at_ns: int) -> None:
-        """From ``at_ns`` on the shut-off valves of these thrusters are closed, all others open."""
+        """Close the shut-off valves of these thrusters at ``at_ns`` and open all others."""
         for k, thruster in enumerate(self._thrusters):
             is_shut = bool(thruster.shut) and thruster.shut[-1][1] == math.inf
             if is_shut == (k in thrusters):
@@ -141,24 +141,24 @@ class Valves:
             self._table = None
 
     def shut_at(self, time_ns: int) -> tuple[int, ...]:
-        """The thrusters whose shut-off valve is closed then."""
+        """Return the thrusters whose shut-off valve is closed at ``time_ns``."""
         return tuple(k for k, j in enumerate(self._thrusters) if any(b <= time_ns < e for b, e in j.shut))
 
     def fail(self, thruster: int, kind: FailureKind | None, at_ns: int, factor: float | None = None) -> None:
-        """From ``at_ns`` on a thruster fails in a way; None: it never did. ``factor`` goes with ``weak``."""
+        """Set the failure of a thruster from ``at_ns`` on, or clear it (None). ``factor``: thrust fraction for ``weak``."""
         self._thrusters[thruster].failure = (
             None if kind is None else (kind, at_ns, 1.0 if factor is None else factor)
         )
         self._table = None
 
     def forget_before(self, time_ns: int) -> None:
-        """Drops what has no effect after ``time_ns``: nobody will ask for what was before."""
+        """Discard spans that have no effect after ``time_ns``; earlier times can no longer be queried."""
         for thruster in self._thrusters:
             thruster.forget_before(time_ns)
         self._table = None
 
     def _spans(self) -> tuple[Array, ...]:
-        """Columns of all openings: thruster, begin, end, rise, fall (ns), factor."""
+        """Return columns of all openings: thruster, begin, end, rise, fall (ns), factor."""
         if self._table is None:
             rows = [
                 (k, begin, end, thruster.rise_ns, thruster.fall_ns, thruster.factor(begin))
@@ -169,18 +169,18 @@ class Valves:
         return self._table
 
     def impulses(self, edges_ns: Array) -> Array:
-        """N s given by every thruster between successive times: (K + 1,) whole nanoseconds -> (K, n)."""
+        """Return the impulse (K, n), N s, of each thruster between successive times (K + 1,), integer nanoseconds."""
         thruster, begin, end, rise, fall, factor = self._spans()
         out = np.zeros((len(edges_ns) - 1, len(self._thrusters)))
         if len(thruster):
             t = np.asarray(edges_ns, dtype=float)[:, None]
-            full_ns = factor * np.diff(_ramp(t - begin, rise) - _ramp(t - end, fall), axis=0)
+            full_thrust_ns = factor * np.diff(_ramp(t - begin, rise) - _ramp(t - end, fall), axis=0)
             number = thruster.astype(int)
-            np.add.at(out.T, number, full_ns.T * (1e-9 * self._thrust_N[number, None]))
+            np.add.at(out.T, number, full_thrust_ns.T * (1e-9 * self._thrust_N[number, None]))
         return out
 
     def open_s(self, from_ns: int, to_ns: int) -> Array:
-        """How long every thruster's valves are open between two times, (n,) s."""
+        """Return how long each thruster's valve is open between two times, (n,) s."""
         out = np.zeros(len(self._thrusters))
         thruster, begin, end = self._spans()[:3]
         np.add.at(
@@ -189,13 +189,13 @@ class Valves:
         return out * 1e-9
 
     def propellant_kg(self, impulses_N_s: Array) -> float:
-        """What impulses (n,) cost: mass flow = thrust / (Isp g0)."""
+        """Return the propellant mass for impulses (n,): mass flow = thrust / (Isp g0)."""
         return float(np.sum(impulses_N_s / self._exhaust_m_s))
 
 
 def _ramp(after_ns: Array, length_ns: Array) -> Array:
-    """The integral of a linear rise from 0 to 1 within ``length_ns``, nanoseconds; length zero: a step."""
+    """Return the integral of a linear rise from 0 to 1 within ``length_ns``, nanoseconds; length zero is a step."""
     x = np.maximum(after_ns, 0.0)
     length = np.maximum(length_ns, 1e-3)
-    # What never ends is infinitely far from its fall, and ``x`` is zero.
+    # A span that never ends has an infinitely late fall, where ``x`` is zero.
     return np.where(x < length, x * x / (2.0 * length), x - length_ns / 2.0)

@@ -1,7 +1,7 @@
-"""What forces and torques a body's thrusters can give at once. Pure functions; SI units, body axes (CRF).
+"""The set of wrenches that a thruster layout can produce. Pure functions; SI units, body axes (CRF).
 
-The set {B f, 0 <= f <= f_max} is a zonotope: every facet of it is parallel to five of the thrusters' wrenches, so the
-normals of all facets come from all choices of five (P. McMullen, "On zonotopes", Trans. AMS 159, 1971).
+The set {B f, 0 <= f <= f_max} is a zonotope. Each of its facets is parallel to five of the thrusters' wrenches, so the
+normals of all facets follow from all combinations of five (P. McMullen, "On zonotopes", Trans. AMS 159, 1971).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from .arrays import Array
 
 
 class Thruster(Protocol):
-    """The part of a thruster that this module needs: place (m) and unit direction of its force, CRF."""
+    """Position (m) and unit direction of force of a thruster, CRF."""
 
     @property
     def position_m(self) -> tuple[float, float, float]: ...
@@ -27,23 +27,23 @@ class Thruster(Protocol):
 
 
 def wrench_matrix(thrusters: Sequence[Thruster]) -> Array:
-    """(6, n): force and torque about the centre of mass for 1 N of each thruster's thrust."""
+    """Return the matrix (6, n) of force and torque about the centre of mass for 1 N of each thruster."""
     directions = np.array([thruster.direction for thruster in thrusters], dtype=float).reshape(-1, 3)
-    places = np.array([thruster.position_m for thruster in thrusters], dtype=float).reshape(-1, 3)
-    return np.concatenate([directions.T, np.cross(places, directions).T])
+    positions = np.array([thruster.position_m for thruster in thrusters], dtype=float).reshape(-1, 3)
+    return np.concatenate([directions.T, np.cross(positions, directions).T])
 
 
 @dataclass(frozen=True, eq=False)
 class WrenchSet:
-    """``matrix`` (6, n) as of ``wrench_matrix``; ``normals`` (K, 6) hold those of all facets, whatever the limits."""
+    """``matrix`` (6, n) from ``wrench_matrix``; ``normals`` (K, 6) of all facets, independent of the thrust limits."""
 
     matrix: Array
     normals: Array
 
     def box_scale(self, thrust_max_N: Array, box: Array) -> float:
-        """The greatest s for which every wrench within +-s * ``box`` (6,) can be given with thrusts up to (n,).
+        """Return the largest s for which every wrench within +-s * ``box`` (6,) is feasible with thrusts up to (n,).
 
-        0: not every direction of force and torque can be given at all.
+        0 if some direction of force and torque is infeasible.
         """
         if not len(self.normals):
             return 0.0
@@ -54,7 +54,7 @@ class WrenchSet:
 
 
 def wrench_set(matrix: Array) -> WrenchSet:
-    """The set of a layout (6, n). One that does not span all six dimensions has no normals."""
+    """Return the wrench set of a layout (6, n). A layout that does not span all six dimensions has no normals."""
     n = matrix.shape[1]
     scale = np.abs(matrix).max(axis=1) if n else np.zeros(6)
     if n < 6 or np.any(scale == 0.0) or np.linalg.matrix_rank(matrix / scale[:, None], tol=1e-9) < 6:

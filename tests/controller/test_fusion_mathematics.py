@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from chaserdock_controller.estimation import CameraPose, MekfParameters, PoseHypothesis, to_world
 from chaserdock_controller.estimation import motion_models as motion
-from chaserdock_controller.estimation.camera_calibration import seen_by
-from chaserdock_controller.estimation.hypothesis import Branch, correct, innovate
-from chaserdock_controller.estimation.parameters import chi_square_6
+from chaserdock_controller.estimation.camera_calibration import predict_measurement
+from chaserdock_controller.estimation.hypothesis import StateHypothesis, correct, innovate
+from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE
 from chaserdock_models import rotations as rot
 from chaserdock_models import scalar_rotations as scalar
 from chaserdock_models.camera import Camera
@@ -26,6 +26,7 @@ from fusion_cases import (
 )
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.stats import chi2
 
 # --- mathematics -----------------------------------------------------------------------------------
 
@@ -113,8 +114,10 @@ def test_process_noise_composes_and_is_positive() -> None:
     assert np.linalg.eigvalsh(whole)[0] > 0.0
 
 
-def _branch(bias: np.ndarray, covariance: np.ndarray) -> Branch:
-    return Branch(0, np.array([1.0, 2.0, 3.0]), V, Q0, W, (7,), bias.reshape(1, 7), covariance, 0.0, {})
+def _branch(bias: np.ndarray, covariance: np.ndarray) -> StateHypothesis:
+    return StateHypothesis(
+        0, np.array([1.0, 2.0, 3.0]), V, Q0, W, (7,), bias.reshape(1, 7), covariance, 0.0, {}
+    )
 
 
 EYE = CameraPose(np.array([0.3, -0.9, 0.2]), rot.normalize([0.6, -0.3, 0.5, -0.4]))
@@ -124,7 +127,7 @@ def test_measurement_jacobian_by_differences() -> None:
     p = MekfParameters()
     bias = np.array([0.05, 0.02, -0.04, 0.02, -0.01, 0.03, 0.01])
     branch = _branch(bias, np.eye(19))
-    expected = seen_by(EYE, branch.position_m, branch.q_wxyz, bias)
+    expected = predict_measurement(EYE, branch.position_m, branch.q_wxyz, bias)
     seen = PoseHypothesis(expected.position_m, expected.q_wxyz, np.eye(6))
     at_truth = innovate(branch, 7, EYE, seen, p)
     np.testing.assert_allclose(at_truth.residual, 0.0, atol=1e-12)
@@ -156,7 +159,7 @@ def test_a_camera_with_errors_measures_what_its_images_show() -> None:
     q_true = rot.multiply(EYE.q_wxyz, rot.exp(errors[:3]))
     lens = EYE.position_m + rot.rotate(EYE.q_wxyz, errors[3:6])
     pixels = true.project(rot.rotate_inverse(q_true, position + rot.rotate(q, points) - lens))
-    seen = seen_by(EYE, position, q, errors)
+    seen = predict_measurement(EYE, position, q, errors)
     again = told.project(
         rot.rotate_inverse(EYE.q_wxyz, seen.position_m + rot.rotate(seen.q_wxyz, points) - EYE.position_m)
     )
@@ -184,12 +187,8 @@ def test_correction_keeps_the_covariance_positive_and_shrinks_the_residual(seed:
     assert innovate(after, 7, EYE, pose, MekfParameters()).nis <= before.nis * (1 + 1e-6)
 
 
-def test_chi_square_quantiles() -> None:
-    # Table values for 6 degrees of freedom.
-    assert chi_square_6(0.95) == pytest.approx(12.592, abs=1e-3)
-    assert chi_square_6(0.999) == pytest.approx(22.458, abs=1e-3)
-    with pytest.raises(ValueError, match="between 0 and 1"):
-        chi_square_6(1.0)
+def test_gate_is_the_chi_square_quantile() -> None:
+    assert pytest.approx(chi2.ppf(0.9999, 6), rel=1e-12) == GATE_CHI_SQUARE
 
 
 # --- geometry --------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import CameraPose, Measurement, Mekf, MekfParameters, PoseHypothesis
-from chaserdock_controller.estimation.camera_calibration import seen_by
+from chaserdock_controller.estimation.camera_calibration import predict_measurement
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
 from chaserdock_controller.guidance.pointing import (
     CALIBRATION_S,
@@ -188,7 +188,7 @@ def test_turning_about_shows_the_mounting_and_flying_in_step_does_not(seed: int)
             place = V * t + rotations.rotate(q, [-1.0, 0.0, 0.0])
             turned = rotations.multiply(q, calibration_turns([t])[0]) if manoeuvre else q
             eye = CameraPose(place, rotations.multiply(turned, Q_CRF_IRF_FORWARD_WXYZ))
-            seen = seen_by(eye, V * t, q, true)
+            seen = predict_measurement(eye, V * t, q, true)
             noise = rng.normal(size=6) * np.sqrt(np.diag(R))
             h = PoseHypothesis(
                 seen.position_m + noise[:3], rotations.multiply(seen.q_wxyz, rotations.exp(noise[3:])), R

@@ -1,4 +1,4 @@
-"""The MEKF when cameras are blind, lie or cannot decide, and when the target jumps."""
+"""The MEKF with blind, faulty and ambiguous cameras, and with a target that jumps."""
 
 from __future__ import annotations
 
@@ -22,9 +22,12 @@ from fusion_cases import (
     ns,
     see,
 )
+from scipy.stats import chi2
+
+NEES_LIMIT = float(chi2.ppf(0.999, 12))
 
 
-def test_blind_for_five_seconds() -> None:
+def test_prediction_without_measurements_stays_consistent() -> None:
     f = Mekf(NO_BIAS)
     rng = np.random.default_rng(4)
     last = fly(f, 2, 10.0, seed=4)[-1]
@@ -32,14 +35,14 @@ def test_blind_for_five_seconds() -> None:
     for k in range(10 * HZ, 15 * HZ):
         e = f.update([Measurement(c, ns(k), (), 0, eye_of(c, ns(k))) for c in range(2)], ns(k))
     assert (e.status, e.sightings) == ("predicting", 0)
-    assert nees(e) < 33.0  # 0.999 quantile for 12 degrees of freedom
+    assert nees(e) < NEES_LIMIT
     assert np.all(np.diag(e.covariance) > np.diag(last.covariance))
     e = f.update([see(rng, c, ns(15 * HZ)) for c in range(2)], ns(15 * HZ))
     assert (e.status, e.sightings, e.rejected) == ("tracking", 2, ())
     assert f.reinitialisations == 0
 
 
-def test_lost_and_found_again_with_the_rates_kept() -> None:
+def test_reacquisition_keeps_the_rates() -> None:
     f = Mekf()
     rng = np.random.default_rng(4)
     fly(f, 1, 5.0, seed=4)
@@ -51,10 +54,10 @@ def test_lost_and_found_again_with_the_rates_kept() -> None:
     assert e.status == "tracking"
     assert np.linalg.norm(e.omega_rad_s - omega) < 1e-12
     assert f.reinitialisations == 1
-    assert "found again by chaser 0" in [t for _, _, t in f.drain_events()]
+    assert "reacquired by chaser 0" in [t for _, _, t in f.drain_events()]
 
 
-def test_a_start_too_vague_for_one_exposure_adds_up() -> None:
+def test_vague_first_measurements_accumulate() -> None:
     """One small far marker, 8 degrees a frame: "lost" at first, but not begun again every time."""
     f = Mekf()
     rng = np.random.default_rng(16)
@@ -70,11 +73,11 @@ def test_a_start_too_vague_for_one_exposure_adds_up() -> None:
     assert states[-1].status == "tracking"
     assert f.reinitialisations == 0
     assert f.accepted == 4 * HZ
-    assert nees(states[-1]) < 33.0
+    assert nees(states[-1]) < NEES_LIMIT
     assert math.degrees(np.linalg.norm(errors(states[-1])[6:9])) < 6.0
 
 
-def test_a_lying_camera_that_began_is_outvoted_by_cameras_at_other_times() -> None:
+def test_faulty_first_camera_is_outvoted_by_cameras_at_other_times() -> None:
     f = Mekf()
     rng = np.random.default_rng(17)
     e = no_estimate(0)
@@ -90,9 +93,9 @@ def test_a_lying_camera_that_began_is_outvoted_by_cameras_at_other_times() -> No
     assert f.estimate_at(ns(4 * HZ - 1)).rejected == (0,)
 
 
-@pytest.mark.parametrize("liar", [0, 1, 2])
+@pytest.mark.parametrize("faulty", [0, 1, 2])
 @pytest.mark.parametrize("alone_s", [0, 1])
-def test_a_lying_camera_among_three_is_gated_out(liar: int, alone_s: int) -> None:
+def test_faulty_camera_among_three_is_gated_out(faulty: int, alone_s: int) -> None:
     """20 cm and 15 degrees off all the time; also when it was the only one to see the target at first."""
     f = Mekf()
     rng = np.random.default_rng(6)
@@ -100,22 +103,22 @@ def test_a_lying_camera_among_three_is_gated_out(liar: int, alone_s: int) -> Non
     e = no_estimate(0)
     for k in range((5 + alone_s) * HZ):
         group = [
-            see(rng, c, ns(k), shift=shift, turn=turn) if c == liar else see(rng, c, ns(k))
+            see(rng, c, ns(k), shift=shift, turn=turn) if c == faulty else see(rng, c, ns(k))
             for c in range(3)
-            if c == liar or k >= alone_s * HZ
+            if c == faulty or k >= alone_s * HZ
         ]
         e = f.update(group, ns(k))
-    assert e.rejected == (liar,)
+    assert e.rejected == (faulty,)
     assert e.sightings == 2
     assert np.linalg.norm(errors(e)[:3]) < 2e-3
     assert np.linalg.norm(errors(e)[6:9]) < math.radians(0.3)
     texts = [t for _, _, t in f.drain_events()]
-    assert f"chaser {liar} gated out: 10 in a row" in texts
+    assert f"chaser {faulty} gated out: 10 in a row" in texts
     assert f.reinitialisations == (1 if alone_s else 0)
 
 
-def test_a_liar_does_not_lead_while_the_prediction_is_vague() -> None:
-    """All come back at the same moment, after a blindness that left a wide but not lost prediction."""
+def test_faulty_camera_does_not_lead_while_the_prediction_is_vague() -> None:
+    """All cameras return together after an outage that left a wide but not lost prediction."""
     f = Mekf(
         replace(MekfParameters(), acceleration_noise_m_s2_sqrt_hz=3e-3, angular_noise_rad_s2_sqrt_hz=3e-3)
     )
@@ -162,7 +165,7 @@ def test_a_jump_of_the_target_re_initialises_and_keeps_the_rates() -> None:
 FLIP = np.array([0.0, math.radians(40.0), 0.0])
 
 
-def test_flips_in_flight_are_chosen_by_innovation() -> None:
+def test_ambiguous_measurements_are_resolved_by_innovation() -> None:
     f = Mekf()
     rng = np.random.default_rng(11)
     fly(f, 1, 2.0, seed=11)
@@ -193,7 +196,7 @@ def test_an_ambiguous_start_is_resolved(wrong_first: bool, helper: str) -> None:
     assert f.reinitialisations == 0
 
 
-def test_an_ambiguity_that_stays_times_out() -> None:
+def test_unresolved_ambiguity_times_out() -> None:
     f = Mekf()
     rng = np.random.default_rng(13)
     e = no_estimate(0)

@@ -45,8 +45,8 @@ def parameters(body: TargetBody) -> MekfParameters:
     )
 
 
-def branch(s: BodyState) -> Branch:
-    return Branch(
+def branch(s: BodyState) -> StateHypothesis:
+    return StateHypothesis(
         0,
         s.position_m,
         s.velocity_m_s,
@@ -122,9 +122,9 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
     )
     dt_ns, e = 500_000_000, 1e-5
 
-    def moved(d: np.ndarray) -> Branch:
+    def moved(d: np.ndarray) -> StateHypothesis:
         return predict(
-            Branch(
+            StateHypothesis(
                 0,
                 start.position_m + d[:3],
                 start.velocity_m_s + d[3:6],
@@ -140,7 +140,7 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
             p,
         )
 
-    def apart(a: Branch, b: Branch) -> np.ndarray:
+    def apart(a: StateHypothesis, b: StateHypothesis) -> np.ndarray:
         turned = so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))
         return np.concatenate(
             [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from chaserdock_models.arrays import Array
-from chaserdock_models.thruster_model import G0_M_S2, Valves, joined, without
+from chaserdock_models.thruster_model import G0_M_S2, Valves, merge_spans, subtract_span
 from chaserdock_protocol.scenario.thrusters import Thruster
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -132,9 +132,9 @@ def test_forgetting_changes_nothing_that_comes(pulses: list[int]) -> None:
 
 
 def test_spans() -> None:
-    assert joined([(5, 8), (0, 2), (3, 4)], 1) == [(0, 8)]
-    assert joined([(5, 8), (0, 2), (3, 4)], 0) == [(0, 2), (3, 4), (5, 8)]
-    assert joined([(0, 9), (1, 2)], 0) == [(0, 9)]
-    assert without([(0, 10)], (3, 4)) == [(0, 3), (4, 10)]
-    assert without([(0, 10), (20, 30)], (5, 25)) == [(0, 5), (25, 30)]
-    assert without([(0, 10)], (0, 10)) == []
+    assert merge_spans([(5, 8), (0, 2), (3, 4)], 1) == [(0, 8)]
+    assert merge_spans([(5, 8), (0, 2), (3, 4)], 0) == [(0, 2), (3, 4), (5, 8)]
+    assert merge_spans([(0, 9), (1, 2)], 0) == [(0, 9)]
+    assert subtract_span([(0, 10)], (3, 4)) == [(0, 3), (4, 10)]
+    assert subtract_span([(0, 10), (20, 30)], (5, 25)) == [(0, 5), (25, 30)]
+    assert subtract_span([(0, 10)], (0, 10)) == []

@@ -1,4 +1,4 @@
-"""Fusion: the target's state from what all chasers see. Mathematics and parameters: docs/fusion.md."""
+"""Estimate the target's state from the sightings of all chasers. Mathematics and parameters: docs/estimation.md."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ ESTIMATORS = ("mekf", "paper")
 
 
 def make_estimator(name: str, parameters: MekfParameters | PaperParameters | None = None) -> Estimator:
-    """The estimator called ``name`` ("mekf" or "paper"), with its own kind of parameters or, for None,
-    the defaults. Raises ValueError for an unknown name, TypeError for the other one's parameters."""
+    """Create the estimator ``name`` ("mekf" or "paper") with its parameters (None: the defaults).
+
+    Raises ValueError for an unknown name and TypeError for parameters of another estimator.
+    """
     if name == "mekf":
         if parameters is not None and not isinstance(parameters, MekfParameters):
             raise TypeError(f"estimator 'mekf' takes MekfParameters, not {type(parameters).__name__}")

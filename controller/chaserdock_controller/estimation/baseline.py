@@ -1,11 +1,10 @@
-"""The paper's estimation combiner, as a baseline to compare with.
+"""The paper's estimation combiner, as a baseline for comparison.
 
-The paper (Fourlas et al. 2023) says: the latest estimates of every chaser that sees the target are
-averaged, with "a moving average filter for noise reduction, outlier detection and removal methods". The
-authors' code differences poses for the rates and averages 11 of them. What the paper leaves open is
-chosen here and a parameter: window, outlier limits, age limit. Kept as weaknesses of the original: no
-weighting, no latency compensation (the latest pose stands for any time asked for), rates from
-differences. Not kept: averaging Euler angles, which is not an average of attitudes.
+The paper (Fourlas et al. 2023) averages the latest estimates of all chasers that see the target, with "a moving average
+filter for noise reduction, outlier detection and removal methods". The authors' code differentiates poses for the rates
+and averages 11 of them. Window, outlier limits and age limit are unspecified there and parameters here. Weaknesses of the
+original that are kept: no weighting, no latency compensation (the latest pose is returned for any time), rates from
+differences. Averaging of Euler angles is replaced by a mean of attitudes.
 """
 
 from __future__ import annotations
@@ -39,12 +38,12 @@ class PaperParameters:
     window: poses in the moving average. rate_window: differences in the mean of the rates.
     stale_s: a chaser's latest estimate is used for this long.
     outlier_position_m, outlier_attitude_rad: a pose farther than this from the median of three and more
-        chasers, or the combination from the moving average, is removed.
-    outlier_patience: after so many combinations removed in a row the history is dropped instead.
+        chasers, or a combination farther than this from the moving average, is removed.
+    outlier_patience: after this many removed combinations in a row the history is dropped instead.
     tracking_s, lost_s: age of the newest combination beyond which the status is "predicting" (the pose
-        is merely held) and "lost".
-    sigma_*: the method computes no covariance; this constant one is reported, of the size of the errors
-        that the averaging showed with good poses in the closed loop.
+        is held constant) and "lost".
+    sigma_*: constant reported standard deviations, as the method computes no covariance; they match the errors of the
+        averaging with good poses in closed loop.
 
     Raises ValueError for values that are not positive.
     """
@@ -70,7 +69,7 @@ class PaperParameters:
 
 
 def average_quaternion(quaternions: Sequence[Array]) -> Array:
-    """Mean attitude (4,) of unit quaternions (4,), whatever their signs; scalar part not negative.
+    """Return the mean attitude (4,) of unit quaternions (4,) of any sign; scalar part not negative.
 
     The eigenvector of sum q q' with the largest eigenvalue. Source: Markley et al., "Averaging
     Quaternions", Journal of Guidance, Control, and Dynamics 30(4), 2007. Raises ValueError for none.
@@ -83,11 +82,11 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
 
 
 class PaperEstimator:
-    """The combiner with the interface of ``Mekf``.
+    """The paper's combiner with the interface of ``Mekf``.
 
-    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest
-    combination, ``gated`` the poses removed as outliers, ``reinitialisations`` the dropped histories.
-    Of an ambiguous view it takes the first hypothesis, as code that knows of no ambiguity does.
+    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest combination, ``gated`` the
+    poses removed as outliers, ``reinitialisations`` the dropped histories. For an ambiguous view the first hypothesis is
+    used.
     """
 
     def __init__(self, parameters: PaperParameters | None = None) -> None:
@@ -111,7 +110,7 @@ class PaperEstimator:
         self._was_lost = False
 
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
-        """Takes in measurements, in any order, and returns the estimate for ``now_ns``."""
+        """Add measurements, in any order, and return the estimate for ``now_ns``."""
         usable: list[Measurement] = []
         for m in sorted(measurements, key=content_key):
             if m.time_ns > now_ns:
@@ -121,7 +120,7 @@ class PaperEstimator:
             elif not is_usable(m):
                 self.invalid += 1
                 self._events.append(
-                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: unusable measurement, dropped")
+                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: dropped an unusable measurement")
                 )
             else:
                 usable.append(m)
@@ -142,7 +141,7 @@ class PaperEstimator:
         return estimate
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """The newest combination, unchanged, whatever the time: the method predicts nothing."""
+        """Return the newest combination for any time; the method does not predict."""
         if self._mean is None:
             return no_estimate(time_ns)
         p = self.parameters
@@ -168,13 +167,13 @@ class PaperEstimator:
         )
 
     def disturb(self, shock: Shock) -> None:
-        """Nothing to do: the rates are differences of poses, and hold no belief that a push could belie."""
+        """Do nothing: the rates are differences of poses."""
 
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
-        """Nothing to do: there is no model of the body."""
+        """Do nothing: the method has no model of the body."""
 
     def drain_events(self) -> list[EstimatorEvent]:
-        """What happened since the last call, as (simulated time in ns, text)."""
+        """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
@@ -192,7 +191,7 @@ class PaperEstimator:
             removed = {
                 c for c, (x, _) in views.items() if float(np.linalg.norm(x - middle)) > p.outlier_position_m
             }
-            # The median attitude: the one with the least sum of angles to the others.
+            # Median attitude: the one with the smallest sum of angles to the others.
             centre = min(views, key=lambda c: (sum(_angle(views[c][1], q) for _, q in views.values()), c))
             removed |= {c for c in views if _angle(views[centre][1], views[c][1]) > p.outlier_attitude_rad}
         self._rejected = tuple(sorted(removed & fresh))

@@ -1,10 +1,10 @@
-"""What a camera that is not quite as calibrated measures: prediction and Jacobians. Pure functions.
+"""Measurement model of a camera with extrinsic and focal-length calibration errors. Pure functions.
 
-Seven numbers a camera, constant in its own axes (IRF), so that they turn with the chaser: the rotation vector delta by
-which it is really turned, the shift b of its lens, and the share s by which its focal length is longer. With the told
-lens e (WRF) and axes E (IRF to WRF), a target at p, q is taken to be at e + E m and E exp(-delta) E^-1 q, where
-m = S^-1 exp(-delta) (E' (p - e) - b) and S = diag(1, 1, 1 + s): a longer focal length makes things nearer, not smaller
-across. An error of the principal point looks, to first order, as a turn does.
+Each camera has seven errors, constant in its own axes (IRF): the rotation vector delta of its true axes, the shift b of
+its optical centre, and the relative error s of its focal length. With the nominal centre e (WRF) and axes E (IRF to WRF),
+a target at p, q is measured at e + E m and E exp(-delta) E^-1 q, where m = S^-1 exp(-delta) (E' (p - e) - b) and
+S = diag(1, 1, 1 + s): a longer focal length reduces the measured distance. To first order, an error of the principal
+point equals a rotation.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ from .parameters import MekfParameters
 from .types import Array, CameraPose
 
 ERRORS = 7
-"""Numbers of a camera's calibration error: turn (3), shift (3), focal length (1)."""
+"""Components of a camera's calibration error: rotation (3), shift (3), focal length (1)."""
 NO_ERROR = np.zeros(ERRORS)
 NO_ERROR.flags.writeable = False
 
 
-class Seen(NamedTuple):
-    """What is to be measured: position (3,) and attitude (4,) in WRF; Jacobian (3, 3) of the position by the target's,
-    and (6, 7) of both (attitude in TRF axes) by the camera's errors."""
+class PredictedMeasurement(NamedTuple):
+    """Predicted position (3,) and attitude (4,) in WRF; Jacobian (3, 3) of the position by the target's position, and
+    (6, 7) of both (attitude in TRF axes) by the camera's errors."""
 
     position_m: Array
     q_wxyz: Array
@@ -34,26 +34,32 @@ class Seen(NamedTuple):
     by_errors: Array
 
 
-def seen_by(eye: CameraPose, position_m: Array, q_wxyz: Array, errors: Array) -> Seen:
-    """What a camera with ``errors`` (7,) measures of a target at ``position_m`` (3,), ``q_wxyz`` (4,), WRF."""
-    axes = so3.to_matrix(eye.q_wxyz)
-    turn, longer = errors[:3], 1.0 + float(errors[6])
-    back = so3.to_matrix(so3.exp(-turn))
-    told = axes * [1.0, 1.0, 1.0 / longer]  # E S^-1
-    line = axes.T @ (position_m - eye.position_m) - errors[3:6]
-    turned = back @ line
-    jr = so3.right_jacobian(-turn)
+def predict_measurement(
+    camera: CameraPose, position_m: Array, q_wxyz: Array, errors: Array
+) -> PredictedMeasurement:
+    """Predict what a camera with ``errors`` (7,) measures of a target at ``position_m`` (3,), ``q_wxyz`` (4,), WRF."""
+    axes = so3.to_matrix(camera.q_wxyz)
+    delta, focal_ratio = errors[:3], 1.0 + float(errors[6])
+    r_delta = so3.to_matrix(so3.exp(-delta))
+    scaled_axes = axes * [1.0, 1.0, 1.0 / focal_ratio]  # E S^-1
+    line = axes.T @ (position_m - camera.position_m) - errors[3:6]
+    measured = r_delta @ line
+    jr = so3.right_jacobian(-delta)
     jacobian = np.zeros((6, ERRORS))
-    jacobian[:3, :3] = told @ back @ so3.skew(line) @ jr
-    jacobian[:3, 3:6] = -told @ back
-    jacobian[:3, 6] = axes[:, 2] * (-float(turned[2]) / longer**2)
+    jacobian[:3, :3] = scaled_axes @ r_delta @ so3.skew(line) @ jr
+    jacobian[:3, 3:6] = -scaled_axes @ r_delta
+    jacobian[:3, 6] = axes[:, 2] * (-float(measured[2]) / focal_ratio**2)
     jacobian[3:, :3] = -so3.to_matrix(q_wxyz).T @ axes @ jr
-    q = so3.multiply(so3.multiply(eye.q_wxyz, so3.exp(-turn)), so3.inverse_multiply(eye.q_wxyz, q_wxyz))
-    return Seen(eye.position_m + told @ turned, q, told @ back @ axes.T, jacobian)
+    q = so3.multiply(
+        so3.multiply(camera.q_wxyz, so3.exp(-delta)), so3.inverse_multiply(camera.q_wxyz, q_wxyz)
+    )
+    return PredictedMeasurement(
+        camera.position_m + scaled_axes @ measured, q, scaled_axes @ r_delta @ axes.T, jacobian
+    )
 
 
 def prior(p: MekfParameters) -> Array:
-    """Covariance (7, 7) of a camera's errors before anything is known of them."""
+    """Return the prior covariance (7, 7) of a camera's errors."""
     return _diagonal(p.bias_attitude_rad, p.bias_position_m, p.bias_focal_share)
 
 
@@ -64,7 +70,7 @@ def _diagonal(turn_rad: float, shift_m: float, share: float) -> Array:
     return matrix
 
 
-def pose_prior(eye: CameraPose, position_m: Array, q_wxyz: Array, p: MekfParameters) -> Array:
-    """Covariance (6, 6) of a measured pose that comes of the camera's unknown errors alone."""
-    g = seen_by(eye, position_m, q_wxyz, NO_ERROR).by_errors
+def pose_prior_covariance(camera: CameraPose, position_m: Array, q_wxyz: Array, p: MekfParameters) -> Array:
+    """Return the covariance (6, 6) of a measured pose due to the camera's prior errors."""
+    g = predict_measurement(camera, position_m, q_wxyz, NO_ERROR).by_errors
     return g @ prior(p) @ g.T

@@ -1,7 +1,7 @@
-"""What one exposure does to the filter: start, update, choice between branches, re-initialisation.
+"""Update of the filter by one exposure: initialization, update, choice between hypotheses, re-initialization.
 
-``process`` is a pure function from state and measurements to state, so that a late measurement can be
-put in by going back to the state before it and running the later exposures again.
+``process`` is a pure function from state and measurements to state. A late measurement is handled by a rollback to the
+state before it and a replay of the later exposures.
 """
 
 from __future__ import annotations
@@ -12,39 +12,41 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 
-from .hypothesis import Branch, absorb, agree, pose_sigmas, predict, start
+from .hypothesis import StateHypothesis, pose_sigmas, poses_agree, predict, start, update_hypothesis
 from .parameters import MekfParameters
 from .types import Array, EstimatorEvent, Measurement, PoseHypothesis, Shock
 
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """All that the filter knows after the exposure at ``time_ns``.
+    """Complete state of the filter after the exposure at ``time_ns``.
 
-    branches: none before the first sight, two while an ambiguous start (at ``ambiguous_since_ns``) is
-    open, one otherwise; the likeliest first. recent: the latest measurement of each chaser, as it came.
-    seen, rejected: chasers accepted and gated out at this exposure. frozen: covariance (6, 6) of the pose that comes of
-    what does not average out of the last accepted measurements. The rest are counts since the start.
+    hypotheses: none before the first measurement, two while an ambiguous start (at ``ambiguous_since_ns``) is unresolved,
+    one otherwise; the likeliest first. recent: the latest measurement of each chaser. seen, rejected: chasers accepted
+    and gated out at this exposure. considered: covariance (6, 6) of the pose error of the last accepted measurements that does
+    not average out. accepted, gated, reinitialisations: counts since the start.
     """
 
     time_ns: int
-    branches: tuple[Branch, ...] = ()
+    hypotheses: tuple[StateHypothesis, ...] = ()
     ambiguous_since_ns: int = 0
     recent: tuple[Measurement, ...] = ()
     last_accepted_ns: int = 0
     seen: tuple[int, ...] = ()
     rejected: tuple[int, ...] = ()
-    frozen: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    considered: Array = field(default_factory=lambda: np.zeros((6, 6)))
     accepted: int = 0
     gated: int = 0
     reinitialisations: int = 0
 
 
-def process(
+def process_exposure(
     state: FilterState | None, time_ns: int, group: list[Measurement], p: MekfParameters
 ) -> tuple[FilterState, tuple[EstimatorEvent, ...]]:
-    """The state after the exposure at ``time_ns`` with the measurements ``group``, sorted by chaser, and
-    what happened. ``state`` is the state after the exposure before, None at the first."""
+    """Return the state after the exposure at ``time_ns`` and the events.
+
+    ``group``: its measurements, sorted by chaser. ``state``: after the previous exposure, None at the first.
+    """
     before = state if state is not None else FilterState(time_ns)
     events: list[EstimatorEvent] = []
     seen = [m for m in group if m.hypotheses]
@@ -55,78 +57,84 @@ def process(
         before,
         time_ns=time_ns,
         recent=tuple(sorted((m for m in recent if m.time_ns >= horizon), key=lambda m: m.chaser)),
-        branches=tuple(predict(b, time_ns, p) for b in before.branches),
+        hypotheses=tuple(predict(b, time_ns, p) for b in before.hypotheses),
         seen=(),
         rejected=(),
     )
     if not seen:
         return now, ()
 
-    if not now.branches:
+    if not now.hypotheses:
         velocity = np.zeros(3)
         rates = np.diag([p.initial_velocity_m_s**2] * 3 + [p.initial_omega_rad_s**2] * 3)
-        now = _begin(now, seen, seen, (velocity, velocity, rates), p, "initialised", events)
+        now = _initialize(now, seen, seen, (velocity, velocity, rates), p, "initialised", events)
     else:
-        found = _find_again(now, seen, p, events) if all(is_lost(b, p) for b in now.branches) else None
-        now = found if found is not None else _absorb_all(now, seen, p, events)
-        if all(_mostly_gated(b, now, p) for b in now.branches):
-            now = _restart(now, seen, p, events)
-    now = replace(now, frozen=_frozen([m for m in seen if m.chaser in now.seen], p, now.frozen))
+        lost = all(is_lost(b, p) for b in now.hypotheses)
+        reacquired = _reacquire(now, seen, p, events) if lost else None
+        now = reacquired if reacquired is not None else _update_hypotheses(now, seen, p, events)
+        if all(_mostly_gated(b, now, p) for b in now.hypotheses):
+            now = _reinitialize(now, seen, p, events)
+    now = replace(
+        now, considered=_considered_covariance([m for m in seen if m.chaser in now.seen], p, now.considered)
+    )
     return _choose(now, p, events), tuple(events)
 
 
-def _frozen(believed: list[Measurement], p: MekfParameters, before: Array) -> Array:
-    """Covariance (6, 6) of the part of the cameras' errors that stays while their view does: each camera's share of its
-    measurement's covariance, independent of the other cameras'; ``before`` where nothing was believed."""
-    if not believed or p.frozen_share == 0.0:
+def _considered_covariance(used: list[Measurement], p: MekfParameters, before: Array) -> Array:
+    """Return the covariance (6, 6) of the camera errors that stay constant while the view does.
+
+    Each camera's part is a fixed ratio of its measurement's sigma, independent of the other cameras'. Without an accepted
+    measurement ``before`` is returned.
+    """
+    if not used or p.considered_ratio == 0.0:
         return before
     information = np.zeros((6, 6))
-    for m in believed:
+    for m in used:
         information += np.linalg.inv(m.hypotheses[0].covariance)
-    return p.frozen_share**2 * np.asarray(np.linalg.inv(information), dtype=np.float64)
+    return p.considered_ratio**2 * np.asarray(np.linalg.inv(information), dtype=np.float64)
 
 
-def shaken(state: FilterState, shocks: list[Shock]) -> FilterState:
-    """The state with every branch's rates changed by ``shocks``, and their covariance by what these leave open."""
+def apply_shocks(state: FilterState, shocks: list[Shock]) -> FilterState:
+    """Add the known part of ``shocks`` to the rates of every hypothesis, and the unknown part to the covariance."""
     i = np.array([3, 4, 5, 9, 10, 11])
-    branches = list(state.branches)
+    hypotheses = list(state.hypotheses)
     for shock in shocks:
         added = np.repeat([shock.sigma_velocity_m_s**2, shock.sigma_omega_rad_s**2], 3)
-        for k, b in enumerate(branches):
+        for k, b in enumerate(hypotheses):
             covariance = b.covariance.copy()
             covariance[i, i] += added
-            branches[k] = replace(
+            hypotheses[k] = replace(
                 b,
                 velocity_m_s=b.velocity_m_s + shock.velocity_m_s,
                 omega_rad_s=b.omega_rad_s + shock.omega_rad_s,
                 covariance=covariance,
             )
-    return replace(state, branches=tuple(branches))
+    return replace(state, hypotheses=tuple(hypotheses))
 
 
-def is_lost(branch: Branch, p: MekfParameters) -> bool:
-    """Whether the branch is too uncertain to be of use."""
-    x, y, z, _, _, _, a, b, c = branch.covariance.diagonal()[:9].tolist()
+def is_lost(hypothesis: StateHypothesis, p: MekfParameters) -> bool:
+    """Test whether the hypothesis is too uncertain to use."""
+    x, y, z, _, _, _, a, b, c = hypothesis.covariance.diagonal()[:9].tolist()
     if x + y + z <= p.lost_position_m**2 and a + b + c <= p.lost_attitude_rad**2:
-        return False  # no eigenvalue is larger than the sum of all
-    position, attitude = pose_sigmas(branch.covariance)
+        return False  # no eigenvalue exceeds the trace
+    position, attitude = pose_sigmas(hypothesis.covariance)
     return position > p.lost_position_m or attitude > p.lost_attitude_rad
 
 
-def weights(branches: tuple[Branch, ...]) -> list[float]:
-    """Probabilities of the branches, from their likelihoods and equal priors."""
-    top = max(b.log_likelihood for b in branches)
-    w = [math.exp(b.log_likelihood - top) for b in branches]
+def weights(hypotheses: tuple[StateHypothesis, ...]) -> list[float]:
+    """Return the probabilities of the hypotheses from their likelihoods and equal priors."""
+    top = max(b.log_likelihood for b in hypotheses)
+    w = [math.exp(b.log_likelihood - top) for b in hypotheses]
     return [x / sum(w) for x in w]
 
 
-def mixture_covariance(branches: tuple[Branch, ...]) -> Array:
-    """Covariance (12, 12) about the first branch, with the spread between branches in it."""
-    first = branches[0]
-    if len(branches) == 1:
+def mixture_covariance(hypotheses: tuple[StateHypothesis, ...]) -> Array:
+    """Return the covariance (12, 12) about the first hypothesis, including the spread between hypotheses."""
+    first = hypotheses[0]
+    if len(hypotheses) == 1:
         return first.covariance[:12, :12].copy()
     total = np.zeros((12, 12))
-    for weight, b in zip(weights(branches), branches, strict=True):
+    for weight, b in zip(weights(hypotheses), hypotheses, strict=True):
         d = np.concatenate(
             [
                 b.position_m - first.position_m,
@@ -139,26 +147,26 @@ def mixture_covariance(branches: tuple[Branch, ...]) -> Array:
     return total
 
 
-def _absorb_all(
+def _update_hypotheses(
     now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState:
-    before = now.branches
-    results = [absorb(b, seen, p) for b in before]
+    before = now.hypotheses
+    results = [update_hypothesis(b, seen, p) for b in before]
     best = max(range(len(results)), key=lambda k: (results[k][0].log_likelihood, -k))
     for chaser in results[best][2]:
-        if results[best][0].misses[chaser] == p.sustained_rejections:
+        if results[best][0].rejections[chaser] == p.sustained_rejections:
             events.append(
                 EstimatorEvent(
                     now.time_ns, "warning", f"chaser {chaser} gated out: {p.sustained_rejections} in a row"
                 )
             )
     for chaser in results[best][1]:
-        if before[best].misses.get(chaser, 0) >= p.sustained_rejections:
+        if before[best].rejections.get(chaser, 0) >= p.sustained_rejections:
             events.append(EstimatorEvent(now.time_ns, "info", f"chaser {chaser} accepted again"))
     accepted, rejected = results[best][1:]
     return replace(
         now,
-        branches=tuple(r[0] for r in results),
+        hypotheses=tuple(r[0] for r in results),
         last_accepted_ns=now.time_ns if accepted else now.last_accepted_ns,
         seen=tuple(sorted({*now.seen, *accepted})),
         rejected=rejected,
@@ -168,10 +176,10 @@ def _absorb_all(
 
 
 def _choose(now: FilterState, p: MekfParameters, events: list[EstimatorEvent]) -> FilterState:
-    """Puts the likeliest branch first and drops what evidence or time has ruled out."""
-    if len(now.branches) < 2:
+    """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout."""
+    if len(now.hypotheses) < 2:
         return now
-    ranked = sorted(now.branches, key=lambda b: -b.log_likelihood)
+    ranked = sorted(now.hypotheses, key=lambda b: -b.log_likelihood)
     top = ranked[0]
     kept = [b for b in ranked if top.log_likelihood - b.log_likelihood < p.ambiguity_log_odds]
     if len(kept) == 1:
@@ -179,13 +187,13 @@ def _choose(now: FilterState, p: MekfParameters, events: list[EstimatorEvent]) -
     elif now.time_ns - now.ambiguous_since_ns > p.ambiguity_timeout_s * 1e9:
         kept = [top]
         events.append(EstimatorEvent(now.time_ns, "info", "ambiguity timed out: kept the likelier attitude"))
-    return replace(now, branches=tuple(kept))
+    return replace(now, hypotheses=tuple(kept))
 
 
-def _opinions(now: FilterState) -> list[Measurement]:
-    """What each camera said last, moved to the present by the first branch's rates."""
-    velocity, omega = now.branches[0].velocity_m_s, now.branches[0].omega_rad_s
-    opinions: list[Measurement] = []
+def _recent_measurements(now: FilterState) -> list[Measurement]:
+    """Return the latest measurement of each camera, propagated to now with the rates of the first hypothesis."""
+    velocity, omega = now.hypotheses[0].velocity_m_s, now.hypotheses[0].omega_rad_s
+    candidates: list[Measurement] = []
     for m in now.recent:
         dt = (now.time_ns - m.time_ns) * 1e-9
         moved = tuple(
@@ -194,94 +202,100 @@ def _opinions(now: FilterState) -> list[Measurement]:
             )
             for h in m.hypotheses
         )
-        opinions.append(replace(m, hypotheses=moved))
-    return [m for m in opinions if m.hypotheses]
+        candidates.append(replace(m, hypotheses=moved))
+    return [m for m in candidates if m.hypotheses]
 
 
-def _support(h: PoseHypothesis, seen: Measurement, opinions: list[Measurement], p: MekfParameters) -> int:
+def _support(h: PoseHypothesis, seen: Measurement, candidates: list[Measurement], p: MekfParameters) -> int:
     return sum(
-        any(agree(h, seen.eye, other, m.eye, p) for other in m.hypotheses)
-        for m in opinions
+        any(poses_agree(h, seen.camera, other, m.camera, p) for other in m.hypotheses)
+        for m in candidates
         if m.chaser != seen.chaser
     )
 
 
-def _ranking(m: Measurement, opinions: list[Measurement], p: MekfParameters) -> tuple[int, bool, int, float]:
-    """How good a measurement is to begin with: agreement, no ambiguity, markers, small covariance."""
-    support = max(_support(h, m, opinions, p) for h in m.hypotheses)
+def _ranking(
+    m: Measurement, candidates: list[Measurement], p: MekfParameters
+) -> tuple[int, bool, int, float]:
+    """Rank a measurement as a starting point: agreement, no ambiguity, markers, small covariance."""
+    support = max(_support(h, m, candidates, p) for h in m.hypotheses)
     return support, len(m.hypotheses) == 1, m.markers, -float(np.trace(m.hypotheses[0].covariance))
 
 
-def _begin(
+def _initialize(
     now: FilterState,
     seen: list[Measurement],
-    opinions: list[Measurement],
+    candidates: list[Measurement],
     rates: tuple[Array, Array, Array],
     p: MekfParameters,
-    verb: str,
+    action: str,
     events: list[EstimatorEvent],
 ) -> FilterState:
-    """Branches from the camera that most others agree with; the other cameras follow as updates."""
-    seed = max(seen, key=lambda m: (*_ranking(m, opinions, p), -m.chaser))
-    supports = [_support(h, seed, opinions, p) for h in seed.hypotheses]
+    """Initialize from the camera that most others poses_agree with; apply the other cameras as updates."""
+    seed = max(seen, key=lambda m: (*_ranking(m, candidates, p), -m.chaser))
+    supports = [_support(h, seed, candidates, p) for h in seed.hypotheses]
     kept = [h for h, s in zip(seed.hypotheses, supports, strict=True) if s == max(supports)]
-    branches = tuple(start(now.time_ns, seed, h, rates, p) for h in kept)
-    text = f"{verb} by chaser {seed.chaser}"
+    hypotheses = tuple(start(now.time_ns, seed, h, rates, p) for h in kept)
+    text = f"{action} by chaser {seed.chaser}"
     events.append(
         EstimatorEvent(now.time_ns, "info", text + (", ambiguous: two hypotheses" if len(kept) > 1 else ""))
     )
     now = replace(
         now,
-        branches=branches,
+        hypotheses=hypotheses,
         ambiguous_since_ns=now.time_ns,
         last_accepted_ns=now.time_ns,
         seen=(seed.chaser,),
         accepted=now.accepted + 1,
     )
     others = [m for m in seen if m is not seed]
-    return _absorb_all(now, others, p, events) if others else now
+    return _update_hypotheses(now, others, p, events) if others else now
 
 
-def _mostly_gated(branch: Branch, now: FilterState, p: MekfParameters) -> bool:
-    """Whether more than half of the cameras that see the target have long been gated out."""
+def _mostly_gated(hypothesis: StateHypothesis, now: FilterState, p: MekfParameters) -> bool:
+    """Test whether more than half of the cameras that see the target have sustained rejections."""
     active = [m.chaser for m in now.recent if m.hypotheses]
-    out = sum(branch.misses.get(chaser, 0) >= p.sustained_rejections for chaser in active)
+    out = sum(hypothesis.rejections.get(chaser, 0) >= p.sustained_rejections for chaser in active)
     return 2 * out > len(active)
 
 
-def _rates(branch: Branch) -> tuple[Array, Array, Array]:
+def _rates(hypothesis: StateHypothesis) -> tuple[Array, Array, Array]:
     r = np.array([3, 4, 5, 9, 10, 11])
-    return branch.velocity_m_s, branch.omega_rad_s, branch.covariance[np.ix_(r, r)]
+    return hypothesis.velocity_m_s, hypothesis.omega_rad_s, hypothesis.covariance[np.ix_(r, r)]
 
 
-def _find_again(
+def _reacquire(
     now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState | None:
-    """Begins anew from the state "lost", with the rates and their covariance as they are; None if the
-    measurements by themselves are no better than lost (then they had better add up)."""
-    told: list[EstimatorEvent] = []
-    again = replace(now, reinitialisations=now.reinitialisations + 1)
-    again = _begin(again, seen, _opinions(now), _rates(now.branches[0]), p, "found again", told)
-    if all(is_lost(b, p) for b in again.branches):
+    """Initialize from the status "lost", keeping the rates and their covariance.
+
+    Returns None if the measurements alone would be "lost" as well; then they accumulate as updates.
+    """
+    new_events: list[EstimatorEvent] = []
+    state = replace(now, reinitialisations=now.reinitialisations + 1)
+    state = _initialize(
+        state, seen, _recent_measurements(now), _rates(now.hypotheses[0]), p, "reacquired", new_events
+    )
+    if all(is_lost(b, p) for b in state.hypotheses):
         return None
-    events += told
-    return again
+    events += new_events
+    return state
 
 
-def _restart(
+def _reinitialize(
     now: FilterState, seen: list[Measurement], p: MekfParameters, events: list[EstimatorEvent]
 ) -> FilterState:
-    """Begins anew where most cameras say the target is, keeping its rates with a wider covariance.
+    """Initialize at the pose that most cameras poses_agree on, keeping the rates with a larger covariance.
 
-    If a camera that is not in this exposure has more agreement, its turn comes within its period.
+    Does nothing if a camera outside this exposure has more agreement; its next exposure will re-initialize.
     """
-    opinions = _opinions(now)
-    best = max(_ranking(m, opinions, p)[0] for m in opinions)
-    if max(_ranking(m, opinions, p)[0] for m in seen) < best:
+    candidates = _recent_measurements(now)
+    best = max(_ranking(m, candidates, p)[0] for m in candidates)
+    if max(_ranking(m, candidates, p)[0] for m in seen) < best:
         return now
-    velocity, omega, covariance = _rates(now.branches[0])
+    velocity, omega, covariance = _rates(now.hypotheses[0])
     wider = np.diag([p.reinitialised_velocity_m_s**2] * 3 + [p.reinitialised_omega_rad_s**2] * 3)
-    # What this exposure counted before is counted again below.
+    # _initialize counts the measurements of this exposure again.
     now = replace(
         now,
         accepted=now.accepted - len(now.seen),
@@ -290,4 +304,6 @@ def _restart(
         rejected=(),
         reinitialisations=now.reinitialisations + 1,
     )
-    return _begin(now, seen, opinions, (velocity, omega, covariance + wider), p, "re-initialised", events)
+    return _initialize(
+        now, seen, candidates, (velocity, omega, covariance + wider), p, "re-initialised", events
+    )

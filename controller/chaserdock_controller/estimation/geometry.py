@@ -1,4 +1,4 @@
-"""From what a camera measures to a pose of the target in the world, with its covariance."""
+"""Transform a camera measurement to a pose of the target in WRF, with covariance."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def to_world(
     covariance_irf: ArrayLike,
     odometry_covariance: ArrayLike | None = None,
 ) -> PoseHypothesis:
-    """Pose of the target in WRF from one chaser's odometry and its camera's measurement.
+    """Return the pose of the target in WRF from one chaser's odometry and its camera's measurement.
 
     position_m (3,), q_wxyz (4,): the chaser's pose, CRF to WRF, at the time of the exposure.
     camera_position_crf_m (3,), q_crf_irf_wxyz (4,): the camera's mounting, IRF to CRF.
     position_irf_m (3,), q_irf_trf_wxyz (4,): the measured pose of the target, TRF to IRF.
-    covariance_irf (6, 6): of that, order (position in IRF axes, dtheta in TRF axes), m and rad.
+    covariance_irf (6, 6): of the measured pose, order (position in IRF axes, dtheta in TRF axes), m and rad.
     odometry_covariance (6, 6): of the chaser's pose, order (position in WRF axes, dtheta in CRF
         axes), or None for a perfectly known pose. Its attitude error moves the target sideways by the
         lever arm from the chaser's origin to the target.
 
-    Quaternions are normalised. Raises ValueError for wrong shapes and for a zero quaternion.
+    Quaternions are normalized. Raises ValueError for wrong shapes and for a zero quaternion.
 
     First-order propagation. With C the chaser's rotation matrix, l the target's position in CRF and
     D = R(CRF <- TRF): dp = dp_chaser - C [l]x dtheta_chaser + C R(CRF <- IRF) dp_irf and

@@ -1,7 +1,7 @@
-"""The default estimator: a multiplicative Kalman filter that takes measurements at their exposure time.
+"""Default estimator: a multiplicative extended Kalman filter that applies measurements at their exposure time.
 
-Mathematics: docs/fusion.md. Late measurements go in by roll back and replay over a short buffer, so the
-state after a set of measurements does not depend on the order or the calls in which they came.
+Mathematics: docs/estimation.md. Late measurements are inserted by rollback and replay over a short buffer, so the state does
+not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from .camera_calibration import ERRORS
-from .filter_update import FilterState, is_lost, mixture_covariance, process, shaken
+from .filter_update import FilterState, apply_shocks, is_lost, mixture_covariance, process_exposure
 from .hypothesis import POSE, predict
 from .parameters import MekfParameters
 from .types import (
@@ -31,9 +31,9 @@ from .types import (
 
 @dataclass
 class Exposure:
-    """The measurements of one exposure time (sorted by chaser) and what they led to.
+    """The measurements of one exposure time (sorted by chaser) and the resulting state.
 
-    ``parameters`` hold up to it from the exposure before; ``shocks`` changed the rates after it.
+    ``parameters`` apply from the previous exposure to this one; ``shocks`` change the rates after it.
     """
 
     time_ns: int
@@ -45,11 +45,11 @@ class Exposure:
 
 
 class Mekf:
-    """Target state from the measurements of all chasers.
+    """Estimate the target state from the measurements of all chasers.
 
     Counters: ``accepted`` and ``gated`` measurements, ``reinitialisations``; ``late_dropped`` (older
     than the buffer), ``early_dropped`` (exposed after ``now_ns``), ``invalid`` (not finite, wrong shape
-    or a covariance that is none) and ``duplicates`` (chaser and time as in one already taken).
+    or not a covariance) and ``duplicates`` (same chaser and time as an earlier one).
     """
 
     def __init__(self, parameters: MekfParameters | None = None) -> None:
@@ -60,7 +60,7 @@ class Mekf:
         self.duplicates = 0
         self._buffer: list[Exposure] = []
         self._base: FilterState | None = None  # the state just before the buffer
-        self._pending: list[EstimatorEvent] = []  # events outside of the buffer, not yet drained
+        self._pending: list[EstimatorEvent] = []  # events outside the buffer, not yet drained
         self._drained: set[EstimatorEvent] = set()  # events of the buffer already drained
         self._was_lost = False
 
@@ -78,13 +78,15 @@ class Mekf:
 
     @property
     def reinitialisations(self) -> int:
-        """How often the filter began anew with the rates kept."""
+        """Number of re-initializations that kept the rates."""
         state = self._newest()
         return state.reinitialisations if state else 0
 
     def update(self, measurements: Sequence[Measurement], now_ns: int) -> TargetState:
-        """Takes in measurements, of any exposure times up to ``now_ns`` and in any order, and returns
-        the estimate for ``now_ns``. Raises ValueError as ``estimate_at``."""
+        """Add measurements with exposure times up to ``now_ns``, in any order, and return the estimate for ``now_ns``.
+
+        Raises ValueError as ``estimate_at``.
+        """
         newest = self._buffer[-1].time_ns if self._buffer else None
         horizon = None if newest is None else newest - self._buffer_ns
         first_changed: int | None = None
@@ -92,7 +94,9 @@ class Mekf:
             if m.time_ns > now_ns:
                 self.early_dropped += 1
                 self._pending.append(
-                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: exposure later than now, dropped")
+                    EstimatorEvent(
+                        now_ns, "info", f"chaser {m.chaser}: dropped a measurement exposed in the future"
+                    )
                 )
             elif (horizon is not None and m.time_ns < horizon) or (
                 self._base is not None and m.time_ns <= self._base.time_ns
@@ -101,7 +105,7 @@ class Mekf:
             elif not is_usable(m):
                 self.invalid += 1
                 self._pending.append(
-                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: unusable measurement, dropped")
+                    EstimatorEvent(now_ns, "info", f"chaser {m.chaser}: dropped an unusable measurement")
                 )
             elif self._insert(m):
                 first_changed = m.time_ns if first_changed is None else min(first_changed, m.time_ns)
@@ -116,26 +120,26 @@ class Mekf:
         return estimate
 
     def estimate_at(self, time_ns: int) -> TargetState:
-        """The estimate for ``time_ns``, from the measurements exposed up to then; changes nothing.
+        """Return the estimate for ``time_ns`` from the measurements exposed up to then; changes no state.
 
         Raises ValueError for a time before the oldest state still held in the buffer.
         """
         i = bisect_right(self._buffer, time_ns, key=lambda e: e.time_ns)
         state = self._buffer[i - 1].state if i > 0 else self._base
-        if state is None or not state.branches:
+        if state is None or not state.hypotheses:
             return no_estimate(time_ns)
         if time_ns < state.time_ns:
-            raise ValueError(f"no state as old as {time_ns} ns is held; the oldest is {state.time_ns} ns")
-        branches = tuple(predict(b, time_ns, self.parameters) for b in state.branches)
-        best = branches[0]
+            raise ValueError(f"no state for {time_ns} ns in the buffer; the oldest is {state.time_ns} ns")
+        hypotheses = tuple(predict(b, time_ns, self.parameters) for b in state.hypotheses)
+        best = hypotheses[0]
         if is_lost(best, self.parameters):
             status = "lost"
         elif time_ns - state.last_accepted_ns <= self.parameters.tracking_s * 1e9:
             status = "tracking"
         else:
             status = "predicting"
-        covariance = mixture_covariance(branches)
-        covariance[np.ix_(POSE, POSE)] += state.frozen
+        covariance = mixture_covariance(hypotheses)
+        covariance[np.ix_(POSE, POSE)] += state.considered
         return TargetState(
             time_ns,
             best.position_m.copy(),
@@ -149,28 +153,30 @@ class Mekf:
         )
 
     def cameras(self) -> tuple[CameraError, ...]:
-        """What is known of the calibration errors of the cameras seen so far, at the newest exposure, by chaser."""
+        """Return the estimated calibration errors of all cameras, sorted by chaser, at the newest exposure."""
         state = self._newest()
-        if state is None or not state.branches:
+        if state is None or not state.hypotheses:
             return ()
-        best, found = state.branches[0], []
+        best, errors = state.hypotheses[0], []
         for k, (chaser, error) in enumerate(zip(best.cameras, best.bias, strict=True)):
             i = slice(12 + ERRORS * k, 12 + ERRORS * (k + 1))
-            found.append(CameraError(chaser, error[:3], error[3:6], float(error[6]), best.covariance[i, i]))
-        return tuple(sorted(found, key=lambda e: e.chaser))
+            errors.append(CameraError(chaser, error[:3], error[3:6], float(error[6]), best.covariance[i, i]))
+        return tuple(sorted(errors, key=lambda e: e.chaser))
 
     def disturb(self, shock: Shock) -> None:
-        """Something has pushed the target since the newest exposure."""
+        """Apply a sudden change of the target's rates after the newest exposure."""
         if self._buffer:
             newest = self._buffer[-1]
             newest.shocks.append(shock)
             if newest.state is not None:
-                newest.state = shaken(newest.state, [shock])
+                newest.state = apply_shocks(newest.state, [shock])
 
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
-        """From the newest exposure on the target is another rigid body, free of torque: ``inertia`` (TRF, rows, about
-        the centre of mass, to any factor), ``centre_trf_m`` its centre of mass in TRF. Raises ValueError for an
-        inertia that no body has."""
+        """Model the target from the newest exposure on as a torque-free rigid body with other mass properties.
+
+        ``inertia``: TRF, rows, about the centre of mass, up to a factor. ``centre_trf_m``: centre of mass in TRF. Raises
+        ValueError for an inertia that no rigid body has.
+        """
         self.parameters = replace(
             self.parameters,
             motion_model="torque_free",
@@ -179,7 +185,7 @@ class Mekf:
         )
 
     def drain_events(self) -> list[EstimatorEvent]:
-        """What happened since the last call, as (simulated time in ns, text), in order of time."""
+        """Return the events since the last call, in order of time."""
         fresh = [e for x in self._buffer for e in x.events if e not in self._drained]
         self._drained.update(fresh)
         events = sorted([*self._pending, *fresh], key=lambda e: e[0])
@@ -210,8 +216,10 @@ class Mekf:
         i = bisect_left(self._buffer, time_ns, key=lambda e: e.time_ns)
         state = self._buffer[i - 1].state if i > 0 else self._base
         for exposure in self._buffer[i:]:
-            state, exposure.events = process(state, exposure.time_ns, exposure.group, exposure.parameters)
-            exposure.state = state = shaken(state, exposure.shocks)
+            state, exposure.events = process_exposure(
+                state, exposure.time_ns, exposure.group, exposure.parameters
+            )
+            exposure.state = state = apply_shocks(state, exposure.shocks)
 
     def _trim(self) -> None:
         horizon = self._buffer[-1].time_ns - self._buffer_ns

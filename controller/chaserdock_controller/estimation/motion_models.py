@@ -1,4 +1,4 @@
-"""Motion models of the target: the mean one step on, and the transition matrix of the error state.
+"""Motion models of the target: prediction of the mean, and transition matrix of the error state.
 
 Error state (12): position and velocity (WRF), dtheta and omega (TRF), with q_true = q (x) exp(dtheta).
 Process noise is white acceleration and white angular acceleration, given as spectral densities.
@@ -19,8 +19,8 @@ _EYE3 = np.eye(3)
 
 
 def constant_rates(q_wxyz: Array, omega_rad_s: Array, dt_s: float) -> tuple[Array, Array, Array]:
-    """Attitude (4,), body rate (3,) and the (6, 6) transition of (dtheta, domega) after ``dt_s`` at a
-    constant body rate; exact. Source: Sola 2017, section 5.4 (right Jacobian for the rate column)."""
+    """Return attitude (4,), body rate (3,) and the (6, 6) transition of (dtheta, domega) after ``dt_s`` at a
+    constant body rate (exact). Source: Sola 2017, section 5.4 (right Jacobian for the rate column)."""
     phi = omega_rad_s * dt_s
     step = so3.exp(phi)
     transition = np.zeros((6, 6))
@@ -33,10 +33,10 @@ def constant_rates(q_wxyz: Array, omega_rad_s: Array, dt_s: float) -> tuple[Arra
 def torque_free(
     q_wxyz: Array, omega_rad_s: Array, dt_s: float, inertia: Array, inertia_inverse: Array
 ) -> tuple[Array, Array, Array]:
-    """As ``constant_rates`` for a free rigid body: I omega' = (I omega) x omega.
+    """Predict as ``constant_rates`` for a free rigid body: I omega' = (I omega) x omega.
 
-    inertia (3, 3) in TRF axes, to any common factor; inertia_inverse (3, 3). State and variational
-    equations are integrated together by RK4, in steps of at most 0.5 s and 0.1 rad.
+    inertia (3, 3) in TRF axes, up to a common factor; inertia_inverse (3, 3). State and variational
+    equations are integrated together by RK4 in steps of at most 0.5 s and 0.1 rad.
     """
     n = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
 
@@ -61,14 +61,14 @@ def torque_free(
 
 
 def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
-    """Matrix (12, 12) from the errors of TRF's origin to those of a point ``centre_trf_m`` (3,) fixed in TRF.
+    """Return the matrix (12, 12) from errors of TRF's origin to errors of a point ``centre_trf_m`` (3,) fixed in TRF.
 
-    The point is at p + R c and moves at v + R (omega x c); dtheta and omega stay.
+    The point is at p + R c and moves at v + R (omega x c); dtheta and omega are unchanged.
     """
-    rotation, turning = so3.to_matrix(q_wxyz), np.cross(omega_rad_s, centre_trf_m)
+    rotation, spin = so3.to_matrix(q_wxyz), np.cross(omega_rad_s, centre_trf_m)
     m = np.eye(12)
     m[0:3, 6:9] = -rotation @ so3.skew(centre_trf_m)
-    m[3:6, 6:9] = -rotation @ so3.skew(turning)
+    m[3:6, 6:9] = -rotation @ so3.skew(spin)
     m[3:6, 9:12] = -rotation @ so3.skew(centre_trf_m)
     return m
 
@@ -80,31 +80,31 @@ def about_centre(
     centre_trf_m: Array,
     dt_s: float,
 ) -> tuple[Array, Array, Array]:
-    """Position, velocity (3,) of TRF's origin and transition (12, 12) where the centre of mass is elsewhere.
+    """Return position, velocity (3,) of TRF's origin and transition (12, 12) for an offset centre of mass.
 
-    ``before``: position, velocity, attitude, rate; ``after``: attitude and rate ``dt_s`` on; ``transition`` (12, 12)
-    of a body whose centre of mass is TRF's origin. The centre of mass moves on at its constant velocity.
+    ``before``: position, velocity, attitude, rate; ``after``: attitude and rate ``dt_s`` later; ``transition`` (12, 12)
+    of a body whose centre of mass is TRF's origin. The centre of mass moves at constant velocity.
     """
     position, velocity, q, omega = before
     q_after, omega_after = after
     arm, arm_after = so3.to_matrix(q) @ centre_trf_m, so3.to_matrix(q_after) @ centre_trf_m
-    turning = so3.to_matrix(q) @ np.cross(omega, centre_trf_m)
-    centre_velocity = velocity + turning
-    there = position + arm + centre_velocity * dt_s
-    back = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
+    spin = so3.to_matrix(q) @ np.cross(omega, centre_trf_m)
+    centre_velocity = velocity + spin
+    centre_after = position + arm + centre_velocity * dt_s
+    from_centre = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
     return (
-        there - arm_after,
+        centre_after - arm_after,
         centre_velocity - so3.to_matrix(q_after) @ np.cross(omega_after, centre_trf_m),
-        back @ transition @ to_centre(q, omega, centre_trf_m),
+        from_centre @ transition @ to_centre(q, omega, centre_trf_m),
     )
 
 
 def process_noise(dt_s: float, acceleration_density: float, angular_density: float) -> Array:
-    """Covariance (12, 12) that white noise adds in ``dt_s``.
+    """Return the covariance (12, 12) that white noise adds in ``dt_s``.
 
     acceleration_density in (m/s^2)^2/Hz, angular_density in (rad/s^2)^2/Hz (the squares of the
-    parameters). The turn of the axes within the step is left out: it changes the attitude block by
-    less than (|omega| dt)^2 / 12 of itself and never makes it too small.
+    parameters). The rotation of the axes within the step is neglected: it changes the attitude block by less than
+    (|omega| dt)^2 / 12 of itself and never makes it too small.
     """
     q = np.zeros((12, 12))
     d3, d2, d1 = dt_s**3 / 3.0, dt_s**2 / 2.0, dt_s

@@ -1,4 +1,4 @@
-"""What goes into and comes out of target state estimation. Arrays are float64; SI units and radians."""
+"""Inputs and outputs of target state estimation. Arrays are float64; SI units and radians."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class PoseHypothesis:
 
 @dataclass(frozen=True, eq=False)
 class CameraPose:
-    """A camera at an exposure, as odometry and calibration have it: its lens (3,) in WRF, and (4,) IRF to WRF."""
+    """Nominal pose of a camera at an exposure: optical centre (3,) in WRF and rotation (4,) IRF to WRF."""
 
     position_m: Array
     q_wxyz: Array
@@ -36,26 +36,26 @@ class CameraPose:
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """What one chaser saw in one exposure.
+    """Measurement of one chaser in one exposure.
 
-    chaser: its number. time_ns: simulated time of the exposure. markers: how many markers it used.
+    time_ns: simulated time of the exposure. markers: number of markers used.
     hypotheses: one pose, two for the planar ambiguity of a single marker (the likelier first), none
-        for "sees nothing". eye: where it was seen from.
+        if the target is not visible. eye: nominal pose of the camera.
     """
 
     chaser: int
     time_ns: int
     hypotheses: tuple[PoseHypothesis, ...]
     markers: int
-    eye: CameraPose
+    camera: CameraPose
 
 
 @dataclass(frozen=True, eq=False)
 class CameraError:
-    """How far a chaser's camera is from its calibration, as estimated.
+    """Estimated calibration error of a chaser's camera.
 
-    turn_rad: (3,) rotation vector in the told IRF by which the true camera is turned. shift_m: (3,) of the lens, in IRF.
-    focal_share: of the focal length. covariance: (7, 7) over these, in that order.
+    turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,) of the optical centre,
+    in IRF. focal_share: relative error of the focal length. covariance: (7, 7) in that order.
     """
 
     chaser: int
@@ -67,15 +67,15 @@ class CameraError:
 
 @dataclass(frozen=True, eq=False)
 class TargetState:
-    """The fused state of the target at ``time_ns``.
+    """Estimated state of the target at ``time_ns``.
 
     position_m, velocity_m_s: (3,) WRF. q_wxyz: (4,) TRF to WRF. omega_rad_s: (3,) TRF axes.
     covariance: (12, 12), order (position WRF, velocity WRF, dtheta TRF, omega TRF).
-    status: "none" (nothing seen yet: pose and rates are zero, the covariance is 1e6 times identity),
-        "tracking" (a measurement was accepted a short while ago), "predicting" (none was: the motion
-        model alone), "lost" (too uncertain to be used).
+    status: "none" (no measurement yet: pose and rates are zero, the covariance is 1e6 times identity),
+        "tracking" (a measurement was accepted recently), "predicting" (motion model only), "lost" (too
+        uncertain to use).
     sightings: number of chasers whose measurements were accepted at the newest exposure.
-    rejected: the chasers whose measurements were gated out at the newest exposure.
+    rejected: chasers whose measurements were gated out at the newest exposure.
     """
 
     time_ns: int
@@ -91,8 +91,11 @@ class TargetState:
 
 @dataclass(frozen=True, eq=False)
 class Shock:
-    """A sudden change of the target's rates: sigmas of what is unknown of it, and what is known: velocity (3,) of
-    TRF's origin in WRF, rate (3,) in TRF."""
+    """A sudden change of the target's rates.
+
+    sigma_*: standard deviation of the unknown part. velocity_m_s (3,) of TRF's origin in WRF and omega_rad_s (3,) in TRF:
+    the known part.
+    """
 
     sigma_velocity_m_s: float
     sigma_omega_rad_s: float
@@ -109,7 +112,7 @@ class EstimatorEvent(NamedTuple):
 
 
 class Estimator(Protocol):
-    """What ``make_estimator`` returns: see ``mekf.Mekf`` for the meaning of each member."""
+    """Interface of estimators; ``mekf.Mekf`` documents the members."""
 
     @property
     def accepted(self) -> int: ...
@@ -138,7 +141,7 @@ NO_ESTIMATE_VARIANCE = 1e6
 
 
 def no_estimate(time_ns: int) -> TargetState:
-    """The estimate with status "none" at ``time_ns``."""
+    """Return the estimate with status "none" at ``time_ns``."""
     return TargetState(
         time_ns,
         np.zeros(3),
@@ -153,19 +156,23 @@ def no_estimate(time_ns: int) -> TargetState:
 
 
 def is_usable(measurement: Measurement) -> bool:
-    """Whether the eye and every hypothesis have the right shapes, finite numbers, a unit quaternion (to 1e-3), and the
-    hypotheses a symmetric, positive definite covariance."""
-    eye = measurement.eye
-    if eye.position_m.shape != (3,) or eye.q_wxyz.shape != (4,) or not np.isfinite(eye.position_m).all():
+    """Check camera pose and hypotheses: shapes, finite numbers, unit quaternions (to 1e-3), and symmetric positive
+    definite covariances."""
+    camera = measurement.camera
+    if (
+        camera.position_m.shape != (3,)
+        or camera.q_wxyz.shape != (4,)
+        or not np.isfinite(camera.position_m).all()
+    ):
         return False
-    if not abs(float(eye.q_wxyz @ eye.q_wxyz) - 1.0) < 1e-3:
+    if not abs(float(camera.q_wxyz @ camera.q_wxyz) - 1.0) < 1e-3:
         return False
     for h in measurement.hypotheses:
         if h.position_m.shape != (3,) or h.q_wxyz.shape != (4,) or h.covariance.shape != (6, 6):
             return False
         if not (np.isfinite(h.position_m).all() and np.isfinite(h.covariance).all()):
             return False
-        # Written so that a NaN fails, too.
+        # This form rejects NaN as well.
         if not abs(float(h.q_wxyz @ h.q_wxyz) - 1.0) < 1e-3:
             return False
         scale = float(np.abs(h.covariance).max())
@@ -179,8 +186,8 @@ def is_usable(measurement: Measurement) -> bool:
 
 
 def content_key(m: Measurement) -> tuple[int, int, int, int, bytes]:
-    """Total order of measurements: time, chaser, and then content, so that no order of arrival matters."""
-    content = m.eye.position_m.tobytes() + m.eye.q_wxyz.tobytes()
+    """Return a sort key (time, chaser, content) that makes results independent of the order of arrival."""
+    content = m.camera.position_m.tobytes() + m.camera.q_wxyz.tobytes()
     content += b"".join(
         h.position_m.tobytes() + h.q_wxyz.tobytes() + h.covariance.tobytes() for h in m.hypotheses
     )

@@ -1,10 +1,10 @@
-"""Load the numerical kernels, which are written in C and compiled when the package is built.
+"""Load the numerical kernels: C code that is compiled when the package is built.
 
 Each package with kernels has a folder ``native`` with its C sources, ``kernels.c`` which includes them, and one shared
-library ``kernels.so``. This module loads such libraries and offers the kernels of ``chaserdock_models`` itself.
+library ``kernels.so``. This module loads such libraries and provides the kernels of ``chaserdock_models``.
 
-A library contains every function once per instruction set (on x86-64: SSE4, and AVX2 with FMA). The processor decides
-which copy runs; all copies give the same bits. Arguments are addresses of C-contiguous float64 arrays (int64 or uint8
+A library contains every function once per instruction set (on x86-64: SSE4, and AVX2 with FMA). The copy is
+chosen at run time; all copies give the same bits. Arguments are addresses of C-contiguous float64 arrays (int64 or uint8
 where stated); callers check shapes.
 """
 
@@ -38,7 +38,9 @@ class KernelLibrary:
         try:
             library = ctypes.CDLL(str(self.path))
         except OSError as error:
-            raise ImportError(f"{self.path}: not for this kind of machine ({error}); {_INSTALL}") from None
+            raise ImportError(
+                f"{self.path}: compiled for another kind of machine ({error}); {_INSTALL}"
+            ) from None
         library.source_digest.restype = ctypes.c_char_p
         if library.source_digest().decode() != source_digest(self.path.parent):
             raise ImportError(f"{self.path}: compiled from other sources than those beside it; {_INSTALL}")
@@ -52,16 +54,16 @@ class KernelLibrary:
     def function(self, name: str, result: Any = None, at_level: int | None = None) -> Any:
         """Return kernel ``name`` for this processor, or its copy for ``at_level``; ``result`` is its ctypes type."""
         level = self.level if at_level is None else at_level
-        found = self._functions.get((name, level))
-        if found is None:
-            found = self._functions[name, level] = self.library[f"v{level}_{name}"]
-            found.restype = result
-        return found
+        kernel = self._functions.get((name, level))
+        if kernel is None:
+            kernel = self._functions[name, level] = self.library[f"v{level}_{name}"]
+            kernel.restype = result
+        return kernel
 
 
 def address(array: NDArray[Any]) -> ctypes.c_void_p:
     """Return the address of a writable C-contiguous array. Keep the array alive while the address is used."""
-    # By the buffer protocol, which refuses other arrays and takes a sixth of the time of `array.ctypes`.
+    # The buffer protocol rejects other arrays and takes a sixth of the time of `array.ctypes`.
     buffer: Any = array
     return ctypes.c_void_p(ctypes.addressof(ctypes.c_char.from_buffer(buffer)) if array.size else 0)
 

@@ -1,9 +1,9 @@
-/* What the kernels share: rows of doubles as vectors, three-vectors, exported names, working memory.
+/* Shared by all kernels: vectors of doubles, three-vectors, exported names, working memory.
  *
- * Results must be the same to the last bit on every processor. So no expression is contracted or reordered by the
- * compiler (-ffp-contract=off, no fast-math), every sum has its order in the source, and vectors are four wide whatever
- * the processor has. Only operations that IEEE 754 defines to the bit occur: + - * / and the square root. A fused
- * multiplication and addition would be one, too, but gained 15 % where there is one and cost twentyfold elsewhere.
+ * Results are the same to the last bit on every processor. The compiler does not contract or reorder expressions
+ * (-ffp-contract=off, no fast-math), the source fixes the order of every sum, and vectors are four wide on every
+ * processor. Only operations that IEEE 754 defines exactly are used: + - * / and the square root. Fused multiply-add
+ * is exact as well, but it gained 15 % with hardware support and cost a factor of twenty without.
  */
 #ifndef CHASERDOCK_BASE_H
 #define CHASERDOCK_BASE_H
@@ -12,7 +12,7 @@
 
 #define PASTE_(a, b) a##b
 #define PASTE(a, b) PASTE_(a, b)
-/* LEVEL: the instruction set that this copy is compiled for, e.g. v3_; it begins the exported names. */
+/* LEVEL: prefix of the exported names for the instruction set of this copy, e.g. v3_. */
 #define NAME(name) PASTE(LEVEL, name)
 #define EXPORT __attribute__((visibility("default")))
 
@@ -37,7 +37,7 @@ static inline void copy(const double *a, double *out, int64_t n) {
     for (int64_t i = 0; i < n; i++) out[i] = a[i];
 }
 
-/* Sum of a row's products, (12) with (12). */
+/* Dot product of two rows (12). */
 static inline double dot12(const double *a, const double *b) {
     v4 s = madd4(load(a + 8), load(b + 8), madd4(load(a + 4), load(b + 4), load(a) * load(b)));
     return (s[0] + s[2]) + (s[1] + s[3]);
@@ -57,7 +57,7 @@ static inline void cross3(const double *a, const double *b, double *out) {
 static inline void times3(const double *m, const double *v, double *out) {
     for (int i = 0; i < 3; i++) out[i] = dot3(m + 3 * i, v);
 }
-/* Normalizes v in place and returns its length; below 1e-9 it is left alone and 0 returned. */
+/* Normalize v in place and return its length; below 1e-9 leave it unchanged and return 0. */
 static inline double normalize3(double *v) {
     double length = root(dot3(v, v));
     if (length < 1e-9) return 0.0;
@@ -65,7 +65,7 @@ static inline double normalize3(double *v) {
     return length;
 }
 
-/* Working memory that the caller lends: taken from the front, in pieces of whole cache lines. */
+/* Allocate from the caller's working memory in pieces of whole cache lines. */
 static inline double *take(double **work, int64_t count) {
     double *piece = *work;
     *work += (count + 7) / 8 * 8;

@@ -1,7 +1,7 @@
 """Compile the kernels: ``python protocol/chaserdock_models/native/build.py``. Building the package does this as well.
 
-The compiler is zig's (a Clang), from the wheel ``ziglang``, so that a machine needs no compiler of its own. The result
-does not depend on the machine: no headers, no C library and no processor type are taken from it.
+The compiler is zig's Clang from the wheel ``ziglang``; no system compiler is needed. The result does not depend on the
+build machine: its headers, C library and processor type are not used.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ NATIVE_FOLDERS = (
     "agents/chaserdock_agents/chaser/perception/native",
     "controller/chaserdock_controller/nmpc/native",
 )
-# What every library is compiled with, beside the sources of its own folder.
+# Sources that every library contains in addition to those of its own folder.
 _SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")
 
-# No floating-point liberties (base.h says why), and no calls into a C library.
+# No floating-point optimizations that change results (see base.h), and no calls into a C library.
 FLAGS = (
     "-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-ffreestanding", "-fno-builtin", "-fvisibility=hidden",
     "-Wall", "-Wextra", "-Werror",
 )  # fmt: skip
-# One copy of the kernels for each instruction set, by the number that `level` in dispatch.c gives.
+# One copy of the kernels for each instruction set, numbered as `level` in dispatch.c.
 X86_64 = ((2, "-mcpu=x86_64_v2"), (3, "-mcpu=x86_64_v3"))
 OTHER = ((0, "-mcpu=baseline"),)
 
@@ -62,10 +62,10 @@ def compile_kernels(folder: Path) -> Path:
 
         def zig(*arguments: str) -> None:
             command = [sys.executable, "-m", "ziglang", "cc", *target, *arguments]
-            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
-            if done.returncode:
+            completed = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+            if completed.returncode:
                 raise RuntimeError(
-                    f"the kernels do not compile: {' '.join(command)}\n{done.stdout}{done.stderr}"
+                    f"the kernels do not compile: {' '.join(command)}\n{completed.stdout}{completed.stderr}"
                 )
 
         include = f"-I{HERE}"
@@ -79,7 +79,7 @@ def compile_kernels(folder: Path) -> Path:
         linked = temporary / LIBRARY_NAME
         freestanding = ["-nostdlib", "-s", "-Wl,-z,defs"] if sys.platform == "linux" else []
         zig("-shared", *freestanding, *objects, "-o", str(linked))
-        # Replaced in one step: a process may have the old library loaded.
+        # Replace atomically: a process may have the old library loaded.
         beside = library.with_suffix(".new")
         beside.write_bytes(linked.read_bytes())
         beside.chmod(0o755)

@@ -1,15 +1,15 @@
-/* Which copy of the kernels this processor runs, and which sources it was made from. */
+/* Selection of the kernel copy for this processor, and the digest of the sources. */
 #include <stdint.h>
 
 #define EXPORT __attribute__((visibility("default")))
 
-/* SHA-256 of the sources, by which a library left from before an edit is told. */
+/* SHA-256 of the sources; detects a library that is older than its sources. */
 EXPORT const char *source_digest(void) { return SOURCE_DIGEST; }
 
 #if defined(__x86_64__)
 #include <cpuid.h>
 
-/* 3 where AVX2 is there (with the rest of x86-64-v3, which compilers use) and the system saves its registers (Intel SDM,
+/* Return 3 if the processor has x86-64-v3 (AVX2 and its companions) and the system saves the registers (Intel SDM,
  * volume 1, 14.3 and 14.7.1), else 2. */
 EXPORT int64_t level(void) {
     unsigned a, b, c, d, low, high;
@@ -26,7 +26,7 @@ EXPORT int64_t level(void) {
 EXPORT int64_t level(void) { return 0; }
 #endif
 
-/* The compiler calls these two whatever the source says; with them the library asks nothing of any C library. */
+/* The compiler emits calls to these two functions; defining them avoids a C library. */
 #if defined(__linux__)
 void *memset(void *to, int value, unsigned long count) {
     char *at = to;

@@ -1,10 +1,10 @@
-/* The elementary functions that kernels need, of + - * / alone, so that they give the same bits everywhere. */
+/* Elementary functions from + - * / only, which give the same bits on every machine. */
 #ifndef CHASERDOCK_ELEMENTARY_H
 #define CHASERDOCK_ELEMENTARY_H
 
 #include "base.h"
 
-/* e^x to about one unit in the last place; 0 below -700. By powers of two and Taylor's series on |r| <= ln(2) / 2. */
+/* Return e^x to about one unit in the last place; 0 below -700. Powers of two and a Taylor series on |r| <= ln(2) / 2. */
 static inline double exponential(double x) {
     if (!(x > -700.0)) return x <= -700.0 ? 0.0 : x;
     if (x > 700.0) x = 700.0;
@@ -21,8 +21,8 @@ static inline double exponential(double x) {
     return sum * power.value;
 }
 
-/* Sine and cosine of an angle from 0 up to 2e-16 (within half a turn): the series at a quarter of it, doubled twice. The C
- * library's differ from version to version, and from processor to processor. */
+/* Compute sine and cosine of a non-negative angle with an error of 2e-16 (within half a turn): Taylor series at a quarter
+ * of the angle, doubled twice. C libraries differ between versions and processors. */
 static inline void sine_cosine(double angle, double *sine, double *cosine) {
     if (angle > 3.141592653589793)
         angle = angle < 1e9 ? angle - (double)(int64_t)(angle * 0.15915494309189535 + 0.5) * 6.283185307179586 : 0.0;
@@ -42,7 +42,7 @@ static inline void sine_cosine(double angle, double *sine, double *cosine) {
     *cosine = c;
 }
 
-/* Solves A x = b in place (A (n, n) row by row, b (n) becomes x), with row pivots; 0 where A is singular. */
+/* Solve A x = b in place (A (n, n) by rows, b (n) becomes x) with row pivoting. Return 0 if A is singular. */
 static inline int solve_rows(double *a, double *b, int n) {
     for (int j = 0; j < n; j++) {
         int p = j;
@@ -51,13 +51,13 @@ static inline int solve_rows(double *a, double *b, int n) {
         if (!(size_of(a[p * n + j]) > 0.0)) return 0;
         if (p != j) {
             for (int k = j; k < n; k++) {
-                double kept = a[j * n + k];
+                double swap = a[j * n + k];
                 a[j * n + k] = a[p * n + k];
-                a[p * n + k] = kept;
+                a[p * n + k] = swap;
             }
-            double kept = b[j];
+            double swap = b[j];
             b[j] = b[p];
-            b[p] = kept;
+            b[p] = swap;
         }
         for (int i = j + 1; i < n; i++) {
             double f = a[i * n + j] / a[j * n + j];

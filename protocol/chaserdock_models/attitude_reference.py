@@ -12,10 +12,10 @@ from .rotations import multiply, normalize
 def facing_attitudes(nominal_m: ArrayLike, q_nominal_wxyz: ArrayLike, offsets_m: ArrayLike) -> Array:
     """Return the attitudes (K, 4), chaser body to TRF, at offsets (K, 3) in TRF.
 
-    The nominal attitude (4,) belongs to the nominal offset (3,). It is rotated by the shortest rotation from the nominal
-    direction a to the direction b of the offset, q = normalize([1 + a . b, a x b]). For an offset opposite to the nominal
-    one the axis is not unique: the axis perpendicular to a that is closest to z (to x if a is along z) is used. At the
-    target's centre the attitude is the nominal one.
+    The nominal attitude (4,) belongs to the nominal offset (3,). It is rotated by the shortest rotation from the
+    nominal direction a to the direction b of the offset, q = normalize([1 + a . b, a x b]). For an offset opposite to
+    the nominal one the axis is not unique: the axis perpendicular to a that is closest to z (to x if a is along z) is
+    used. At the target's centre the attitude is the nominal one.
     """
     offsets = np.atleast_2d(np.asarray(offsets_m, dtype=float))
     a = np.asarray(nominal_m, dtype=float) / np.linalg.norm(nominal_m)

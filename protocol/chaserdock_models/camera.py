@@ -128,7 +128,8 @@ class Camera:
     def irf_pose_in_world(
         self, chaser_position_w_m: ArrayLike, chaser_q_w_crf_wxyz: ArrayLike
     ) -> tuple[Array, Array]:
-        """Return the optical centre (3,) in WRF and the rotation IRF -> WRF (4,) of the camera on a chaser at this pose."""
+        """Return the optical centre (3,) in WRF and the rotation IRF -> WRF (4,) of the camera on a chaser at this
+        pose."""
         q_w_crf = np.asarray(chaser_q_w_crf_wxyz, dtype=float)
         position = np.asarray(chaser_position_w_m, dtype=float) + rotations.rotate(
             q_w_crf, self.position_crf_m

@@ -38,8 +38,8 @@ class PoseLimits(Protocol):
 class PortView:
     """State of a probe's tip relative to its port, in the port's rotating frame.
 
-    ``gap_m``: along the axis, positive outside. ``lateral_m``: distance from the axis. ``closing_m_s``: speed towards the
-    port. ``angle_rad``: between the chaser's attitude and its docked attitude.
+    ``gap_m``: along the axis, positive outside. ``lateral_m``: distance from the axis. ``closing_m_s``: speed towards
+    the port. ``angle_rad``: between the chaser's attitude and its docked attitude.
     """
 
     gap_m: float
@@ -75,8 +75,8 @@ def axis_error_deg(port: Port, q_off_wxyz: Array) -> float:
 def view_of(port: Port, reach_m: float, q_off_wxyz: Array, chaser: BodyState, target: BodyState) -> PortView:
     """Return the state of the tip relative to the port.
 
-    ``reach_m``: distance of the tip from the chaser's centre along +X. ``q_off_wxyz`` (4,): docked attitude, CRF to TRF.
-    Velocities are relative to the rotating target, as seen by an observer on the port.
+    ``reach_m``: distance of the tip from the chaser's centre along +X. ``q_off_wxyz`` (4,): docked attitude, CRF to
+    TRF. Velocities are relative to the rotating target, as seen by an observer on the port.
     """
     tip = rotations.rotate(chaser.q_wxyz, (reach_m, 0.0, 0.0))
     position = rotations.rotate_inverse(target.q_wxyz, chaser.position_m + tip - target.position_m)

@@ -98,7 +98,8 @@ def skew(v: Array) -> Array:
 
 
 def right_jacobian(phi: Array) -> Array:
-    """Return the right Jacobian of SO(3) (3, 3): exp(phi + d) = exp(phi) exp(Jr(phi) d) to first order (Sola eq. 183)."""
+    """Return the right Jacobian of SO(3) (3, 3): exp(phi + d) = exp(phi) exp(Jr(phi) d) to first order (Sola eq.
+    183)."""
     x, y, z = phi.tolist()
     a2 = x * x + y * y + z * z
     if a2 < 1e-8:

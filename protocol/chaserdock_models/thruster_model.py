@@ -112,7 +112,8 @@ class Valves:
         self._table: tuple[Array, ...] | None = None
 
     def pulse(self, thruster: int, open_ns: int, close_ns: int) -> bool:
-        """Open a thruster's valve for a span. Return False for an unknown thruster or a span below the minimum on-time."""
+        """Open a thruster's valve for a span. Return False for an unknown thruster or a span below the minimum
+        on-time."""
         if (
             not 0 <= thruster < len(self._thrusters)
             or close_ns - open_ns < self._thrusters[thruster].shortest_ns
@@ -145,7 +146,8 @@ class Valves:
         return tuple(k for k, j in enumerate(self._thrusters) if any(b <= time_ns < e for b, e in j.shut))
 
     def fail(self, thruster: int, kind: FailureKind | None, at_ns: int, factor: float | None = None) -> None:
-        """Set the failure of a thruster from ``at_ns`` on, or clear it (None). ``factor``: thrust fraction for ``weak``."""
+        """Set the failure of a thruster from ``at_ns`` on, or clear it (None). ``factor``: thrust fraction for
+        ``weak``."""
         self._thrusters[thruster].failure = (
             None if kind is None else (kind, at_ns, 1.0 if factor is None else factor)
         )

@@ -174,7 +174,7 @@ def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
 def test_a_library_that_is_missing_or_broken_is_named(tmp_path: Path) -> None:
     copy = copied(tmp_path)
     copy.path.write_bytes(b"not a library")
-    with pytest.raises(ImportError, match=r"not for this kind of machine.*pip install"):
+    with pytest.raises(ImportError, match=r"compiled for another kind of machine.*pip install"):
         _ = copy.library
     copy.path.unlink()
     with pytest.raises(ImportError, match=r"missing.*pip install"):

@@ -111,8 +111,8 @@ def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_neve
     assert used[0] > 3
     if realtime:
         assert all(n <= 3 for n in used[1:])
-        assert all("budget" in s.status for s in told[1:] if s is not None)
-        assert all(s.wall_solve_s <= 3 * SLOW_S + 1e-9 for s in told[1:] if s is not None)
+        assert all("budget" in s.status for s in reports[1:] if s is not None)
+        assert all(s.wall_solve_s <= 3 * SLOW_S + 1e-9 for s in reports[1:] if s is not None)
     else:
         assert all(n > 3 for n in used)
         assert slow.max_iterations is None

@@ -1,4 +1,4 @@
-"""Fusion's interface: estimators by name, refused parameters, and what its modules may import."""
+"""Estimation interface: estimators by name, refused parameters, and what its modules may import."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 from pathlib import Path
 
 import pytest
-from chaserdock_controller import estimation as fusion
+from chaserdock_controller import estimation
 from chaserdock_controller.estimation import (
     Mekf,
     MekfParameters,
@@ -59,7 +59,7 @@ def test_no_clock_and_no_global_randomness() -> None:
         "functools",
     }
     allowed |= {"itertools", "math", "numpy", "typing"}
-    files = sorted(Path(fusion.__file__).parent.glob("*.py"))
+    files = sorted(Path(estimation.__file__).parent.glob("*.py"))
     assert len(files) >= 8
     for file in files:
         for node in ast.walk(ast.parse(file.read_text())):

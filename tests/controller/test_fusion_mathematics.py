@@ -1,4 +1,4 @@
-"""Fusion's mathematics: Jacobians by differences, motion models, covariances, geometry."""
+"""Estimation mathematics: Jacobians by differences, motion models, covariances, geometry."""
 
 from __future__ import annotations
 
@@ -150,20 +150,20 @@ def test_measurement_jacobian_by_differences() -> None:
 
 
 def test_a_camera_with_errors_measures_what_its_images_show() -> None:
-    """The same points of the target through the true camera, as seen by one who is told the nominal one."""
+    """The same points of the target through the true camera, seen through the nominal camera."""
     errors = np.array([0.004, -0.006, 0.005, 0.002, -0.003, 0.001, 0.002])
-    told = Camera.from_hfov(1280, 720, math.radians(60.0))
-    true = replace(told, fx_px=told.fx_px * (1.0 + errors[6]), fy_px=told.fy_px * (1.0 + errors[6]))
+    nominal = Camera.from_hfov(1280, 720, math.radians(60.0))
+    true = replace(nominal, fx_px=nominal.fx_px * (1.0 + errors[6]), fy_px=nominal.fy_px * (1.0 + errors[6]))
     position, q = EYE.position_m + rot.rotate(EYE.q_wxyz, [0.02, -0.03, 1.1]), Q0
     points = 0.1 * np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
     q_true = rot.multiply(EYE.q_wxyz, rot.exp(errors[:3]))
     lens = EYE.position_m + rot.rotate(EYE.q_wxyz, errors[3:6])
     pixels = true.project(rot.rotate_inverse(q_true, position + rot.rotate(q, points) - lens))
     seen = predict_measurement(EYE, position, q, errors)
-    again = told.project(
+    again = nominal.project(
         rot.rotate_inverse(EYE.q_wxyz, seen.position_m + rot.rotate(seen.q_wxyz, points) - EYE.position_m)
     )
-    wrong = told.project(rot.rotate_inverse(EYE.q_wxyz, position + rot.rotate(q, points) - EYE.position_m))
+    wrong = nominal.project(rot.rotate_inverse(EYE.q_wxyz, position + rot.rotate(q, points) - EYE.position_m))
     # What is left is the depth within the target that a longer focal length changes: 0.2 % of 0.1 m.
     assert np.abs(again - pixels).max() < 0.25
     assert np.abs(wrong - pixels).max() > 5.0

@@ -86,7 +86,7 @@ def test_stuck_on_thrusts_until_its_shut_off_valve_closes_and_again_when_it_open
     valves.fail(0, "stuck_on", 100 * MS)
     valves.pulse(0, 150 * MS, 160 * MS)  # asked for or not
     valves.set_shut([0], 200 * MS)
-    valves.set_shut([0], 250 * MS)  # told again: nothing new
+    valves.set_shut([0], 250 * MS)  # repeated command: no change
     assert given_N_s(valves, 0, 1000)[0] == pytest.approx(0.2, rel=1e-12)
     assert valves.shut_at(199 * MS) == ()
     assert valves.shut_at(200 * MS) == (0,)

@@ -2,8 +2,8 @@
 
 The paper (Fourlas et al. 2023) averages the latest estimates of all chasers that see the target, with "a moving average
 filter for noise reduction, outlier detection and removal methods". The authors' code differentiates poses for the rates
-and averages 11 of them. Window, outlier limits and age limit are unspecified there and parameters here. Weaknesses of the
-original that are kept: no weighting, no latency compensation (the latest pose is returned for any time), rates from
+and averages 11 of them. Window, outlier limits and age limit are unspecified there and parameters here. Weaknesses of
+the original that are kept: no weighting, no latency compensation (the latest pose is returned for any time), rates from
 differences. Averaging of Euler angles is replaced by a mean of attitudes.
 """
 
@@ -84,9 +84,9 @@ def average_quaternion(quaternions: Sequence[Array]) -> Array:
 class PaperEstimator:
     """The paper's combiner with the interface of ``Mekf``.
 
-    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest combination, ``gated`` the
-    poses removed as outliers, ``reinitialisations`` the dropped histories. For an ambiguous view the first hypothesis is
-    used.
+    ``late_dropped`` counts measurements not newer than the chaser's latest or than the newest combination, ``gated``
+    the poses removed as outliers, ``reinitialisations`` the dropped histories. For an ambiguous view the first
+    hypothesis is used.
     """
 
     def __init__(self, parameters: PaperParameters | None = None) -> None:

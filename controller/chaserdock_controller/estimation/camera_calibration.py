@@ -1,8 +1,8 @@
 """Measurement model of a camera with extrinsic and focal-length calibration errors. Pure functions.
 
 Each camera has seven errors, constant in its own axes (IRF): the rotation vector delta of its true axes, the shift b of
-its optical centre, and the relative error s of its focal length. With the nominal centre e (WRF) and axes E (IRF to WRF),
-a target at p, q is measured at e + E m and E exp(-delta) E^-1 q, where m = S^-1 exp(-delta) (E' (p - e) - b) and
+its optical centre, and the relative error s of its focal length. With the nominal centre e (WRF) and axes E (IRF to
+WRF), a target at p, q is measured at e + E m and E exp(-delta) E^-1 q, where m = S^-1 exp(-delta) (E' (p - e) - b) and
 S = diag(1, 1, 1 + s): a longer focal length reduces the measured distance. To first order, an error of the principal
 point equals a rotation.
 """

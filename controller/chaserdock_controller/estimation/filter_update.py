@@ -21,10 +21,10 @@ from .types import Array, EstimatorEvent, Measurement, PoseHypothesis, Shock
 class FilterState:
     """Complete state of the filter after the exposure at ``time_ns``.
 
-    hypotheses: none before the first measurement, two while an ambiguous start (at ``ambiguous_since_ns``) is unresolved,
-    one otherwise; the likeliest first. recent: the latest measurement of each chaser. seen, rejected: chasers accepted
-    and gated out at this exposure. considered: covariance (6, 6) of the pose error of the last accepted measurements that does
-    not average out. accepted, gated, reinitialisations: counts since the start.
+    hypotheses: none before the first measurement, two while an ambiguous start (at ``ambiguous_since_ns``) is
+    unresolved, one otherwise; the likeliest first. recent: the latest measurement of each chaser. seen, rejected:
+    chasers accepted and gated out at this exposure. considered: covariance (6, 6) of the pose error of the last
+    accepted measurements that does not average out. accepted, gated, reinitialisations: counts since the start.
     """
 
     time_ns: int
@@ -83,8 +83,8 @@ def process_exposure(
 def _considered_covariance(used: list[Measurement], p: MekfParameters, before: Array) -> Array:
     """Return the covariance (6, 6) of the camera errors that stay constant while the view does.
 
-    Each camera's part is a fixed ratio of its measurement's sigma, independent of the other cameras'. Without an accepted
-    measurement ``before`` is returned.
+    Each camera's part is a fixed ratio of its measurement's sigma, independent of the other cameras'. Without an
+    accepted measurement ``before`` is returned.
     """
     if not used or p.considered_ratio == 0.0:
         return before

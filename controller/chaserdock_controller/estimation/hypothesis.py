@@ -28,8 +28,8 @@ _EYE3 = np.eye(3)
 class StateHypothesis:
     """State and covariance at ``time_ns``.
 
-    cameras: chaser of each bias slot. bias: (n, 7) for n slots. covariance: (12 + 7 n, 12 + 7 n). log_likelihood: of all
-    measurements since initialization. rejections: number of consecutive rejected measurements of each chaser.
+    cameras: chaser of each bias slot. bias: (n, 7) for n slots. covariance: (12 + 7 n, 12 + 7 n). log_likelihood: of
+    all measurements since initialization. rejections: number of consecutive rejected measurements of each chaser.
     """
 
     time_ns: int
@@ -189,9 +189,9 @@ def update_hypothesis(
 ) -> tuple[StateHypothesis, tuple[int, ...], tuple[int, ...]]:
     """Update a hypothesis with the non-empty measurements of one exposure at its time.
 
-    The cameras are processed in the given order. If the prediction is vague, the cameras that agree with most others come
-    first, and among these the closest to the prediction; a faulty camera then does not pull the state away. Returns the
-    hypothesis, the accepted chasers and the rejected chasers.
+    The cameras are processed in the given order. If the prediction is vague, the cameras that agree with most others
+    come first, and among these the closest to the prediction; a faulty camera then does not pull the state away.
+    Returns the hypothesis, the accepted chasers and the rejected chasers.
     """
     gate = p.gate_chi_square
     hypothesis = with_cameras(hypothesis, [m.chaser for m in group], p)

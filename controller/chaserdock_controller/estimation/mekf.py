@@ -1,7 +1,7 @@
 """Default estimator: a multiplicative extended Kalman filter that applies measurements at their exposure time.
 
-Mathematics: docs/estimation.md. Late measurements are inserted by rollback and replay over a short buffer, so the state does
-not depend on the order of arrival.
+Mathematics: docs/estimation.md. Late measurements are inserted by rollback and replay over a short buffer, so the state
+does not depend on the order of arrival.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ class Mekf:
     def change_body(self, inertia: Matrix3, centre_trf_m: tuple[float, float, float]) -> None:
         """Model the target from the newest exposure on as a torque-free rigid body with other mass properties.
 
-        ``inertia``: TRF, rows, about the centre of mass, up to a factor. ``centre_trf_m``: centre of mass in TRF. Raises
-        ValueError for an inertia that no rigid body has.
+        ``inertia``: TRF, rows, about the centre of mass, up to a factor. ``centre_trf_m``: centre of mass in TRF.
+        Raises ValueError for an inertia that no rigid body has.
         """
         self.parameters = replace(
             self.parameters,

@@ -34,7 +34,8 @@ class MekfParameters:
     single_marker_scale: factor on the sigma of a first pose from one marker.
     reinitialised_*: standard deviation added to the rates, whose values are kept, at a re-initialization.
     gate_chi_square: bound of the normalized innovation squared (6 degrees of freedom).
-    sustained_rejections: this many rejections in a row are reported; if most cameras have them, the filter re-initializes.
+    sustained_rejections: this many rejections in a row are reported; with most cameras they cause a
+        re-initialization.
     recent_s: age up to which a camera's latest measurement counts in comparisons between cameras.
     ambiguity_log_odds, ambiguity_timeout_s: the less likely of two hypotheses after an ambiguous start is dropped at
         these log odds, or after this time.

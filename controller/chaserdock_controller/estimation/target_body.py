@@ -41,7 +41,8 @@ class TargetPath:
 
 
 def attach_bodies(target: TargetBody, attached: Sequence[tuple[float, Array, Array, Array]]) -> TargetBody:
-    """Return the target with bodies fixed to it: each mass, principal inertia (3,), centre (3,) and attitude (4,) in TRF.
+    """Return the target with bodies fixed to it: each mass, principal inertia (3,), centre (3,) and attitude (4,) in
+    TRF.
 
     Parallel axes: I = sum of R I_i R' + m_i (d'd 1 - d d'), d from the common centre of mass (Goldstein, "Classical
     Mechanics", section 5.3).

@@ -54,8 +54,8 @@ class Measurement:
 class CameraError:
     """Estimated calibration error of a chaser's camera.
 
-    turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,) of the optical centre,
-    in IRF. focal_share: relative error of the focal length. covariance: (7, 7) in that order.
+    turn_rad: (3,) rotation vector from nominal to true camera axes, in nominal IRF. shift_m: (3,) of the optical
+    centre, in IRF. focal_share: relative error of the focal length. covariance: (7, 7) in that order.
     """
 
     chaser: int
@@ -93,8 +93,8 @@ class TargetState:
 class Shock:
     """A sudden change of the target's rates.
 
-    sigma_*: standard deviation of the unknown part. velocity_m_s (3,) of TRF's origin in WRF and omega_rad_s (3,) in TRF:
-    the known part.
+    sigma_*: standard deviation of the unknown part. velocity_m_s (3,) of TRF's origin in WRF and omega_rad_s (3,) in
+    TRF: the known part.
     """
 
     sigma_velocity_m_s: float

@@ -1,4 +1,4 @@
-"""Centralized nonlinear MPC: one problem (`problem`), solved by a back end chosen by name."""
+"""Centralized nonlinear MPC: one problem (`problem`), solved by a back end selected by name."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ BACK_ENDS = SOLVERS
 
 
 def make_solver(name: str, params: NmpcParameters, n: int, max_iterations: int | None = None) -> NmpcSolver:
-    """The back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, as the back end counts.
+    """Create the back end ``name`` for up to ``n`` chasers; ``max_iterations`` bounds a solve, counted by the back end.
 
-    One of ours, or an installed ``chaserdock.solvers`` entry point: a function of (params, n, max_iterations). Raises
-    PluginError when there is no such thing here, ValueError for n < 1, or a back end whose package is not installed.
+    ``name`` is a built-in back end or an installed ``chaserdock.solvers`` entry point: a function of (params, n,
+    max_iterations). Raises PluginError for an unknown name, ValueError for n < 1 or a package that is not installed.
     """
-    # Imported here so that the one does not cost the start-up time of the other.
+    # Imports are local to avoid the start-up time of unused back ends.
     if name == "rti":
         from .rti import RtiSolver
 

@@ -1,9 +1,9 @@
-"""Back end `alpaqa`: PANOC with an augmented Lagrangian, the family of the paper's solver, by alpaqa's own wheel.
+"""Back end `alpaqa`: PANOC with an augmented Lagrangian, the solver family of the paper, from the wheel `alpaqa`.
 
-Single shooting of `problem.build_nlp`: states are eliminated, distances are left to the augmented Lagrangian, whose
-greatest penalty stands for the slack. CasADi's wheel has a plugin of that name, but with fixed settings (a
-tolerance of 1e-10, an L-BFGS memory of two) and a report on standard output at each call, so the wheel
-`alpaqa` is used (extra ``chaserdock[alpaqa]``). Limited by iterations, never by time.
+Single shooting of `problem.build_nlp`: states are eliminated, and the augmented Lagrangian handles the distances; its
+largest penalty corresponds to the slack. CasADi's alpaqa plugin has fixed settings (tolerance 1e-10, L-BFGS memory 2)
+and prints at each call, so the wheel `alpaqa` is used (extra ``chaserdock[alpaqa]``). Limited by iterations, never by
+time.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
 from .warm_start import Frame, status_of
 
 MAX_OUTER, MAX_INNER = 10, 100
-# Of the scaled problem, inputs as shares of their limits: gradient in units of cost (it begins at some 1e3), and m.
-TOLERANCE, ROOM_TOLERANCE = 0.5, 1e-3
+# For inputs scaled by their limits: gradient in units of cost (initially about 1e3), and metres.
+TOLERANCE, DISTANCE_TOLERANCE = 0.5, 1e-3
 
 
 class AlpaqaSolver:
-    """alpaqa for up to ``n_chasers`` chasers; keeps each one's plan as its warm start.
+    """Solve with alpaqa for up to ``n_chasers`` chasers, warm-started from the last plans.
 
     ``max_iterations`` bounds the inner iterations of one outer step, MAX_INNER if None. Raises ValueError for
     n_chasers < 1 or where alpaqa is not installed.
@@ -44,7 +44,7 @@ class AlpaqaSolver:
         self._solver: Any = alpaqa.ALMSolver(
             alm_params={
                 "tolerance": TOLERANCE,
-                "dual_tolerance": ROOM_TOLERANCE,
+                "dual_tolerance": DISTANCE_TOLERANCE,
                 "max_iter": MAX_OUTER,
                 "initial_penalty": 1e3,
                 "max_penalty": 1e7,
@@ -57,31 +57,31 @@ class AlpaqaSolver:
             alpaqa.SolverStatus.Converged,
             (alpaqa.SolverStatus.MaxIter, alpaqa.SolverStatus.NoProgress),
         )
-        self._programmes: dict[int, tuple[Nlp, Any]] = {}
+        self._programs: dict[int, tuple[Nlp, Any]] = {}
         for n in range(1, n_chasers + 1):
             nlp = build_nlp(n, params, shooting="single")
-            self._programmes[n] = nlp, _callbacks(alpaqa, nlp)
+            self._programs[n] = nlp, _callbacks(alpaqa, nlp)
 
     def reset(self) -> None:
-        """Forgets every warm start."""
+        """Discard all warm starts."""
         self._frame.plans = {}
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """One tick; arguments, answer and errors as `RtiSolver.solve`. The chasers share one status.
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
 
-        ``iterations`` counts the inner ones.
+        ``iterations`` counts inner iterations.
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
         u, limits = task.start.copy(), task.problem.input_max
         n, d = len(u), frame.params.stages
-        nlp, programme = self._programmes[n]
-        programme.parameters = np.concatenate([pack(frame.params, task), limits.ravel()])
-        programme.general_bounds.lower = row_floor(nlp, task).ravel()
+        nlp, program = self._programs[n]
+        program.parameters = np.concatenate([pack(frame.params, task), limits.ravel()])
+        program.general_bounds.lower = row_floor(nlp, task).ravel()
         scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
         start = (u / scale).transpose(1, 0, 2).ravel()
         w, _, stats = self._solver(
-            self._alpaqa.Problem(programme), x=start, y=np.zeros(d * nlp.rows), asynchronous=False
+            self._alpaqa.Problem(program), x=start, y=np.zeros(d * nlp.rows), asynchronous=False
         )
         solution = np.asarray(w).reshape(d, n, 6).transpose(1, 0, 2)
         late = stats["status"] in self._late
@@ -93,23 +93,22 @@ class AlpaqaSolver:
 
 
 def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
-    """The problem as alpaqa asks for it, evaluated by CasADi's virtual machine.
+    """Wrap the problem in alpaqa's callback interface, evaluated by CasADi's virtual machine.
 
-    alpaqa's own way from CasADi needs a C compiler, or a CasADi whose files the one built into alpaqa reads
-    (1.1.0a2 reads none of 3.8).
+    alpaqa's CasADi loader needs a C compiler or a compatible CasADi file format (1.1.0a2 cannot read files of 3.8).
     """
     n = nlp.n
     x, p = nlp.problem["x"], nlp.problem["p"]
-    # TickInputs as shares of their limits, which are the last parameters: a well-scaled box.
+    # Inputs are scaled by their limits, which are the last parameters, so that the box is well scaled.
     w, limits = ca.SX.sym("w", x.numel()), ca.SX.sym("limits", 6 * n)
     f, g = ca.Function("nlp", [x, p], [nlp.problem["f"], nlp.problem["g"]])(
         w * ca.repmat(limits, nlp.stages, 1), p
     )
     y, parameters = ca.SX.sym("y", g.numel()), ca.vertcat(p, limits)
     cost = ca.Function("f", [w, parameters], [f])
-    slope = ca.Function("grad_f", [w, parameters], [ca.gradient(f, w)])
-    rooms = ca.Function("g", [w, parameters], [g])
-    pull = ca.Function("grad_g_prod", [w, y, parameters], [ca.jtimes(g, w, y, True)])
+    gradient = ca.Function("grad_f", [w, parameters], [ca.gradient(f, w)])
+    distances = ca.Function("g", [w, parameters], [g])
+    gradient_product = ca.Function("grad_g_prod", [w, y, parameters], [ca.jtimes(g, w, y, True)])
 
     class Callbacks(alpaqa.BoxConstrProblem):
         def __init__(self) -> None:
@@ -122,12 +121,12 @@ def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:
             return float(cost(at, self.parameters))
 
         def eval_objective_gradient(self, at: Array, out: Array) -> None:
-            out[:] = slope(at, self.parameters).full().ravel()
+            out[:] = gradient(at, self.parameters).full().ravel()
 
         def eval_constraints(self, at: Array, out: Array) -> None:
-            out[:] = rooms(at, self.parameters).full().ravel()
+            out[:] = distances(at, self.parameters).full().ravel()
 
         def eval_constraints_gradient_product(self, at: Array, multipliers: Array, out: Array) -> None:
-            out[:] = pull(at, multipliers, self.parameters).full().ravel()
+            out[:] = gradient_product(at, multipliers, self.parameters).full().ravel()
 
     return Callbacks()

@@ -1,8 +1,8 @@
 """Back ends `ipopt` and `fatrop`: the problem of `problem.build_nlp`, coupled, by CasADi and solvers in its wheel.
 
-ipopt with MUMPS solves it to convergence in tens of milliseconds: the yardstick for faster back ends rather
-than a controller for real time. fatrop is an interior point with a Riccati recursion over the stages. Limited by
-iterations, never by time.
+ipopt with MUMPS converges in tens of milliseconds; it is the reference for faster back ends, not a real-time
+controller. fatrop is an interior-point method with a Riccati recursion over the stages. Limited by iterations, never by
+time.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
 from .warm_start import Frame, Task, status_of
 
 MAX_ITERATIONS = 200
-# The solvers' own words for an answer that can be flown, and for the best one had when iterations ran out.
+# Return codes for a usable solution, and for the iteration limit.
 _GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 _LIMIT = ("Maximum_Iterations_Exceeded", "1")  # ipopt's and fatrop's
 
 
 def pack(params: NmpcParameters, task: Task) -> Array:
-    """The parameter vector p of `Nlp`."""
+    """Return the parameter vector p of `Nlp`."""
     p = task.problem
     parts: list[Any] = []
     for i in range(len(p.states)):
@@ -38,7 +38,7 @@ def pack(params: NmpcParameters, task: Task) -> Array:
 
 
 def row_floor(nlp: Nlp, task: Task) -> Array:
-    """Lower bounds (D, rows) of the distances: zero, and out of the way where there is no corridor."""
+    """Return the lower bounds (D, rows) of the distances: zero, and inactive where there is no corridor."""
     floor = np.zeros((nlp.stages, nlp.rows))
     used = np.any(task.corridors[:, 1:, :3] != 0.0, axis=-1)
     floor[:, 2 : 3 * nlp.n : 3][~used.T] = -1e4
@@ -48,7 +48,7 @@ def row_floor(nlp: Nlp, task: Task) -> Array:
 def _options(name: str, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
     shared: dict[str, Any] = {"print_time": False, "error_on_fail": False}
     if name == "ipopt":
-        # Bounds are relaxed by default and the input box would be left by 1e-8.
+        # ipopt relaxes bounds by default, which would violate the input box by 1e-8.
         own = {"print_level": 0, "sb": "yes", "max_iter": max_iterations, "tol": 1e-6, "mu_init": 1e-2}
         return {**shared, "ipopt": {**own, "bound_relax_factor": 0.0}}
     states, inputs, rows = zip(*nlp.stage_sizes, strict=True)
@@ -69,11 +69,10 @@ def _options(name: str, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
 
 
 class NlpSolver:
-    """`ipopt` or `fatrop` (``name``) for up to ``n_chasers`` chasers; keeps each one's plan as its warm start.
+    """Solve with `ipopt` or `fatrop` (``name``) for up to ``n_chasers`` chasers, warm-started from the last plans.
 
-    A programme for every number of chasers up to ``n_chasers`` is built at construction, so that who joins or
-    leaves costs no tick. ``max_iterations`` bounds a solve, MAX_ITERATIONS if None. Raises ValueError for
-    n_chasers < 1.
+    The constructor builds a program for every number of chasers, so that a change of the number delays no tick.
+    ``max_iterations`` bounds a solve, MAX_ITERATIONS if None. Raises ValueError for n_chasers < 1.
     """
 
     def __init__(
@@ -81,40 +80,40 @@ class NlpSolver:
     ) -> None:
         self._frame = Frame(params, n_chasers)
         limit = MAX_ITERATIONS if max_iterations is None else max_iterations
-        self._programmes: dict[int, tuple[Nlp, Any]] = {}
+        self._programs: dict[int, tuple[Nlp, Any]] = {}
         for n in range(1, n_chasers + 1):
             nlp = build_nlp(n, params)
-            self._programmes[n] = nlp, ca.nlpsol("nmpc", name, nlp.problem, _options(name, nlp, limit))
+            self._programs[n] = nlp, ca.nlpsol("nmpc", name, nlp.problem, _options(name, nlp, limit))
 
     def reset(self) -> None:
-        """Forgets every warm start."""
+        """Discard all warm starts."""
         self._frame.plans = {}
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """One tick; arguments, answer and errors as `RtiSolver.solve`. The chasers share one status.
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
 
-        ``iterations`` counts the solver's. The states are the answer's inputs rolled through the model.
+        ``iterations`` counts those of the solver. The states are the solution's inputs rolled through the model.
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
         u = task.start.copy()
         n, d = len(u), frame.params.stages
-        nlp, programme = self._programmes[n]
+        nlp, program = self._programs[n]
         x, limits, floor = frame.rolled(task, u), task.problem.input_max, row_floor(nlp, task)
         start, low, high, bottom, top = [], [], [], [], []
-        where = []
+        input_columns = []
         for k in range(d + 1):
             free = np.full(13 * n, np.inf)
             inputs = limits.ravel() if k < d else np.zeros(0)
             slack = np.zeros(nlp.rows if k > 0 else 0)
-            where.append(sum(map(len, start)) + len(free))
+            input_columns.append(sum(map(len, start)) + len(free))
             start += [x[:, k].ravel(), u[:, k].ravel() if k < d else inputs, slack]
             low += [-free, -inputs, slack]
             high += [free, inputs, slack + np.inf]
             defects = np.zeros((13 * n if k < d else 0) + (13 * n if k == 0 else 0))
             bottom += [defects, floor[k - 1] if k > 0 else slack]
             top += [defects, slack + np.inf]
-        answer = programme(
+        result = program(
             x0=np.concatenate(start),
             p=pack(frame.params, task),
             lbx=np.concatenate(low),
@@ -122,9 +121,9 @@ class NlpSolver:
             lbg=np.concatenate(bottom),
             ubg=np.concatenate(top),
         )
-        stats = programme.stats()
-        flat = np.array(answer["x"]).ravel()
-        solution = np.stack([flat[at : at + 6 * n].reshape(n, 6) for at in where[:d]], axis=1)
+        stats = program.stats()
+        flat = np.array(result["x"]).ravel()
+        solution = np.stack([flat[at : at + 6 * n].reshape(n, 6) for at in input_columns[:d]], axis=1)
         code = str(stats.get("return_status", ""))
         solved = bool(stats["success"]) or code in _GOOD
         iterations = int(stats.get("iter_count", 0))

@@ -1,4 +1,4 @@
-"""What every back end does to a problem before solving it: check it, and find where to start from."""
+"""Validation of a problem and its warm start, common to all back ends."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from .kernels import normalize_rows, shifted, sign_of
 from .types import Array, NmpcInput, NmpcParameters
 
-# Measured quaternions are normalized; one this far off is a mistake, not a rounding error.
+# Measured quaternions are normalized; a larger deviation is an error, not rounding.
 QUATERNION_NORM_TOLERANCE = 0.1
 
 
@@ -30,11 +30,11 @@ def _poses(name: str, array: Array, first: int) -> None:
 
 
 def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
-    """A copy of ``problem`` with contiguous arrays, unit quaternions and everything optional written out:
+    """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values expanded:
     (N, D+1) target distances, (N, N) chaser distances, corridors.
 
     Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
-    length, a negative distance or limit, an asymmetric distance matrix, a corridor that is no cone, or more than
+    length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor, or more than
     ``n_max`` chasers.
     """
     states = np.asarray(problem.states, dtype=np.float64)
@@ -98,7 +98,7 @@ def _check_corridors(corridors: Array) -> None:
 
 
 def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
-    """The chasers' identities, 0..N-1 if not given. Raises ValueError for a wrong number or a repetition."""
+    """Return the chasers' ids, 0..N-1 by default. Raises ValueError for a wrong number or a repetition."""
     chosen = tuple(range(n)) if ids is None else tuple(int(i) for i in ids)
     if len(chosen) != n or len(set(chosen)) != n:
         raise ValueError(f"ids must be {n} different numbers, not {chosen}")
@@ -106,17 +106,17 @@ def check_ids(ids: Sequence[int] | None, n: int) -> tuple[int, ...]:
 
 
 def check_shift(shift_s: float) -> float:
-    """The time since the previous solve, s. Raises ValueError if it is negative or not finite."""
+    """Return the time since the previous solve, s. Raises ValueError if it is negative or not finite."""
     if not (math.isfinite(shift_s) and shift_s >= 0.0):
         raise ValueError(f"shift_s must be finite and not negative, not {shift_s!r}")
     return float(shift_s)
 
 
 def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
-    """Piecewise constant inputs (..., D, 6) seen ``shift_s`` later on the same grid (..., D, 6).
+    """Shift piecewise constant inputs (..., D, 6) by ``shift_s`` on the same grid.
 
-    Each new value is the mean of the old plan over its interval, so the impulse is kept; beyond the old
-    horizon the last value is held.
+    Each new value is the mean of the old plan over its interval, which preserves the impulse. The last value is held
+    beyond the old horizon.
     """
     whole, part = divmod(shift_s / dt_s, 1.0)
     return shifted(inputs, int(min(whole, inputs.shape[-2])), part)
@@ -125,7 +125,7 @@ def shift_inputs(inputs: Array, shift_s: float, dt_s: float) -> Array:
 def warm_start(
     plans: dict[int, Array], names: tuple[int, ...], problem: NmpcInput, shift_s: float, dt_s: float
 ) -> Array:
-    """Inputs (N, D, 6) to start from, within the box: each chaser's shifted plan, its u_ref if it has none."""
+    """Return the initial inputs (N, D, 6) within the box: each chaser's shifted plan, or u_ref without a plan."""
     start = problem.u_ref.copy()
     known = [row for row, name in enumerate(names) if name in plans]
     if known:

@@ -1,6 +1,6 @@
-"""What the NMPC asks of the compiled kernels (`native`): the same names, with arrays.
+"""Array interface of the compiled NMPC kernels (`native`), with the same names.
 
-Arrays are C-contiguous float64 (int64 where said) of the shapes given; nothing is checked here.
+Arrays are C-contiguous float64 (int64 where stated) of the given shapes; nothing is checked here.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from numpy.typing import NDArray
 from .native import function
 from .types import Array, IntArray, NmpcInput, NmpcParameters
 
-# Explicit Runge-Kutta tableaux with one sub-diagonal, which is all that euler and rk4 need.
+# Explicit Runge-Kutta tableaus with one subdiagonal, sufficient for euler and rk4.
 RK_NODES = {"euler": (0.0,), "rk4": (0.0, 0.5, 0.5, 1.0)}
 RK_WEIGHTS = {"euler": (1.0,), "rk4": (1.0 / 6.0, 2.0 / 6.0, 2.0 / 6.0, 1.0 / 6.0)}
 
-# As in native/ipm.c: codes of an answer, and the complementarity at which it stops; native/tick.c: iterations a chaser.
+# From native/ipm.c: return codes and final complementarity; from native/tick.c: iteration limit of a chaser.
 FREE, CONVERGED, LIMIT, BROKEN = 0, 1, 2, 3
 MU_STOP = 1e-3
 MAX_ITERATIONS = 40
 
 
 class Model(Structure):
-    """native/base.h."""
+    """`Model` of native/model.h."""
 
     _fields_ = [
         ("step_s", c_double),
@@ -43,7 +43,7 @@ class Model(Structure):
 
 
 def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
-    """The body and the discretization, over ``params.dt_s`` or another step."""
+    """Return body and discretization, with step ``params.dt_s`` by default."""
     inertia = np.array(params.inertia_kg_m2, dtype=float)
     nodes, weights = RK_NODES[params.integrator], RK_WEIGHTS[params.integrator]
     return Model(
@@ -54,7 +54,7 @@ def model_of(params: NmpcParameters, step_s: float | None = None) -> Model:
 
 
 def normalize_rows(array: Array, first: int, tolerance: float) -> int:
-    """Normalizes the quaternions in columns first..first+3 of ``array`` (..., width) in place.
+    """Normalize the quaternions in columns first..first+3 of ``array`` (..., width) in place.
 
     Returns 1 for a value that is not finite, 2 for a quaternion further off unit length than ``tolerance``, else 0.
     """
@@ -65,12 +65,12 @@ def normalize_rows(array: Array, first: int, tolerance: float) -> int:
 
 
 def sign_of(array: Array) -> int:
-    """1 if a value is not finite, else 2 if one is negative, else 0."""
+    """Return 1 if a value is not finite, else 2 if one is negative, else 0."""
     return function("sign_of", c_int64)(address(array), c_int64(array.size))
 
 
 def shifted(inputs: Array, whole: int, part: float) -> Array:
-    """Piecewise constant inputs (..., D, 6), ``whole + part`` steps later on the same grid; 0 <= part < 1."""
+    """Shift piecewise constant inputs (..., D, 6) by ``whole + part`` steps on the same grid; 0 <= part < 1."""
     out, d = np.empty_like(inputs), inputs.shape[-2]
     n = inputs.size // (6 * d)
     function("shift_inputs")(
@@ -80,12 +80,12 @@ def shifted(inputs: Array, whole: int, part: float) -> Array:
 
 
 def roll(model: Model, x: Array, u: Array) -> None:
-    """Rolls u (N, D, 6) from x[:, 0] through x (N, D+1, 13)."""
+    """Roll out u (N, D, 6) from x[:, 0] into x (N, D+1, 13)."""
     function("roll")(ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(x))
 
 
 def roll_linearized(model: Model, x: Array, u: Array, limits: Array, mats: Array) -> None:
-    """The same with mats (N, D, 12, 12) = [C B] along the way; B that of the inputs as shares of limits (N, 6)."""
+    """Roll out and linearize: mats (N, D, 12, 12) = [C B], B for inputs scaled by limits (N, 6)."""
     function("roll_linearized")(
         ctypes.byref(model), c_int64(u.shape[0]), c_int64(u.shape[1]), address(u), address(limits), address(x),
         address(mats),
@@ -109,7 +109,7 @@ class Weights:
 def quadratic_model(
     weights: Weights, x: Array, u: Array, refs: Array, u_ref: Array, limits: Array
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Cost of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled inputs w = u / limits.
+    """Quadratic cost model of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled inputs w = u / limits.
 
     Returns q_pos and q_att (D+1, 3, 3), qx (D+1, 12), r_diag, r and w_bar (D, 6).
     """
@@ -125,7 +125,7 @@ def quadratic_model(
 
 
 def plan_cost(weights: Weights, x: Array, u: Array, refs: Array, u_ref: Array) -> Array:
-    """Eq. 6 for every chaser, (N,), of x (N, D+1, 13), u (N, D, 6)."""
+    """Return the cost (eq. 6) of every chaser (N,) for x (N, D+1, 13), u (N, D, 6)."""
     cost = np.empty(len(x))
     arrays = (address(a) for a in (x, u, refs, u_ref, cost))
     function("plan_cost")(ctypes.byref(weights.native), c_int64(len(x)), *arrays)
@@ -170,7 +170,7 @@ class _Rows(Structure):
 
 @dataclass(frozen=True)
 class Rows:
-    """Half-spaces a' dp_k >= c of each chaser: stage (N, M), a (N, M, 3), c (N, M), of which n_rows (N,) count."""
+    """Half-spaces a' dp_k >= c of each chaser: stage (N, M), a (N, M, 3), c (N, M); the first n_rows (N,) are used."""
 
     stage: IntArray
     a: Array
@@ -179,7 +179,7 @@ class Rows:
 
 
 def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> Rows:
-    """Rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input` returns it.
+    """Build the rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input` returns it.
 
     reach_m (N, D+1): how far admissible inputs can move a chaser from its rollout.
     """
@@ -195,7 +195,8 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
 
 
 def plan_violation(problem: NmpcInput, x: Array, outer_m: float) -> Array:
-    """Deepest violation of the distances, m, (N,), by plans x (N, D+1, 13); ``problem`` as `check_input` returns it."""
+    """Return the deepest violation of the distances, m (N,), by plans x (N, D+1, 13); ``problem`` as `check_input`
+    returns it."""
     worst, zones = np.empty(len(x)), _zones(problem, outer_m)
     function("plan_violation")(ctypes.byref(zones), address(x), address(worst))
     return worst
@@ -243,7 +244,8 @@ def solve_qp(
     mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float, w2: float,
     max_iterations: int = MAX_ITERATIONS,
 ) -> QpAnswer:  # fmt: skip
-    """One chaser's QP: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows (R,), (R, 3), (R,)."""
+    """Solve the QP of one chaser: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows (R,), (R, 3),
+    (R,)."""
     d, rows = len(mats), len(stage)
     dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
     qp = _Qp(d, rows, max_iterations, h, w1, w2, *(address(v) for v in (mats, *model, stage, a, c)))
@@ -275,19 +277,19 @@ def solve_tick(
     model: Model, weights: Weights, problem: NmpcInput, inputs: Array, outer_m: float, reach_m_per_N: Array, w1: Array,
     w2: float, budget: int,
 ) -> tuple[IntArray, IntArray]:  # fmt: skip
-    """One real-time iteration for every chaser: ``inputs`` (N, D, 6), where it starts, become the answer.
+    """Run one real-time iteration for every chaser; ``inputs`` (N, D, 6) hold the start and receive the solution.
 
-    ``problem`` as `check_input` returns it; reach_m_per_N (D+1,): how far a newton more or less on each axis moves a
-    chaser by each stage; w1 (N,) and w2 price the slacks; ``budget``: iterations of all together.
-    Returns code and iterations, each (N,); where the code is BROKEN the inputs are left alone.
+    ``problem`` from `check_input`. reach_m_per_N (D+1,): displacement of a chaser by each stage for 1 N on each axis.
+    w1 (N,), w2: slack weights. ``budget``: total iterations. Returns code and iterations, each (N,); the inputs of a
+    chaser with code BROKEN are unchanged.
     """
     n, d, _ = inputs.shape
     zones = _zones(problem, outer_m)
     code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     tick = _Tick(
         ctypes.addressof(model), ctypes.addressof(weights.native), ctypes.addressof(zones), address(problem.states),
-        address(problem.u_ref), address(problem.input_max), address(reach_m_per_N), address(w1), address(inputs), w2, budget,
-        address(code), address(iterations),
+        address(problem.u_ref), address(problem.input_max), address(reach_m_per_N), address(w1), address(inputs), w2,
+        budget, address(code), address(iterations),
     )  # fmt: skip
     function("solve_tick")(ctypes.byref(tick), address(_tick_memory(n, d)))
     return code, iterations

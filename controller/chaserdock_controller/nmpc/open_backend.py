@@ -1,11 +1,11 @@
 """Back end `open`: OpEn (Optimization Engine), the paper's own solver, through opengen.
 
 Sopasakis, Fresk and Patrinos, "OpEn: Code generation for embedded nonconvex optimization", IFAC 2020: PANOC over the
-box of inputs, single shooting. Distances are priced by a quadratic penalty of fixed weight within the cost; OpEn's own
-ways (`with_penalty_constraints`, `with_aug_lagrangian_constraints`) make opengen write C that differentiates every
-distance by itself, tens of megabytes for four chasers, which no compiler here came to the end of. opengen writes
-Rust for each number of chasers, which cargo compiles, a minute the first time; the result is kept in
-``$XDG_CACHE_HOME/chaserdock/open`` (``~/.cache``), under a digest of the problem. Limited by iterations, never by time.
+box of inputs, single shooting. A quadratic penalty of fixed weight in the cost enforces the distances: with OpEn's own
+constraints (`with_penalty_constraints`, `with_aug_lagrangian_constraints`) opengen differentiates every distance
+separately and writes tens of megabytes of C for four chasers, too much to compile. opengen writes Rust code for each
+number of chasers; cargo compiles it, which takes a minute once. The library is cached under a digest of the problem in
+``$XDG_CACHE_HOME/chaserdock/open`` (``~/.cache``). Limited by iterations, never by time.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from .warm_start import Frame, status_of
 
 MAX_INNER = 500
 TOLERANCE = 1e-3
-# Cost of a squared metre of violation, halved: 1 mm for a multiplier of 1e3.
+# Twice the cost of one square metre of violation: 1 mm for a multiplier of 1e3.
 PENALTY = 1e6
-# Far beyond any solve: OpEn wants a time, and ours are limited by iterations.
+# OpEn requires a time limit; this one is never reached, since iterations limit a solve.
 _NEVER_US = 60_000_000
-# What cargo calls a shared library, and what Python wants it to be called.
+# Suffixes of shared libraries from cargo, and of Python extension modules.
 _LIBRARY_SUFFIXES = (".so", ".dylib", ".dll")
 _SUFFIX = {"win32": ".pyd"}
 
 
 class OpenSolver:
-    """OpEn for up to ``n_chasers`` chasers; keeps each one's plan as its warm start.
+    """Solve with OpEn for up to ``n_chasers`` chasers, warm-started from the last plans.
 
     ``max_iterations`` bounds the iterations of a solve, MAX_INNER if None. Raises ValueError for
     n_chasers < 1 or where opengen or cargo is not installed.
@@ -57,28 +57,28 @@ class OpenSolver:
                 "solver 'open' needs cargo, Rust's build tool, on the PATH: see https://rustup.rs"
             )
         inner = MAX_INNER if max_iterations is None else max_iterations
-        self._programmes: dict[int, tuple[Nlp, Any]] = {}
+        self._programs: dict[int, tuple[Nlp, Any]] = {}
         for n in range(1, n_chasers + 1):
             nlp = build_nlp(n, params, shooting="single", symbol=ca.MX.sym)
-            self._programmes[n] = nlp, _built(nlp, inner)
+            self._programs[n] = nlp, _load_solver(nlp, inner)
 
     def reset(self) -> None:
-        """Forgets every warm start."""
+        """Discard all warm starts."""
         self._frame.plans = {}
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """One tick; arguments, answer and errors as `RtiSolver.solve`. The chasers share one status.
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
 
-        ``iterations`` counts the inner ones.
+        ``iterations`` counts inner iterations.
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
         u, limits = task.start.copy(), task.problem.input_max
         n, d = len(u), frame.params.stages
         scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
-        nlp, programme = self._programmes[n]
+        nlp, program = self._programs[n]
         floor = row_floor(nlp, task)
-        answer = programme.run(
+        answer = program.run(
             p=np.concatenate([pack(frame.params, task), limits.ravel(), floor.ravel()]).tolist(),
             initial_guess=(u / scale).transpose(1, 0, 2).ravel().tolist(),
         )
@@ -94,40 +94,40 @@ class OpenSolver:
         return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
 
 
-def _called(nlp: Nlp, x: Any, p: Any) -> tuple[Any, Any]:
-    """Cost and distances of a programme of MX symbols, at ``x`` and ``p``."""
+def _evaluate(nlp: Nlp, x: Any, p: Any) -> tuple[Any, Any]:
+    """Return cost and distances of a program of MX symbols at ``x`` and ``p``."""
     symbols = [ca.symvar(nlp.problem["x"]), ca.symvar(nlp.problem["p"])]
     arguments = []
-    for given, parts in zip((x, p), symbols, strict=True):
-        pieces = ca.vertsplit(given, [0, *np.cumsum([s.numel() for s in parts]).tolist()])
+    for values, parts in zip((x, p), symbols, strict=True):
+        pieces = ca.vertsplit(values, [0, *np.cumsum([s.numel() for s in parts]).tolist()])
         arguments += [ca.reshape(piece, *s.shape) for piece, s in zip(pieces, parts, strict=True)]
     function = ca.Function("nlp", [*symbols[0], *symbols[1]], [nlp.problem["f"], nlp.problem["g"]])
     cost, distances = function.call(arguments, True, False)
     return cost, distances
 
 
-def _built(nlp: Nlp, inner: int) -> Any:
-    """The compiled solver of a problem, from the cache or fresh."""
+def _load_solver(nlp: Nlp, inner: int) -> Any:
+    """Return the compiled solver of a problem, from the cache or newly built."""
     import opengen as og  # pyright: ignore[reportMissingImports] (an extra)
 
-    # TickInputs as shares of their limits, a well-scaled box. Lower bounds of the distances are parameters.
-    inputs, rooms = 6 * nlp.n * nlp.stages, nlp.stages * nlp.rows
+    # Inputs are scaled by their limits, so that the box is well scaled. Lower bounds of the distances are parameters.
+    inputs, distances = 6 * nlp.n * nlp.stages, nlp.stages * nlp.rows
     w, p = ca.MX.sym("w", inputs), ca.MX.sym("p", nlp.problem["p"].numel())
-    limits, floor = ca.MX.sym("limits", 6 * nlp.n), ca.MX.sym("floor", rooms)
-    f, g = _called(nlp, w * ca.repmat(limits, nlp.stages, 1), p)
-    missed = ca.fmin(0, g - floor)
-    cost = f + 0.5 * PENALTY * ca.dot(missed, missed)
-    parameters = ca.MX.sym("parameters", p.numel() + limits.numel() + rooms)
+    limits, floor = ca.MX.sym("limits", 6 * nlp.n), ca.MX.sym("floor", distances)
+    f, g = _evaluate(nlp, w * ca.repmat(limits, nlp.stages, 1), p)
+    violation = ca.fmin(0, g - floor)
+    cost = f + 0.5 * PENALTY * ca.dot(violation, violation)
+    parameters = ca.MX.sym("parameters", p.numel() + limits.numel() + distances)
     parts = ca.vertsplit(parameters, [0, p.numel(), p.numel() + limits.numel(), parameters.numel()])
     whole = ca.Function("whole", [w, p, limits, floor], [cost])
     cost = whole.call([w, *parts], True, False)[0]
     text = ca.Function("all", [w, parameters], [cost]).serialize()
     name = "open_" + hashlib.sha256(f"{text} {inner} {TOLERANCE} {sys.version}".encode()).hexdigest()[:16]
     cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "chaserdock" / "open"
-    found = cache / f"{name}{_SUFFIX.get(sys.platform, '.so')}"
-    if not found.exists():
-        _build(og, name, cache, og.builder.Problem(w, parameters, cost), inputs, inner, found)
-    spec = importlib.util.spec_from_file_location(name, found)
+    library = cache / f"{name}{_SUFFIX.get(sys.platform, '.so')}"
+    if not library.exists():
+        _build(og, name, cache, og.builder.Problem(w, parameters, cost), inputs, inner, library)
+    spec = importlib.util.spec_from_file_location(name, library)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -135,8 +135,8 @@ def _built(nlp: Nlp, inner: int) -> Any:
     return module.solver()
 
 
-def _build(og: Any, name: str, cache: Path, problem: Any, size: int, inner: int, found: Path) -> None:
-    """Has opengen write the Rust and cargo compile it to ``found``. Raises RuntimeError with cargo's words."""
+def _build(og: Any, name: str, cache: Path, problem: Any, size: int, inner: int, library: Path) -> None:
+    """Generate Rust code with opengen and compile it to ``library``. Raises RuntimeError with cargo's output."""
     problem = problem.with_constraints(og.constraints.Rectangle([-1.0] * size, [1.0] * size))
     solver = (
         og.config.SolverConfiguration()
@@ -155,21 +155,21 @@ def _build(og: Any, name: str, cache: Path, problem: Any, size: int, inner: int,
     )
     meta = og.config.OptimizerMeta().with_optimizer_name(name)
     cache.mkdir(parents=True, exist_ok=True)
-    # opengen writes some of its files beside itself first: into the folder it is run in.
+    # opengen writes temporary files into the current folder.
     with contextlib.chdir(cache):
         builder = og.builder.OpEnOptimizerBuilder(problem, meta, build, solver)
         builder.with_verbosity_level(logging.WARNING).with_generate_not_build_flag(True).build()
-    # By ourselves, for opengen would compile the solver twice, and all that it is made of again for each problem.
+    # opengen would compile the solver twice and its dependencies again for each problem.
     target = cache / "target"
-    done = subprocess.run(
+    completed = subprocess.run(
         ["cargo", "build", "-q", "--release"],
         cwd=cache / name / f"python_bindings_{name}",
         env=os.environ | {"CARGO_TARGET_DIR": str(target)},
         capture_output=True,
         text=True,
     )
-    if done.returncode:
-        raise RuntimeError(f"cargo could not compile OpEn's solver:\n{done.stderr}")
-    made = next(path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES)
-    made.replace(found)
+    if completed.returncode:
+        raise RuntimeError(f"cargo failed to compile the OpEn solver:\n{completed.stderr}")
+    built = next(path for path in (target / "release").glob(f"*{name}.*") if path.suffix in _LIBRARY_SUFFIXES)
+    built.replace(library)
     shutil.rmtree(cache / name)

@@ -1,8 +1,8 @@
-"""The optimal control problem, written once, in CasADi, to be read beside the paper (section 4, eq. 6 and 7).
+"""The optimal control problem in CasADi, following the paper (section 4, eq. 6 and 7).
 
 State x = [p (3, WRF), v (3, WRF), q_wxyz (4, body to world), omega (3, body)], input u = [F (3), tau (3)] in
-body axes. Every back end solves this problem; `ipopt` this very graph, `rti` the same functions written in
-C (`native`), which the tests hold against these.
+body axes. Every back end solves this problem: `ipopt` this graph, `rti` the same functions in C (`native`), which the
+tests compare with these.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ def rotate(q: Any, v: Any) -> Any:
 
 
 def derivative(x: Any, u: Any, params: NmpcParameters) -> Any:
-    """Newton-Euler equations (paper, eq. 1 and 2, with q' in the body-to-world convention), x' (13)."""
+    """Return x' (13) from the Newton-Euler equations (paper, eq. 1 and 2, with q' in the body-to-world convention)."""
     inertia = ca.DM(np.array(params.inertia_kg_m2))
     v, q, omega = x[3:6], x[6:10], x[10:13]
     force, torque = u[0:3], u[3:6]
@@ -47,7 +47,7 @@ def derivative(x: Any, u: Any, params: NmpcParameters) -> Any:
 
 
 def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Function:
-    """Discrete dynamics (x (13), u (6)) -> x_next (13) over ``params.dt_s``, the input held.
+    """Return the discrete dynamics (x (13), u (6)) -> x_next (13) over ``params.dt_s``, the input held.
 
     ``integrator``: "euler" (the paper's) or "rk4"; ``params.integrator`` if None. The quaternion is
     normalized after the step. Raises ValueError for another integrator.
@@ -72,8 +72,8 @@ def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Functi
 def pose_cost(x: Any, reference: Any, weight_position: Any, weight_orientation: Any) -> Any:
     """Q_p |p_ref - p|^2 + Q_q |vec(q (x) q_ref*)|^2; ``reference`` (7) is p, q_wxyz.
 
-    The paper weights all four components of q (x) q_ref*, whose norm is always one; its vector part is what
-    vanishes on the reference, and both signs of a quaternion cost the same.
+    The paper weights all four components of q (x) q_ref*, whose norm is always one. The vector part vanishes on the
+    reference, and both signs of a quaternion cost the same.
     """
     error = multiply(x[6:10], conjugate(reference[3:7]))[1:4]
     return weight_position * ca.sumsqr(reference[0:3] - x[0:3]) + weight_orientation * ca.sumsqr(error)
@@ -81,11 +81,11 @@ def pose_cost(x: Any, reference: Any, weight_position: Any, weight_orientation: 
 
 @dataclass(frozen=True)
 class Nlp:
-    """The nonlinear programme of ``n`` chasers over ``stages`` and where its parts lie, stage by stage.
+    """The nonlinear program of ``n`` chasers over ``stages``, and its layout stage by stage.
 
     ``problem``: CasADi dictionary x, p, f, g. Multiple shooting: x = for k = 0..D: states of all chasers (13 each),
     inputs of all (6 each; not at D), slacks of the stage's distances (not at 0). g = for k = 0..D: the defects to
-    stage k + 1 (not at D), the distances of the stage with slack; at 0 in their place x - x_0. Single shooting: x is
+    stage k + 1 (not at D), the distances of the stage with slack; at 0 instead x - x_0. Single shooting: x is
     the inputs, stage by stage, chaser by chaser, and g the distances without slack.
     p = per chaser: x_0 (13), references (7 (D+1)), u_ref (6 D), target distances (D+1), corridors (5 (D+1)); then
     target positions (3 (D+1)), chaser distances (upper triangle, row by row), L1 weight (1).
@@ -101,25 +101,26 @@ class Nlp:
 
 
 def _norm(a: Any) -> Any:
-    # The tiny term keeps the gradient finite where two points coincide; it changes 0.35 m by 1e-12 m.
+    # The constant keeps the gradient finite where two points coincide; it changes 0.35 m by 1e-12 m.
     return ca.sqrt(ca.sumsqr(a) + 1e-12)
 
 
 def _corridor(r: Any, corridor: Any) -> Any:
-    """Distance from the surface of the corridor's cone, positive inside (`corridor_room` in native/planes.c)."""
+    """Return the distance from the surface of the corridor's cone, positive inside (`corridor_room` in
+    native/planes.c)."""
     axis, half_angle, apex = corridor[0:3], corridor[3], corridor[4]
     along = ca.dot(axis, r)
     return ca.sin(half_angle) * (along - apex) - ca.cos(half_angle) * _norm(r - along * axis)
 
 
-def _pose_price() -> ca.Function:
+def _pose_cost_function() -> ca.Function:
     x, reference, weights = ca.SX.sym("x", 13), ca.SX.sym("reference", 7), ca.SX.sym("weights", 2)
     return ca.Function("pose", [x, reference, weights], [pose_cost(x, reference, weights[0], weights[1])])
 
 
 def _distances(n: int, params: NmpcParameters) -> ca.Function:
-    """Of one stage: states (13, n), positions of references (3, n), of the target (3), keep-outs (n), corridors (5, n),
-    distances of the pairs -> rooms, per chaser target, outer bound, corridor, then the pairs."""
+    """Return the constraints of one stage: states (13, n), positions of references (3, n) and target (3), keep-out
+    radii (n), corridors (5, n), pair distances -> margins; per chaser target, outer bound, corridor; then the pairs."""
     pairs = [(i, j) for i in range(n) for j in range(i + 1, n)]
     x, p_ref, target = ca.SX.sym("x", 13, n), ca.SX.sym("p_ref", 3, n), ca.SX.sym("target", 3)
     to_target, corridors, apart = (
@@ -138,15 +139,23 @@ def _distances(n: int, params: NmpcParameters) -> ca.Function:
     return ca.Function("distances", [x, p_ref, target, to_target, corridors, apart], [ca.vertcat(*out)])
 
 
+def _stage_sizes(n: int, k: int, stages: int, rows: int, multiple: bool) -> tuple[int, int, int]:
+    """Return the numbers of states, inputs with slacks, and constraints besides the defects of stage ``k``."""
+    inputs = 6 * n if k < stages else 0
+    if not multiple:
+        return 0, inputs, rows if k > 0 else 0
+    return (13 * n, inputs + rows, rows) if k > 0 else (13 * n, inputs, 13 * n)
+
+
 def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple", symbol: Any = ca.SX.sym) -> Nlp:
-    """Eq. 6 and 7 for ``n`` chasers. Raises ValueError for n < 1.
+    """Build eq. 6 and 7 for ``n`` chasers. Raises ValueError for n < 1.
 
-    ``symbol``: CasADi's kind, ``ca.SX.sym`` for one graph of scalars, ``ca.MX.sym`` for calls of one function a stage,
-    which make much shorter C.
+    ``symbol``: ``ca.SX.sym`` for one graph of scalars, ``ca.MX.sym`` for calls of one function per stage, which
+    generates much shorter C.
 
-    The input box (4a) is left to the variable bounds. The distances (4b to 4d) stand at stages 1..D (stage 0 cannot
-    be changed) and carry a slack each in multiple shooting (``shooting`` "multiple"); in "single" shooting, for
-    augmented-Lagrangian methods, which have their own penalty, they stand as they are.
+    The variable bounds contain the input box (4a). The distances (4b to 4d) apply at stages 1..D, as stage 0 cannot be
+    changed. With ``shooting`` "multiple" each has a slack; with "single", for augmented-Lagrangian methods with their
+    own penalty, they have none.
     """
     if n < 1:
         raise ValueError(f"n must be at least 1, not {n}")
@@ -166,51 +175,44 @@ def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple", symbol
     pair_distance = symbol("d_pair", n_pairs)
     slack_l1 = symbol("w1")
 
-    price, rooms = _pose_price(), _distances(n, params)
+    pose_term, distance_terms = _pose_cost_function(), _distances(n, params)
 
     def distances(k: int, x: list[Any]) -> Any:
-        return rooms(
+        return distance_terms(
             ca.horzcat(*x), ca.horzcat(*(r[0:3, k] for r in references)), targets[:, k],
             ca.vertcat(*(d[k] for d in to_target)), ca.horzcat(*(c[:, k] for c in corridors)), pair_distance,
         )  # fmt: skip
 
     variables: list[Any] = []
     constraints: list[Any] = []
-    sizes: list[tuple[int, int, int]] = []
     cost: Any = 0
     x = [symbol(f"x_{i}_0", 13) for i in range(n)] if multiple else x0
     for k in range(d + 1):
-        here = x
-        if multiple:
-            variables += here
+        state = x
+        variables += state if multiple else []
         for i in range(n):
             weights = ca.DM([position_weight[k], orientation_weight[k]])
-            cost += price(here[i], references[i][:, k], weights)
+            cost += pose_term(state[i], references[i][:, k], weights)
         if k < d:
             inputs = [symbol(f"u_{i}_{k}", 6) for i in range(n)]
             variables += inputs
             for i in range(n):
                 cost += ca.dot(input_weight, (u_ref[i][:, k] - inputs[i]) ** 2)
-            x = [step(a, u) for a, u in zip(here, inputs, strict=True)]
+            x = [step(a, u) for a, u in zip(state, inputs, strict=True)]
             if multiple:
-                reached, x = x, [symbol(f"x_{i}_{k + 1}", 13) for i in range(n)]
-                # fatrop asks for the next state first, with a plus sign.
-                constraints += [b - a for a, b in zip(reached, x, strict=True)]
+                propagated, x = x, [symbol(f"x_{i}_{k + 1}", 13) for i in range(n)]
+                # fatrop requires the next state first, with positive sign.
+                constraints += [b - a for a, b in zip(propagated, x, strict=True)]
                 if k == 0:
-                    constraints += [a - b for a, b in zip(here, x0, strict=True)]
+                    constraints += [a - b for a, b in zip(state, x0, strict=True)]
         if k > 0:
-            room = distances(k, here)
+            margin = distances(k, state)
             if multiple:
                 s = symbol(f"s_{k}", rows)
                 variables.append(s)
                 cost += slack_l1 * ca.sum1(s) + 0.5 * SLACK_L2 * ca.sumsqr(s)
-                room += s
-            constraints.append(room)
-        inputs_here = 6 * n if k < d else 0
-        if multiple:
-            sizes.append((13 * n, inputs_here + rows, rows) if k > 0 else (13 * n, inputs_here, 13 * n))
-        else:
-            sizes.append((0, inputs_here, rows if k > 0 else 0))
+                margin += s
+            constraints.append(margin)
 
     parameters: list[Any] = []
     for i in range(n):
@@ -225,5 +227,5 @@ def build_nlp(n: int, params: NmpcParameters, shooting: str = "multiple", symbol
             "g": ca.vertcat(*constraints),
         },
         rows=rows,
-        stage_sizes=tuple(sizes),
+        stage_sizes=tuple(_stage_sizes(n, k, d, rows, multiple) for k in range(d + 1)),
     )

@@ -1,9 +1,9 @@
-"""Default back end: a real-time iteration, one structured QP per chaser and tick (native/tick.c).
+"""Default back end: a real-time iteration with one structured QP per chaser and tick (native/tick.c).
 
 Diehl, Bock and Schloeder, SIAM J. Control Optim. 43 (2005): the shifted inputs are rolled through the nonlinear
 dynamics, everything is linearized about that rollout, and one quadratic programme is solved. The vector part
 of q (x) q_ref* is linear in q, so the cost is exactly quadratic and needs no convexification. Limited by
-iterations, never by time: equal inputs give equal plans.
+iterations, never by time, so equal inputs give equal plans.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .slack import SLACK_L2, slack_l1_weight
 from .types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
 from .warm_start import Frame, status_of
 
-# Rows that no admissible input can reach are left out; the bound is taken this much wider.
+# Rows that no admissible input can reach are omitted; safety factor of that bound.
 REACH_SAFETY = 1.5
 
 
@@ -26,9 +26,9 @@ class RtiSolver:
     """Real-time iteration for up to ``n_chasers`` chasers; keeps the last plan of each as its warm start.
 
     ``max_iterations`` bounds the interior point's iterations of all chasers together in one solve; each
-    chaser may take what is left, shared evenly over those to come, and at most `MAX_ITERATIONS`. It may be changed
-    between solves; who ran out of it, and not of the solver's own limit, has the status "budget".
-    Raises ValueError for n_chasers < 1 or a negative budget.
+    chaser may use an even share of the remaining iterations, at most `MAX_ITERATIONS`. It may be changed between
+    solves. A chaser that is stopped by this bound has the status "budget". Raises ValueError for n_chasers < 1 or a
+    negative budget.
     """
 
     def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
@@ -36,19 +36,19 @@ class RtiSolver:
         if max_iterations is not None and max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, not {max_iterations}")
         self.max_iterations = max_iterations
-        # Per newton: the farthest that any admissible change of the inputs moves a chaser by stage k.
+        # Largest displacement of a chaser by stage k for a change of the inputs by 1 N.
         times = params.dt_s * np.arange(params.stages + 1)
         self._reach = REACH_SAFETY * np.sqrt(3.0) / params.mass_kg * times**2
 
     def reset(self) -> None:
-        """Forgets every warm start."""
+        """Discard all warm starts."""
         self._frame.plans = {}
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """One tick. ``shift_s``: time since the previous call, s; ``ids``: who the rows are, 0..N-1 if None.
+        """Solve one tick. ``shift_s``: time since the previous call, s; ``ids``: chasers of the rows, 0..N-1 if None.
 
         The warm start follows the id: a chaser whose id was not in the previous call starts from its u_ref.
-        Raises ValueError for what `check_input`, `check_ids` and `check_shift` refuse.
+        Raises ValueError as `check_input`, `check_ids` and `check_shift`.
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
@@ -63,5 +63,5 @@ class RtiSolver:
         )
         plan = frame.finish(task, u, [status_of(c != BROKEN, c == LIMIT) for c in code], iterations)
         cut_short = (code == LIMIT) & (iterations < MAX_ITERATIONS)
-        words = [BUDGET if cut else word for cut, word in zip(cut_short, plan.status, strict=True)]
-        return replace(plan, status=tuple(words))
+        status = [BUDGET if cut else code for cut, code in zip(cut_short, plan.status, strict=True)]
+        return replace(plan, status=tuple(status))

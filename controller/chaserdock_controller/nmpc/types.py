@@ -1,4 +1,4 @@
-"""What goes into and comes out of the NMPC, independent of the back end that solves it."""
+"""Inputs and outputs of the NMPC, independent of the back end."""
 
 from __future__ import annotations
 
@@ -15,19 +15,30 @@ INTEGRATORS = ("rk4", "euler")
 STATUSES = ("solved", "iteration_limit", "budget", "infeasible_relaxed", "failed")
 SOLVED, ITERATION_LIMIT, BUDGET, INFEASIBLE_RELAXED, FAILED = STATUSES
 
-# A plan that enters a keep-out ball (or leaves the outer bound) by more than this is called relaxed.
+# A plan that enters a keep-out ball or leaves the outer bound by more than this is relaxed.
 VIOLATION_TOLERANCE_M = 1e-4
+
+
+_POSITIVE = ("mass_kg", "dt_s", "weight_force", "weight_torque", "max_reference_distance_m")
+_NOT_NEGATIVE = (
+    "force_max_N",
+    "torque_max_N_m",
+    "weight_position",
+    "weight_orientation",
+    "weight_final_position",
+    "weight_final_orientation",
+)
 
 
 @dataclass(frozen=True)
 class NmpcParameters:
-    """Everything about the problem that stays the same from tick to tick. SI units, radians.
+    """Constant parameters of the problem. SI units, radians.
 
     The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2, ``weight_orientation``
     on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
     (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
     body axes. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
-    Raises ValueError, naming the field, for a value that makes no physical or mathematical sense.
+    Raises ValueError, naming the field, for an invalid value.
     """
 
     mass_kg: float
@@ -47,13 +58,10 @@ class NmpcParameters:
     integrator: str
 
     def __post_init__(self) -> None:
-        for name in ("mass_kg", "dt_s", "weight_force", "weight_torque", "max_reference_distance_m"):
+        for name in _POSITIVE:
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
                 raise ValueError(f"{name} must be positive and finite, not {getattr(self, name)!r}")
-        for name in ("force_max_N", "torque_max_N_m", "weight_position", "weight_orientation"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise ValueError(f"{name} must be finite and not negative, not {getattr(self, name)!r}")
-        for name in ("weight_final_position", "weight_final_orientation"):
+        for name in _NOT_NEGATIVE:
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise ValueError(f"{name} must be finite and not negative, not {getattr(self, name)!r}")
         if not (math.isfinite(self.horizon_s) and round(self.horizon_s / self.dt_s) >= 1):
@@ -62,6 +70,9 @@ class NmpcParameters:
             raise ValueError(f"falloff must lie between 0 and 1, not {self.falloff!r}")
         if self.integrator not in INTEGRATORS:
             raise ValueError(f"integrator must be one of {', '.join(INTEGRATORS)}, not {self.integrator!r}")
+        self._check_inertia()
+
+    def _check_inertia(self) -> None:
         inertia = np.asarray(self.inertia_kg_m2, dtype=float)
         if inertia.shape != (3, 3) or not np.all(np.isfinite(inertia)):
             raise ValueError("inertia_kg_m2 must be a finite 3 x 3 matrix")
@@ -76,7 +87,8 @@ class NmpcParameters:
         return round(self.horizon_s / self.dt_s)
 
     def stage_weights(self) -> tuple[Array, Array]:
-        """Weights of position and orientation at stages 0..D, each (D+1,), the final ones included (eq. 6)."""
+        """Return the weights of position and orientation at stages 0..D, each (D+1,), the final ones included (eq.
+        6)."""
         scale = 1.0 - self.falloff * np.arange(self.stages + 1) / self.stages
         position, orientation = self.weight_position * scale, self.weight_orientation * scale
         position[-1] += self.weight_final_position
@@ -84,24 +96,24 @@ class NmpcParameters:
         return position, orientation
 
     def input_limits(self) -> Array:
-        """The box (6,): force (N) and torque (N m) per body axis."""
+        """Return the input box (6,): force (N) and torque (N m) per body axis."""
         return np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
 
 
 @dataclass(frozen=True)
 class NmpcInput:
-    """One tick's problem for N chasers over D stages.
+    """The problem of one tick for N chasers over D stages.
 
     states (N, 13): p (WRF, m), v (WRF, m/s), q_wxyz (body to world), omega (body, rad/s).
     references (N, D+1, 7): p (WRF, m), q_wxyz; stage 0 is now.
-    u_ref (N, D, 6): force (N) and torque (N m), body axes, from which the input cost is counted.
+    u_ref (N, D, 6): force (N) and torque (N m), body axes, the reference of the input cost.
     target_positions (D+1, 3): WRF, m. min_distance_target_m (N,) or, for each stage, (N, D+1);
     min_distance_chasers_m: one float or a symmetric (N, N), diagonal ignored; 0 switches a constraint off.
     input_max (N, 6): N and N m, body axes; may change from tick to tick.
     corridors (N, D+1, 5) or None: an approach corridor of a chaser at a stage: a cone about an axis through the
     target, [axis (3; WRF, unit, from the target outwards; zero: no corridor), half angle (rad, above 0 and below
-    pi/2), distance of the apex from the target's centre along the axis (m; may be negative)]. It comes beside the
-    keep-out ball, whose distance a docking chaser is given smaller, or 0.
+    pi/2), distance of the apex from the target's centre along the axis (m; may be negative)]. It applies in addition to
+    the keep-out ball, which is smaller or 0 for a docking chaser.
     """
 
     states: Array
@@ -116,14 +128,14 @@ class NmpcInput:
 
 @dataclass(frozen=True)
 class NmpcPlan:
-    """Answer for N chasers, rows in the order of the input.
+    """Solution for N chasers, rows in the order of the input.
 
     inputs (N, D, 6): N and N m, body axes, within ``input_max``. states (N, D+1, 13): those inputs through
-    the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point reached in the solver's own limit);
-    "budget" (best point reached in what was allowed, whether it keeps its distances or not: see ``max_violation_m``);
-    "infeasible_relaxed" (the plan enters a keep-out zone, ``max_violation_m`` deep: no input avoids it,
-    or the start lies inside); "failed" (numerical breakdown: the inputs are then the shifted previous plan).
-    iterations (N,): interior-point iterations, 0 if none was needed. cost (N,): eq. 6 on ``states``.
+    the nonlinear model. status per chaser: "solved"; "iteration_limit" (best point within the solver's limit);
+    "budget" (best point within the iteration budget, which may violate distances: see ``max_violation_m``);
+    "infeasible_relaxed" (the plan enters a keep-out zone by ``max_violation_m``: no input avoids it, or the start lies
+    inside); "failed" (numerical breakdown: the inputs are the shifted previous plan).
+    iterations (N,): interior-point iterations, 0 if none is needed. cost (N,): eq. 6 on ``states``.
     """
 
     inputs: Array
@@ -135,7 +147,7 @@ class NmpcPlan:
 
 
 class NmpcSolver(Protocol):
-    """What every back end offers."""
+    """Interface of the back ends."""
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan: ...
 

@@ -21,14 +21,14 @@ typedef double row12[12];
 
 static inline v4 load(const double *a) { return *(const v4 *)a; }
 static inline void store(double *a, v4 v) { *(v4 *)a = v; }
-static inline v4 all(double s) { return (v4){s, s, s, s}; }
+static inline v4 splat(double s) { return (v4){s, s, s, s}; }
 static inline v4 madd4(v4 a, v4 b, v4 c) { return a * b + c; }
 static inline double madd(double a, double b, double c) { return a * b + c; }
-static inline double root(double a) { return __builtin_sqrt(a); }
-static inline double least(double a, double b) { return a < b ? a : b; }
-static inline double most(double a, double b) { return a > b ? a : b; }
-static inline double size_of(double a) { return __builtin_fabs(a); }
-static inline int finite(double a) { return size_of(a) <= 1.7976931348623157e308; }
+static inline double sqrt_of(double a) { return __builtin_sqrt(a); }
+static inline double min_of(double a, double b) { return a < b ? a : b; }
+static inline double max_of(double a, double b) { return a > b ? a : b; }
+static inline double abs_of(double a) { return __builtin_fabs(a); }
+static inline int finite(double a) { return abs_of(a) <= 1.7976931348623157e308; }
 
 static inline void zero(double *a, int64_t n) {
     for (int64_t i = 0; i < n; i++) a[i] = 0.0;
@@ -44,7 +44,7 @@ static inline double dot12(const double *a, const double *b) {
 }
 
 static inline double dot3(const double *a, const double *b) { return madd(a[2], b[2], madd(a[1], b[1], a[0] * b[0])); }
-static inline void minus3(const double *a, const double *b, double *out) {
+static inline void subtract3(const double *a, const double *b, double *out) {
     for (int i = 0; i < 3; i++) out[i] = a[i] - b[i];
 }
 static inline void cross3(const double *a, const double *b, double *out) {
@@ -54,19 +54,19 @@ static inline void cross3(const double *a, const double *b, double *out) {
     }
 }
 /* out = M v, M (3, 3). */
-static inline void times3(const double *m, const double *v, double *out) {
+static inline void multiply3(const double *m, const double *v, double *out) {
     for (int i = 0; i < 3; i++) out[i] = dot3(m + 3 * i, v);
 }
 /* Normalize v in place and return its length; below 1e-9 leave it unchanged and return 0. */
 static inline double normalize3(double *v) {
-    double length = root(dot3(v, v));
+    double length = sqrt_of(dot3(v, v));
     if (length < 1e-9) return 0.0;
     for (int i = 0; i < 3; i++) v[i] /= length;
     return length;
 }
 
 /* Allocate from the caller's working memory in pieces of whole cache lines. */
-static inline double *take(double **work, int64_t count) {
+static inline double *allocate(double **work, int64_t count) {
     double *piece = *work;
     *work += (count + 7) / 8 * 8;
     return piece;

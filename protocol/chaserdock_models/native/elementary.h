@@ -47,8 +47,8 @@ static inline int solve_rows(double *a, double *b, int n) {
     for (int j = 0; j < n; j++) {
         int p = j;
         for (int i = j + 1; i < n; i++)
-            if (size_of(a[i * n + j]) > size_of(a[p * n + j])) p = i;
-        if (!(size_of(a[p * n + j]) > 0.0)) return 0;
+            if (abs_of(a[i * n + j]) > abs_of(a[p * n + j])) p = i;
+        if (!(abs_of(a[p * n + j]) > 0.0)) return 0;
         if (p != j) {
             for (int k = j; k < n; k++) {
                 double swap = a[j * n + k];

@@ -5,9 +5,9 @@
 static void derivative(const double *q, const double *w, const double *inertia, const double *inverse, double *dq,
                        double *dw) {
     double momentum[3], torque[3], cross[3];
-    times3(inertia, w, momentum);
+    multiply3(inertia, w, momentum);
     cross3(momentum, w, torque);
-    times3(inverse, torque, dw);
+    multiply3(inverse, torque, dw);
     dq[0] = -0.5 * dot3(q + 1, w);
     cross3(q + 1, w, cross);
     for (int i = 0; i < 3; i++) dq[1 + i] = 0.5 * madd(q[0], w[i], cross[i]);
@@ -31,7 +31,7 @@ EXPORT void NAME(free_rotation)(const double *q, const double *omega, const doub
         copy(k[0] + 4, accelerations + 3 * i, 3);
         for (int n = 0; n < 7; n++)
             y[n] = madd(h / 6.0, (k[0][n] + k[3][n]) + 2.0 * (k[1][n] + k[2][n]), y[n]);
-        double f = 1.0 / root((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
+        double f = 1.0 / sqrt_of((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
         for (int n = 0; n < 4; n++) y[n] *= f;
     }
 }

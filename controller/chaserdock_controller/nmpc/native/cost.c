@@ -1,8 +1,8 @@
-/* The cost of the paper's eq. 6: its quadratic model about a rollout, and its value along a plan. */
+/* Cost of the paper's eq. 6: quadratic model about a rollout, and value along a plan. */
 #include "base.h"
 
 /* An attitude error beyond 150 degrees is treated as one of this angle about the same axis: the gradient of
- * sin^2(angle / 2) vanishes at 180 degrees, where nothing would move. Cosine and sine of 75 degrees. */
+ * sin^2(angle / 2) vanishes at 180 degrees, where the cost would not act. Cosine and sine of 75 degrees. */
 #define ETA_MIN 0.25881904510252074
 #define EPS_MAX 0.9659258262890683
 
@@ -26,9 +26,9 @@ static void attitude_model(const double *q, const double *q_ref, double weight, 
     double e[4];
     attitude_error(q, q_ref, e);
     double eta = e[0], f = 1.0;
-    if (size_of(eta) < ETA_MIN) {
+    if (abs_of(eta) < ETA_MIN) {
         eta = eta >= 0.0 ? ETA_MIN : -ETA_MIN;
-        f = EPS_MAX / root(dot3(e + 1, e + 1));
+        f = EPS_MAX / sqrt_of(dot3(e + 1, e + 1));
     }
     for (int i = 1; i < 4; i++) e[i] *= f;
     for (int i = 0; i < 3; i++) {
@@ -38,8 +38,8 @@ static void attitude_model(const double *q, const double *q_ref, double weight, 
     }
 }
 
-/* Cost of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled inputs w = u / limits.
- * Writes q_pos and q_att (D+1, 3, 3), qx (D+1, 12), r_diag, r and w_bar (D, 6). */
+/* Quadratic cost model of one chaser about x (D+1, 13), u (D, 6), in dp, dtheta and scaled inputs w = u / limits.
+ * Write q_pos and q_att (D+1, 3, 3), qx (D+1, 12), r_diag, r and w_bar (D, 6). */
 EXPORT void NAME(quadratic_model)(const Weights *weights, const double *x, const double *u, const double *refs,
                              const double *u_ref, const double *limits, double *q_pos, double *q_att, double *qx,
                              double *r_diag, double *r, double *w_bar) {
@@ -56,7 +56,7 @@ EXPORT void NAME(quadratic_model)(const Weights *weights, const double *x, const
     for (int c = 0; c < 6; c++) {
         const double top = limits[c], slope = 2.0 * weights->input[c] * top;
         for (int64_t i = c; i < 6 * weights->stages; i += 6) {
-            /* an axis without authority: its column of B is zero, it stays at zero */
+            /* an axis without authority has a zero column of B and stays at zero */
             w_bar[i] = top > 0.0 ? u[i] / top : 0.0;
             r_diag[i] = top > 0.0 ? slope * top : 1.0;
             r[i] = slope * (u[i] - u_ref[i]);
@@ -64,15 +64,15 @@ EXPORT void NAME(quadratic_model)(const Weights *weights, const double *x, const
     }
 }
 
-/* Writes eq. 6 for every chaser: cost (N,) of x (N, D+1, 13), u (N, D, 6). */
+/* Write the cost (eq. 6) of every chaser: cost (N,) of x (N, D+1, 13), u (N, D, 6). */
 EXPORT void NAME(plan_cost)(const Weights *weights, int64_t n, const double *x, const double *u, const double *refs,
                        const double *u_ref, double *cost) {
     for (int64_t i = 0; i < n; i++) {
         double total = 0.0, e[4], away[3];
         for (int64_t k = 0; k <= weights->stages; k++, x += 13, refs += 7) {
-            /* |vec(q (x) q_ref*)| = |vec(q_ref* (x) q)|: the one is the other, turned */
+            /* |vec(q (x) q_ref*)| = |vec(q_ref* (x) q)|: the vectors differ by a rotation */
             attitude_error(x + 6, refs + 3, e);
-            minus3(x, refs, away);
+            subtract3(x, refs, away);
             total = madd(weights->position[k], dot3(away, away), total);
             total = madd(weights->orientation[k], dot3(e + 1, e + 1), total);
         }

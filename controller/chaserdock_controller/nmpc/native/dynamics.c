@@ -1,4 +1,7 @@
-/* The chaser's discrete dynamics and their Jacobians. Held against `problem.dynamics` by the tests.
+/* Discrete dynamics of a chaser and their Jacobians; the tests compare them with `problem.dynamics`.
+ *
+ * The Jacobians share intermediate results with the step itself, so the NMPC has its own integrator beside
+ * chaserdock_models.rigid_body.
  *
  * State x (13) = [p, v (WRF), q_wxyz (body to world), omega (body)], input u (6) = [force, torque] (body axes).
  * Jacobians are taken in the tangent space [dp, dv, dtheta, domega] with q_true = q (x) exp(dtheta): A is 12 x 12 and
@@ -7,7 +10,7 @@
  */
 #include "base.h"
 
-/* Rates at y (7) = [q, omega]: q', omega', acceleration (WRF), and on the way R(q) / m (9) and I omega (3). */
+/* Rates at y (7) = [q, omega]: q', omega', acceleration (WRF), and the intermediate R(q) / m (9) and I omega (3). */
 typedef struct {
     double q[4], omega[3], a[3], turn[9], momentum[3];
 } Rates;
@@ -27,20 +30,20 @@ static inline void rates(const Model *model, const double *y, const double *u, R
     double turning[3], torque[3];
     cross3(y + 1, o, turning);
     for (int i = 0; i < 3; i++) k->q[1 + i] = 0.5 * madd(w, o[i], turning[i]);
-    times3(k->turn, u, k->a);
-    times3(model->inertia, o, k->momentum);
+    multiply3(k->turn, u, k->a);
+    multiply3(model->inertia, o, k->momentum);
     cross3(o, k->momentum, torque);
     for (int i = 0; i < 3; i++) torque[i] = u[3 + i] - torque[i];
-    times3(model->inverse, torque, k->omega);
+    multiply3(model->inverse, torque, k->omega);
 }
 
 static inline double normalize_quaternion(double *q) {
-    double length = root((q[0] * q[0] + q[2] * q[2]) + (q[1] * q[1] + q[3] * q[3])), f = 1.0 / length;
+    double length = sqrt_of((q[0] * q[0] + q[2] * q[2]) + (q[1] * q[1] + q[3] * q[3])), f = 1.0 / length;
     for (int i = 0; i < 4; i++) q[i] *= f;
     return length;
 }
 
-/* One part of the step: rates at x + c k (k: the part before, unused where c is 0), added with weight b to out. */
+/* One Runge-Kutta part: rates at x + c k (k: the previous part, unused if c is 0), added with weight b to out. */
 static inline void part(const Model *model, const double *x, const double *u, double b, double c, double *y, Rates *k,
                         double *out) {
     for (int i = 0; i < 3; i++) out[i] = madd(b, madd(c, k->a[i], x[3 + i]), out[i]);
@@ -67,12 +70,12 @@ typedef struct {
 } Row;
 
 static inline void add(Row *out, double f, Row r) {
-    out->a = madd4(all(f), r.a, out->a);
-    out->b = madd4(all(f), r.b, out->b);
+    out->a = madd4(splat(f), r.a, out->a);
+    out->b = madd4(splat(f), r.b, out->b);
 }
 static inline double entry(const Row *r, int i) { return i < 4 ? r->a[i] : r->b[i - 4]; }
 
-/* d[q', omega', a] by [omega, torque] at y, whose own sensitivities are `here` (7); torque (3): I^-1 in its columns.
+/* d[q', omega', a] by [omega, torque] at y, whose sensitivities are `here` (7); torque (3): I^-1 in its columns.
  *
  * q' = 1/2 q (0, omega); omega' = I^-1 (tau - omega x I omega); a = (1 - |q|^2) F / m + q F q* / m, so that
  * m da = 2 [ s dv x F + (v . F) dv + v (F . dv) - 2 F (v . dv) + ds v x F ] for q = (s, v).
@@ -115,8 +118,8 @@ static inline void rate_rows(const Model *model, const double *y, const double *
 
 /* One step as in `step`, with its Jacobians m_mat = [C B] (12, 12); B by inputs in shares of `limits` (6).
  *
- * What turns with the body at the start needs no sensitivities: q' = 1/2 q (0, omega) commutes with a turn from the
- * left, so dtheta goes on as R(q_0* q_1)' dtheta, and the accelerations' part q F q* turns as a whole.
+ * The initial attitude needs no sensitivities: q' = 1/2 q (0, omega) commutes with a rotation from the left, so dtheta
+ * propagates as R(q_0* q_1)' dtheta, and the acceleration q F q* rotates as a whole.
  */
 static void linearize(const Model *model, const double *x, const double *u, const double *limits, double *out,
                       double *m_mat) {
@@ -142,7 +145,7 @@ static void linearize(const Model *model, const double *x, const double *u, cons
         for (int i = 0; i < 3; i++) {
             add(&sum[i], bc, rate[7 + i]);
         }
-        /* the force's own columns and the part that turns, of the part before into p ... */
+        /* the columns of the force and the rotating acceleration: of the previous part into p ... */
         if (s > 0) {
             double excess = 1.0 - ((y[0] * y[0] + y[2] * y[2]) + (y[1] * y[1] + y[3] * y[3]));
             for (int i = 0; i < 9; i++) force_p[i] = madd(bc, k.turn[i], force_p[i]);
@@ -217,7 +220,7 @@ EXPORT void NAME(roll)(const Model *model, int64_t n, int64_t stages, const doub
         }
 }
 
-/* The same with mats (N, D, 12, 12) = [C B] along the way; B that of the inputs as shares of limits (N, 6). */
+/* Roll out and linearize: mats (N, D, 12, 12) = [C B], B for inputs scaled by limits (N, 6). */
 EXPORT void NAME(roll_linearized)(const Model *model, int64_t n, int64_t stages, const double *u, const double *limits,
                              double *x, double *mats) {
     for (int64_t i = 0; i < n; i++)

@@ -6,11 +6,11 @@
  * block of Q_k and the sparsity of the Riccati sweep stays.
  * Method: S. Mehrotra, SIAM J. Optim. 2 (1992); Nocedal and Wright, "Numerical Optimization", sec. 16.6.
  *
- * Everything that must stay positive lies in one flat vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6 D); its
+ * All positive quantities are stored in one vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6 D); its
  * multipliers, in that order, in mul: lam, pi, and those of the box.
  *
- * Most rows are far from the chaser. Only those that it comes near take part; an answer that meets the others too is
- * the answer to the whole, and one that does not is found again with those that it came near.
+ * Most rows are far from the chaser. Only near rows are active. A solution that satisfies the others as well solves the
+ * whole problem; otherwise the problem is solved again with the rows it came near.
  */
 #include "base.h"
 
@@ -22,11 +22,11 @@
 /* Stationarity at which to stop, relative to the gradient at the start. */
 #define GRADIENT_STOP 1e-6
 #define STEP_TO_BOUNDARY 0.995
-/* Rows and bounds of the plain linear-quadratic solution may be missed by this much (m, or share of a limit). */
+/* Tolerance for rows and bounds of the unconstrained solution (m, or fraction of a limit). */
 #define FREE_TOLERANCE 1e-9
-/* Inputs at the start keep this far within the box. */
+/* Initial inputs are limited to this fraction of the box. */
 #define START_WITHIN 0.9
-/* Rows with less room than this take part, m. */
+/* Rows with less margin than this are active, m. */
 #define NEAR_M 0.1
 
 enum { FREE, CONVERGED, LIMIT, BROKEN };
@@ -47,7 +47,7 @@ typedef struct {
     int64_t iterations;
 } Answer;
 
-/* The rows that take part, and what an iteration works on. */
+/* The active rows, and the working vectors of an iteration. */
 typedef struct {
     int64_t count, n, *stage, *index;
     double *a, *c;
@@ -63,21 +63,21 @@ static int64_t ipm_workspace(int64_t d, int64_t rows) {
     return 20 * 8 + 6 * count + 6 * rows + 3 * x + 5 * w + 9 * (d + 1) + d * (int64_t)(sizeof(Factor) / 8);
 }
 
-static Iterate laid_out(int64_t d, int64_t rows, double *work) {
+static Iterate lay_out(int64_t d, int64_t rows, double *work) {
     int64_t count = padded(2 * rows + 12 * d), x = 12 * (d + 1), w = 6 * d;
     Iterate it = {0};
-    it.factors = (Factor *)take(&work, d * (int64_t)(sizeof(Factor) / 8));
+    it.factors = (Factor *)allocate(&work, d * (int64_t)(sizeof(Factor) / 8));
     double **vectors[] = {&it.val, &it.mul, &it.d_val, &it.d_mul, &it.res, &it.inverse};
-    for (int i = 0; i < 6; i++) *vectors[i] = take(&work, count);
+    for (int i = 0; i < 6; i++) *vectors[i] = allocate(&work, count);
     double **inputs[] = {&it.w, &it.gw, &it.grad_w, &it.step_w, &it.r_eff};
-    for (int i = 0; i < 5; i++) *inputs[i] = take(&work, w);
+    for (int i = 0; i < 5; i++) *inputs[i] = allocate(&work, w);
     double **states[] = {&it.gx, &it.grad_x, &it.step_x};
-    for (int i = 0; i < 3; i++) *states[i] = take(&work, x);
-    it.q_eff = take(&work, 9 * (d + 1));
-    it.a = take(&work, 3 * rows);
-    it.c = take(&work, rows);
-    it.stage = (int64_t *)take(&work, rows);
-    it.index = (int64_t *)take(&work, rows);
+    for (int i = 0; i < 3; i++) *states[i] = allocate(&work, x);
+    it.q_eff = allocate(&work, 9 * (d + 1));
+    it.a = allocate(&work, 3 * rows);
+    it.c = allocate(&work, rows);
+    it.stage = (int64_t *)allocate(&work, rows);
+    it.index = (int64_t *)allocate(&work, rows);
     return it;
 }
 
@@ -92,30 +92,30 @@ static void gradients(const Qp *qp, const double *dx, const double *dw, double *
     for (int64_t i = 0; i < 6 * qp->stages; i++) gw[i] = madd(qp->r_diag[i], dw[i], qp->r[i]);
 }
 
-/* Room of a row: a' dp - c. */
-static inline double room(const double *dx, int64_t stage, const double *a, double c) {
+/* Margin of a row: a' dp - c. */
+static inline double row_margin(const double *dx, int64_t stage, const double *a, double c) {
     return dot3(a, dx + 12 * stage) - c;
 }
 
-/* Adds force along a row's normal to the gradient gx. */
-static inline void pull(double *gx, int64_t stage, const double *a, double force) {
+/* Add force along a row's normal to the gradient gx. */
+static inline void add_row_force(double *gx, int64_t stage, const double *a, double force) {
     for (int i = 0; i < 3; i++) gx[12 * stage + i] = madd(force, a[i], gx[12 * stage + i]);
 }
 
 static int is_free(const Qp *qp, const double *dx, const double *w) {
     for (int64_t i = 0; i < 6 * qp->stages; i++)
-        if (!(size_of(w[i]) <= 1.0 + FREE_TOLERANCE)) return 0;
+        if (!(abs_of(w[i]) <= 1.0 + FREE_TOLERANCE)) return 0;
     for (int64_t j = 0; j < qp->n_rows; j++)
-        if (!(room(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= -FREE_TOLERANCE)) return 0;
+        if (!(row_margin(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= -FREE_TOLERANCE)) return 0;
     return 1;
 }
 
-/* Lets the rows take part that dx (D+1, 12) comes near, and those that did already. `here` marks each (R,). */
-static void gather(const Qp *qp, const double *dx, double *here, Iterate *it) {
+/* Activate the rows that dx (D+1, 12) comes near, in addition to the active ones. `active` marks each (R,). */
+static void activate_rows(const Qp *qp, const double *dx, double *active, Iterate *it) {
     it->n = 0;
     for (int64_t j = 0; j < qp->n_rows; j++) {
-        if (!(room(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= NEAR_M)) here[j] = 1.0;
-        if (here[j] == 0.0) continue;
+        if (!(row_margin(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= NEAR_M)) active[j] = 1.0;
+        if (active[j] == 0.0) continue;
         copy(qp->a + 3 * j, it->a + 3 * it->n, 3);
         it->c[it->n] = qp->c[j];
         it->stage[it->n] = qp->stage[j];
@@ -124,10 +124,10 @@ static void gather(const Qp *qp, const double *dx, double *here, Iterate *it) {
     it->count = 2 * it->n + 12 * qp->stages;
 }
 
-/* Whether a row that does not take part is missed. */
-static int missed(const Qp *qp, const double *dx, const double *here) {
+/* Test whether dx violates an inactive row. */
+static int violates_inactive(const Qp *qp, const double *dx, const double *active) {
     for (int64_t j = 0; j < qp->n_rows; j++)
-        if (here[j] == 0.0 && !(room(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= 0.0)) return 1;
+        if (active[j] == 0.0 && !(row_margin(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= 0.0)) return 1;
     return 0;
 }
 
@@ -137,29 +137,29 @@ static inline void curvature(const Iterate *it, int64_t j, double w2, double *d,
     *e = madd(it->mul[it->n + j], it->inverse[it->n + j], w2);
 }
 
-/* The start: the inputs kept a little inside the box, with centred slacks and multipliers. Returns the scale of the
+/* Set the starting point: inputs inside the box, with centred slacks and multipliers. Return the scale of the
  * gradient there. */
-static double begin(const Qp *qp, Answer *answer, Iterate *it) {
+static double set_start(const Qp *qp, Answer *answer, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     for (int64_t i = 0; i < inputs; i++) {
-        it->w[i] = least(most(it->w[i], -START_WITHIN), START_WITHIN);
+        it->w[i] = min_of(max_of(it->w[i], -START_WITHIN), START_WITHIN);
         answer->dw[i] = it->w[i] - qp->w_bar[i];
         it->val[bottom + i] = 1.0 + it->w[i];
         it->val[top + i] = 1.0 - it->w[i];
     }
     advance(qp->stages, qp->mats, qp->h, answer->dx, answer->dw);
     gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
-    double scale = most(1.0, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
-    /* Rows missed at the start pull with their full price; a complementarity much below that pull starts the search
-     * next to the boundary, where steps are short (27 to 40 iterations instead of 12). */
+    double scale = max_of(1.0, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
+    /* Rows violated at the start contribute their full slack weight; a much smaller initial complementarity would start
+     * close to the boundary, where steps are short (27 to 40 iterations instead of 12). */
     for (int64_t j = 0; j < it->n; j++)
-        if (room(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]) < 0.0) pull(it->gx, it->stage[j], it->a + 3 * j, -qp->w1);
-    double slope = most(scale, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
-    double mu = least(most(MU_START * slope, MU_START), MU_START_MAX);
+        if (row_margin(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]) < 0.0) add_row_force(it->gx, it->stage[j], it->a + 3 * j, -qp->w1);
+    double slope = max_of(scale, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
+    double mu = min_of(max_of(MU_START * slope, MU_START), MU_START_MAX);
     for (int64_t j = 0; j < it->n; j++) {
-        double g = room(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]);
-        double price = qp->w1 + qp->w2 * most(-g, 0.0), t = price * g;
-        double s = (2.0 * mu + (root(t * t + 4.0 * mu * mu) - t)) / (2.0 * price);
+        double g = row_margin(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]);
+        double price = qp->w1 + qp->w2 * max_of(-g, 0.0), t = price * g;
+        double s = (2.0 * mu + (sqrt_of(t * t + 4.0 * mu * mu) - t)) / (2.0 * price);
         it->val[j] = g + s;
         it->val[it->n + j] = s;
         it->mul[j] = mu / it->val[j];
@@ -167,7 +167,7 @@ static double begin(const Qp *qp, Answer *answer, Iterate *it) {
     }
     for (int64_t j = bottom; j < it->count; j++) it->mul[j] = mu / it->val[j];
     for (int64_t j = it->count; j < padded(it->count); j++) {
-        it->val[j] = 1.0; /* fills the last vector: a value that never limits a step */
+        it->val[j] = 1.0; /* padding: never limits a step */
         it->mul[j] = it->d_val[j] = it->d_mul[j] = it->res[j] = 0.0;
     }
     return scale;
@@ -175,9 +175,9 @@ static double begin(const Qp *qp, Answer *answer, Iterate *it) {
 
 static inline double sum4(v4 s) { return (s[0] + s[2]) + (s[1] + s[3]); }
 
-/* res = val mul, element by element; returns the mean. */
+/* res = val mul, element by element; return the mean. */
 static double complementarity(const Iterate *it) {
-    v4 sum = all(0.0);
+    v4 sum = splat(0.0);
     for (int64_t j = 0; j < it->count; j += 4) {
         v4 product = load(it->val + j) * load(it->mul + j);
         store(it->res + j, product);
@@ -186,7 +186,7 @@ static double complementarity(const Iterate *it) {
     return sum4(sum) / (double)it->count;
 }
 
-/* The Newton system of the present point, factored: curvatures of rows and box added to the cost's. */
+/* Factor the Newton system: curvatures of rows and box added to those of the cost. */
 static int factor_newton(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     copy(qp->q_pos, it->q_eff, 9 * (qp->stages + 1));
@@ -203,14 +203,14 @@ static int factor_newton(const Qp *qp, Iterate *it) {
     return factor(qp->stages, qp->mats, qp->h, it->q_eff, qp->q_att, it->r_eff, it->factors);
 }
 
-/* The step that takes the products val mul down by res, and the longest share of it that keeps all positive. */
+/* Compute the step that reduces the products val mul by res; return the largest fraction that keeps all positive. */
 static double newton_step(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     copy(it->gx, it->grad_x, 12 * (qp->stages + 1));
     for (int64_t j = 0; j < it->n; j++) {
         double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
         curvature(it, j, qp->w2, &d, &e);
-        pull(it->grad_x, it->stage[j], it->a + 3 * j, rz - d * (rs + rz) / (d + e));
+        add_row_force(it->grad_x, it->stage[j], it->a + 3 * j, rz - d * (rs + rz) / (d + e));
     }
     for (int64_t i = 0; i < inputs; i++)
         it->grad_w[i] = it->gw[i] + (it->res[bottom + i] * it->inverse[bottom + i] - it->res[top + i] * it->inverse[top + i]);
@@ -226,35 +226,35 @@ static double newton_step(const Qp *qp, Iterate *it) {
         it->d_val[bottom + i] = it->step_w[i];
         it->d_val[top + i] = -it->step_w[i];
     }
-    v4 steepest = all(0.0);
+    v4 steepest = splat(0.0);
     for (int64_t j = 0; j < it->count; j += 4) {
         v4 inverse = load(it->inverse + j), change = load(it->d_val + j), mul = load(it->mul + j);
         v4 change_mul = -(madd4(mul, change, load(it->res + j))) * inverse;
         store(it->d_mul + j, change_mul);
-        /* the spare places of the last vector hold a multiplier of zero */
-        v4 of_mul = -change_mul / __builtin_elementwise_max(mul, all(1e-300));
+        /* the padding has a multiplier of zero */
+        v4 of_mul = -change_mul / __builtin_elementwise_max(mul, splat(1e-300));
         steepest = __builtin_elementwise_max(steepest, __builtin_elementwise_max(-change * inverse, of_mul));
     }
-    return 1.0 / most(most(steepest[0], steepest[1]), most(steepest[2], steepest[3]));
+    return 1.0 / max_of(max_of(steepest[0], steepest[1]), max_of(steepest[2], steepest[3]));
 }
 
-/* Mean complementarity after a share alpha of the step. */
+/* Mean complementarity after a fraction alpha of the step. */
 static double after_step(const Iterate *it, double alpha) {
-    v4 sum = all(0.0);
+    v4 sum = splat(0.0);
     for (int64_t j = 0; j < it->count; j += 4)
-        sum += madd4(all(alpha), load(it->d_val + j), load(it->val + j)) * madd4(all(alpha), load(it->d_mul + j), load(it->mul + j));
+        sum += madd4(splat(alpha), load(it->d_val + j), load(it->val + j)) * madd4(splat(alpha), load(it->d_mul + j), load(it->mul + j));
     return sum4(sum) / (double)it->count;
 }
 
-/* Iterates to the solution for the rows that take part; at most `limit` iterations in all. */
+/* Iterate to the solution for the active rows; at most max_iterations in total. */
 static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
-    const double scale = begin(qp, answer, it);
+    const double scale = set_start(qp, answer, it);
     for (;;) {
-        /* complementarity and stationarity of the present point */
+        /* complementarity and stationarity of the current point */
         double mu = complementarity(it);
         gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
-        for (int64_t j = 0; j < it->n; j++) pull(it->gx, it->stage[j], it->a + 3 * j, -it->mul[j]);
+        for (int64_t j = 0; j < it->n; j++) add_row_force(it->gx, it->stage[j], it->a + 3 * j, -it->mul[j]);
         for (int64_t i = 0; i < inputs; i++) it->gw[i] += it->mul[top + i] - it->mul[bottom + i];
         answer->mu = mu;
         answer->residual = reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w) / scale;
@@ -263,13 +263,13 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
         if (answer->iterations >= qp->max_iterations) return LIMIT;
         answer->iterations++;
 
-        for (int64_t j = 0; j < it->count; j += 4) store(it->inverse + j, all(1.0) / load(it->val + j));
+        for (int64_t j = 0; j < it->count; j += 4) store(it->inverse + j, splat(1.0) / load(it->val + j));
         if (!factor_newton(qp, it)) return BROKEN;
-        double after = after_step(it, least(1.0, newton_step(qp, it)));
-        /* Never far below the stopping point: smaller gains nothing and spoils the conditioning. */
-        double centre = most(after * after * after / (mu * mu), 0.1 * MU_STOP);
+        double after = after_step(it, min_of(1.0, newton_step(qp, it)));
+        /* Not far below the stopping point: a smaller value degrades the conditioning. */
+        double centre = max_of(after * after * after / (mu * mu), 0.1 * MU_STOP);
         for (int64_t j = 0; j < it->count; j++) it->res[j] += it->d_val[j] * it->d_mul[j] - centre;
-        double alpha = least(1.0, STEP_TO_BOUNDARY * newton_step(qp, it));
+        double alpha = min_of(1.0, STEP_TO_BOUNDARY * newton_step(qp, it));
 
         for (int64_t j = 0; j < it->count; j++) {
             it->val[j] = madd(alpha, it->d_val[j], it->val[j]);
@@ -280,8 +280,8 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
     }
 }
 
-/* Multipliers of all rows: one that did not take part has lam = 0 and pi = w1. */
-static void spread(const Qp *qp, const Iterate *it, double *mul) {
+/* Multipliers of all rows; an inactive one has lam = 0 and pi = w1. */
+static void expand_multipliers(const Qp *qp, const Iterate *it, double *mul) {
     for (int64_t j = 0; j < qp->n_rows; j++) {
         mul[j] = 0.0;
         mul[qp->n_rows + j] = qp->w1;
@@ -293,13 +293,13 @@ static void spread(const Qp *qp, const Iterate *it, double *mul) {
     copy(it->mul + 2 * it->n, mul + 2 * qp->n_rows, 12 * qp->stages);
 }
 
-/* |w_bar + dw| <= 1 always holds, but for FREE, where it does within FREE_TOLERANCE. With CONVERGED and LIMIT the point
- * lies strictly within the box; with LIMIT it is the best reached in max_iterations. Working memory: `ipm_workspace`
+/* |w_bar + dw| <= 1 always holds, for FREE within FREE_TOLERANCE. With CONVERGED and LIMIT the point
+ * lies strictly within the box; with LIMIT it is the best of max_iterations. Working memory: `ipm_workspace`
  * doubles, and R more. */
 static int solve_one(const Qp *qp, Answer *answer, double *work) {
     const int64_t inputs = 6 * qp->stages;
-    double *here = take(&work, qp->n_rows);
-    Iterate it = laid_out(qp->stages, qp->n_rows, work);
+    double *active = allocate(&work, qp->n_rows);
+    Iterate it = lay_out(qp->stages, qp->n_rows, work);
     answer->iterations = 0;
     answer->residual = answer->mu = 0.0;
     if (!factor(qp->stages, qp->mats, qp->h, qp->q_pos, qp->q_att, qp->r_diag, it.factors)) return BROKEN;
@@ -309,14 +309,14 @@ static int solve_one(const Qp *qp, Answer *answer, double *work) {
         zero(answer->mul, 2 * qp->n_rows + 2 * inputs);
         return FREE;
     }
-    /* near at the rollout itself, or where the cost alone would go */
-    zero(here, qp->n_rows);
-    for (int64_t j = 0; j < qp->n_rows; j++) here[j] = -qp->c[j] < NEAR_M ? 1.0 : 0.0;
+    /* near the rollout or the unconstrained solution */
+    zero(active, qp->n_rows);
+    for (int64_t j = 0; j < qp->n_rows; j++) active[j] = -qp->c[j] < NEAR_M ? 1.0 : 0.0;
     for (;;) {
-        gather(qp, answer->dx, here, &it);
+        activate_rows(qp, answer->dx, active, &it);
         int code = iterate(qp, answer, &it);
-        spread(qp, &it, answer->mul);
-        if (code != CONVERGED || !missed(qp, answer->dx, here)) return code;
+        expand_multipliers(qp, &it, answer->mul);
+        if (code != CONVERGED || !violates_inactive(qp, answer->dx, active)) return code;
         for (int64_t i = 0; i < inputs; i++) it.w[i] = qp->w_bar[i] + answer->dw[i];
     }
 }

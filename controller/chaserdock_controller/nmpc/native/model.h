@@ -3,7 +3,7 @@
 
 #include "base.h"
 
-/* What `NmpcParameters` says of the body and the discretization; the Runge-Kutta tableau has one sub-diagonal. */
+/* Body and discretization from `NmpcParameters`; the Runge-Kutta tableau has one subdiagonal. */
 typedef struct {
     double step_s, mass_kg, per_mass, inertia[9], inverse[9], nodes[4], weights[4];
     int64_t parts;

@@ -7,24 +7,24 @@
  */
 #include "base.h"
 
-/* Linearization gave away 2 mm of a distance; the plan keeps this much more. */
+/* Linearization can lose 2 mm of a distance; additional margin of the plan. */
 #define MARGIN_M 5e-3
-/* A chaser heading for the centre within 10 degrees has no side to pass on; the normal is tilted by TILT. */
+/* For a chaser heading for the centre within 10 degrees the passing side is undetermined; the normal is tilted by TILT. */
 #define COS_HEAD_ON 0.984807753012208
 #define TILT 0.2
-/* Deeper than this share of the distance the rollout counts as inside and the last normal is kept, so that a rollout
- * which crosses does not come out with the normal of the far side. */
+/* Closer than this fraction of the distance the rollout counts as inside and the last normal is kept, so that a crossing
+ * rollout does not get the normal of the far side. */
 #define INSIDE 0.8
-/* A tilted normal sees 1 / sqrt(1 + TILT^2) of the gap: what `out_of_reach` allows for, and a little more. */
+/* A tilted normal sees 1 / sqrt(1 + TILT^2) of the gap: bound for `out_of_reach`, with a small margin. */
 #define TILTED_SHARE 0.98
 
 typedef struct {
     int64_t n, stages;
-    const double *references, *targets, *to_target, *between, *corridors; /* as in `NmpcInput`, all written out */
+    const double *references, *targets, *to_target, *between, *corridors; /* as in `NmpcInput`, all expanded */
     double outer;
 } Zones;
 
-/* The rows of all chasers, `width` places each; reach (N, D+1): how far admissible inputs can move a chaser from its
+/* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can move a chaser from its
  * rollout by each stage, m. */
 typedef struct {
     int64_t width, nodes;
@@ -33,12 +33,12 @@ typedef struct {
     double *a, *c;
 } Rows;
 
-/* Turns the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane. The side is n x e,
- * e the axis that n has least of. */
+/* Tilt the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane. The side is n x e,
+ * e the axis with the smallest component of n. */
 static void tilt(double *n) {
     int i = 0;
     for (int c = 1; c < 3; c++)
-        if (size_of(n[c]) < size_of(n[i])) i = c;
+        if (abs_of(n[c]) < abs_of(n[i])) i = c;
     int j = (i + 1) % 3, k = (i + 2) % 3;
     double t[3];
     t[i] = 0.0;
@@ -49,7 +49,7 @@ static void tilt(double *n) {
     normalize3(n);
 }
 
-/* Adds the row sign n' dp_k >= -room of chaser i unless no admissible input can use up the room. */
+/* Add the row sign n' dp_k >= -room of chaser i unless no admissible input can reach it. */
 static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n, double sign, double room) {
     if (!(room <= rows->reach[i * rows->nodes + k])) return;
     int64_t m = i * rows->width + rows->n_rows[i]++;
@@ -58,17 +58,17 @@ static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n,
     rows->stage[m] = k;
 }
 
-/* The side at stage 0: where the one is from the other, else where it is to be. */
+/* Set the normal at stage 0: direction of the relative position, else of the relative reference. */
 static void first_side(const double *here, const double *there, const double *ref, const double *ref_there,
                        double *last) {
-    minus3(here, there, last);
+    subtract3(here, there, last);
     if (normalize3(last) > 0.0) return;
-    minus3(ref, ref_there, last);
+    subtract3(ref, ref_there, last);
     if (normalize3(last) == 0.0) last[0] = 1.0;
 }
 
-/* n becomes the normal at a stage; last is that of the stage before, and is updated. `held`: the rollout goes through,
- * and keeps the normal of the side that it came from. The way `want` is normalized, its length returned. */
+/* Compute the normal n of a stage; last is that of the previous stage and is updated. `held`: the rollout crosses the
+ * constraint and keeps the normal of its entry side. The displacement `want` is normalized and its length returned. */
 static double side(double *n, double *want, double d, int *held, double *last, double *gap, double *heading) {
     *gap = normalize3(n);
     double ahead = dot3(n, last);
@@ -83,7 +83,7 @@ static double side(double *n, double *want, double d, int *held, double *last, d
     return length;
 }
 
-/* Distance from the surface of the corridor's cone, m, positive inside; n (3) gets the normal inwards. r (3): position
+/* Distance from the surface of the corridor's cone, m, positive inside; n (3) receives the inward normal. r (3): position
  * from the target; corridor (5): axis (unit), half angle, distance of the apex from the target. */
 static double corridor_room(const double *r, const double *corridor, double *n) {
     double s, c, along = dot3(r, corridor);
@@ -98,15 +98,14 @@ static double corridor_room(const double *r, const double *corridor, double *n) 
     return madd(s, along - corridor[4], -(c * aside));
 }
 
-/* Whether two chasers stay so far apart over the whole rollout that no row of theirs could be reached: then `pair_rows`
- * would add none, and need not be run. */
+/* Test whether two chasers stay so far apart over the whole rollout that no row between them could be reached. */
 static int out_of_reach(const Rows *rows, const double *x, const double *y, const double *reach_x,
                         const double *reach_y, double d) {
     double last[3], now[3];
-    minus3(x, y, last);
+    subtract3(x, y, last);
     for (int64_t k = 1; k < rows->nodes; k++) {
-        minus3(x + 13 * k, y + 13 * k, now);
-        double needed = (d + MARGIN_M + 2.0 * most(reach_x[k], reach_y[k])) / TILTED_SHARE;
+        subtract3(x + 13 * k, y + 13 * k, now);
+        double needed = (d + MARGIN_M + 2.0 * max_of(reach_x[k], reach_y[k])) / TILTED_SHARE;
         if (dot3(now, now) <= needed * needed || dot3(now, last) <= 0.0) return 0;
         copy(now, last, 3);
     }
@@ -122,11 +121,11 @@ static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j
     int held = 0;
     first_side(x, y, here, there, last);
     for (int64_t k = 1; k < nodes; k++) {
-        minus3(x + 13 * k, y + 13 * k, n);
-        minus3(here + 7 * k, there + 7 * k, want);
+        subtract3(x + 13 * k, y + 13 * k, n);
+        subtract3(here + 7 * k, there + 7 * k, want);
         double length = side(n, want, d, &held, last, &gap, &heading);
         if (heading > COS_HEAD_ON && length >= d) tilt(n);
-        minus3(x + 13 * k, y + 13 * k, want);
+        subtract3(x + 13 * k, y + 13 * k, want);
         double room = 0.5 * (dot3(n, want) - d - MARGIN_M);
         push(rows, i, k, n, 1.0, room);
         push(rows, j, k, n, -1.0, room);
@@ -139,11 +138,11 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
     const double *distance = zones->to_target + nodes * i, *target = zones->targets;
     double last[3] = {0}, n[3], want[3], gap, heading;
     for (int64_t k = 1; k < nodes; k++) {
-        minus3(reference + 7 * k, x + 13 * k, n);
+        subtract3(reference + 7 * k, x + 13 * k, n);
         gap = normalize3(n);
         push(rows, i, k, n, 1.0, zones->outer - gap);
         if (dot3(corridor + 5 * k, corridor + 5 * k) > 0.0) {
-            minus3(x + 13 * k, target + 3 * k, want);
+            subtract3(x + 13 * k, target + 3 * k, want);
             double room = corridor_room(want, corridor + 5 * k, n);
             push(rows, i, k, n, 1.0, room);
         }
@@ -153,18 +152,18 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
     for (int64_t k = 1; k < nodes; k++) {
         const double d = distance[k];
         if (!(d > 0.0)) continue;
-        minus3(reference + 7 * k, target + 3 * k, want);
+        subtract3(reference + 7 * k, target + 3 * k, want);
         double away = dot3(want, want);
-        minus3(x + 13 * k, target + 3 * k, n);
-        minus3(reference + 7 * k, x + 13 * k, want);
+        subtract3(x + 13 * k, target + 3 * k, n);
+        subtract3(reference + 7 * k, x + 13 * k, want);
         double length = side(n, want, d, &held, last, &gap, &heading);
         if (heading > COS_HEAD_ON && length > gap && away >= d * d) tilt(n);
-        minus3(x + 13 * k, target + 3 * k, want);
+        subtract3(x + 13 * k, target + 3 * k, want);
         push(rows, i, k, n, 1.0, dot3(n, want) - d - MARGIN_M);
     }
 }
 
-/* Writes the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
+/* Write the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
  * at least D (N + 2). None at stage 0. */
 EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *rows) {
     for (int64_t i = 0; i < zones->n; i++) rows->n_rows[i] = 0;
@@ -176,7 +175,7 @@ EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *ro
     }
 }
 
-/* Writes the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if none. All stages 0..D
+/* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if none. All stages 0..D
  * count, without margin. */
 EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *worst) {
     const int64_t nodes = zones->stages + 1;
@@ -186,18 +185,18 @@ EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *wo
         const double *at = x + 13 * nodes * i;
         for (int64_t k = 0; k < nodes; k++, at += 13) {
             const double *corridor = zones->corridors + 5 * (nodes * i + k);
-            minus3(at, zones->references + 7 * (nodes * i + k), r);
-            worst[i] = most(worst[i], root(dot3(r, r)) - zones->outer);
-            minus3(at, zones->targets + 3 * k, r);
-            if (dot3(corridor, corridor) > 0.0) worst[i] = most(worst[i], -corridor_room(r, corridor, n));
-            worst[i] = most(worst[i], zones->to_target[nodes * i + k] - root(dot3(r, r)));
+            subtract3(at, zones->references + 7 * (nodes * i + k), r);
+            worst[i] = max_of(worst[i], sqrt_of(dot3(r, r)) - zones->outer);
+            subtract3(at, zones->targets + 3 * k, r);
+            if (dot3(corridor, corridor) > 0.0) worst[i] = max_of(worst[i], -corridor_room(r, corridor, n));
+            worst[i] = max_of(worst[i], zones->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
             for (int64_t j = i + 1; j < zones->n; j++) {
                 const double d = zones->between[i * zones->n + j];
-                minus3(at, x + 13 * (nodes * j + k), r);
+                subtract3(at, x + 13 * (nodes * j + k), r);
                 double square = dot3(r, r);
                 if (square >= d * d) continue;
-                worst[i] = most(worst[i], d - root(square));
-                worst[j] = most(worst[j], d - root(square));
+                worst[i] = max_of(worst[i], d - sqrt_of(square));
+                worst[j] = max_of(worst[j], d - sqrt_of(square));
             }
         }
     }

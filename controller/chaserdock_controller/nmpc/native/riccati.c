@@ -9,7 +9,7 @@
  */
 #include "base.h"
 
-/* What `factor` leaves of a stage, with Rt = R + B'PB = L D L': -Rt^-1 B'PA, L (unit lower, row by row), 1 / D. */
+/* Factors of a stage from `factor`, with Rt = R + B'PB = L D L': -Rt^-1 B'PA, L (unit lower, row by row), 1 / D. */
 typedef struct {
     double gain[6][12], low[15], inverse[6], spare[3];
 } Factor;
@@ -20,29 +20,29 @@ typedef struct {
 static inline void gram_rows(const row12 *left, const row12 *right, row12 *out, int first, int width) {
     v4 sum[3][3];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < width; j++) sum[i][j] = all(left[0][first + i]) * load(right[0] + 4 * j);
+        for (int j = 0; j < width; j++) sum[i][j] = splat(left[0][first + i]) * load(right[0] + 4 * j);
     for (int m = 1; m < 12; m++)
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < width; j++)
-                sum[i][j] = madd4(all(left[m][first + i]), load(right[m] + 4 * j), sum[i][j]);
+                sum[i][j] = madd4(splat(left[m][first + i]), load(right[m] + 4 * j), sum[i][j]);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < width; j++) store(out[first + i] + 4 * j, sum[i][j]);
 }
 
-/* The same for out = left right. */
+/* Rows first.. of out = left right (12, 12). */
 static inline void product_rows(const row12 *left, const row12 *right, row12 *out, int first, int width) {
     v4 sum[3][3];
     for (int i = 0; i < 3; i++)
-        for (int j = 0; j < width; j++) sum[i][j] = all(left[first + i][0]) * load(right[0] + 4 * j);
+        for (int j = 0; j < width; j++) sum[i][j] = splat(left[first + i][0]) * load(right[0] + 4 * j);
     for (int m = 1; m < 12; m++)
         for (int i = 0; i < 3; i++)
             for (int j = 0; j < width; j++)
-                sum[i][j] = madd4(all(left[first + i][m]), load(right[m] + 4 * j), sum[i][j]);
+                sum[i][j] = madd4(splat(left[first + i][m]), load(right[m] + 4 * j), sum[i][j]);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < width; j++) store(out[first + i] + 4 * j, sum[i][j]);
 }
 
-/* L D L' = gram[6:, 6:] + diag(r); returns 0 where that is not positive definite. */
+/* L D L' = gram[6:, 6:] + diag(r); return 0 if not positive definite. */
 static inline int decompose(const row12 *gram, const double *r, double *low, double *inverse) {
     double scaled[6][6]; /* L D */
     for (int j = 0; j < 6; j++) {
@@ -60,7 +60,7 @@ static inline int decompose(const row12 *gram, const double *r, double *low, dou
     return 1;
 }
 
-/* Backward sweep over the matrices. q_pos, q_att (D+1, 3, 3), r_diag (D, 6). Returns 0 where Rt is not positive
+/* Backward sweep over the matrices. q_pos, q_att (D+1, 3, 3), r_diag (D, 6). Return 0 if Rt is not positive
  * definite. */
 static int factor(int64_t stages, const double *mats, double h, const double *q_pos, const double *q_att,
                   const double *r_diag, Factor *factors) {
@@ -76,7 +76,7 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
         double *low = factors[k].low, *inverse = factors[k].inverse;
         row12 *gain = factors[k].gain;
         for (int i = 0; i < 12; i += 3) gram_rows(m_mat, p, t, i, 3);
-        /* of the symmetric product, what lies on and below the diagonal */
+        /* lower triangle of the symmetric product */
         product_rows(t, m_mat, gram, 0, 1);
         product_rows(t, m_mat, gram, 3, 2);
         product_rows(t, m_mat, gram, 6, 3);
@@ -92,14 +92,14 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
         for (int i = 0; i < 6; i++)
             for (int j = 0; j < 12; j += 4) {
                 v4 s = load(y[i] + j);
-                for (int m = 0; m < i; m++) s = madd4(all(-LOW(i, m)), load(y[m] + j), s);
+                for (int m = 0; m < i; m++) s = madd4(splat(-LOW(i, m)), load(y[m] + j), s);
                 store(y[i] + j, s);
-                store(scaled[i] + j, all(inverse[i]) * s);
+                store(scaled[i] + j, splat(inverse[i]) * s);
             }
         for (int i = 5; i >= 0; i--)
             for (int j = 0; j < 12; j += 4) {
                 v4 s = -load(scaled[i] + j);
-                for (int m = i + 1; m < 6; m++) s = madd4(all(-LOW(m, i)), load(gain[m] + j), s);
+                for (int m = i + 1; m < 6; m++) s = madd4(splat(-LOW(m, i)), load(gain[m] + j), s);
                 store(gain[i] + j, s);
             }
         /* P <- Q + A'PA - y'D^-1 y: A'PA by its blocks, lower triangle, from the bottom up */
@@ -117,7 +117,7 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
         for (int i = 0; i < 12; i++)
             for (int j = 0; j <= i; j += 4) {
                 v4 s = load(p[i] + j);
-                for (int m = 0; m < 6; m++) s = madd4(all(-y[m][i]), load(scaled[m] + j), s);
+                for (int m = 0; m < 6; m++) s = madd4(splat(-y[m][i]), load(scaled[m] + j), s);
                 store(p[i] + j, s);
             }
         for (int i = 0; i < 3; i++)
@@ -135,13 +135,13 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
 static inline void adjoint(const double *m_mat, double h, const double *p, double *out) {
     v4 s[3], t[3];
     for (int j = 0; j < 3; j++) {
-        s[j] = all(p[0]) * load(m_mat + 4 * j);
-        t[j] = all(p[6]) * load(m_mat + 72 + 4 * j);
+        s[j] = splat(p[0]) * load(m_mat + 4 * j);
+        t[j] = splat(p[6]) * load(m_mat + 72 + 4 * j);
     }
     for (int m = 1; m < 6; m++)
         for (int j = 0; j < 3; j++) {
-            s[j] = madd4(all(p[m]), load(m_mat + 12 * m + 4 * j), s[j]);
-            t[j] = madd4(all(p[6 + m]), load(m_mat + 72 + 12 * m + 4 * j), t[j]);
+            s[j] = madd4(splat(p[m]), load(m_mat + 12 * m + 4 * j), s[j]);
+            t[j] = madd4(splat(p[6 + m]), load(m_mat + 72 + 12 * m + 4 * j), t[j]);
         }
     for (int i = 0; i < 3; i++) {
         out[i] = p[i];
@@ -166,13 +166,13 @@ static inline void forward(const double *m_mat, double h, const double *dx, cons
     }
 }
 
-/* dx (D+1, 12) by dw (D, 6), from zero. */
+/* Propagate dw (D, 6) to dx (D+1, 12) from zero. */
 static void advance(int64_t stages, const double *mats, double h, double *dx, const double *dw) {
     zero(dx, 12);
     for (int64_t k = 0; k < stages; k++) forward(mats + 144 * k, h, dx + 12 * k, dw + 6 * k, dx + 12 * (k + 1));
 }
 
-/* With `factor`'s result: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx (D+1, 12), r (D, 6). */
+/* Solve with the result of `factor`: the minimizer dx (D+1, 12), dw (D, 6) for the gradients qx (D+1, 12), r (D, 6). */
 static void minimize(int64_t stages, const double *mats, double h, const Factor *factors, const double *qx,
                      const double *r, double *dx, double *dw) {
     double p[12], t[18];
@@ -184,7 +184,7 @@ static void minimize(int64_t stages, const double *mats, double h, const Factor 
         for (int i = 0; i < 6; i++) f[i] = r[6 * k + i] + t[12 + i];
         for (int j = 0; j < 12; j += 4) {
             v4 s = load(t + j) + load(qx + 12 * k + j);
-            for (int i = 0; i < 6; i++) s = madd4(all(f[i]), load(factors[k].gain[i] + j), s);
+            for (int i = 0; i < 6; i++) s = madd4(splat(f[i]), load(factors[k].gain[i] + j), s);
             store(p + j, s);
         }
         for (int i = 1; i < 6; i++)
@@ -201,7 +201,7 @@ static void minimize(int64_t stages, const double *mats, double h, const Factor 
     }
 }
 
-/* Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r. Returns its greatest
+/* Gradient (D, 6) with respect to the inputs alone, states eliminated, for gradients qx and r. Return its largest
  * absolute value; NaN if any value is. */
 static double reduced_gradient(int64_t stages, const double *mats, double h, const double *qx, const double *r,
                                double *out) {
@@ -213,7 +213,7 @@ static double reduced_gradient(int64_t stages, const double *mats, double h, con
         for (int i = 0; i < 6; i++) {
             double g = r[6 * k + i] + t[12 + i];
             out[6 * k + i] = g;
-            if (!(size_of(g) <= greatest) && greatest == greatest) greatest = size_of(g);
+            if (!(abs_of(g) <= greatest) && greatest == greatest) greatest = abs_of(g);
         }
     }
     return greatest;

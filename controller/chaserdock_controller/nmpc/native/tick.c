@@ -1,12 +1,11 @@
-/* One tick of the real-time iteration for all chasers: roll and linearize, rows, then one QP for each chaser. */
+/* One tick of the real-time iteration for all chasers: rollout and linearization, rows, then one QP per chaser. */
 #include "base.h"
 
 #define MAX_ITERATIONS 40
 
-/* inputs (N, D, 6): the plan to begin with and what becomes of it; states (N, 13), limits (N, 6); reach (D+1,): how far a
- * newton more or less on each axis moves a chaser by each stage, m; w1 (N,): price of the slacks. `budget`: iterations
- * of all chasers together; each may take what is left, shared evenly over those to come, and at most MAX_ITERATIONS.
- * code and iterations (N,) are written. */
+/* inputs (N, D, 6): initial plan, replaced by the solution; states (N, 13), limits (N, 6); reach (D+1,): displacement by
+ * each stage for 1 N on each axis, m; w1 (N,): slack weights. `budget`: total iterations; each chaser may use an even
+ * share of the remaining ones, at most MAX_ITERATIONS. code and iterations (N,) are outputs. */
 typedef struct {
     const Model *model;
     const Weights *weights;
@@ -27,19 +26,19 @@ EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d) {
 
 EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
     const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d);
-    double *x = take(&work, 13 * n * (d + 1)), *mats = take(&work, 144 * n * d);
-    double *reach = take(&work, n * (d + 1));
+    double *x = allocate(&work, 13 * n * (d + 1)), *mats = allocate(&work, 144 * n * d);
+    double *reach = allocate(&work, n * (d + 1));
     Rows rows = {width, d + 1, reach, 0, 0, 0, 0};
-    rows.stage = (int64_t *)take(&work, n * width);
-    rows.n_rows = (int64_t *)take(&work, n);
-    rows.a = take(&work, 3 * n * width);
-    rows.c = take(&work, n * width);
-    double *q_pos = take(&work, 9 * (d + 1)), *q_att = take(&work, 9 * (d + 1)), *qx = take(&work, 12 * (d + 1));
-    double *r_diag = take(&work, 6 * d), *r = take(&work, 6 * d), *w_bar = take(&work, 6 * d);
-    Answer answer = {take(&work, 12 * (d + 1)), take(&work, 6 * d), take(&work, 2 * width + 12 * d), 0.0, 0.0, 0};
+    rows.stage = (int64_t *)allocate(&work, n * width);
+    rows.n_rows = (int64_t *)allocate(&work, n);
+    rows.a = allocate(&work, 3 * n * width);
+    rows.c = allocate(&work, n * width);
+    double *q_pos = allocate(&work, 9 * (d + 1)), *q_att = allocate(&work, 9 * (d + 1)), *qx = allocate(&work, 12 * (d + 1));
+    double *r_diag = allocate(&work, 6 * d), *r = allocate(&work, 6 * d), *w_bar = allocate(&work, 6 * d);
+    Answer answer = {allocate(&work, 12 * (d + 1)), allocate(&work, 6 * d), allocate(&work, 2 * width + 12 * d), 0.0, 0.0, 0};
 
     for (int64_t i = 0; i < n; i++) {
-        const double *top = tick->limits + 6 * i, force = most(most(top[0], top[1]), top[2]);
+        const double *top = tick->limits + 6 * i, force = max_of(max_of(top[0], top[1]), top[2]);
         for (int64_t k = 0; k <= d; k++) reach[(d + 1) * i + k] = force * tick->reach[k];
         copy(tick->states + 13 * i, x + 13 * (d + 1) * i, 13);
     }
@@ -61,12 +60,12 @@ EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
         for (int64_t m = 0; m < 6 * d; m++)
             if (!finite(answer.dw[m])) tick->code[i] = BROKEN;
         if (tick->code[i] == BROKEN) continue;
-        for (int64_t m = 0; m < 6 * d; m++) u[m] = least(most(w_bar[m] + answer.dw[m], -1.0), 1.0) * limits[m % 6];
+        for (int64_t m = 0; m < 6 * d; m++) u[m] = min_of(max_of(w_bar[m] + answer.dw[m], -1.0), 1.0) * limits[m % 6];
     }
 }
 
-/* Piecewise constant inputs (N, D, 6) seen `whole + part` steps later on the same grid: each new value is the mean of the
- * old plan over its interval, so the impulse is kept; beyond the old horizon the last value is held. */
+/* Shift piecewise constant inputs (N, D, 6) by `whole + part` steps on the same grid. Each new value is the mean of the
+ * old plan over its interval, which preserves the impulse; the last value is held beyond the old horizon. */
 EXPORT void NAME(shift_inputs)(int64_t n, int64_t d, int64_t whole, double part, const double *inputs, double *out) {
     for (int64_t i = 0; i < n; i++, inputs += 6 * d, out += 6 * d)
         for (int64_t k = 0; k < d; k++) {

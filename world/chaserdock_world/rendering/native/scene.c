@@ -98,9 +98,9 @@ EXPORT void NAME(visible_faces)(const Frustum *f, const double *camera, const do
         VisibleBox *box = boxes + visible;
         matrix_of(pose + 3, turn);
         product9(to_irf, turn, body);
-        minus3(pose, camera, from);
-        times3(to_irf, from, at);
-        times3(body, s->position, place);
+        subtract3(pose, camera, from);
+        multiply3(to_irf, from, at);
+        multiply3(body, s->position, place);
         for (int k = 0; k < 3; k++) box->centre[k] = at[k] + place[k];
         if (!reaches(f, box->centre, s->radius)) continue;
         product9(body, s->rotation, box->rotation);
@@ -128,8 +128,8 @@ EXPORT void NAME(visible_faces)(const Frustum *f, const double *camera, const do
             for (int k = 0; k < 2; k++) {
                 if (!any) box->low[k] = box->high[k] = face->outline[0][k];
                 for (int n = 0; n < (int)face->count; n++) {
-                    box->low[k] = least(box->low[k], face->outline[n][k]);
-                    box->high[k] = most(box->high[k], face->outline[n][k]);
+                    box->low[k] = min_of(box->low[k], face->outline[n][k]);
+                    box->high[k] = max_of(box->high[k], face->outline[n][k]);
                 }
             }
             any = 1;
@@ -155,7 +155,7 @@ static int occludes(const VisibleBox *a, const VisibleBox *b) {
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
             cross3(axes[i], axes[3 + j], axes[n]);
-            double length = root(dot3(axes[n], axes[n]));
+            double length = sqrt_of(dot3(axes[n], axes[n]));
             if (!(length > 1e-6)) continue;
             for (int k = 0; k < 3; k++) axes[n][k] /= length;
             n++;
@@ -163,14 +163,14 @@ static int occludes(const VisibleBox *a, const VisibleBox *b) {
     for (int i = 0; i < n; i++) {
         double at_a = dot3(axes[i], a->centre), at_b = dot3(axes[i], b->centre), reach_a = 0.0, reach_b = 0.0;
         for (int j = 0; j < 3; j++) {
-            reach_a += size_of(dot3(axes[i], axes[j])) * a->half[j];
-            reach_b += size_of(dot3(axes[i], axes[3 + j])) * b->half[j];
+            reach_a += abs_of(dot3(axes[i], axes[j])) * a->half[j];
+            reach_b += abs_of(dot3(axes[i], axes[3 + j])) * b->half[j];
         }
         double sign = at_a > at_b ? -1.0 : 1.0; /* orients every axis from a to b */
         end[i] = sign * at_a + reach_a;
         start[i] = sign * at_b - reach_b;
         gap[i] = start[i] - end[i];
-        widest = most(widest, gap[i]);
+        widest = max_of(widest, gap[i]);
     }
     /* The origin projects to 0 on every axis, and every plane between the end of a and the start of b separates the boxes:
      * one of them has the origin on b's side if a ends before 0, and one on a's side if b starts after 0. */
@@ -239,13 +239,13 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
     for (int k = 0; k < 2; k++) {
         for (int i = 0; i < count; i++) {
             double at = (face->outline[i][k] - origin[k]) * samples + (samples - 1.0) / 2.0;
-            low[k] = i ? least(low[k], at) : at;
-            high[k] = i ? most(high[k], at) : at;
+            low[k] = i ? min_of(low[k], at) : at;
+            high[k] = i ? max_of(high[k], at) : at;
             middle[k] += at;
         }
         middle[k] /= count;
-        low[k] = most(__builtin_floor(low[k]) - 2.0, 0.0);
-        high[k] = least(__builtin_ceil(high[k]) + 3.0, (double)patch[k]);
+        low[k] = max_of(__builtin_floor(low[k]) - 2.0, 0.0);
+        high[k] = min_of(__builtin_ceil(high[k]) + 3.0, (double)patch[k]);
         if (!(high[k] > low[k])) return 0;
         region[k] = (int64_t)low[k];
         region[2 + k] = (int64_t)high[k];
@@ -261,7 +261,7 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
         const double *along = axis ? face->up : face->right;
         double by[2];
         for (int k = 0; k < 2; k++) by[k] = lens[k] * (along[k] - at[k] / at[2] * along[2]) / at[2];
-        double share = most(root(by[0] * by[0] + by[1] * by[1]), 1.0) * texel_m;
+        double share = max_of(sqrt_of(by[0] * by[0] + by[1] * by[1]), 1.0) * texel_m;
         halved[axis] = 0;
         for (double limit = 0.7071067811865476; share < limit && halved[axis] < 30; limit *= 0.5) halved[axis]++;
         texels[axis] = finest[axis] >> halved[axis];
@@ -285,10 +285,10 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
     cross3(m + 6, m, rows_of + 3);
     cross3(m, m + 3, rows_of + 6);
     det = dot3(m, rows_of);
-    if (!(size_of(det) > 0.0)) return 0;
+    if (!(abs_of(det) > 0.0)) return 0;
     for (int i = 0; i < 9; i++) {
         matrix[i] = rows_of[i] / det;
-        largest = most(largest, size_of(matrix[i]));
+        largest = max_of(largest, abs_of(matrix[i]));
     }
     for (int i = 0; i < 9; i++) matrix[i] /= largest;
     return 1;

@@ -34,19 +34,19 @@ static void sides_of(const double *corners, Side *sides) {
         Side *s = sides + i;
         const double *a = corners + 2 * i, *b = corners + 2 * ((i + 1) % 4);
         for (int k = 0; k < 2; k++) s->start[k] = a[k], s->vector[k] = b[k] - a[k];
-        double length = most(root(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]), 1e-6);
+        double length = max_of(sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]), 1e-6);
         s->normal[0] = s->vector[1] / length;
         s->normal[1] = -s->vector[0] / length;
         double across = 0.0;
         for (int k = 0; k < 2; k++) across += (a[k] + 0.5 * s->vector[k] - middle[k]) * s->normal[k];
-        s->extent = 2.0 * size_of(across);
+        s->extent = 2.0 * abs_of(across);
     }
 }
 
 /* Grey level between pixels; beyond the image that of its border. */
 static double level_at(const Image *p, double x, double y) {
-    x = x > 0.0 ? least(x, (double)(p->width - 1)) : 0.0;
-    y = y > 0.0 ? least(y, (double)(p->height - 1)) : 0.0;
+    x = x > 0.0 ? min_of(x, (double)(p->width - 1)) : 0.0;
+    y = y > 0.0 ? min_of(y, (double)(p->height - 1)) : 0.0;
     int64_t column = (int64_t)x, row = (int64_t)y;
     if (column > p->width - 2) column = p->width - 2;
     if (row > p->height - 2) row = p->height - 2;
@@ -85,7 +85,7 @@ static int row_of(const Image *p, const Side *s, double along, const double *acr
 }
 
 static double reach_of(const Settings *set, const Side *s, double cells, double most_px) {
-    return least(most(set->reach_cells / cells * s->extent, set->reach_least_px), most_px);
+    return min_of(max_of(set->reach_cells / cells * s->extent, set->reach_least_px), most_px);
 }
 
 /* Weighted least squares of offset = level + slope * along. */
@@ -95,9 +95,9 @@ static void fit_line(const double *along, const double *offset, const double *we
         double w = weight[i], wa = w * along[i];
         s0 += w, s1 += wa, s2 += wa * along[i], t0 += w * offset[i], t1 += wa * offset[i];
     }
-    s0 = most(s0, 1e-9);
+    s0 = max_of(s0, 1e-9);
     double mean = s1 / s0;
-    *slope = (t1 - mean * t0) / most(s2 - mean * s1, 1e-9);
+    *slope = (t1 - mean * t0) / max_of(s2 - mean * s1, 1e-9);
     *level = t0 / s0 - *slope * mean;
 }
 
@@ -127,11 +127,11 @@ static int centroid_line(const Image *p, const Settings *set, int pass, const Si
         along[i] = set->first + (set->last - set->first) * i / (rows - 1) - 0.5;
         int inside = row_of(p, s, along[i], across, taps, levels);
         for (int t = 0; t + 1 < taps; t++) {
-            double rise = most(levels[t + 1] - levels[t], 0.0);
+            double rise = max_of(levels[t + 1] - levels[t], 0.0);
             total += rise;
             first += rise * ((2.0 * t + 1.0) / (taps - 1) - 1.0);
         }
-        offset[i] = first / most(total, 1e-6) * reach;
+        offset[i] = first / max_of(total, 1e-6) * reach;
         usable[i] = inside && total > set->min_contrast ? 1.0 : 0.0;
         count += usable[i] != 0.0;
     }
@@ -139,10 +139,10 @@ static int centroid_line(const Image *p, const Settings *set, int pass, const Si
     fit_line(along, offset, usable, rows, &level, &slope);
     for (int k = 0; k < (int)set->reweighted[pass]; k++) {
         double residual[ROWS_MOST];
-        for (int i = 0; i < rows; i++) residual[i] = size_of(offset[i] - (level + slope * along[i]));
-        double scale = 4.0 * most(1.4826 * median_of(residual, usable, rows), 0.02);
+        for (int i = 0; i < rows; i++) residual[i] = abs_of(offset[i] - (level + slope * along[i]));
+        double scale = 4.0 * max_of(1.4826 * median_of(residual, usable, rows), 0.02);
         for (int i = 0; i < rows; i++) { /* Tukey */
-            double share = residual[i] / scale, left = most(1.0 - share * share, 0.0);
+            double share = residual[i] / scale, left = max_of(1.0 - share * share, 0.0);
             weight[i] = left * left * usable[i];
         }
         fit_line(along, offset, weight, rows, &level, &slope);
@@ -165,8 +165,8 @@ static int crossings(const Side *sides, const double *at_start, const double *at
         const double *a = vector[(i + 3) % 4], *b = vector[i], *from = low[(i + 3) % 4];
         double d[2] = {low[i][0] - from[0], low[i][1] - from[1]};
         double cross = a[0] * b[1] - a[1] * b[0];
-        double lengths = root(a[0] * a[0] + a[1] * a[1]) * root(b[0] * b[0] + b[1] * b[1]);
-        if (!(size_of(cross) > 0.05 * lengths)) return 0;
+        double lengths = sqrt_of(a[0] * a[0] + a[1] * a[1]) * sqrt_of(b[0] * b[0] + b[1] * b[1]);
+        if (!(abs_of(cross) > 0.05 * lengths)) return 0;
         double t = (d[0] * b[1] - d[1] * b[0]) / cross;
         for (int k = 0; k < 2; k++) {
             found[2 * i + k] = from[k] + t * a[k];
@@ -180,7 +180,7 @@ static int crossings(const Side *sides, const double *at_start, const double *at
 /* Normal density and, to 1e-7 (Abramowitz and Stegun 26.2.17), distribution function. */
 static double density_of(double z) { return exponential(-0.5 * z * z) * 0.3989422804014327; }
 static double distribution_of(double z, double density) {
-    double t = 1.0 / (1.0 + 0.2316419 * size_of(z));
+    double t = 1.0 / (1.0 + 0.2316419 * abs_of(z));
     double poly = t * 1.330274429;
     poly = (poly + -1.821255978) * t;
     poly = (poly + 1.781477937) * t;
@@ -189,14 +189,14 @@ static double distribution_of(double z, double density) {
     return z >= 0.0 ? 1.0 - poly : poly;
 }
 
-static double limited(double value, double limit) { return least(most(value, -limit), limit); }
+static double limited(double value, double limit) { return min_of(max_of(value, -limit), limit); }
 
 /* How far out a side has to be moved, from the mean profile of a blurred strip ``border`` pixels wide:
  * b + a Phi((s - e) / sigma) - d Phi((s - e - m) / sigma), with b, a, d, e by least squares and sigma with a prior. */
 static double strip_shift(const Image *p, const Settings *set, const Side *side, double cells, double border) {
     int rows = (int)set->strip_rows, taps = (int)set->strip_taps, count = 0;
     double inner = reach_of(set, side, cells, set->reach_px[1]);
-    double outer = least(border + set->strip_beyond_px, set->reach_px[1]);
+    double outer = min_of(border + set->strip_beyond_px, set->reach_px[1]);
     double s[TAPS_MOST], profile[TAPS_MOST] = {0.0}, line[6][TAPS_MOST], z_density[2][TAPS_MOST];
     for (int t = 0; t < taps; t++) s[t] = (outer + inner) * ((double)t / (taps - 1)) - inner;
     for (int i = 0; i < rows; i++) {
@@ -271,13 +271,13 @@ EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t w
             for (int i = 0; i < 4; i++) fine &= centroid_line(&p, set, pass, sides + i, cells, at_start + i, at_end + i);
             fine = fine && crossings(sides, at_start, at_end, refined);
         }
-        for (int i = 0; i < 8; i++) fine &= size_of(refined[i] - given[i]) < set->max_move_px;
+        for (int i = 0; i < 8; i++) fine &= abs_of(refined[i] - given[i]) < set->max_move_px;
         if (!fine) copy(given, refined, 8);
         sides_of(refined, sides);
         double finest = sides[0].extent;
-        for (int i = 1; i < 4; i++) finest = least(finest, sides[i].extent);
-        finest = most(finest * least(margin[m], 1.0 / cells), 0.1);
-        sigma[m] = root(1.0 + (set->uncertain_px / finest) * (set->uncertain_px / finest));
+        for (int i = 1; i < 4; i++) finest = min_of(finest, sides[i].extent);
+        finest = max_of(finest * min_of(margin[m], 1.0 / cells), 0.1);
+        sigma[m] = sqrt_of(1.0 + (set->uncertain_px / finest) * (set->uncertain_px / finest));
         for (int i = 0; i < 4 && fine; i++) {
             double border = sides[i].extent * margin[m];
             at_start[i] = border < set->strip_px ? strip_shift(&p, set, sides + i, cells, border) : 0.0;

@@ -19,7 +19,7 @@ static int normal_of(const double *lens, const double *points, const double *pix
     zero(out->information, 36);
     for (int64_t i = 0; i < n; i++) {
         double turned[3], row[2][6], residual[2];
-        times3(pose + 3, points + 3 * i, turned);
+        multiply3(pose + 3, points + 3 * i, turned);
         double x = turned[0] + pose[0], y = turned[1] + pose[1], z = turned[2] + pose[2];
         if (!(z > 1e-6)) return 0;
         double u = x / z, v = y / z;
@@ -46,7 +46,7 @@ static int normal_of(const double *lens, const double *points, const double *pix
 
 /* out = exp([phi]x) R (Rodrigues' formula). */
 static void turned_by(const double *phi, const double *rotation, double *out) {
-    double angle = root(dot3(phi, phi)), axis[3] = {0.0, 0.0, 0.0}, s, c;
+    double angle = sqrt_of(dot3(phi, phi)), axis[3] = {0.0, 0.0, 0.0}, s, c;
     if (angle > 2.2e-16)
         for (int i = 0; i < 3; i++) axis[i] = phi[i] / angle;
     else

@@ -32,9 +32,9 @@ EXPORT void NAME(marker_errors)(const double *lens, const double *at, const doub
             if (!seen) break;
             double x = px[0] - pixels[2 * i], y = px[1] - pixels[2 * i + 1], square = x * x + y * y;
             seen = finite(square);
-            worst = most(worst, square);
+            worst = max_of(worst, square);
         }
-        error[m] = seen ? root(worst) : __builtin_inf();
+        error[m] = seen ? sqrt_of(worst) : __builtin_inf();
     }
 }
 
@@ -49,7 +49,7 @@ EXPORT int64_t NAME(count_visible_markers)(const double *lens, const double *fra
         double px[4][2], centre[3];
         int inside = 1;
         for (int k = 0; k < 3; k++) centre[k] = centres[3 * m + k] + position[k];
-        cosine[m] = -dot3(normals + 3 * m, centre) / root(dot3(centre, centre));
+        cosine[m] = -dot3(normals + 3 * m, centre) / sqrt_of(dot3(centre, centre));
         for (int i = 0; i < 4 && inside; i++) {
             double at[3];
             for (int k = 0; k < 3; k++) at[k] = surface[12 * m + 3 * i + k] + position[k];
@@ -60,8 +60,8 @@ EXPORT int64_t NAME(count_visible_markers)(const double *lens, const double *fra
         if (!inside) continue;
         for (int i = 0; i < 4; i++) {
             const double *a = px[i], *b = px[(i + 1) % 4];
-            double side = most(size_of(b[0] - a[0]), size_of(b[1] - a[1]));
-            size[m] = i ? least(size[m], side) : side;
+            double side = max_of(abs_of(b[0] - a[0]), abs_of(b[1] - a[1]));
+            size[m] = i ? min_of(size[m], side) : side;
             inside &= a[0] > frame_px[0] && a[0] < frame_px[1] && a[1] > frame_px[0] && a[1] < frame_px[2];
         }
         if (!inside && m != row) size[m] = __builtin_nan("");

@@ -106,8 +106,8 @@ def test_in_real_time_a_slow_solver_is_held_to_its_seconds_and_in_lock_step_neve
     flight = ControllerCore(mission, lambda: slow.time_s, PerfectEstimator(mission.target), realtime)
     slow.inner = flight.planning.solver
     flight.planning.solver = slow  # type: ignore[assignment]
-    told = [far(mission, flight, tick).solver for tick in range(4)]
-    used = [sum(s.iterations) for s in told if s is not None]
+    reports = [far(mission, flight, tick).solver for tick in range(4)]
+    used = [sum(s.iterations) for s in reports if s is not None]
     assert used[0] > 3
     if realtime:
         assert all(n <= 3 for n in used[1:])

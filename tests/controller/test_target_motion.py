@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.estimation import motion_models as motion
 from chaserdock_controller.estimation.composite_body import target_body
-from chaserdock_controller.estimation.hypothesis import predict
+from chaserdock_controller.estimation.hypothesis import StateHypothesis, predict
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies, predict_path
 from chaserdock_controller.guidance.reference import feed_forward

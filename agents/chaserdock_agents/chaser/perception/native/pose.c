@@ -87,7 +87,7 @@ EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const
             double gain = now.cost - then.cost;
             copy(trial, pose, 12);
             now = then;
-            damping = most(damping * 0.1, 1e-9);
+            damping = max_of(damping * 0.1, 1e-9);
             if (gain <= MIN_GAIN * now.cost + 1e-12) break;
         } else {
             damping *= 100.0;

@@ -71,7 +71,7 @@ def test_nobody_listens(tmp_path: Path) -> None:
     arguments = ("--namespace", "nobody", "-l", "tcp/127.0.0.1:0", "--timeout", "0.5")
     status, said = finished("log", "play", str(GOLDEN), *arguments)
     assert (status, "Traceback" in said) == (2, False)
-    assert "no recorder came within 0.5 s" in said
+    assert "no recorder joined within 0.5 s" in said
 
 
 @pytest.mark.slow

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 # chaserdock in a container: one image for all processes of a mission. See compose.yaml and docs/deployment.md.
 FROM python:3.11-slim AS wheel
 COPY docker/build-requirements.txt /src/docker/

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Hatchling build hook: compile the C kernels whenever the package is built or installed for editing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """acados as a peer for `nmpc.py`: SQP-RTI, HPIPM and compiled code, on the problem of `nmpc/problem.py`.
 
 "coupled" is one optimal control problem of all chasers; "decoupled" one for each chaser, solved one after the other in one

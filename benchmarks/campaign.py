@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A campaign killed half way, resumed, and flown once more on a cluster: ``python benchmarks/campaign.py [--quick]``.
 
 200 seeds (``--runs``) of a shortened ``single`` with small images, two at a time. With half of the results there the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults on containers: ``python benchmarks/containers.py [--quick] [--json FILE] [--only FAULT]``.
 
 Builds the image, then flies a mission by compose.yaml once for each fault, with rights on, each in a project of its own,

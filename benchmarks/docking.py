@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Docking success: ``python benchmarks/docking.py [--quick] [--json FILE] [--flights N] [--images N] [--aborts N]
 [--aborts-images N] [--failures N] [--results FILE]``.
 

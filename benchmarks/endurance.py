@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whether anything grows with time: ``python benchmarks/endurance.py [--hours 24] [--quick] [--json FILE]``.
 
 Flies the scenario ``endurance`` in lock-step as separate processes, the recorder rotating its log every simulated

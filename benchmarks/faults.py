@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seeded random faults at a shortened docking: ``python benchmarks/faults.py [--runs N] [--quick] [--json FILE]``.
 
 Each run flies the scenario ``fault-drill`` as separate processes with one fault of a kind, a process, a moment and a

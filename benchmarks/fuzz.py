@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Robustness of the decoders: ``python benchmarks/fuzz.py [--messages N] [--quick] [--json FILE]``.
 
 Feeds seeded mutations of one valid sample to the decoder of every topic (and of the two queries), to the scenario loader

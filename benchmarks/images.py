@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The images of docs/cameras.md: ``python benchmarks/images.py [FOLDER]`` (docs/images by default).
 
 One image for each effect and target: what chaser 0 of ``harsh-light`` sees at its start, with one thing changed.

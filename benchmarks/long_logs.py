@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How long the verbs on a log take, and what memory they need: on a log as it is, and on one of many hours.
 
 The long one is made of the given one by repetition: its ticks and times go on where the last repetition ended, and the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How fast the main job flies, and how well: ``python benchmarks/mission.py [--quick] [--json FILE]``.
 
 Flies ``four-chaser-docking`` in lock-step with everything on (images, recording), three times, each in its own

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Controller performance in closed loop: ``python benchmarks/missions.py [--part NAME ...] [--quick] [--json FILE]``.
 
 Whole missions in one process (``chaserdock.evaluation.in_process``). Parts:

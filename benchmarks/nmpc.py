@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How fast each NMPC back end solves, and how well it flies: ``python benchmarks/nmpc.py [--quick] [--json FILE]``.
 
 The hard case: D = 30 stages (3 s), cuboids of 10 kg, 3 N, 0.3 N m, on a ring about a target; half of the chasers

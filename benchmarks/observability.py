@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which calibration errors of the cameras show in flight: ``python benchmarks/observability.py [--json FILE]``.
 
 The Jacobian of all measured poses of a minute by the target's twelve numbers and the cameras' (mounting's turn alone, or

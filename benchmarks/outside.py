@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What other people's programs make of a log: ``python benchmarks/outside.py LOG [--tools DIR] [--image PNG]
 [--json FILE]``.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--flights 1] [--only SUBJECT] [--seconds 5]
 [--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
 

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options and output that all benchmarks share: ``--quick``, ``--json``, printed figures, and the JSON file."""
 
 from __future__ import annotations

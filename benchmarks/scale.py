@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cost of a tick with 1 to 16 chasers, by part: ``python benchmarks/scale.py [--quick] [--json FILE]``.
 
 The first N chasers of ``sixteen-chasers``. In one process (``chaserdock.evaluation.in_process``) each part is timed by

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Target estimation with rendered images: ``python benchmarks/seeing_flights.py PART [--quick] [--json FILE]``.
 
 Parts: ``exact`` (all image effects, cameras as calibrated; both targets, one and two chasers; the paper's perception and

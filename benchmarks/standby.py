@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A standby takes over: ``python benchmarks/standby.py [--flights 5] [--only KIND] [--quick] [--json FILE]``.
 
 Flies ``fault-drill`` in real time, all processes as clients of a router, and in its final approach does to the commanding

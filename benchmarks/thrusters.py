@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster performance: ``python benchmarks/thrusters.py [--quick] [--json FILE] [--only PART ...]``.
 
 Parts: ``allocation`` (random wrenches), ``pulses`` (delivered against commanded impulse), ``tracking`` (measurements

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """How well, how far and how fast the cameras see: ``python benchmarks/vision.py [--quick] [--json FILE]``.
 
 Random views of both targets with all effects at default strength, by the default perception and by the paper's

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Python API of chaserdock: fly missions, open their logs, load scenarios.
 
 >>> import chaserdock as cd

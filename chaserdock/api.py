@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Functions of the Python API, which ``import chaserdock`` exports. Heavy imports wait until a function needs them."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Exit statuses, the same for every command (docs/cli.md)."""
 
 from __future__ import annotations

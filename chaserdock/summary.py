@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The summary of a flight as typed values; docs/summary.md describes the fields. SI units and radians."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Takes out of the installed packages what no process of a mission loads. Run in the layer that installs them.
 
 What goes: PyBullet's models and examples, tests of packages, and what only a compiler needs.

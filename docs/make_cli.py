@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Generate docs/cli.md from the program: ``python docs/make_cli.py``.
 
 ``--print`` prints it instead. tests/chaserdock/test_cli.py compares the committed file with the output.

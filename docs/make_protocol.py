@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Generate docs/protocol.md from the message types and the topics table: ``python docs/make_protocol.py``.
 
 ``--print`` prints it instead. tests/protocol/test_protocol_page.py checks the committed file.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write docs/scenario.md and scenarios/scenario.schema.json from the schema: ``python docs/make_scenario.py``.
 
 ``--print`` prints the page, ``--print-schema`` the JSON schema instead. tests/protocol/test_scenario_page.py compares them.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Build the documentation as a self-contained site: ``python docs/make_site.py [OUT]`` (default: ``site/``).
 
 Needs the packages of requirements-dev.txt. The pages are written for GitHub. Here their mathematics becomes MathML, and files outside

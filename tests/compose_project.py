@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A mission in containers by compose.yaml, for the tests and ``benchmarks/containers.py``."""
 
 from __future__ import annotations

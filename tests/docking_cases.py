@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Builders shared by the tests of docking by capture: a servicer, a chaser before its port, a world and a guidance."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Builders shared by the tests of moves, guidance, prediction and pilot."""
 
 from __future__ import annotations

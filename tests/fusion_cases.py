@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A target in steady motion, what cameras see of it, and the errors of an estimate."""
 
 from __future__ import annotations

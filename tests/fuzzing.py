@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seeded mutations of messages, scenarios and logs at their decoders, and an independent check of what is accepted.
 
 ``mutate`` works on bytes (bit flips, cuts, splices, wrong lengths), ``value_mutator`` on the decoded map (other types,

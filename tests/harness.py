@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Flies missions as a user does: the ``chaserdock`` program, separate processes, real Zenoh."""
 
 from __future__ import annotations

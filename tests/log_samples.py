@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A short mission's messages, and how to put them into a log."""
 
 from __future__ import annotations

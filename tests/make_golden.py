@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Record the golden logs: ``python tests/make_golden.py``. Only after a deliberate change of the replies.
 
 ``two-chasers``: images through commands, of every process. ``capture``: one chaser docks on thrusters and is verified; for the

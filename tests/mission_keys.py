@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A router with rights, and links to it, for tests."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chasers, problems and a closed loop for the tests of the NMPC."""
 
 from __future__ import annotations

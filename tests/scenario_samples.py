@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A small valid scenario for tests to change."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The packages' source files, parsed: which modules there are, and what each imports."""
 
 from __future__ import annotations

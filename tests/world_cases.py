@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Builders shared by the tests of the world: a small mission and its rates."""
 
 from __future__ import annotations

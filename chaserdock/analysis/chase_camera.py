@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """External view of a mission, drawn with OpenCV: flat faces in order of depth (painter's algorithm)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Growing tables of 8-byte numbers. Large tables are stored in a temporary file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Docking and goal criteria of a recorded flight, evaluated on ground truth."""
 
 from __future__ import annotations

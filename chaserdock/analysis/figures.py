@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures of a recorded flight, one function each: the paper's figures and diagnostics.
 
 A function raises ``MissingData`` when the log lacks what it needs. Errors refer to ground truth, as in ``summary``. A

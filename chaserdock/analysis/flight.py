@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A recorded flight as arrays, one row per tick, built while the log is read."""
 
 from __future__ import annotations

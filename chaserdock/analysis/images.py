@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera images of a log with their sightings, streamed: only a few are in memory at a time."""
 
 from __future__ import annotations

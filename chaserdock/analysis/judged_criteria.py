@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which success criteria of a scenario its flight can be judged by."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Style of the figures, and their export to files or inline SVG.
 
 The colours are distinguishable for colour-blind readers (Okabe and Ito, 2008) on white and on dark backgrounds. Text

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Data of the report's 3-D replay: the decimated flight, faces, and small camera images.
 
 The replay is our own canvas script (page/replay.js, 12 kB) because the export of viser 1.1 (``StateSerializer.as_html``),

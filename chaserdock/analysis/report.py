@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Self-contained HTML report of a recorded flight: result, tables, 3-D replay, figures, events, scenario, versions.
 
 The page opens from a file without a network; its Content-Security-Policy forbids requests. It names the parts that an

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bodies of a mission as coloured faces in body axes, for the 3-D replay, the video and the viewer."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Mosaic of all camera images at one time of a recorded flight, with the detections drawn."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Evaluation of a flight on ground truth: ``summary.json``. SI units and radians; keys as in docs/summary.md."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Time series of a log for figures: actuator forces, latencies and outcomes of images."""
 
 from __future__ import annotations

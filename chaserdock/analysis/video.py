@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Video of a recorded flight: external view beside the camera images with their detections."""
 
 from __future__ import annotations

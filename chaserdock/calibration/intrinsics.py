@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Calibration of camera matrix and distortion from images of a board, with OpenCV.
 
 Outlier images are excluded and named: those with an RMS error above three times the median and above half a pixel. This

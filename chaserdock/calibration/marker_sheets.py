@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sheets of markers in true scale for printing, as PDF or SVG.
 
 Lengths are millimetres from the upper left corner of the sheet.

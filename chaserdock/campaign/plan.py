@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Campaign file and the runs it defines.
 
 A campaign is a scenario, values shared by all runs, and varied parameters: a grid (every combination of ``values``) or a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Report of a campaign: one HTML file with pass rate, causes, sensitivities and a link to every failure."""
 
 from __future__ import annotations

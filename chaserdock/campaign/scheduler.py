@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``chaserdock campaign``: fly the runs, print progress, write the table and the report."""
 
 from __future__ import annotations

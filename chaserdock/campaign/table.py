@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Results of a campaign as a table, and the statistics of the table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Execution of runs: one ``chaserdock run`` process each, on this machine or on the workers of a Dask cluster.
 
 A finished run leaves ``runs/NAME/result.json``, written atomically. A later call skips the runs that have one.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands that look at a recorded flight: summary, report, figures, video, snapshot."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands for cameras and targets: marker sheets and camera calibration."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Operator commands to a running mission, and its status."""
 
 from __future__ import annotations

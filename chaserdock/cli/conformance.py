@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command that tests a process for conformance with the protocol."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Command and group classes: grouped help that loads nothing but typer, and one check that every number is finite."""
 
 from __future__ import annotations

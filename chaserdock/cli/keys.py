@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keys and certificates of a mission: ``chaserdock keys …``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands for recorded logs: ``chaserdock log …``."""
 
 from __future__ import annotations

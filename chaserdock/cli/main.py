@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The ``chaserdock`` program: all commands by group. Exit statuses: ``chaserdock.exit_codes``."""
 
 from __future__ import annotations

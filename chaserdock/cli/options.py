@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options that several commands share, the network link they describe, and how commands report errors and results.
 
 Heavy imports wait until a command needs them, so that ``--help`` is quick.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands that run one process of a mission, for missions on several hosts or in containers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands that compare a recorded flight with the present code, or with another flight."""
 
 from __future__ import annotations

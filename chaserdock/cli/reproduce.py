@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands that reproduce the paper's results."""
 
 from __future__ import annotations

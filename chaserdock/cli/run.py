@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands that fly a whole mission on this machine, or judge one that other machines fly."""
 
 from __future__ import annotations

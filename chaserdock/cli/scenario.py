@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Commands for scenario files: ``chaserdock scenario …``."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Test stand: world and partners replayed from a log over Zenoh, for one process under test."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rules of the protocol, checked on all messages of one process."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Input of one process from a log, tick by tick."""
 
 from __future__ import annotations

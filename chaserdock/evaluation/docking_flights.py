@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seeded docking flights of ``docking-contact``: random starts and target rates, flown until verified or aborted."""
 
 from __future__ import annotations

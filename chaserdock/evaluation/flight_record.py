@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A whole in-process mission as arrays: states, tracking errors, commands, and what the actuators delivered."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A mission in one process: physics, sensors and actuators of the world, the chasers' code, and the controller core.
 
 They are called in the order and with the latencies of a lock-step mission, so that the bodies of a scenario move exactly

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lower bound of the transient tracking error: the optimum under the actuators' limits, for any controller."""
 
 from __future__ import annotations

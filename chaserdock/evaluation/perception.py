@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the chasers see of the target in an in-process mission: rendered images, or a statistical measurement model."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """An estimator that knows a prescribed target exactly, so that the errors that remain are the controller's."""
 
 from __future__ import annotations

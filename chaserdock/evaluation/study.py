@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``chaserdock study``: fly a file of cases with perfect knowledge, one after the other, and append each result."""
 
 from __future__ import annotations

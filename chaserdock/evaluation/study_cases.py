@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cases and results of ``chaserdock study``: JSON, one per line."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seeded transfers around the target, ``collision-avoidance`` and ``swap``: variations, and figures of a flight."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Main process of a container: run ``chaserdock ARGUMENTS`` as one process of a mission in Docker Compose.
 
 ``python -m chaserdock.launch.container ARGUMENTS``. With ``--exit-code-from`` Compose stops all containers as soon as one

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State of a running mission, from its messages: notices for the operator, and progress. No I/O; wall time is passed in."""
 
 from __future__ import annotations

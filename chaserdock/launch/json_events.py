@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """JSON lines that ``--json`` prints while a mission flies: one object per line, distinguished by ``type``.
 
 SI units and radians. docs/cli.md is generated from these types (``docs/make_cli.py``).

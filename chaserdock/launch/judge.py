@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Watch a mission that other machines or containers fly, wait for its log, and judge it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Keys of a mission: its own certificate authority, and a key and a certificate per process.
 
 Elliptic curve P-256. The authority's private key is never written: no process can be added later, a new mission needs

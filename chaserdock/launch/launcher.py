@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fly a mission on this machine: start every process, watch them, stop them, judge the log."""
 
 from __future__ import annotations

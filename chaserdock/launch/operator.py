@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Send operator commands to a running mission."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Show the progress of a mission: a live table, text lines, or JSON lines."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observe a running mission: processes, tick, speed, phases."""
 
 from __future__ import annotations

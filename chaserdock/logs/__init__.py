@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recorded logs: open, check, repair, export, play."""
 
 from .reader import Log, open_log

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write tables of a log as Parquet or CSV files while reading it: memory does not grow with its length."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Describe a log and check that it is complete."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publish a log again, byte for byte, in place of the world: to recorders, viewers and other subscribers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Open a log: typed messages, and tables by topic.
 
 >>> from chaserdock.logs import open_log                                                # doctest: +SKIP

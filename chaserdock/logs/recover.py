@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recover the readable messages of a log that is cut off or damaged into a new log."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages as tables: one row per message, nested fields flattened, the unit of every column in its metadata.
 
 Columns: ``key``, ``sent_ns`` (the sender's wall clock), ``time_s`` (simulated), then the message's fields. Vectors become

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Write trajectories of a log as TUM files: ``time_s x y z qx qy qz qw`` per line, in WRF; evo and others read them."""
 
 from __future__ import annotations

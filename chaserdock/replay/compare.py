@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Comparison of two recorded flights: summaries, digests, first different message, deviations of the bodies."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Comparison of messages field by field: first and largest differences of two runs, or of a log and current code."""
 
 from __future__ import annotations

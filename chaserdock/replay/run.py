@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay of a log through one stage of the current code, compared with the recorded output."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Content of the page: prose and tables, filled in from the results. A missing result is shown as a dash."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``chaserdock reproduce``: fly the plan, write the page."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's results: Fourlas et al., IFAC 2023, table 2. Mean squares over two minutes, average of three runs."""
 
 from __future__ import annotations

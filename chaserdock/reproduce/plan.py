@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plan of a reproduction: missions with images, and studies of the controller on perfect knowledge."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Execution of a plan: missions as runs of a campaign, studies by ``chaserdock study``. Finished work is kept."""
 
 from __future__ import annotations

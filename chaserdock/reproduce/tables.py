@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Values of the tables: means over runs, ratios, requirements."""
 
 from __future__ import annotations

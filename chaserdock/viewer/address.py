@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Address of the viewer's page and admission of connections. Imports no viser: the launcher uses it, too."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """History of a mission: series over simulated time, trails and event lines, bounded in memory."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Viewer of a running mission: receives messages, draws, sends commands. A process of its own.
 
 It keeps only the newest messages of each topic, the rest is dropped inside Zenoh: a blocked browser never delays the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Random access to a log for the viewer: indexed in one pass, images stay in the file."""
 
 from __future__ import annotations

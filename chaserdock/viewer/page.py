@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Panels of the page: state, commands, images, plots, events, and the time line of a log."""
 
 from __future__ import annotations

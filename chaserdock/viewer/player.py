@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Viewer of a log: the page with a time line."""
 
 from __future__ import annotations

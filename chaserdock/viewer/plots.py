@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plots of the page: their series, decimated for the browser."""
 
 from __future__ import annotations

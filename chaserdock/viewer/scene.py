@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """3-D scene, drawn with viser: bodies, estimate, plans, corridors, keep-out sphere, camera frustums."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Web server of the page: viser's, bound to one address, without public sharing, closed to pages of other origins."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bodies, corridors and lines of the 3-D scene as arrays."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State of a mission at one time: the latest message of each kind, and derived values."""
 
 from __future__ import annotations

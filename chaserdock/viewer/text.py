@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Text of the page as Markdown: state of the mission and of each chaser, faults, events."""
 
 from __future__ import annotations

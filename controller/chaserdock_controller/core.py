@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One tick of the controller, without I/O: ingest, estimate, guide, plan, command."""
 
 from __future__ import annotations

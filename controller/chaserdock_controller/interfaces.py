@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs and outputs of a controller tick, and the results that its stages hand to each other."""
 
 from __future__ import annotations

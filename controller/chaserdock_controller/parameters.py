@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Parameters of estimator and NMPC from the scenario."""
 
 from __future__ import annotations

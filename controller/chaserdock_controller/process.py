@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller process: receives the messages of a tick, has it processed, and publishes the outputs."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay of the controller process on the inputs recorded in a log."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A controller that is no part of chaserdock: it speaks the published protocol with `zenoh` and `msgpack` alone.
 
 It takes the place of `chaserdock controller` for one chaser: joins the mission, tracks the target with an alpha-beta

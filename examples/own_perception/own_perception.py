@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A perception of twenty lines: OpenCV's markers, one PnP over all corners, a covariance from the distance."""
 
 import cv2

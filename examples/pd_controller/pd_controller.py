@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A PD law in the place of the NMPC: same references, same limits, no look ahead and no regard for obstacles."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Types of numerical data that all packages share."""
 
 from __future__ import annotations

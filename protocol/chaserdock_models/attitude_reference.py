@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reference attitudes that keep a chaser facing the target when its offset differs from the nominal one."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Safe fallback command: brake to rest within the actuator limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pinhole camera with Brown-Conrady lens distortion, and its mounting on the chaser.
 
 Pixel centres lie at integer coordinates: the image covers (-0.5, width - 0.5) x (-0.5, height - 0.5).

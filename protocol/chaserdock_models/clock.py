@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated time in whole physics steps, which avoids accumulated rounding."""
 
 from __future__ import annotations

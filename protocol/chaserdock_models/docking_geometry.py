@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Geometry of a probe relative to its docking port, shared by guidance and simulator. Pure functions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rigid-body motion: the Newton-Euler equations and their integration by the classical Runge-Kutta method (RK4).
 
 Three functions cover the uses in simulator and flight software; all have the same equations. ``propagate`` integrates

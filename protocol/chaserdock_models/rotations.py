@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rotations: Hamilton quaternions, scalar first, unit length, body to world.
 
 ``q_wxyz`` rotates a vector given in body axes into world axes: ``v_world = rotate(q, v_body)``.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rotations of one quaternion at a time, in plain Python floats.
 
 The conventions are those of ``rotations`` (Hamilton, scalar first, unit length, body to world), which handles arrays of

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Docking targets: their boxes and ArUco markers.
 
 Marker axes: x to the marker's right, y up, z out of the face, origin at the marker's centre.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Built-in chaser bodies with thrusters: defaults of the scenario's section ``chaser``."""
 
 from __future__ import annotations

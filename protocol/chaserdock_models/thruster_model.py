@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Impulse of thrusters from the opening times of their valves; used by the simulator and by a chaser's own model.
 
 Times are integer nanoseconds of simulated time. A valve is open where a pulse or a failure opens it and its shut-off

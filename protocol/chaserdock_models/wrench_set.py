@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The set of wrenches that a thruster layout can produce. Pure functions; SI units, body axes (CRF).
 
 The set {B f, 0 <= f <= f_max} is a zonotope. Each of its facets is parallel to five of the thrusters' wrenches, so the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Encoding and decoding of messages, with validation of all external data."""
 
 from __future__ import annotations

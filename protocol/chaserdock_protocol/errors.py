@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Base class of errors for users: one line of text per fault, printed without a traceback."""
 
 

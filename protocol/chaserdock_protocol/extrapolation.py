@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Extrapolation of a body's last odometry."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inject the scenario's faults into the messages of a process, by simulated time.
 
 Network faults (loss, delay, corruption) apply at the *receiver*: the log holds the message as sent, and receivers may

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Plugins: entry points of installed packages, by name.
 
 A scenario names a plugin. Only packages installed on the machine of the process are loaded, so that a scenario received

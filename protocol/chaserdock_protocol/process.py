@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Options, stop signal and start-up steps that all processes share."""
 
 from __future__ import annotations

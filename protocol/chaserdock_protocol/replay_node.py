@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Stand-ins for a process' network node and heartbeat, which replay a log through today's code."""
 
 from __future__ import annotations

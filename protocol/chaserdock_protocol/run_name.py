@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Name of a run's folder, which several processes must agree on."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Find scenario files: by path, or by the name of a scenario that is shipped with chaserdock."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Table of topics: key, type, writer, readers, rate and quality of service.
 
 Keys are relative to the run's namespace and begin with their publisher's name, so that an access rule can restrict a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the router denies is noted: who, what, on which key, how often; and nothing that is allowed."""
 
 from __future__ import annotations

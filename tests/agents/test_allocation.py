@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster selection: exact where that is possible, closest where not, cheap, and within limits that change."""
 
 from __future__ import annotations

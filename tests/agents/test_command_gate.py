@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The pilot: which commands a chaser refuses to fly, and how it brakes."""
 
 from __future__ import annotations

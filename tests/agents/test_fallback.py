@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fallback of a chaser without commands: its modes, and the process that enters and leaves it."""
 
 from __future__ import annotations

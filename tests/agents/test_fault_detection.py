@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Which thruster has failed: found from residuals alone, and never where nothing has."""
 
 from __future__ import annotations

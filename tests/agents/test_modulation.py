@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thrusts into pulses: what is given follows what is asked for, in whole steps and never too short."""
 
 from __future__ import annotations

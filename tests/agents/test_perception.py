@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pose from rendered images: accuracy, consistency of the covariance, and images that should give nothing."""
 
 import numpy as np

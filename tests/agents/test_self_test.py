@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Test burns: they leave the motion of a healthy chaser as it is, reach every thruster in turn, and find the idle one that
 has failed."""
 

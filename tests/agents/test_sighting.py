@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """From an image message to a sighting message: whatever is in the message, there is an answer."""
 
 from __future__ import annotations

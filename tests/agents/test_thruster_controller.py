@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A chaser's thrusters in flight: what it is told, finds and tells, and what the controller makes of that."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What markers look like from a pose, by kernel: to the bit what NumPy's plain formulae say, on every instruction set."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What no module may do with what comes from outside, and that nothing that waits is without a bound."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Architecture rules: who imports whom, and that flight software cannot reach ground truth."""
 
 from __future__ import annotations

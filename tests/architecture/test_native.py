@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled kernels: the same bits from every instruction set, and one clear error where they cannot be had."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rules for source files: licence header and typed packages."""
 
 from __future__ import annotations
@@ -12,7 +13,11 @@ def test_source_files_state_their_licence() -> None:
     tracked = subprocess.check_output(["git", "ls-files"], cwd=ROOT, text=True).split()
     sources = [name for name in tracked if re.search(r"\.(py|c|h|js|css|toml|ya?ml|json5)$", name)]
     assert len(sources) > 400
-    missing = [name for name in sources if "SPDX-License-Identifier: Apache-2.0" not in (ROOT / name).read_text()[:300]]
+    missing = [
+        name
+        for name in sources
+        if "SPDX-License-Identifier: Apache-2.0" not in (ROOT / name).read_text()[:300]
+    ]
     assert missing == []
 
 

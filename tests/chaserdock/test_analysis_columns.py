@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Growing tables: in memory, in a file, and equal reports from both."""
 
 from __future__ import annotations

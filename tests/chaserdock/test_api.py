@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The Python API: runs, logs, scenarios, errors; no output and no signal handlers."""
 
 from __future__ import annotations

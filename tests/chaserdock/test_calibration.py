@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera calibration from rendered boards."""
 
 import cv2

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Campaigns: runs defined by a file, table and report, resumption."""
 
 from __future__ import annotations

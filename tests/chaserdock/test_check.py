@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``chaserdock check``: conforming processes pass, every kind of violation is found."""
 
 from __future__ import annotations

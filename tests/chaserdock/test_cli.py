@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The command line: statuses, JSON lines, help without heavy imports, completion, docs/cli.md."""
 
 from __future__ import annotations

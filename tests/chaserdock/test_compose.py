@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compose builds the image and flies a short mission, where a Docker engine runs; compose.yaml is checked everywhere."""
 
 from __future__ import annotations

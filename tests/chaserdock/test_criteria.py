@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The criterion ``success.reached``: evaluation and validation."""
 
 from __future__ import annotations

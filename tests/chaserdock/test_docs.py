@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The documentation: builds strictly, needs no network, and says nothing that the repository contradicts."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The examples of docs/extend.md fly: a perception plugin, a solver plugin, and a foreign controller."""
 
 from __future__ import annotations

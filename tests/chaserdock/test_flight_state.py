@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Progress and notices of a running mission, and how they are shown."""
 
 from __future__ import annotations

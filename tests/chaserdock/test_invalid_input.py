@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Invalid command lines: one line on standard error that names the fault, status 2, nothing on standard output."""
 
 from __future__ import annotations

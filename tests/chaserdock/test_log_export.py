@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Tables, typed messages and tracks of a finished log."""
 
 from __future__ import annotations

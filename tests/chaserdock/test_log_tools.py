@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Finished logs: damage and repair, the viewer layer, schema migrations."""
 
 from __future__ import annotations

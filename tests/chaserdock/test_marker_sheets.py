@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Marker sheets have true scale as SVG and as PDF."""
 
 import re

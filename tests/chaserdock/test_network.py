@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A mission over a router, with rights, from the command line: keys, router, status, judge."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay of logs through current code; comparison of messages and of runs."""
 
 from __future__ import annotations

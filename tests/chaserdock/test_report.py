@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Figures, report page and film of recorded flights: whole, cut short, or with hardly anything in them."""
 
 from __future__ import annotations

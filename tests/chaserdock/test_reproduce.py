@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """`chaserdock reproduce`: plan, arithmetic of the tables, page, resumption."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``chaserdock scenario``: list, validate, show, schema and new."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The controller by itself: the offline loop, the perfect estimator, and the least possible transient."""
 
 from __future__ import annotations

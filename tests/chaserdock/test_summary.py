@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """summary.json: its fields equal those of the typed summary and of docs/summary.md."""
 
 from __future__ import annotations

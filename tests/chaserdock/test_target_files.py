@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Targets defined by a file: validation, rendering, detection."""
 
 import numpy as np

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Seeded variations of ``collision-avoidance`` and ``swap``, and the figures of a flight."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Viewer without a browser: state, history, plots, shapes, logs, admission of connections."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The viewer's page in a real browser: no external requests, moving scene, commands by click, no effect of a blocked
 browser on the flight."""
 

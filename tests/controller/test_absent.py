@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A chaser that is lost to the others: an obstacle where it should be, and wider the longer nothing is heard."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/architecture.md lists calls that exist, in the order of packages; docs/phases.md is generated."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A solve's budget: seconds in real time, iterations anywhere, and the word for it."""
 
 from __future__ import annotations

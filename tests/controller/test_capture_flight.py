@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Capture from start to end in one process, and docking sections that are refused."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Docking by capture: phases, guards, time-outs, corridors and commands, without a world."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Approach corridors in flight: who is planned in one, when, and what it does to the plan."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The chaser's prediction model: CasADi's and the compiled one, against each other and against physics."""
 
 from __future__ import annotations

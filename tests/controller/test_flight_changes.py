@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chasers come, go and latch between two ticks, limits change, commands act late: the flight code takes it in its stride."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Estimation interface: estimators by name, refused parameters, and what its modules may import."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Estimation mathematics: Jacobians by differences, motion models, covariances, geometry."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's combiner: a mean over the last poses, with its known faults."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Phases, operator commands, and behaviour without a target."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Where chasers look that search, and that show how their camera is mounted; what the filter makes of the latter."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What each process does about a message that has been lost on its way, in lock-step: the tick is answered."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The MEKF without faults: consistency, accuracy, order and time."""
 
 from __future__ import annotations

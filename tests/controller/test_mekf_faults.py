@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The MEKF with blind, faulty and ambiguous cameras, and with a target that jumps."""
 
 from __future__ import annotations

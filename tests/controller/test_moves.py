@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Moves: smooth from any state to rest, on a line, within the speed limit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The NMPC in closed loop: against ipopt's, constraints, stationary points, invariances."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One conformance test for every back end, and what they promise about budgets, corridors and changing limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The NMPC's own quadratic programme, held against dense linear algebra, and what it refuses."""
 
 from __future__ import annotations

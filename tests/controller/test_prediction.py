@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prediction: the rigid body, the commands under way, and the state they lead to."""
 
 from __future__ import annotations

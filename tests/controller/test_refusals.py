@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Bad input to the controller: one clear error before the flight, or a named refusal and a safe command in flight."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A controller in another's shadow: what it waits for, what it takes over, and that it then knows the same."""
 
 from __future__ import annotations

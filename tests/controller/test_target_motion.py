@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The free target's predicted motion and the estimator's, against PyBullet."""
 
 from __future__ import annotations

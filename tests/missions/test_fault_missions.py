@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Faults in whole missions over real processes: deterministic in lock-step, told in the log, survived."""
 
 from __future__ import annotations

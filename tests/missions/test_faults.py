@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Killed, duplicated, foreign and malformed: nothing hangs, nothing recorded is lost, every refusal has its reason."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Decoders under mutated input (a short benchmarks/fuzz.py), and the check of what they accept."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Each process' answers to recorded inputs, against what it answered when the golden log was made.
 
 Recorded by ``tests/make_golden.py``. Compared with a tolerance, since another kind of CPU differs in the last bits.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A standby takes over: killed, frozen, cut off, in whole missions over real processes."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """A mission over hosts: network namespaces with a network between them, and the shipped configuration files."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The in-process mission moves the bodies exactly as a lock-step mission in separate processes does."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Whole missions: separate processes over real Zenoh, in lock-step, and that nothing about the machine matters."""
 
 from __future__ import annotations

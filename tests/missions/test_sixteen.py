@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario ``sixteen-chasers``: laid out as it says, and held without a distance below the limit."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario ``swap`` with perfect state: head-on pairs around the tumbling target pass each other."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thrusters in whole missions: separate processes, real Zenoh, images and all."""
 
 from __future__ import annotations

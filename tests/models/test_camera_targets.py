@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The camera's projection and the geometry of the targets, against independent formulae."""
 
 import cv2

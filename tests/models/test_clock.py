@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The clock: steps, ticks, images and their times in whole nanoseconds."""
 
 from __future__ import annotations

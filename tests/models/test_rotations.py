@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rotations: the group's axioms, the two ways of writing it, and the conventions (Hamilton, body to world)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Valves and what thrusters give through them, in closed form."""
 
 from __future__ import annotations

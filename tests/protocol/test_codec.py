@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Message types and codec: what passes, what must not, and how messages may grow."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leader election between controllers, and rejection of commands of stale terms by chasers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """What the fault layer does to messages: pure, by simulated time, drawn from the seed."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """``[[fault]]`` tables: valid ones load, each invalid one is a single line with its path."""
 
 from __future__ import annotations

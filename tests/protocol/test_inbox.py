@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The queue between threads keeps order and is bounded."""
 
 from __future__ import annotations

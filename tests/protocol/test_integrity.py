@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Odometry that cannot be believed, and sightings that go on disagreeing."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mission log: what goes in comes out, for us and for tools that know nothing of us."""
 
 from __future__ import annotations

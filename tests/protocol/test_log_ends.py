@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Logs that end uncleanly: what a flush keeps, a file cut off anywhere, a file that is damaged."""
 
 from __future__ import annotations

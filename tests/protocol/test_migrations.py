@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Logs and scenarios of older formats open as if they had been written today."""
 
 from __future__ import annotations

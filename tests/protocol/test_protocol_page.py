@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """docs/protocol.md matches the message types and the topics table."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Recorders over real Zenoh: a log played and recorded again is the same; a killed one loses its last second at most."""
 
 from __future__ import annotations

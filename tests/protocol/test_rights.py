@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rights: every wrong identity on every key is dropped by the router, every right one gets through."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario schema: shipped scenarios are valid, and every error is one line with its path."""
 
 from __future__ import annotations

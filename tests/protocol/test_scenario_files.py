@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario files, variants and overrides: every error is one line that names the file or the override, and the path."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every scenario key is documented, and the generated page and JSON schema are up to date."""
 
 from __future__ import annotations

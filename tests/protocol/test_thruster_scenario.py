@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thrusters in scenario files: shipped layouts give full control, and invalid ones are an error."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The topics table: keys, who may write and who may read."""
 
 from __future__ import annotations

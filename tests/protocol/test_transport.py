@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Zenoh configuration of a link: safe defaults, and precedence of a user's file."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Ideal actuators: effective times, limits, and the output they report."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Cameras of a scenario: every effect, and the distribution of drawn errors."""
 
 from pathlib import Path

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Contact, latch and capture in the simulation, and conservation of momentum."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Merging of overlapping rectangles: disjoint, covering, and merged only where necessary."""
 
 from __future__ import annotations

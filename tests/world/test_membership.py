@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Membership of a mission: joining, departure and mutual discovery."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The PyBullet simulation against analytical physics and the controller model: motion, forces, contacts."""
 
 from __future__ import annotations

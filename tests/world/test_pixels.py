@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pixel operations of rendering are bit-identical to OpenCV and NumPy on every instruction set."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rendered images against projected ground truth, occlusion, and camera effects."""
 
 import cv2

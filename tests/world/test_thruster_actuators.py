@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thrusters in the world: the body gets what they give at their places, however they fail and whatever comes late."""
 
 from __future__ import annotations

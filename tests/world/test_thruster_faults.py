@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster faults by operator command: applied between ticks, refused with a reason, recorded as events."""
 
 from __future__ import annotations

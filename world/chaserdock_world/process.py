@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The world process: owns simulated time, simulates the bodies, renders the images and publishes the ground truth.
 
 Lock-step: a tick ends when all expected replies have arrived; nothing depends on the order of arrival or on the wall clock.

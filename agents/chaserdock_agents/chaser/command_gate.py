@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Validation of wrench commands by a chaser, and construction of actuator commands. Pure functions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fallback of a chaser that receives no commands. Pure functions; SI units; WRF unless stated otherwise.
 
 Three modes in this order, recorded as events: fly the last plan to the end of its horizon (``plan``), come to rest

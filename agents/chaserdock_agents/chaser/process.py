@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The chaser process: images to sightings, wrench commands to actuator commands. It has no access to ground truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Replay of the chasers' perception on recorded images: the code of their processes on a replay node."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Convert an image message to a sighting message; a pure function of image, prediction and parameters."""
 
 from __future__ import annotations

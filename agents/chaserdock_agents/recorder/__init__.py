@@ -1,1 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recorder process: everything that travels, verbatim, into an MCAP file."""

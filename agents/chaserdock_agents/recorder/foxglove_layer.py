@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Viewer layer of a log: Foxglove messages in addition to the verbatim ones, for Rerun, Foxglove and Lichtblick.
 
 Channels (all under ``/viewer/``); times are simulated:

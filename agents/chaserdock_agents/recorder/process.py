@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The recorder process: writes every message of a run verbatim to MCAP.
 
 In lock-step it acknowledges each tick that it has received completely, which bounds how far the flight runs ahead. At the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The files of one recording: verbatim and viewer layer, with rotation by size or time."""
 
 from __future__ import annotations

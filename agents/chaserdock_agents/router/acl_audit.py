@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Audit log of access-control denials, read from Zenoh's log, as Zenoh drops messages without notice.
 
 At level ``trace`` Zenoh writes a line for every decision. Some are not attempts: when a client declares a key, all

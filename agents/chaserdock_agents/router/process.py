@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The router process, to which clients on several hosts or in several containers connect.
 
 It forwards messages, enforces access control (``access_control``) and reports denials on standard error and as events.

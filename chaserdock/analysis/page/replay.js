@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 // 3-D replay: flat faces on a 2-D canvas in order of depth (painter's algorithm), without library or request.
 (function () {
   "use strict";

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Estimate the target's state from the sightings of all chasers. Mathematics and parameters: docs/estimation.md."""
 
 from __future__ import annotations

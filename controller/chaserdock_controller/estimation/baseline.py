@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The paper's estimation combiner, as a baseline for comparison.
 
 The paper (Fourlas et al. 2023) averages the latest estimates of all chasers that see the target, with "a moving average

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Measurement model of a camera with extrinsic and focal-length calibration errors. Pure functions.
 
 Each camera has seven errors, constant in its own axes (IRF): the rotation vector delta of its true axes, the shift b of

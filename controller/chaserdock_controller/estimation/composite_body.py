@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The target and the chasers whose latch holds it, as one rigid body."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Update of the filter by one exposure: initialization, update, choice between hypotheses, re-initialization.
 
 ``process`` is a pure function from state and measurements to state. A late measurement is handled by a rollback to the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Transform a camera measurement to a pose of the target in WRF, with covariance."""
 
 from __future__ import annotations

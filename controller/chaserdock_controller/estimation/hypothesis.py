@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """One hypothesis of the target's state: prediction and measurement update of the error-state filter.
 
 Error state: position, velocity (WRF), dtheta, omega (TRF), then for every camera seen so far its seven calibration

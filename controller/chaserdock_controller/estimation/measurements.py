@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Conversion of sightings to measurements of the target's pose in WRF."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Default estimator: a multiplicative extended Kalman filter that applies measurements at their exposure time.
 
 Mathematics: docs/estimation.md. Late measurements are inserted by rollback and replay over a short buffer, so the state

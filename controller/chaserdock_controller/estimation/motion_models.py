@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Motion models of the target: prediction of the mean, and transition matrix of the error state.
 
 Error state (12): position and velocity (WRF), dtheta and omega (TRF), with q_true = q (x) exp(dtheta).

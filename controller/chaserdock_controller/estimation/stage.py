@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Second stage of a tick: estimate the target's state from the sightings of all chasers."""
 
 from __future__ import annotations

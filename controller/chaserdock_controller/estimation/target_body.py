@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The target as a free rigid body: its predicted path, and its mass properties with captured chasers attached.
 
 TRF's origin need not be the centre of mass: with a captured chaser it is not.

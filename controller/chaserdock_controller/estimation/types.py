@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs and outputs of target state estimation. Arrays are float64; SI units and radians."""
 
 from __future__ import annotations

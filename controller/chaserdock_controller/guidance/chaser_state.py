@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Guidance state of one chaser, and the result of a command."""
 
 from __future__ import annotations

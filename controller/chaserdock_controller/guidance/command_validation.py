@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Reasons for refusing a command; an empty string where there is none. Pure functions."""
 
 from __future__ import annotations

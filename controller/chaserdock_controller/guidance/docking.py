@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Docking by capture: geometry of a port's corridor and the conditions of phase changes. Pure functions."""
 
 from __future__ import annotations

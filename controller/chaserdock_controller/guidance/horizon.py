@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """References of the chasers, now and over the NMPC horizon."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State machine of every chaser: phase, and motion of the reference position in TRF. No I/O; time is an argument.
 
 Phases and transitions: ``phases``. Every phase change looks up its target in the transition table.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Phases of a chaser and the transitions between them, as one table.
 
 `docs/phases.md` is generated from ``TRANSITIONS``.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pointing: the search pattern for the target, and the manoeuvre that makes camera errors observable. Pure functions of
 time; SI units, radians.
 """

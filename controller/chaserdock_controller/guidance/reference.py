@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Predicted motion of the target, reference poses and feed-forward wrenches.
 
 The target moves at constant velocity (WRF) and constant body rate. Pure functions; SI units, radians.

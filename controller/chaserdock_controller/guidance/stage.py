@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Third stage of a tick: apply commands, advance the phases, and compute the references."""
 
 from __future__ import annotations

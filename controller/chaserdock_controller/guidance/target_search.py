@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Search for the target: criterion for its end, and the wrench of each searching chaser."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Operator commands that isolate and restore thrusters. No I/O."""
 
 from __future__ import annotations

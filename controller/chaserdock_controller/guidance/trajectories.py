@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Smooth motions of a reference position: polynomials between states of motion. Pure functions.
 
 A motion from rest to rest is the fifth-degree polynomial of least jerk (T. Flash and N. Hogan, 1985). A motion from

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Prediction of a chaser's own state to the time when the next command takes effect."""
 
 from __future__ import annotations

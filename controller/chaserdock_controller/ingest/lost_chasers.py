@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Chasers without odometry for a while. No I/O.
 
 They are taken to coast, as a chaser does whose process has stopped. The margin that other chasers keep grows with the time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have made. No I/O.
 
 A chaser that suddenly believes to be somewhere else would fly there, through the target if that lies between. A jump is

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Consistency of each chaser's sightings with the fused estimate. No I/O."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """First stage of a tick: check the inputs and predict the chasers' own states."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The newest thruster report of every chaser: input limits and impulses. No I/O."""
 
 from __future__ import annotations

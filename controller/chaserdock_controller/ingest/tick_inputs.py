@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Collects the messages of a tick: which have arrived, which were lost, which are duplicates or stale. No I/O."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Centralized nonlinear MPC: one problem (`problem`), solved by a back end selected by name."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Back end `alpaqa`: PANOC with an augmented Lagrangian, the solver family of the paper, from the wheel `alpaqa`.
 
 Single shooting of `problem.build_nlp`: states are eliminated, and the augmented Lagrangian handles the distances; its

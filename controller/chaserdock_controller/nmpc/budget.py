@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Iteration limit for a real-time budget in seconds, from the measured durations of previous solves.
 
 A solve is limited by iterations and never reads a clock, so its result depends on its inputs and that limit only. In

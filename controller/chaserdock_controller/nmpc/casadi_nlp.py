@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Back ends `ipopt` and `fatrop`: the problem of `problem.build_nlp`, coupled, by CasADi and solvers in its wheel.
 
 ipopt with MUMPS converges in tens of milliseconds; it is the reference for faster back ends, not a real-time

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Validation of a problem and its warm start, common to all back ends."""
 
 from __future__ import annotations

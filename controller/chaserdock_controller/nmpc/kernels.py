@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Array interface of the compiled NMPC kernels (`native`), with the same names.
 
 Arrays are C-contiguous float64 (int64 where stated) of the given shapes; nothing is checked here.

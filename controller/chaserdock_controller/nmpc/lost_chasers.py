@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Obstacle rows of lost chasers in the NMPC problem. Pure functions."""
 
 from __future__ import annotations

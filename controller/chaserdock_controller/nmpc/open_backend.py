@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Back end `open`: OpEn (Optimization Engine), the paper's own solver, through opengen.
 
 Sopasakis, Fresk and Patrinos, "OpEn: Code generation for embedded nonconvex optimization", IFAC 2020: PANOC over the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The optimal control problem in CasADi, following the paper (section 4, eq. 6 and 7).
 
 State x = [p (3, WRF), v (3, WRF), q_wxyz (4, body to world), omega (3, body)], input u = [F (3), tau (3)] in

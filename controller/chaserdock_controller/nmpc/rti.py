@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Default back end: a real-time iteration with one structured QP per chaser and tick (native/tick.c).
 
 Diehl, Bock and Schloeder, SIAM J. Control Optim. 43 (2005): the shifted inputs are rolled through the nonlinear

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Slack weights of the distance constraints, common to all back ends."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Fourth stage of a tick: build the NMPC problem and solve it."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Inputs and outputs of the NMPC, independent of the back end."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Steps common to all back ends: validation, warm start, and evaluation of the plan."""
 
 from __future__ import annotations

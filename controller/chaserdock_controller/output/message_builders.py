@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages built from the results of a tick."""
 
 from __future__ import annotations

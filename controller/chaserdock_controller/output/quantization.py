@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Quantization of commands: finite steps, within limits."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Last stage of a tick: select each chaser's command and build the messages."""
 
 from __future__ import annotations

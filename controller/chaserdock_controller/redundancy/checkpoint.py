@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Serialize and restore controller state for a standby that joins late.
 
 Of the filter's buffer only the newest exposure is included: a sighting older than that cannot be used after a restore. The

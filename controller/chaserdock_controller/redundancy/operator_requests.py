@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Operator commands that wait for the next tick. Thread-safe; no I/O."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leader and hot standby of the controller: what to wait for, what to hold back, when to publish. No I/O.
 
 In lock-step a standby processes a tick once it has the same inputs and the leader's operator commands of that tick, so that

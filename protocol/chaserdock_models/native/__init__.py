@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Load the numerical kernels: C code that is compiled when the package is built.
 
 Each package with kernels has a folder ``native`` with its C sources, ``kernels.c`` which includes them, and one shared

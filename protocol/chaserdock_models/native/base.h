@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Shared by all kernels: vectors of doubles, three-vectors, exported names, working memory.
  *
  * Results are the same to the last bit on every processor. The compiler does not contract or reorder expressions

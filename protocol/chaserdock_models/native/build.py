@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Compile the kernels: ``python protocol/chaserdock_models/native/build.py``. Building the package does this as well.
 
 The compiler is zig's Clang from the wheel ``ziglang``; no system compiler is needed. The result does not depend on the

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Selection of the kernel copy for this processor, and the digest of the sources. */
 #include <stdint.h>
 

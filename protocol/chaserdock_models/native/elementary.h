@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Elementary functions from + - * / only, which give the same bits on every machine. */
 #ifndef CHASERDOCK_ELEMENTARY_H
 #define CHASERDOCK_ELEMENTARY_H

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Rotation of a free rigid body. */
 #include "base.h"
 

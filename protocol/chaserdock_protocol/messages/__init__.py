@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages that processes exchange and logs store.
 
 On the wire a message is a msgpack map of its field names; the Zenoh encoding carries its type and version (see

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Field types of messages with their bounds, and nested structures."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages of a flight: world, chaser and controller."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Messages for joining and leaving a mission."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Operator command that injects thruster faults into the simulation."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """MCAP writer of the logs: the ``mcap`` package's, with a compact list of chunk indexes.
 
 The package keeps one object per chunk until the file is closed. With 60 channels and a flush every 0.5 s that is 4.6 kB

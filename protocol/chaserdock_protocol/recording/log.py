@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The mission log: MCAP files with every message verbatim, one channel per key and encoding.
 
 ``log_time`` is simulated time (the message's ``sim_time_ns``, or that of the message before if it has none);

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Provenance of a log: versions of all installed packages, and the lock file."""
 
 from __future__ import annotations

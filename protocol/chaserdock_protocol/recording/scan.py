@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sequential reader of the records of MCAP log files, with integrity checks. All log readers use it.
 
 Checks the CRC of each chunk, of the data section of a closed file, of attachments and of our metadata, and that

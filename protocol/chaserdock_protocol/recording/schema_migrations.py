@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Migrate messages and keys of old logs to the present schema.
 
 On the wire only the present version of a message is accepted. When the meaning or the name of a field changes, the

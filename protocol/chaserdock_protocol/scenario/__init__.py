@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario file: schema, loading, variants and overrides."""
 
 from .errors import ScenarioError

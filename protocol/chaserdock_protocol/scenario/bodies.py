@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario sections ``[target]`` and ``[chaser]``."""
 
 from __future__ import annotations

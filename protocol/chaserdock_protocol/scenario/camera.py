@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario section ``[camera]``: the chasers' cameras and the light."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Checks across several sections of a scenario. Each raises ValueError with the path of what is wrong."""
 
 from __future__ import annotations

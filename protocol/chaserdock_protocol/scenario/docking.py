@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario section ``[docking]``: ports, approach corridors, and when a chaser counts as docked."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario tables ``[[fault]]``: failures to inject, with time and place (docs/faults.md)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Value types of a scenario file, and the base classes of its sections."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Read scenario files, and the target and calibration files that they name.
 
 Their content becomes part of the scenario, because the world sends it to processes that do not have these files.

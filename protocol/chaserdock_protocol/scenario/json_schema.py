@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The scenario's JSON schema: for editors, for the reference page, and for the texts of validation errors."""
 
 from __future__ import annotations

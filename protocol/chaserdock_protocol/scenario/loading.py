@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Load scenarios: files with their variants and overrides, and the JSON that the world sends and logs store."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Older scenario formats: scenarios stored in logs are migrated, files get an error that names the new key."""
 
 from __future__ import annotations

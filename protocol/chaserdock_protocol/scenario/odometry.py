@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario section ``[odometry]``: errors of the chasers' own odometry."""
 
 from __future__ import annotations

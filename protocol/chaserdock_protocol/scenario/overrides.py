@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Change the values of a scenario: variants (``extends``) and overrides (``--set``)."""
 
 from __future__ import annotations

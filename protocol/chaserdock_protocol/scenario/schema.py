@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Schema of a scenario: every key with type, default, range and description.
 
 Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF target, IRF image (docs/frames.md).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Custom targets: cuboids, an optional mesh, and markers, in a scenario or in a target file (docs/cameras.md)."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scenario tables about thrusters: layout, pulse modulation, and failures."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Transport over Eclipse Zenoh: nodes, their configuration and access control."""
 
 from .config import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, RawSample, ReceivedMessage, Tls

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Zenoh access-control rules of a mission, derived from the topics table.
 
 The common name in its certificate identifies a process. The router denies everything that no rule allows: a process

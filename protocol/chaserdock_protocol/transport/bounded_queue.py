@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Queue from Zenoh's threads to a process' own thread, bounded in bytes and items."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Link configuration, and the messages that a session delivers."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Zenoh sessions with safe defaults, and typed topics on them. No other module imports zenoh.
 
 Defaults: no multicast, loopback only, one namespace per run, no shared memory. Callbacks run on Zenoh's threads

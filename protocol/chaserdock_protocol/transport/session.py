@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Joining a mission, and the discovery barrier before its first tick.
 
 Zenoh propagates declarations one by one, so that a message published too early may miss a subscriber. Every process

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Actuators of a chaser in the simulation: the interface, and ideal actuators that give the commanded wrench.
 
 Commands wait until they take effect; ideal actuators limit each axis of a command to the body's limits.

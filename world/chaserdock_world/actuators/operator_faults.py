@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster faults injected by an operator in flight: requested at any time, applied and answered between ticks."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Simulated thrusters of a chaser: valves that open and close as commanded, with failures.
 
 The wrench about the centre of mass is constant in body axes over a physics step and equals the mean over the step.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Leader election between controllers: the world grants numbered terms, one leader at a time. No I/O; time is passed in.
 
 As in Raft (D. Ongaro, J. Ousterhout, 2014) every command carries the number of its term, and commands of an older term

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Membership of a mission: admits processes, tracks their liveliness and which of them have discovered each other."""
 
 from __future__ import annotations

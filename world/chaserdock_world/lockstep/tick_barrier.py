@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lock-step barrier: collects the replies that a tick expects, and applies the actuator commands among them."""
 
 from __future__ import annotations

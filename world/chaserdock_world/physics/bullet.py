@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Import PyBullet and connect to it without its messages on standard output and error, which other programs may parse."""
 
 from __future__ import annotations

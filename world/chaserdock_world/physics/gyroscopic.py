@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Correction torque that makes Bullet's integration of rotation second order.
 
 Bullet evaluates the gyroscopic torque omega x I omega at the beginning of a step, so that angular momentum drifts in

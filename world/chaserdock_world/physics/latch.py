@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """State machine of a probe's latch: due commands, and whether a touch closes it. Contains no physics."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rigid-body simulation in PyBullet; the only module that uses its conventions.
 
 PyBullet orders quaternions x, y, z, w and expresses angular velocity in world axes; this module's interface is scalar first

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Background of an image: space, stars and the Earth; and the illumination of the scene."""
 
 from __future__ import annotations

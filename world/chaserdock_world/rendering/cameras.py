@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The chasers' cameras: rendering, motion blur, glare, sensor effects, compression."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Merge overlapping rectangles of pixels into disjoint patches to be painted."""
 
 from __future__ import annotations

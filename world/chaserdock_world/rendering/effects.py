@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Camera effects on the rendered image: exposure, point spread, noise. Lens distortion is part of rendering (``lens``).
 
 Deterministic: the noise of an image depends on the seed, the chaser and the image number only.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Glare of the sun in or near the image: its disc, and stray light in the lens."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Lens distortion: the extent of the ideal image that a distorted image needs, and the mapping between them."""
 
 from __future__ import annotations

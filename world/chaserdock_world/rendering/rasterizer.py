@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Rasterizer of textured cuboids: each visible face is exactly projected, warped with OpenCV and supersampled.
 
 Painting order: boxes do not overlap, so any two have a separating plane; the box on the camera's side of it can occlude the

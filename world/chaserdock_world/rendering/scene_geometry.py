@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Scene geometry: visible faces of boxes, their outlines in the image, and their painting order.
 
 The arithmetic is in C (native/scene.c): an image shows about a dozen faces, too few to vectorize with NumPy.

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Textures of a target's faces: markers, exactly averaged over the area of each texel.
 
 A texel's value is the mean over its area at every resolution, so that rendering from a coarser texture blurs a marker but

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Adapter to PyBullet's software renderer TinyRenderer, for targets of any shape.
 
 Renders a scene of its own, separate from the physics, with the camera at the origin (x right, y up, looking along -z).

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Sensor errors: camera calibration errors, and bias and noise of the chasers' odometry.
 
 Calibration errors and biases are drawn once per chaser, noise once per tick, from the scenario's seed, the chaser's number

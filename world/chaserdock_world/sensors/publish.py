@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Publish the world's messages at the beginning of a tick: odometry, docking sensors and ground truth."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pose of the target from markers in an image (ArUco detection, edge-fitted corners, PnP with covariance)."""
 
 from __future__ import annotations

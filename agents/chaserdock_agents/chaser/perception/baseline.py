@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The perception of the paper, as a baseline: undistort the image, ArUco, EPnP on all corners.
 
 Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC 2023, sec. 4.

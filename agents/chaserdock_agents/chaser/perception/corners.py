@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Marker corners from lines fitted to the sides, in undistorted coordinates.
 
 Contours and corner filters bias the corners of a black square inwards; the centroid of the grey-level gradient across a

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Marker detection: OpenCV's ArUco detector with settings tuned by measurement."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Perception pipeline from an image to the pose of the target; the entry point of this package."""
 
 from __future__ import annotations

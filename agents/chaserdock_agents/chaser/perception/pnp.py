@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pose of a target from the corners of its markers, in ideal (undistorted) pixels.
 
 Candidates from SQPnP (G. Terzakis, M. Lourakis, ECCV 2020) and IPPE (T. Collins, A. Bartoli, IJCV 2014), a

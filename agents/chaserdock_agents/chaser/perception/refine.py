@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pose refinement: Levenberg-Marquardt on the weighted reprojection error."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Projection of a target's markers for a pose, implemented in native/views.c.
 
 Points are rotated here by NumPy's matrix product, whose rounding the C code would not reproduce.

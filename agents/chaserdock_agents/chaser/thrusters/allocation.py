@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster allocation: thrusts that produce a wrench (docs/thrusters.md).
 
 Feasible wrenches: of all thrusts in [0, max] that produce the wrench exactly, those with minimum sum, and of these the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster controller of a chaser: wrench to thrusts to pulses, fault detection and capability report. No I/O."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Thruster fault detection from the residual of commanded and observed impulse (docs/thrusters.md).
 
 Two hypotheses are tested for every thruster, each with its signature: stuck on (constant full thrust: the residual is the

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Observed impulse of a chaser and the covariance of its residual to the expected impulse. Pure functions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Pulse modulation: thrusts to pulses, one carrier period after the other (docs/thrusters.md).
 
 Every thruster has an impulse deficit: what was commanded and not yet delivered. The pulse of a period delivers the deficit

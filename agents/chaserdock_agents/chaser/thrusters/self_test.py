@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Self-test of thrusters that have not been observed recently (docs/thrusters.md).
 
 A thruster that is rarely used would show a failure only when it is needed. A test burn fires it for one minimum pulse

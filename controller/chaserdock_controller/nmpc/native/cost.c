@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Cost of the paper's eq. 6: quadratic model about a rollout, and value along a plan. */
 #include "base.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Discrete dynamics of a chaser and their Jacobians; the tests compare them with `problem.dynamics`.
  *
  * The Jacobians share intermediate results with the step itself, so the NMPC has its own integrator beside

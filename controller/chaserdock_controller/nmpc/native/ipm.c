@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Mehrotra's predictor-corrector interior point for one chaser's QP, on top of the Riccati sweeps.
  *
  * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dp_k >= c (a unit normal, dp_k the change of position

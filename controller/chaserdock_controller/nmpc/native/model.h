@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 #ifndef CHASERDOCK_MODEL_H
 #define CHASERDOCK_MODEL_H
 

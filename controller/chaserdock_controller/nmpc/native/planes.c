@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Distance constraints as half-spaces about a rollout, so that the chasers' problems separate.
  *
  * A chaser-target constraint becomes the plane tangent to the keep-out ball; a chaser-chaser constraint a separating

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* One tick of the real-time iteration for all chasers: rollout and linearization, rows, then one QP per chaser. */
 #include "base.h"
 

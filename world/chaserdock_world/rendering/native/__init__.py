@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """The compiled kernels of this package; chaserdock_models.native states the conventions."""
 
 from __future__ import annotations

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* The kernels of rendering, compiled once per instruction set (LEVEL). See base.h. */
 #include "base.h"
 #include "elementary.h"

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Adds grey-level dependent noise to an image. */
 #include "base.h"
 

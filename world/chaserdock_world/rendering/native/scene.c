@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Scene geometry: visible faces of boxes, their painting order, and the placement of textures. */
 #include "base.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Corners of markers from lines fitted to their sides. What is measured, and why so: chaserdock_agents.chaser.perception.corners. */
 #include "base.h"
 

@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Pose of minimum weighted reprojection error: Levenberg-Marquardt. */
 #include "base.h"
 

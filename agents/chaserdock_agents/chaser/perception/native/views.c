@@ -1,3 +1,4 @@
+/* SPDX-License-Identifier: Apache-2.0 */
 /* Projection of markers for a pose: distances from the detections, and which markers should be visible. */
 #include "base.h"
 

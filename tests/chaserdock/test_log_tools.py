@@ -130,7 +130,7 @@ def test_rotation_by_size_keeps_every_message(tmp_path: Path) -> None:
 
 def test_folder_with_a_log_is_rejected(tmp_path: Path) -> None:
     recorded(tmp_path)
-    with pytest.raises(LogError, match="holds a log already; a log is never overwritten"):
+    with pytest.raises(LogError, match="contains a log already; a log is never overwritten"):
         recorded(tmp_path, Rotation(seconds=1.0))
 
 

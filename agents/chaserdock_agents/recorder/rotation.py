@@ -33,7 +33,7 @@ class Recording:
         except OSError as error:
             raise LogError(f"{folder}: cannot be created: {error.strerror or error}") from None
         if any(folder.glob("mission*.mcap")):
-            raise LogError(f"{folder}: contains a log already; logs are not overwritten")
+            raise LogError(f"{folder}: contains a log already; a log is never overwritten")
         self._open()
 
     @property

@@ -90,7 +90,7 @@ def test_two_are_captured_at_once_and_the_third_waits_for_its_turn() -> None:
         ({"docking": {"ports": [PORTS[0], PORTS[0]]}}, "chaser 0 has more than one"),
         ({"docking": {"ports": [PORTS[1]]}}, "docking.ports.0.chaser: there is no chaser 1"),
         ({"docking": {"ports": [PORTS[0] | {"axis": [-0.98, 0.199, 0.0]}]}}, "degrees off the axis"),
-        ({"docking": {"ports": [PORTS[0] | {"axis": [-2.0, 0.0, 0.0]}]}}, "must be a unit vector"),
+        ({"docking": {"ports": [PORTS[0] | {"axis": [-2.0, 0.0, 0.0]}]}}, "must be of unit length"),
         ({"docking": {"final_m": 0.5}}, "must be less than entry_m"),
         ({"docking": {"contact_speed_m_s": 0.05}}, "must not exceed approach_speed_m_s"),
         ({"docking": {"entry_m": 0.15}}, "its corridor begins"),

@@ -31,7 +31,7 @@ AT_START = [
     ({"limits": {"min_distance_target_m": 1.1}}, "chasers.0.position_m: 1 m from the target, nearer than"),
     (
         {"limits": {"min_distance_chasers_m": 1.6}},
-        "chasers.0 and chasers.1 are to be 1.56 m apart, nearer than",
+        "the positions of chasers.0 and chasers.1 are 1.56 m apart, nearer than",
     ),
     (
         {"limits": {"max_reference_distance_m": 0.9}},

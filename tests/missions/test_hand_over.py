@@ -123,7 +123,7 @@ def test_who_was_lost_and_comes_back_stands_by_and_can_take_over_again(tmp_path:
         first.kill()
         first.wait()
         hand.start("controller", "controller")
-        wait_for(log, lambda e: e.process == "controller" and e.what == "follows the commander's state")
+        wait_for(log, lambda e: e.process == "controller" and e.what == "restored the leader's state")
         hand.processes["standby"].kill()
         for name in ("world", "controller", "recorder", *(f"chaser/{i}" for i in range(4))):
             status, said = hand.said(name)
@@ -134,7 +134,7 @@ def test_who_was_lost_and_comes_back_stands_by_and_can_take_over_again(tmp_path:
     assert [k for k, _ in groupby(t.commander for t in ticks)] == ["controller", "standby", "controller"]
     assert ticks[-1].term == 3
     flight = load_flight(log)
-    assert not [e for e in flight.events if e.what.startswith(("begins anew", "fallback"))]
+    assert not [e for e in flight.events if e.what.startswith(("takes over without any state", "fallback"))]
     phases = [e.what for e in flight.events if "from" in e.what]
     assert len(phases) == 4  # each once: nobody began as at the start
     assert flight.world.contacts == 0

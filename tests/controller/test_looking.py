@@ -26,8 +26,8 @@ from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ, Camera
 from chaserdock_models.rigid_body import propagate
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Odometry, OperatorCommand
+from estimation_cases import R, V, W
 from flight_cases import odometry, scenario
-from fusion_cases import R, V, W
 from hypothesis import given, settings
 from hypothesis import strategies as st
 

@@ -14,8 +14,7 @@ from chaserdock_controller.estimation import motion_models as motion
 from chaserdock_controller.estimation.types import no_estimate
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_models import rotations as rot
-from flight_cases import scenario
-from fusion_cases import (
+from estimation_cases import (
     HZ,
     NO_BIAS,
     Q0,
@@ -34,6 +33,7 @@ from fusion_cases import (
     see,
     truth,
 )
+from flight_cases import scenario
 from hypothesis import given
 from hypothesis import strategies as st
 

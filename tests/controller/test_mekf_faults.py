@@ -11,7 +11,7 @@ import pytest
 from chaserdock_controller.estimation import Measurement, Mekf, MekfParameters, PoseHypothesis
 from chaserdock_controller.estimation.types import no_estimate
 from chaserdock_models import rotations as rot
-from fusion_cases import (
+from estimation_cases import (
     HZ,
     NO_BIAS,
     V,

@@ -16,7 +16,7 @@ from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE
 from chaserdock_models import rotations as rot
 from chaserdock_models import scalar_rotations as scalar
 from chaserdock_models.camera import Camera
-from fusion_cases import (
+from estimation_cases import (
     Q0,
     R,
     V,

@@ -12,7 +12,7 @@ from chaserdock_controller.estimation import PaperEstimator
 from chaserdock_controller.estimation.baseline import average_quaternion
 from chaserdock_controller.estimation.types import no_estimate
 from chaserdock_models import rotations as rot
-from fusion_cases import (
+from estimation_cases import (
     HZ,
     V,
     W,

@@ -53,6 +53,7 @@ def test_no_clock_and_no_global_randomness() -> None:
     allowed = {
         "__future__",
         "bisect",
+        "chaserdock_controller",
         "chaserdock_models",
         "chaserdock_protocol",
         "collections",

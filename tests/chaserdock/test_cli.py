@@ -88,7 +88,16 @@ def test_help_imports_no_heavy_module() -> None:
 def test_help_lists_every_command_in_its_group() -> None:
     status, text = finished("-h")
     assert status == 0
-    sections = ["Fly", "Processes", "Operate", "Look at a flight", "Logs", "Reproduce and compare", "Setup"]
+    sections = [
+        "Fly",
+        "Scenarios",
+        "Processes",
+        "Operate",
+        "Look at a flight",
+        "Logs",
+        "Reproduce and compare",
+        "Setup",
+    ]
     assert [line.rstrip(":") for line in text.splitlines() if re.match(r"[A-Z][a-z ]+:$", line)] == [
         "Options",
         *sections,

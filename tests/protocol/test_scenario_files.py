@@ -19,7 +19,7 @@ from chaserdock_protocol.scenario import (
 )
 from chaserdock_protocol.scenario.fields import facing_origin, unit
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 from scenario_samples import GOOD, good
 
@@ -347,6 +347,8 @@ def test_look_at_is_exact_along_the_axes(position: tuple[float, ...], q: tuple[f
 
 
 @given(st.tuples(*[st.floats(-20.0, 20.0)] * 3).filter(lambda p: math.hypot(*p) > 1e-3))
+@example((2.2e-313, 2.2e-313, 1.0))
+@example((1e-313, -3e-314, 2e-313))
 def test_look_at_points_x_at_the_target_without_roll(position: tuple[float, float, float]) -> None:
     q = facing_origin(position)
     assert unit(q) == q

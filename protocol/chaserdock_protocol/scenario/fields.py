@@ -100,11 +100,17 @@ def _half_angle(cosine: float, sine: float) -> tuple[float, float]:
     return c, math.copysign(s, sine) if sine else s
 
 
+# Relative distance from the Z axis below which the yaw is undefined, and set to 0.
+_ON_AXIS = 1e-15
+
+
 def facing_origin(position_m: tuple[float, float, float]) -> tuple[float, float, float, float]:
     """Return the q_wxyz that points +X from ``position_m`` at the origin without roll (yaw, then pitch)."""
-    x, y, z = position_m
+    # Scaled, so that subnormal coordinates keep their digits.
+    largest = max(map(abs, position_m))
+    x, y, z = (v / largest for v in position_m)
     across, distance = math.hypot(x, y), math.hypot(x, y, z)
-    yaw_c, yaw_s = _half_angle(-x / across, -y / across) if across > 0.0 else (1.0, 0.0)
+    yaw_c, yaw_s = _half_angle(-x / across, -y / across) if across > _ON_AXIS else (1.0, 0.0)
     pitch_c, pitch_s = _half_angle(across / distance, z / distance)
     # yaw about Z times pitch about Y; "+ 0.0" turns -0.0 into 0.0.
     return (yaw_c * pitch_c + 0.0, -yaw_s * pitch_s + 0.0, yaw_c * pitch_s + 0.0, yaw_s * pitch_c + 0.0)

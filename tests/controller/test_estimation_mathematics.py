@@ -174,7 +174,8 @@ def test_a_camera_with_errors_measures_what_its_images_show() -> None:
 @given(st.integers(0, 2**32 - 1))
 def test_correction_keeps_the_covariance_positive_and_shrinks_the_residual(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    a = rng.normal(size=(19, 19)) * 10.0 ** rng.uniform(-4, -1, size=(19, 1))
+    # Within the linear range of attitude, where the residual must shrink: with sigmas up to 0.4 rad it grew in 3 % of seeds.
+    a = rng.normal(size=(19, 19)) * 10.0 ** rng.uniform(-4, -2, size=(19, 1))
     covariance = a @ a.T + 1e-12 * np.eye(19)
     branch = _branch(rng.normal(size=7) * 1e-3, covariance)
     pose = PoseHypothesis(

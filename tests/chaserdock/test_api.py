@@ -75,7 +75,8 @@ def test_run_from_a_thread_prints_nothing(tmp_path: Path, capfd: pytest.CaptureF
 
 
 _INTERRUPTED = """
-import sys, chaserdock as cd
+import signal, sys, chaserdock as cd
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a background shell starts programs with SIGINT ignored
 try:
     cd.run("single", out=sys.argv[1], on_event=lambda event: print(type(event).__name__, flush=True))
 except KeyboardInterrupt:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builders shared by the tests of moves, guidance, prediction and pilot."""
+"""Builders shared by the tests of trajectories, guidance and prediction."""
 
 from __future__ import annotations
 

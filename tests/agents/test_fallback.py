@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fallback of a chaser without commands: its modes, and the process that enters and leaves it."""
+"""Fallback of a chaser without commands: modes, wrenches, and transitions in the chaser process."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def moving(x: Array, time_s: float) -> Odometry:
 
 
 def straight(speed_m_s: float) -> Plan:
-    """Three seconds along +X from (-1, 0, 0)."""
+    """Return a plan of three seconds along +X from (-1, 0, 0)."""
     along = np.arange(STAGES + 1) * DT_S * speed_m_s
     places = np.stack([along - 1.0, 0 * along, 0 * along], axis=1)
     return Plan(
@@ -83,12 +83,12 @@ def target(
     )
 
 
-def flown(
+def fly_fallback(
     scenario: Scenario, last: LastCommand, x: Array, seconds: float
 ) -> tuple[list[FallbackState], Array]:
-    """A rigid body that flies by itself: what it did at every step, and its states (K, 13)."""
+    """Simulate a rigid body in fallback; return its fallback state of each step and its states (K, 13)."""
     body, min_distance_m = scenario.chaser, clearance_m(scenario, 0)
-    did: list[FallbackState] = []
+    history: list[FallbackState] = []
     states, state = [x], None
     for k in range(round(seconds / STEP_S)):
         odometry = moving(x, k * STEP_S)
@@ -100,58 +100,58 @@ def flown(
         v = x[3:6] + rotations.rotate(x[6:10], u[:3]) / body.mass_kg * STEP_S
         omega = x[10:] + u[3:] / np.asarray(body.inertia) * STEP_S
         x = np.concatenate([x[:3] + v * STEP_S, v, rotations.integrate(x[6:10], omega, STEP_S), omega])
-        did.append(state)
+        history.append(state)
         states.append(x)
-    return did, np.array(states)
+    return history, np.array(states)
 
 
 def start(position_m: Any = (-1.0, 0.0, 0.0), velocity_m_s: Any = ZERO, omega_rad_s: Any = ZERO) -> Array:
     return np.array([*position_m, *velocity_m_s, *Q, *omega_rad_s], dtype=float)
 
 
-def states_of(did: list[FallbackState]) -> list[str]:
-    """The states in a row, each once."""
-    return [a.mode for k, a in enumerate(did) if k == 0 or did[k - 1].mode != a.mode]
+def modes_of(history: list[FallbackState]) -> list[str]:
+    """Return the sequence of modes without repetitions."""
+    return [a.mode for k, a in enumerate(history) if k == 0 or history[k - 1].mode != a.mode]
 
 
 def test_fallback_flies_the_plan_then_brakes_then_holds(scenario: Scenario) -> None:
     speed = 0.03
     last = LastCommand(straight(speed), target())
-    did, x = flown(scenario, last, start(velocity_m_s=(speed, 0.0, 0.0)), 60.0)
-    assert states_of(did) == ["plan", "brake", "hold"]
-    assert [a.mode for a in did].count("plan") == STAGES
+    history, x = fly_fallback(scenario, last, start(velocity_m_s=(speed, 0.0, 0.0)), 60.0)
+    assert modes_of(history) == ["plan", "brake", "hold"]
+    assert [a.mode for a in history].count("plan") == STAGES
     np.testing.assert_allclose(x[STAGES, :3], [-1.0 + 3.0 * speed, 0.0, 0.0], atol=1e-3)
-    rested = next(k for k, a in enumerate(did) if a.mode == "hold")
-    assert np.linalg.norm(x[rested, 3:6]) < 0.005
-    assert np.linalg.norm(x[-1, :3] - x[rested, :3]) < 0.01  # far enough out: it stays
+    at_rest = next(k for k, a in enumerate(history) if a.mode == "hold")
+    assert np.linalg.norm(x[at_rest, 3:6]) < 0.005
+    assert np.linalg.norm(x[-1, :3] - x[at_rest, :3]) < 0.01  # outside the clearance: it holds this position
 
 
 def test_fallback_returns_to_its_plan(scenario: Scenario) -> None:
     x = start((-1.0, 0.02, 0.0), (0.0, 0.0, 0.0))
-    did, states = flown(scenario, LastCommand(straight(0.0), target()), x, 2.9)
-    assert states_of(did) == ["plan"]
+    history, states = fly_fallback(scenario, LastCommand(straight(0.0), target()), x, 2.9)
+    assert modes_of(history) == ["plan"]
     assert abs(states[-1, 1]) < 0.016
 
 
 def test_fallback_leaves_the_corridor_and_moves_with_the_target(scenario: Scenario) -> None:
     drift = (0.0, 0.01, 0.0)
     last = LastCommand(None, target(0.0, drift))
-    did, x = flown(scenario, last, start((-0.45, 0.0, 0.0), (0.02, 0.0, 0.0)), 90.0)
-    assert states_of(did) == ["brake", "hold"]
-    away = x[:, :3] - np.outer(np.arange(len(x)) * STEP_S, drift)
-    assert did[-1].distance_m == pytest.approx(clearance_m(scenario, 0))
-    assert np.linalg.norm(away[-1]) == pytest.approx(clearance_m(scenario, 0), abs=0.01)
-    assert np.linalg.norm(away, axis=1).min() > 0.35
+    history, x = fly_fallback(scenario, last, start((-0.45, 0.0, 0.0), (0.02, 0.0, 0.0)), 90.0)
+    assert modes_of(history) == ["brake", "hold"]
+    relative = x[:, :3] - np.outer(np.arange(len(x)) * STEP_S, drift)
+    assert history[-1].distance_m == pytest.approx(clearance_m(scenario, 0))
+    assert np.linalg.norm(relative[-1]) == pytest.approx(clearance_m(scenario, 0), abs=0.01)
+    assert np.linalg.norm(relative, axis=1).min() > 0.35
     np.testing.assert_allclose(x[-1, 3:6], drift, atol=1e-3)
 
 
 def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
-    did, x = flown(
+    history, x = fly_fallback(
         scenario, LastCommand(), start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)), 60.0
     )
-    assert states_of(did) == ["brake", "hold"]
-    assert did[-1].distance_m is None
-    assert "the target is unknown" in did[-1].text()
+    assert modes_of(history) == ["brake", "hold"]
+    assert history[-1].distance_m is None
+    assert "the target is unknown" in history[-1].text()
     assert is_at_rest(moving(x[-1], 60.0))
 
 
@@ -192,14 +192,15 @@ def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
     assert clearance_m(docking, 0) > np.linalg.norm(entry)
 
 
-# -- in its process -----------------------------------------------------------------------------------------
+# -- the chaser process -----------------------------------------------------------------------------------------
 
 
-def tell(chaser: Chaser, topic: Any, message: Any) -> list[tuple[Any, Any]]:
-    tape: Any = chaser.node
-    tape.put(ReceivedMessage(topic, None if topic is topics.TICK else "0", message, 0))
+def deliver(chaser: Chaser, topic: Any, message: Any) -> list[tuple[Any, Any]]:
+    """Hand the process one message; return what it publishes."""
+    node: Any = chaser.node
+    node.put(ReceivedMessage(topic, None if topic is topics.TICK else "0", message, 0))
     chaser.listen()
-    return [(t, m) for t, _, m in tape.take_published()]
+    return [(t, m) for t, _, m in node.take_published()]
 
 
 def tick_of(scenario: Scenario, tick: int, commander: str, term: int, revision: int = 0) -> Tick:
@@ -246,57 +247,57 @@ def at(scenario: Scenario, tick: int) -> Odometry:
     )
 
 
-def sources(said: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
-    return [(m.source, m.term) for t, m in said if t is topics.ACTUATORS]
+def sources(published: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
+    return [(m.source, m.term) for t, m in published if t is topics.ACTUATORS]
 
 
-def test_lost_controller_triggers_fallback_events_once_per_mode(chaser: Chaser, scenario: Scenario) -> None:
+def test_lost_controller_reports_each_fallback_mode_once(chaser: Chaser, scenario: Scenario) -> None:
     plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
-    tell(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
-    tell(chaser, topics.ODOMETRY, at(scenario, 0))
-    tell(chaser, topics.PLAN, plan)
-    assert sources(tell(chaser, topics.WRENCH, command(scenario, 0, "controller", 1))) == [("command", 1)]
-    said = []
+    deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
+    deliver(chaser, topics.ODOMETRY, at(scenario, 0))
+    deliver(chaser, topics.PLAN, plan)
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 0, "controller", 1))) == [("command", 1)]
+    published = []
     for tick in range(1, 40):
-        said += tell(chaser, topics.TICK, tick_of(scenario, tick, "", 1))
-        said += tell(chaser, topics.ODOMETRY, at(scenario, tick))
-    told = [m.what for t, m in said if t is topics.EVENT]
-    assert told == ["fallback: plan", "fallback: hold"]  # it was at rest when the plan was over
-    assert [s for s, _ in sources(said)].count("plan") == STAGES - 1
-    tell(chaser, topics.TICK, tick_of(scenario, 40, "standby", 2))
-    tell(chaser, topics.ODOMETRY, at(scenario, 40))
-    said = tell(chaser, topics.WRENCH, command(scenario, 40, "standby", 2))
-    assert sources(said) == [("command", 2)]
-    assert "fallback ends" in [m.what for t, m in said if t is topics.EVENT]
+        published += deliver(chaser, topics.TICK, tick_of(scenario, tick, "", 1))
+        published += deliver(chaser, topics.ODOMETRY, at(scenario, tick))
+    events = [m.what for t, m in published if t is topics.EVENT]
+    assert events == ["fallback: plan", "fallback: hold"]  # at rest when the plan ends: no braking
+    assert [s for s, _ in sources(published)].count("plan") == STAGES - 1
+    deliver(chaser, topics.TICK, tick_of(scenario, 40, "standby", 2))
+    deliver(chaser, topics.ODOMETRY, at(scenario, 40))
+    published = deliver(chaser, topics.WRENCH, command(scenario, 40, "standby", 2))
+    assert sources(published) == [("command", 2)]
+    assert "fallback ends" in [m.what for t, m in published if t is topics.EVENT]
 
 
 def test_plan_without_its_command_is_not_executed(chaser: Chaser, scenario: Scenario) -> None:
-    tell(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
-    tell(chaser, topics.ODOMETRY, at(scenario, 0))
-    tell(chaser, topics.PLAN, straight(0.0))
-    said = tell(chaser, topics.TICK, tick_of(scenario, 0, "", 1, 1))
-    assert [s for s, _ in sources(said)] == ["hold"]
+    deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
+    deliver(chaser, topics.ODOMETRY, at(scenario, 0))
+    deliver(chaser, topics.PLAN, straight(0.0))
+    published = deliver(chaser, topics.TICK, tick_of(scenario, 0, "", 1, 1))
+    assert [s for s, _ in sources(published)] == ["hold"]
 
 
-def test_stale_terms_are_refused_counted_and_reported_once(chaser: Chaser, scenario: Scenario) -> None:
+def test_stale_terms_are_rejected_counted_and_reported_once(chaser: Chaser, scenario: Scenario) -> None:
     for tick in (1, 2):
-        tell(chaser, topics.TICK, tick_of(scenario, tick, "standby", 2))
-        tell(chaser, topics.ODOMETRY, at(scenario, tick))
-        said = tell(chaser, topics.WRENCH, command(scenario, tick, "controller", 1))
-        assert sources(said) == []  # the right one is still to come
-        assert len([m for t, m in said if t is topics.EVENT]) == (1 if tick == 1 else 0)
+        deliver(chaser, topics.TICK, tick_of(scenario, tick, "standby", 2))
+        deliver(chaser, topics.ODOMETRY, at(scenario, tick))
+        published = deliver(chaser, topics.WRENCH, command(scenario, tick, "controller", 1))
+        assert sources(published) == []  # waits for the leader's command
+        assert len([m for t, m in published if t is topics.EVENT]) == (1 if tick == 1 else 0)
     assert chaser.node.counts.rejected["wrench:stale term"] == 2
-    assert sources(tell(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))) == [("command", 2)]
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))) == [("command", 2)]
 
 
 def test_new_leader_within_a_tick_does_not_repeat_a_command(chaser: Chaser, scenario: Scenario) -> None:
-    tell(chaser, topics.TICK, tick_of(scenario, 3, "controller", 1))
-    tell(chaser, topics.ODOMETRY, at(scenario, 3))
-    assert sources(tell(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]
-    tell(chaser, topics.TICK, tick_of(scenario, 3, "standby", 2, 1))
-    assert tell(chaser, topics.WRENCH, command(scenario, 3, "standby", 2)) == []
-    tell(chaser, topics.TICK, tick_of(scenario, 4, "standby", 2))
-    tell(chaser, topics.ODOMETRY, at(scenario, 4))
-    # Its tick is known, the older commander's next word is not obeyed any more.
-    assert sources(tell(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == []
-    assert sources(tell(chaser, topics.WRENCH, command(scenario, 4, "standby", 2))) == [("command", 2)]
+    deliver(chaser, topics.TICK, tick_of(scenario, 3, "controller", 1))
+    deliver(chaser, topics.ODOMETRY, at(scenario, 3))
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]
+    deliver(chaser, topics.TICK, tick_of(scenario, 3, "standby", 2, 1))
+    assert deliver(chaser, topics.WRENCH, command(scenario, 3, "standby", 2)) == []
+    deliver(chaser, topics.TICK, tick_of(scenario, 4, "standby", 2))
+    deliver(chaser, topics.ODOMETRY, at(scenario, 4))
+    # Once the tick names the new term, commands of the previous leader are rejected.
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == []
+    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "standby", 2))) == [("command", 2)]

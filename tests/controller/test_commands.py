@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operators' commands through the whole controller: whatever cannot be is refused or changes nothing, and is answered
-with the reason and in the name of who asked. What the controller answers it publishes for the log (test_faults)."""
+"""Operator commands through the whole controller: impossible ones are rejected with a reason, repeated ones change nothing."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One conformance test for every back end, and what they promise about budgets, corridors and changing limits."""
+"""Conformance of every NMPC back end; iteration budgets, approach cones and changing actuator limits."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmpc_cases import D_MIN_M, PARAMS, Array, at_rest, far_start, fixed_problem, fly, fresh, swap
 
-# Eight stages: the same mathematics, sooner.
-CONFORM = replace(PARAMS, horizon_s=0.8)
+# Eight stages, for speed.
+SHORT_HORIZON = replace(PARAMS, horizon_s=0.8)
 
 
 def installed(name: str) -> bool:
@@ -27,7 +27,7 @@ def installed(name: str) -> bool:
 
 
 def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
-    """The first ``d`` stages of a problem."""
+    """Truncate a problem to its first ``d`` stages."""
     return replace(
         problem,
         references=problem.references[:, : d + 1],
@@ -37,16 +37,16 @@ def short(problem: NmpcInput, d: int = 8) -> NmpcInput:
     )
 
 
-# Compiling OpEn's solver takes minutes, the first time.
+# Compiling OpEn's solver takes minutes the first time.
 @pytest.mark.parametrize(
     "name", [pytest.param(n, marks=pytest.mark.slow) if n == "open" else n for n in BACK_ENDS]
 )
 @pytest.mark.parametrize("case", ["transfer", "keep-out", "corridor"])
 def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
-    """The plan's cost is the converged optimum's, its box holds exactly, its distances to 5 mm."""
+    """Cost within 2 % of IPOPT's optimum, input bounds exact, distance constraints within 5 mm."""
     if not installed(name):
         with pytest.raises(ValueError, match=rf"'{name}' needs"):
-            make_solver(name, CONFORM, 1)
+            make_solver(name, SHORT_HORIZON, 1)
         pytest.skip(f"{name} is not installed")
     problem_at, states = far_start(1)
     problem = problem_at(states, 0.0)
@@ -59,7 +59,7 @@ def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
         corridors[...] = [-1.0, 0.0, 0.0, np.deg2rad(8.0), 0.0]
         problem = replace(problem, min_distance_target_m=np.zeros(1), corridors=corridors)
     problem = short(problem)
-    chosen, best = fresh(name, 1, CONFORM), fresh("ipopt", 1, CONFORM).solve(problem, 0.0)
+    chosen, best = fresh(name, 1, SHORT_HORIZON), fresh("ipopt", 1, SHORT_HORIZON).solve(problem, 0.0)
     plan = chosen.solve(problem, 0.0)
     for _ in range(5):
         plan = chosen.solve(problem, 0.0)
@@ -70,7 +70,7 @@ def test_every_back_end_solves_the_same_problem(name: str, case: str) -> None:
 
 
 def corridor_room(r: Array, corridor: Array) -> tuple[float, Array]:
-    """Room in a corridor (5,) at r (3,) from the target, and the normal of the plane there: the row's."""
+    """Return the clearance inside a corridor (5,) at r (3,) from the target, m, and its gradient, from the linearized row."""
     params = replace(PARAMS, horizon_s=0.1)
     problem = short(fixed_problem(at_rest(r)[None], r[None], d_target=0.0), 1)
     problem = replace(problem, corridors=np.tile(corridor, (1, 2, 1)))
@@ -82,8 +82,8 @@ def corridor_room(r: Array, corridor: Array) -> tuple[float, Array]:
 
 @settings(derandomize=True, deadline=None, max_examples=50)
 @given(st.integers(0, 10_000))
-def test_the_corridors_plane_is_its_cones(seed: int) -> None:
-    """Room: positive inside, zero on the surface; the normal is its gradient (finite differences)."""
+def test_corridor_row_is_distance_to_the_cone(seed: int) -> None:
+    """The clearance is positive inside and zero on the surface; the row's normal equals finite differences."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     axis /= np.linalg.norm(axis)
@@ -101,8 +101,8 @@ def test_the_corridors_plane_is_its_cones(seed: int) -> None:
         assert normal[i] == pytest.approx(slope / 2e-6, abs=1e-7)
 
 
-def test_a_docking_chaser_stays_in_its_corridor_and_the_other_keeps_out() -> None:
-    """Chaser 0 comes in to 0.2 m from beside its axis; chaser 1 has no corridor and is sent as near."""
+def test_docking_chaser_stays_in_corridor_and_the_other_outside_keep_out() -> None:
+    """Chaser 0 approaches to 0.2 m from beside its axis; chaser 1 has the same goal distance without a corridor."""
     states = np.array([at_rest(np.array([-1.0, 0.25, 0.0])), at_rest(np.array([1.0, 0.2, 0.0]))])
     goals = np.array([[-0.2, 0.0, 0.0], [0.2, 0.0, 0.0]])
     corridors = np.zeros((2, 31, 5))
@@ -117,8 +117,8 @@ def test_a_docking_chaser_stays_in_its_corridor_and_the_other_keeps_out() -> Non
 
 
 @pytest.mark.parametrize("budget", [0, 3, 10])
-def test_a_budget_gives_the_best_plan_so_far(budget: int) -> None:
-    """Never more iterations than allowed; the box holds; never worse than what it came with."""
+def test_iteration_budget_returns_feasible_plan(budget: int) -> None:
+    """The number of iterations never exceeds the budget, and the chasers keep their distance."""
     problem_at, states = swap(0.2, 0.4)
     chosen = make_solver("rti", PARAMS, 2, budget)
     plan = chosen.solve(problem_at(states, 0.0), 0.0)
@@ -130,19 +130,19 @@ def test_a_budget_gives_the_best_plan_so_far(budget: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["ipopt", "fatrop"])
-def test_an_iteration_limit_is_no_failure(name: str) -> None:
-    """The answer had by then is flown if it is better than the start; a start that is kept would be kept for ever."""
+def test_plan_at_iteration_limit_is_used_if_better_than_the_guess(name: str) -> None:
+    """Keeping the initial guess instead would repeat it in every tick."""
     problem_at, states = far_start(1)
     problem = short(problem_at(states, 0.0))
-    chosen = make_solver(name, CONFORM, 1, 3)
+    chosen = make_solver(name, SHORT_HORIZON, 1, 3)
     plan = chosen.solve(problem, 0.0)
     assert plan.status == ("iteration_limit",)
-    assert plan.cost[0] < fresh("ipopt", 1, CONFORM).solve(problem, 0.0).cost[0] * 1.5
+    assert plan.cost[0] < fresh("ipopt", 1, SHORT_HORIZON).solve(problem, 0.0).cost[0] * 1.5
     assert plan.inputs.any()
 
 
 def test_actuator_limits_change_in_flight() -> None:
-    """A thruster weakens to a quarter half way: the box of that tick holds at once, and the chaser still arrives."""
+    """The force limit along X drops to a quarter at 4 s; the chaser still reaches its goal."""
     problem_at, states = far_start(1)
 
     def weakening(x: Array, now_s: float) -> NmpcInput:
@@ -155,19 +155,19 @@ def test_actuator_limits_change_in_flight() -> None:
     assert np.linalg.norm(flight.states[-1, 0, :3] - goal) < 0.02
 
 
-def test_joining_and_leaving_costs_nothing_of_the_others_plan() -> None:
-    """Far from each other, a chaser's plan is the same whoever else is there."""
+def test_distant_chasers_plan_independently() -> None:
+    """The plan of a chaser does not depend on which distant chasers join or leave."""
     states = np.array([at_rest(np.array([3.0 * i - 4.0, 2.0, 0.0])) for i in range(3)])
     goals = states[:, :3] + np.array([0.0, 0.3, 0.1])
-    alone, crowd = make_solver("rti", PARAMS, 3), make_solver("rti", PARAMS, 3)
+    single, several = make_solver("rti", PARAMS, 3), make_solver("rti", PARAMS, 3)
     for ids in ([0, 1], [0, 1, 2], [0, 2], [0]):
-        one = alone.solve(fixed_problem(states[:1], goals[:1]), 0.1, [0])
-        many = crowd.solve(fixed_problem(states[ids], goals[ids]), 0.1, ids)
+        one = single.solve(fixed_problem(states[:1], goals[:1]), 0.1, [0])
+        many = several.solve(fixed_problem(states[ids], goals[ids]), 0.1, ids)
         np.testing.assert_allclose(many.inputs[0], one.inputs[0], rtol=0, atol=1e-12)
 
 
-def test_unreachable_reference_is_flown_towards() -> None:
-    """Ten kilometres away and turned about: finite, saturated, within the box, and no failure."""
+def test_unreachable_reference_saturates_the_input() -> None:
+    """A goal 10 km away with reversed attitude: finite plan at the force limit, no failure."""
     states = np.array([at_rest(np.array([-1.0, 0.0, 0.0]))])
     problem = fixed_problem(states, np.array([[-1e4, 0.0, 0.0]]), np.array([0.0, 0, 0, 1.0]))
     plan = fresh("rti", 1).solve(problem, 0.0)

@@ -110,13 +110,13 @@ def test_controller_answers_the_same(scenario: Scenario, records: dict[type, lis
     assert len(wrenches) == 2 * scenario.ticks
 
 
-def test_chaser_flies_what_it_was_told(scenario: Scenario, records: dict[type, list[Record]]) -> None:
-    flown = {(r.message.chaser, r.message.tick): r.message for r in records[ActuatorCommand]}
+def test_chaser_executes_the_command(scenario: Scenario, records: dict[type, list[Record]]) -> None:
+    executed = {(r.message.chaser, r.message.tick): r.message for r in records[ActuatorCommand]}
     for record in records[WrenchCommand]:
         command: WrenchCommand = record.message
         why_not = refusal(command, command.chaser, scenario.chaser, command.tick - 1, command.sim_time_ns)
         assert why_not is None
-        expected: ActuatorCommand = flown[command.chaser, command.tick]
+        expected: ActuatorCommand = executed[command.chaser, command.tick]
         assert passed_on(command) == ActuatorCommand(
             **{name: getattr(expected, name) for name in expected.__struct_fields__ if name != "seq"}
         )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A mission over hosts: network namespaces with a network between them, and the shipped configuration files."""
+"""A mission on four hosts (network namespaces joined by a bridge), with the shipped configuration files."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def ip(*arguments: str) -> None:
 
 @pytest.fixture
 def hosts() -> Iterator[dict[str, str]]:
-    """Names of network namespaces by host, joined by a bridge in a namespace of its own."""
+    """Create network namespaces joined by a bridge; yield their names by host."""
     mark = uuid.uuid4().hex[:6]
     names = {host: f"cd-{mark}-{host}" for host in (*HOSTS, "switch")}
     try:
@@ -54,8 +54,8 @@ def hosts() -> Iterator[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_mission_over_four_hosts_from_the_shipped_files(hosts: dict[str, str], tmp_path: Path) -> None:
-    """Router, world and controller, and each chaser on a host of its own; none of them listens but the router."""
+def test_mission_over_four_hosts_with_shipped_configuration(hosts: dict[str, str], tmp_path: Path) -> None:
+    """Router, world with controller, and each chaser run on separate hosts; only the router listens."""
     file = tmp_path / "host.json5"
     shipped = (ROOT / "config" / "host.json5").read_text()
     file.write_text(shipped.replace("tcp/router:7447", f"tcp/{HOSTS['hub']}:7447"))
@@ -89,13 +89,13 @@ def test_mission_over_four_hosts_from_the_shipped_files(hosts: dict[str, str], t
                 stderr=subprocess.STDOUT,
             )
         deadline = time.monotonic() + 300
-        said = {n: p.communicate(timeout=deadline - time.monotonic())[0] for n, p in processes.items()}
+        outputs = {n: p.communicate(timeout=deadline - time.monotonic())[0] for n, p in processes.items()}
     finally:
         for process in processes.values():
             if process.poll() is None:
                 process.kill()
             process.wait()
-    assert {p.returncode for p in processes.values()} == {0}, said
+    assert {p.returncode for p in processes.values()} == {0}, outputs
     (path,) = runs.glob("two-chaser-tracking-*/summary.json")
     summary = json.loads(path.read_text())
     assert summary["success"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The in-process mission moves the bodies exactly as a lock-step mission in separate processes does."""
+"""The in-process mission equals a lock-step mission in separate processes, bit for bit."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_truth_equals_that_of_a_lockstep_mission(case: str, tmp_path: Path) -> None:
+def test_truth_equals_lockstep_mission(case: str, tmp_path: Path) -> None:
     name, overrides = CASES[case][0], (*CASES[case][1], *SMALL)
     _, text = run(name, tmp_path / "run", *overrides)
     log = open_log(tmp_path / "run")
@@ -83,7 +83,7 @@ def test_odometry_errors_of_the_scenario_apply() -> None:
     )
 
 
-def test_equal_seeds_make_equal_flights() -> None:
+def test_equal_seeds_give_equal_flights() -> None:
     scenario = parse_scenario(mission(), "test")
     ends = []
     for _ in range(2):
@@ -95,7 +95,7 @@ def test_equal_seeds_make_equal_flights() -> None:
 
 
 @pytest.mark.parametrize("option", [{"actuator_gain": 1.05}, {"solve_delay_s": lambda _: 0.1}])
-def test_gain_and_delay_are_refused_with_thrusters(option: dict) -> None:
+def test_gain_and_delay_are_rejected_with_thrusters(option: dict) -> None:
     chaser = {"body": "tetra12", "actuation": "thrusters"}
     with pytest.raises(ValueError, match=r"need chaser\.actuation"):
         InProcessMission(parse_scenario(mission(chaser=chaser), "test"), **option)

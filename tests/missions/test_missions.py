@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whole missions: separate processes over real Zenoh, in lock-step, and that nothing about the machine matters."""
+"""Complete missions with separate processes over Zenoh: success, determinism, contents of the log."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ OTHER_SIMD = {
     "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX2 FMA3",
     "OPENBLAS_CORETYPE": "Prescott",
 }
-"""OpenCV, NumPy and the BLAS one or two levels below what this machine has."""
+"""Disables AVX and newer instructions in OpenCV, NumPy and OpenBLAS."""
 
 
-def test_same_flight_twice(short_flight: Path, tmp_path: Path) -> None:
-    status, said = run(TWO, tmp_path / "again", *SHORT, arguments=["--quiet"])
-    assert status == 0, said
+def test_repeated_flight_has_equal_digest(short_flight: Path, tmp_path: Path) -> None:
+    status, output = run(TWO, tmp_path / "again", *SHORT, arguments=["--quiet"])
+    assert status == 0, output
     assert summary(tmp_path / "again")["digest"] == summary(short_flight)["digest"]
 
 
-def test_other_seed_is_another_flight(short_flight: Path, tmp_path: Path) -> None:
-    status, said = run(TWO, tmp_path / "other", *SHORT, arguments=["--seed", "7"])
-    assert status == 0, said
+def test_other_seed_gives_another_digest(short_flight: Path, tmp_path: Path) -> None:
+    status, output = run(TWO, tmp_path / "other", *SHORT, arguments=["--seed", "7"])
+    assert status == 0, output
     assert summary(tmp_path / "other")["seed"] == 7
     assert summary(tmp_path / "other")["digest"] != summary(short_flight)["digest"]
 
 
-def test_started_by_hand_in_another_order(short_flight: Path, tmp_path: Path) -> None:
-    """Recorder and chasers first, the world last, as in separate terminals."""
+def test_digest_is_independent_of_start_order(short_flight: Path, tmp_path: Path) -> None:
+    """Recorder and chasers first, the world last, each started by its own command."""
     by_hand = ByHand.at_free_port("by-hand")
     try:
         by_hand.start("recorder", "record", "--out", str(tmp_path))
@@ -54,16 +54,16 @@ def test_started_by_hand_in_another_order(short_flight: Path, tmp_path: Path) ->
         time.sleep(1.0)
         by_hand.start("world", "world", TWO, *sets(*SHORT))
         for name in ("world", "chaser/0", "chaser/1", "controller", "recorder"):
-            status, said = by_hand.said(name)
-            assert status == 0, f"{name}: {said}"
+            status, output = by_hand.said(name)
+            assert status == 0, f"{name}: {output}"
     finally:
         by_hand.end()
     assert load_flight(tmp_path / "mission.mcap").digest == summary(short_flight)["digest"]
 
 
 @pytest.mark.slow
-def test_stopped_processes_change_nothing(short_flight: Path, tmp_path: Path) -> None:
-    """Controller, a chaser and the recorder are each stopped for ten seconds and continued."""
+def test_digest_is_independent_of_suspended_processes(short_flight: Path, tmp_path: Path) -> None:
+    """Suspend controller, chaser 1 and recorder for ten seconds each."""
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*SHORT))
     try:
         for words in (("controller",), ("chaser", "1"), ("record",)):
@@ -77,12 +77,12 @@ def test_stopped_processes_change_nothing(short_flight: Path, tmp_path: Path) ->
         mission.kill()
         mission.wait()
     assert summary(tmp_path / "run")["digest"] == summary(short_flight)["digest"]
-    assert summary(tmp_path / "run")["wall_time_s"] > 20.0  # they were stopped while it flew
+    assert summary(tmp_path / "run")["wall_time_s"] > 20.0  # they were suspended during the flight
 
 
-def farthest_apart_m(one: Path, other: Path) -> dict[str, float]:
-    """By body, how far apart two flights ever were; they must not be equal to the last bit."""
-    a, b = load_flight(one / "mission.mcap"), load_flight(other / "mission.mcap")
+def max_separation_m(first: Path, second: Path) -> dict[str, float]:
+    """Return the largest distance between two flights by body, m; the flights must not be bitwise equal."""
+    a, b = load_flight(first / "mission.mcap"), load_flight(second / "mission.mcap")
     assert a.digest != b.digest
     return {
         name: float(np.linalg.norm(track.position_m - b.truth[name].position_m, axis=1).max())
@@ -91,32 +91,34 @@ def farthest_apart_m(one: Path, other: Path) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_other_simd_level_short(short_flight: Path, tmp_path: Path) -> None:
-    status, said = run(TWO, tmp_path / "simd", *SHORT, env=OTHER_SIMD)
-    assert status == 0, said
-    assert max(farthest_apart_m(short_flight, tmp_path / "simd").values()) < 1e-3
+def test_short_flight_on_another_simd_level_stays_within_a_millimetre(
+    short_flight: Path, tmp_path: Path
+) -> None:
+    status, output = run(TWO, tmp_path / "simd", *SHORT, env=OTHER_SIMD)
+    assert status == 0, output
+    assert max(max_separation_m(short_flight, tmp_path / "simd").values()) < 1e-3
 
 
-def test_log_holds_every_topic_in_its_numbers(short_flight: Path) -> None:
+def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
     counts = count_messages(short_flight / "mission.mcap")
     ticks = 6 * 15
     for key, count in counts.items():
         found = topic_of_key(key)
         assert found is not None, key
-        # What is also told after the last tick comes once more.
+        # Topics that are also published after the last tick have one message more.
         if found[0].rate in ("tick", "image"):
             assert ticks - 1 <= count <= ticks + 1, key
         elif found[0].rate == "second":
             assert 1 <= count <= 8, key
-    held = {id(found[0]) for key in counts if (found := topic_of_key(key)) is not None}
-    missing = {topic.key for topic in TOPICS if id(topic) not in held}
-    # Nobody commanded anything, there are no thrusters and no ports, and no controller stands by.
+    recorded = {id(found[0]) for key in counts if (found := topic_of_key(key)) is not None}
+    missing = {topic.key for topic in TOPICS if id(topic) not in recorded}
+    # No operator commands, thrusters, docking ports or standby in this flight.
     absent = (topics.COMMAND, topics.OPERATED, topics.THRUSTERS, topics.DOCKING, topics.STATE)
     assert missing == {t.key for t in absent}
 
 
-def test_log_is_read_by_others(short_flight: Path) -> None:
-    """mcap's own reader, the plain msgpack package, a schema for every channel, no gap in any numbering."""
+def test_log_is_readable_with_mcap_and_msgpack(short_flight: Path) -> None:
+    """Every channel has a schema and consecutive sequence numbers."""
     with (short_flight / "mission.mcap").open("rb") as file:
         reader = make_reader(file)
         last: dict[str, int] = {}
@@ -139,60 +141,60 @@ def test_log_is_read_by_others(short_flight: Path) -> None:
     assert "version.numpy" in metadata["chaserdock"]
 
 
-def test_late_processes_are_named(tmp_path: Path) -> None:
-    """Ctrl-C while the world still waits for others ends it at once."""
+def test_interrupted_world_names_missing_processes(tmp_path: Path) -> None:
+    """SIGINT ends a world that waits for processes, and its message lists them."""
     by_hand = ByHand.at_free_port("waiting")
     try:
         world = by_hand.start("world", "world", TWO, *sets(*SHORT))
         time.sleep(3.0)
         world.send_signal(signal.SIGINT)
-        status, said = by_hand.said("world", timeout_s=20)
+        status, output = by_hand.said("world", timeout_s=20)
     finally:
         by_hand.end()
     assert status == 1
-    assert "waiting for chaser/0, chaser/1, controller, recorder" in said
+    assert "waiting for chaser/0, chaser/1, controller, recorder" in output
 
 
 @pytest.mark.slow
-def test_realtime_flies(tmp_path: Path) -> None:
-    _, said = run("single", tmp_path / "run", *SHORT, arguments=["--mode", "realtime"])
+def test_realtime_flight_completes(tmp_path: Path) -> None:
+    _, output = run("single", tmp_path / "run", *SHORT, arguments=["--mode", "realtime"])
     result = summary(tmp_path / "run")
     assert result["mode"] == "realtime"
-    assert result["ticks"] == 90, said
+    assert result["ticks"] == 90, output
     assert result["latency_s"]["p50"] > 0
     assert result["collisions"] == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["single", TWO])
-def test_tracking_missions(scenario: str, tmp_path: Path) -> None:
-    """The scenarios' own criteria: steady 8 mm and 0.3 degrees, estimate never off by 1 cm or 1 degree."""
-    status, said = run(scenario, tmp_path / "run", timeout_s=1200)
-    assert status == 0, said
+def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> None:
+    """The scenario's criteria hold; the estimate is never off by more than 1 cm or 1 degree."""
+    status, output = run(scenario, tmp_path / "run", timeout_s=1200)
+    assert status == 0, output
     estimate = summary(tmp_path / "run")["target_estimate"]
     assert estimate["max_position_error_m"] < 0.01
     assert estimate["max_orientation_error_rad"] < math.radians(1.0)
 
 
 @pytest.mark.slow
-def test_collision_avoidance(tmp_path: Path) -> None:
-    """Past the target to its other side on what the other chaser sees, never below 0.35 m, there within 60 s."""
-    status, said = run("collision-avoidance", tmp_path / "run")
-    assert status == 0, said
+def test_collision_avoidance_mission(tmp_path: Path) -> None:
+    """Chaser 0 passes the target at 0.35 m or more within 60 s, guided by the sightings of chaser 1."""
+    status, output = run("collision-avoidance", tmp_path / "run")
+    assert status == 0, output
     result = summary(tmp_path / "run")
     assert result["chasers"]["0"]["min_distance_target_m"] >= 0.35
     assert result["chasers"]["0"]["reached_time_s"] <= 70.0
     flight = load_flight(tmp_path / "run" / "mission.mcap")
-    # At the end chaser 0 looks away from the target: it has seen nothing for a while.
+    # At the end chaser 0 faces away from the target and has no sightings.
     assert not flight.sightings[0].seen[-150:].any()
     assert result["target_estimate"]["max_position_error_m"] < 0.01
 
 
 @pytest.mark.slow
-def test_main_job_on_another_simd_level(main_job: Path, tmp_path: Path) -> None:
-    status, said = run("four-chaser-docking", tmp_path / "run", timeout_s=1800, env=OTHER_SIMD)
-    assert status == 0, said
-    assert max(farthest_apart_m(main_job, tmp_path / "run").values()) < 1e-3
+def test_four_chaser_docking_on_another_simd_level(main_job: Path, tmp_path: Path) -> None:
+    status, output = run("four-chaser-docking", tmp_path / "run", timeout_s=1800, env=OTHER_SIMD)
+    assert status == 0, output
+    assert max(max_separation_m(main_job, tmp_path / "run").values()) < 1e-3
 
 
 @pytest.mark.slow

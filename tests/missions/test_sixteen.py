@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario ``sixteen-chasers``: laid out as it says, and held without a distance below the limit."""
+"""The scenario ``sixteen-chasers``: geometry of the formation, convergence without approaches below the limit."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 PATH = ROOT / "scenarios" / "sixteen-chasers.toml"
 
 
-def test_two_rings_of_eight_as_the_file_says() -> None:
+def test_formation_is_two_rings_of_eight() -> None:
     places = np.array([c.position_m for c in load_scenario(PATH).chasers])
     np.testing.assert_allclose(np.linalg.norm(places, axis=1), 1.2435, atol=1e-4)
     gaps = np.linalg.norm(places[:, None] - places[None], axis=-1) + 9.0 * np.eye(16)
@@ -21,8 +21,8 @@ def test_two_rings_of_eight_as_the_file_says() -> None:
     assert (places[:, 2] > 0.0).sum() == 8
 
 
-def test_the_first_seconds_on_perfect_knowledge() -> None:
-    """From their scattered starts all come nearer to their places, and nobody to anybody."""
+def test_sixteen_chasers_converge_without_close_approaches() -> None:
+    """From scattered starts every chaser converges on its position; perfect target state."""
     mission = load_scenario(PATH, ("duration_s=8.0", "settling_s=1.0"))
     trace, truth = record_flight(mission), PerfectEstimator(mission.target)
     there = np.array([truth.estimate_at(round(t * 1e9)).position_m for t in trace.time_s])

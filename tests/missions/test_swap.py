@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The scenario ``swap`` with perfect state: head-on pairs around the tumbling target pass each other."""
+"""The scenario ``swap`` with perfect state: pairs on head-on courses pass each other around the tumbling target."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ TICK_S = 0.2
 
 
 def fly_swap(seed: int, time_s: float = 100.0) -> tuple[float, float, float]:
-    """Nearest two chasers come, nearest one comes to the target, farthest one ends from its goal, m.
+    """Return the least chaser separation, the least target distance and the largest final error, m.
 
-    Starts are scattered by the seed (0: exactly head-on), and so is the target's tumble.
+    The seed scatters the starts and the target's rotation axis; 0 is exactly head-on.
     """
     rng = np.random.default_rng(seed)
     scenario = load_scenario(ROOT / "scenarios/swap.toml")
@@ -80,8 +80,8 @@ def test_pairs_pass_each_other(seed: int) -> None:
 
 @settings(derandomize=True, deadline=None, max_examples=60)
 @given(st.integers(0, 10_000), st.floats(0.2, 3.0))
-def test_facing_goes_on_looking_where_it_looked(seed: int, far: float) -> None:
-    """What the body sees along the line to the target is the same at any offset."""
+def test_facing_attitude_keeps_line_of_sight_in_body_frame(seed: int, far: float) -> None:
+    """The direction to the target in the body frame is the same at any offset."""
     rng = np.random.default_rng(seed)
     nominal, q = rng.normal(size=3), rotations.normalize(rng.normal(size=4))
     offsets = np.vstack([far * rng.normal(size=(3, 3)), -nominal, 2.0 * nominal])

@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Corners of markers from lines fitted to their sides. What is measured, and why so: chaserdock_agents.chaser.perception.corners. */
+/* Refines marker corners as intersections of lines fitted to the sides. Method: chaserdock_agents.chaser.perception.corners. */
 #include "base.h"
 
 #define ROWS_MOST 20
@@ -12,13 +12,12 @@ typedef struct {
     const double *lens;
 } Image;
 
-/* Settings, in the order in which Python hands them over. The ends of a side are left out: there the neighbouring side's
- * gradient leaks in. */
+/* Settings, in the order of the Python caller. `first` and `last` exclude the ends of a side, where the gradient of the
+ * adjacent side interferes. */
 typedef struct {
     double first, last, reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px;
     double strip_px, log_edge_sigma, edge_sigma_spread, strip_beyond_px, uncertain_px;
-    /* Of the two passes: samples along and across a side, half length across at most, times that outlying rows are
-     * given less weight. */
+    /* Per pass: samples along and across a side, maximum half length across, number of reweighting iterations. */
     double rows[2], taps[2], reach_px[2], reweighted[2];
     double strip_rows, strip_taps, strip_steps;
 } Settings;
@@ -44,7 +43,7 @@ static void sides_of(const double *corners, Side *sides) {
     }
 }
 
-/* Grey level between pixels; beyond the image that of its border. */
+/* Bilinear grey level; pixels outside the image have the level of the nearest border pixel. */
 static double level_at(const Image *p, double x, double y) {
     x = x > 0.0 ? min_of(x, (double)(p->width - 1)) : 0.0;
     y = y > 0.0 ? min_of(y, (double)(p->height - 1)) : 0.0;
@@ -60,7 +59,7 @@ static double level_at(const Image *p, double x, double y) {
     return upper + (lower - upper) * y;
 }
 
-/* Ideal pixel to pixel of the image as taken (Brown-Conrady). */
+/* Converts an ideal to a distorted pixel (Brown-Conrady). */
 static void distort(const Image *p, double *x, double *y) {
     const double *l = p->lens;
     double a = (*x - l[2]) / l[0], b = (*y - l[3]) / l[1], r2 = a * a + b * b;
@@ -69,8 +68,8 @@ static void distort(const Image *p, double *x, double *y) {
     *y = ((b * radial + l[6] * (r2 + 2.0 * b * b)) + 2.0 * l[7] * a * b) * l[1] + l[3];
 }
 
-/* Grey levels of a row across a side, ``along`` it (-0.5 to 0.5), at ``across`` (taps) pixels out of it; whether its ends lie
- * inside the image: it is straight enough for them to tell. */
+/* Samples a row across a side: position `along` it (-0.5 to 0.5), offsets `across` (taps), pixels, positive outwards. Returns
+ * whether both ends of the row, and thus all of it, lie inside the image. */
 static int row_of(const Image *p, const Side *s, double along, const double *across, int taps, double *levels) {
     double base[2];
     int inside = 1;
@@ -102,7 +101,7 @@ static void fit_line(const double *along, const double *offset, const double *we
     *level = t0 / s0 - *slope * mean;
 }
 
-/* Upper median of ``values`` where ``weight`` is not 0; 0 if that is nowhere. */
+/* Upper median of `values` with nonzero `weight`; 0 if there are none. */
 static double median_of(const double *values, const double *weight, int rows) {
     double ordered[ROWS_MOST];
     int count = 0;
@@ -115,8 +114,8 @@ static double median_of(const double *values, const double *weight, int rows) {
     return count ? ordered[count / 2] : 0.0;
 }
 
-/* One side's line, from the centroids of the grey level's gradient across it: how far out its ends are to be moved.
- * Returns whether enough rows count. */
+/* Fits a side's line to the centroids of the grey-level gradient across it: outward offsets of its two ends, pixels.
+ * Returns whether enough rows are usable. */
 static int centroid_line(const Image *p, const Settings *set, int pass, const Side *s, double cells, double *at_start,
                          double *at_end) {
     int rows = (int)set->rows[pass], taps = (int)set->taps[pass], count = 0;
@@ -153,8 +152,7 @@ static int centroid_line(const Image *p, const Settings *set, int pass, const Si
     return (double)count >= set->min_rows_share * rows;
 }
 
-/* Corners where neighbouring sides cross once moved outwards at their ends; 0, and nothing written, where sides are nearly
- * parallel. */
+/* Intersects adjacent sides after moving their ends outwards. Returns 0, with nothing written, if two are nearly parallel. */
 static int crossings(const Side *sides, const double *at_start, const double *at_end, double *corners) {
     double low[4][2], vector[4][2], found[8];
     for (int i = 0; i < 4; i++)
@@ -192,7 +190,7 @@ static double distribution_of(double z, double density) {
 
 static double limited(double value, double limit) { return min_of(max_of(value, -limit), limit); }
 
-/* How far out a side has to be moved, from the mean profile of a blurred strip ``border`` pixels wide:
+/* Outward offset of a side from the mean profile of a blurred strip that is `border` pixels wide:
  * b + a Phi((s - e) / sigma) - d Phi((s - e - m) / sigma), with b, a, d, e by least squares and sigma with a prior. */
 static double strip_shift(const Image *p, const Settings *set, const Side *side, double cells, double border) {
     int rows = (int)set->strip_rows, taps = (int)set->strip_taps, count = 0;
@@ -208,10 +206,10 @@ static double strip_shift(const Image *p, const Settings *set, const Side *side,
     }
     for (int t = 0; t < taps; t++) profile[t] /= count ? count : 1;
     double shift = 0.0, log_sigma = set->log_edge_sigma;
-    /* Levels are weighed as if they had an error of 2: sets the prior of sigma against the data. */
+    /* An assumed error of 2 grey levels sets the weight of the prior of sigma. */
     double prior = (2.0 / set->edge_sigma_spread) * (2.0 / set->edge_sigma_spread);
-    /* Lines: 1, Phi at either edge, the model's derivatives by e and log sigma, and the profile less what the first three
-     * explain. */
+    /* Rows: 1, Phi at both edges, derivatives of the model by e and log sigma, residual of the profile after fitting the
+     * first three. */
     for (int step = 0; step < (int)set->strip_steps; step++) {
         double sigma = exponential(log_sigma), a[25], b[5];
         for (int t = 0; t < taps; t++) {
@@ -255,9 +253,9 @@ static double strip_shift(const Image *p, const Settings *set, const Side *side,
     return shift;
 }
 
-/* Corners (n, 4, 2), ideal pixels, refined in place, and of each marker: whether all four sides are good (else its corners
- * are as they were), and its corners' uncertainty against that of a large marker's. ``margin`` (n): width of the white
- * border over the marker's side; ``cells``: along a side, the black border included. */
+/* Refines corners (n, 4, 2), ideal pixels, in place. `good` (n): whether all four sides are usable; otherwise the corners
+ * are unchanged. `sigma` (n): uncertainty relative to that of a large marker. `margin` (n): width of the white border over
+ * the marker's side. `cells`: cells along a side, including the black border. */
 EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width, const double *lens, int64_t distorted,
                                 const Settings *set, double cells, int64_t n, const double *margin, double *corners,
                                 uint8_t *good, double *sigma) {

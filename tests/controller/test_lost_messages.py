@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What each process does about a message that has been lost on its way, in lock-step: the tick is answered."""
+"""Lost messages: chaser and controller complete the tick without them."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ def tick_of(scenario: Scenario, tick: int, chasers: tuple[int, ...]) -> Tick:
     )
 
 
-def tell(process: Any, topic: Topic, place: int | None, message: Any) -> list[tuple[Topic, Any]]:
-    """Hands a process one message; what it says to that."""
+def deliver(process: Any, topic: Topic, place: int | None, message: Any) -> list[tuple[Topic, Any]]:
+    """Hand a process one message; return what it publishes."""
     process.node.put(ReceivedMessage(topic, None if place is None else str(place), message, 0))
     process.listen()
     return [(t, m) for t, _, m in process.node.take_published()]
@@ -85,68 +85,68 @@ def wrench(scenario: Scenario, tick: int, **values: Any) -> WrenchCommand:
     )
 
 
-def actuated(said: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:
-    return [(m.tick, m.source) for t, m in said if t is topics.ACTUATORS]
+def actuated(published: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:
+    return [(m.tick, m.source) for t, m in published if t is topics.ACTUATORS]
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
 @pytest.mark.parametrize("how", ["lost", "none", "expired"])
-def test_a_chaser_without_its_command_answers_once(
+def test_chaser_without_command_actuates_once_per_tick(
     chaser: Chaser, scenario: Scenario, order: tuple[int, ...], how: str
 ) -> None:
-    """In whatever order tick, odometry and the loss reach it."""
+    """Tick, odometry and the lost command arrive in any order."""
     commands = {
         "lost": lost(scenario, 1),
         "none": wrench(scenario, 1, mode="none"),
         "expired": msgspec.structs.replace(wrench(scenario, 1), expires_ns=0),
     }
-    come = [
+    arrivals = [
         (topics.TICK, None, tick_of(scenario, 1, (0,))),
         (topics.ODOMETRY, 0, odometry(scenario, 0, 1)),
         (topics.WRENCH, 0, commands[how]),
     ]
-    said = [s for k in order for s in tell(chaser, *come[k])]
-    assert [tick for tick, source in actuated(said)] == [1]
-    assert [source for tick, source in actuated(said)] != ["command"]
-    assert any(t is topics.EVENT for t, _ in said)
+    published = [s for k in order for s in deliver(chaser, *arrivals[k])]
+    assert [tick for tick, source in actuated(published)] == [1]
+    assert [source for tick, source in actuated(published)] != ["command"]
+    assert any(t is topics.EVENT for t, _ in published)
 
 
-def test_a_lost_image_is_no_sighting_and_is_told(chaser: Chaser, scenario: Scenario) -> None:
-    ((topic, sighting),) = tell(chaser, topics.IMAGE, 0, lost(scenario, 4))
+def test_lost_image_gives_empty_sighting(chaser: Chaser, scenario: Scenario) -> None:
+    ((topic, sighting),) = deliver(chaser, topics.IMAGE, 0, lost(scenario, 4))
     assert topic is topics.SIGHTING
     assert (sighting.tick, sighting.status, sighting.solutions) == (4, "bad_image", ())
 
 
-def test_a_image_twice_is_looked_at_once(chaser: Chaser, scenario: Scenario) -> None:
+def test_duplicate_image_is_ignored(chaser: Chaser, scenario: Scenario) -> None:
     image = Image(tick=3, chaser=0, width_px=8, height_px=8, encoding="mono8", data=bytes(64))
-    first = [m for t, m in tell(chaser, topics.IMAGE, 0, image) if t is topics.SIGHTING]
+    first = [m for t, m in deliver(chaser, topics.IMAGE, 0, image) if t is topics.SIGHTING]
     assert len(first) == 1
-    assert tell(chaser, topics.IMAGE, 0, image) == []
+    assert deliver(chaser, topics.IMAGE, 0, image) == []
     assert chaser.node.counts.stale == 1
 
 
-def test_lost_odometry_is_reckoned_and_not_braked_by_for_long(chaser: Chaser, scenario: Scenario) -> None:
+def test_lost_odometry_is_extrapolated_and_braking_ends(chaser: Chaser, scenario: Scenario) -> None:
     moving = msgspec.structs.replace(odometry(scenario, 0, 0), velocity_m_s=(0.5, 0.0, 0.0))
-    tell(chaser, topics.ODOMETRY, 0, moving)
+    deliver(chaser, topics.ODOMETRY, 0, moving)
     forces = {}
     for tick in range(1, 9):
-        tell(chaser, topics.TICK, None, tick_of(scenario, tick, (0,)))
-        said = tell(chaser, topics.ODOMETRY, 0, lost(scenario, tick))
-        said += tell(chaser, topics.WRENCH, 0, lost(scenario, tick))
-        (command,) = [m for t, m in said if t is topics.ACTUATORS]
+        deliver(chaser, topics.TICK, None, tick_of(scenario, tick, (0,)))
+        published = deliver(chaser, topics.ODOMETRY, 0, lost(scenario, tick))
+        published += deliver(chaser, topics.WRENCH, 0, lost(scenario, tick))
+        (command,) = [m for t, m in published if t is topics.ACTUATORS]
         forces[tick] = command.force_N
         assert chaser.odometry is not None
         assert chaser.odometry.tick == tick
-    reckoned = chaser.odometry
-    assert reckoned is not None
-    assert abs(reckoned.position_m[0] - moving.position_m[0] - 0.5 * 0.8) < 1e-9
+    extrapolated = chaser.odometry
+    assert extrapolated is not None
+    assert abs(extrapolated.position_m[0] - moving.position_m[0] - 0.5 * 0.8) < 1e-9
     assert any(forces[3])
-    assert not any(forces[8])  # 0.8 s without knowing its own motion: it gives nothing
+    assert not any(forces[8])  # 0.8 s without odometry: no force
 
 
-def test_older_odometry_does_not_take_the_newers_place(chaser: Chaser, scenario: Scenario) -> None:
+def test_older_odometry_does_not_replace_newer(chaser: Chaser, scenario: Scenario) -> None:
     for tick in (2, 1):
-        tell(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, tick))
+        deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, tick))
     assert chaser.odometry is not None
     assert chaser.odometry.tick == 2
 
@@ -174,46 +174,46 @@ def sighting(scenario: Scenario, i: int, tick: int) -> Sighting:
     )
 
 
-def flown_tick(
+def run_tick(
     controller: Controller, scenario: Scenario, tick: int, without: dict[Topic, set[int]], chasers: int = 2
 ) -> dict[int, WrenchCommand]:
-    """A tick of which some messages are lost; the commands by chaser."""
-    said = tell(controller, topics.TICK, None, tick_of(scenario, tick, tuple(range(chasers))))
+    """Run a tick without some of its messages; return the commands by chaser."""
+    published = deliver(controller, topics.TICK, None, tick_of(scenario, tick, tuple(range(chasers))))
     makers: dict[Topic, Any] = {topics.ODOMETRY: odometry, topics.SIGHTING: sighting}
     for topic, make in makers.items():
         for i in range(chasers):
-            gone = i in without.get(topic, set())
-            message: Message | LostMessage = lost(scenario, tick) if gone else make(scenario, i, tick)
-            said += tell(controller, topic, i, message)
-    return {m.chaser: m for t, m in said if t is topics.WRENCH}
+            missing = i in without.get(topic, set())
+            message: Message | LostMessage = lost(scenario, tick) if missing else make(scenario, i, tick)
+            published += deliver(controller, topic, i, message)
+    return {m.chaser: m for t, m in published if t is topics.WRENCH}
 
 
-def test_a_tick_is_worked_out_without_what_was_lost(controller: Controller, scenario: Scenario) -> None:
-    assert set(flown_tick(controller, scenario, 1, {})) == {0, 1}
-    without = flown_tick(controller, scenario, 2, {topics.SIGHTING: {0, 1}})
-    assert "none" not in {c.mode for c in without.values()}
-    reckoned = flown_tick(controller, scenario, 3, {topics.ODOMETRY: {1}})
-    assert {i: c.mode == "none" for i, c in reckoned.items()} == {0: False, 1: False}
-
-
-def test_who_has_not_been_heard_of_for_long_gets_no_command(
+def test_controller_commands_without_lost_odometry_or_sightings(
     controller: Controller, scenario: Scenario
 ) -> None:
-    flown_tick(controller, scenario, 1, {})
-    modes = [flown_tick(controller, scenario, k, {topics.ODOMETRY: {1}})[1].mode for k in range(2, 10)]
+    assert set(run_tick(controller, scenario, 1, {})) == {0, 1}
+    without = run_tick(controller, scenario, 2, {topics.SIGHTING: {0, 1}})
+    assert "none" not in {c.mode for c in without.values()}
+    extrapolated = run_tick(controller, scenario, 3, {topics.ODOMETRY: {1}})
+    assert {i: c.mode == "none" for i, c in extrapolated.items()} == {0: False, 1: False}
+
+
+def test_chaser_without_recent_odometry_gets_no_command(controller: Controller, scenario: Scenario) -> None:
+    run_tick(controller, scenario, 1, {})
+    modes = [run_tick(controller, scenario, k, {topics.ODOMETRY: {1}})[1].mode for k in range(2, 10)]
     assert [mode == "none" for mode in modes] == [False] * 5 + [True] * 3  # a command's lifetime is 0.5 s
-    assert flown_tick(controller, scenario, 10, {})[1].mode != "none"
+    assert run_tick(controller, scenario, 10, {})[1].mode != "none"
 
 
-def test_odometry_that_never_came_is_no_command_either(controller: Controller, scenario: Scenario) -> None:
-    assert flown_tick(controller, scenario, 1, {topics.ODOMETRY: {1}})[1].mode == "none"
+def test_chaser_without_any_odometry_gets_no_command(controller: Controller, scenario: Scenario) -> None:
+    assert run_tick(controller, scenario, 1, {topics.ODOMETRY: {1}})[1].mode == "none"
 
 
-def test_no_tick_is_worked_out_before_its_loss_is_known(controller: Controller, scenario: Scenario) -> None:
-    tell(controller, topics.TICK, None, tick_of(scenario, 1, (0,)))
-    tell(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
+def test_tick_waits_until_a_loss_is_known(controller: Controller, scenario: Scenario) -> None:
+    deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0,)))
+    deliver(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
     assert controller.done_tick == -1
-    tell(controller, topics.SIGHTING, 0, lost(scenario, 1))
+    deliver(controller, topics.SIGHTING, 0, lost(scenario, 1))
     assert controller.done_tick == 1
 
 
@@ -227,34 +227,34 @@ class Clock:
 
 
 def in_real_time(scenario: Scenario) -> tuple[Controller, Clock]:
-    """A controller that waits for the sightings of tick 1."""
+    """Return a realtime controller that waits for the sightings of tick 1, and its clock."""
     clock = Clock()
     flight = ControllerCore(scenario, lambda: 0.0)
     made = Controller(ReplayNode("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
-    tell(made, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    deliver(made, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
     for i in (0, 1):
-        tell(made, topics.ODOMETRY, i, odometry(scenario, i, 1))
+        deliver(made, topics.ODOMETRY, i, odometry(scenario, i, 1))
     return made, clock
 
 
-def test_in_real_time_a_tick_waits_for_its_sightings_and_not_for_ever(scenario: Scenario) -> None:
+def test_realtime_tick_waits_for_sightings_until_its_deadline(scenario: Scenario) -> None:
     controller, clock = in_real_time(scenario)
-    said = tell(controller, topics.SIGHTING, 0, sighting(scenario, 0, 1))
-    assert not [m for t, m in said if t is topics.WRENCH]
+    published = deliver(controller, topics.SIGHTING, 0, sighting(scenario, 0, 1))
+    assert not [m for t, m in published if t is topics.WRENCH]
     clock.now_s = 0.9 / scenario.time.rate_hz
-    controller.listen()  # nothing comes
+    controller.listen()  # nothing arrives
     commands: list[Any] = [
         m for t, _, m in cast(ReplayNode, controller.node).take_published() if t is topics.WRENCH
     ]
     assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]
-    # The sighting that is late belongs to the next tick's estimate, and makes no second command.
-    said = tell(controller, topics.SIGHTING, 1, sighting(scenario, 1, 1))
-    assert not [m for t, m in said if t is topics.WRENCH]
+    # A late sighting is used in the next tick and triggers no second command.
+    published = deliver(controller, topics.SIGHTING, 1, sighting(scenario, 1, 1))
+    assert not [m for t, m in published if t is topics.WRENCH]
 
 
-def test_in_real_time_the_next_ticks_odometry_does_not_cost_a_tick_its_commands(scenario: Scenario) -> None:
+def test_realtime_tick_is_completed_when_odometry_of_the_next_arrives(scenario: Scenario) -> None:
     controller, _ = in_real_time(scenario)
-    said = tell(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
-    commands = [m for t, m in said if t is topics.WRENCH]
+    published = deliver(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
+    commands = [m for t, m in published if t is topics.WRENCH]
     assert [(c.chaser, c.tick, c.mode != "none") for c in commands] == [(0, 1, True), (1, 1, True)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Moves: smooth from any state to rest, on a line, within the speed limit."""
+"""Trajectories of moves: straight, smooth from any state to rest, within the speed limit."""
 
 from __future__ import annotations
 
@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 
 @given(points, points, st.floats(0.0, 100.0), st.floats(0.01, 0.2))
 @quick
-def test_a_move_from_rest_goes_from_here_to_there_and_rests(
-    start: Any, goal: Any, now: float, speed: float
-) -> None:
+def test_move_from_rest_is_straight_and_ends_at_rest(start: Any, goal: Any, now: float, speed: float) -> None:
     move = move_to(stay(start, 0.0), goal, now, speed)
     end = move.start_s + move.duration_s
     for t, place in ((now, start), (end, goal)):
@@ -29,18 +27,18 @@ def test_a_move_from_rest_goes_from_here_to_there_and_rests(
     np.testing.assert_allclose(move.goal_m, goal, rtol=0, atol=1e-9)
     assert move.over_at(end)
     assert not move.over_at(end - 1e-3)
-    # Before and after it stands still, where it was and where it went.
+    # At rest before its start and after its end.
     np.testing.assert_allclose(at(move, now - 5.0)[0], start, rtol=0, atol=1e-9)
     np.testing.assert_allclose(at(move, end + 5.0)[0], goal, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(at(move, end + 5.0)[1:], np.zeros((2, 3)))
     times = np.linspace(now, end, 500)
     positions, velocities, _ = move.at(times)
     assert np.linalg.norm(velocities, axis=1).max() <= speed * 1.002
-    # On the straight line between the two, and never back.
-    way = np.subtract(goal, start)
-    if np.linalg.norm(way) > 1e-3:
-        along = (positions - start) @ way / (way @ way)
-        np.testing.assert_allclose(positions, np.add(start, along[:, None] * way), rtol=0, atol=1e-8)
+    # On the straight line from start to goal, monotonic.
+    path = np.subtract(goal, start)
+    if np.linalg.norm(path) > 1e-3:
+        along = (positions - start) @ path / (path @ path)
+        np.testing.assert_allclose(positions, np.add(start, along[:, None] * path), rtol=0, atol=1e-8)
         assert np.all(np.diff(along) >= -1e-9)
 
 
@@ -50,13 +48,13 @@ def fastest(move: Move) -> float:
 
 
 @given(points, points, points, st.floats(0.0, 1.0), st.floats(0.01, 0.2), st.sampled_from([0.5, 1.0, 2.0]))
-@example((-1, 0, 0), (0, 0, 0.5), (-0.4, 0, 0), 0.2, 0.06, 0.5)  # accelerating when a slower move begins
-@example((0, 0, 0), (-0.6, 0, 0), (0, 0, 0), 0.21, 0.03, 1.0)  # back, at the moment of most acceleration
+@example((-1, 0, 0), (0, 0, 0.5), (-0.4, 0, 0), 0.2, 0.06, 0.5)  # a slower move begins during acceleration
+@example((0, 0, 0), (-0.6, 0, 0), (0, 0, 0), 0.21, 0.03, 1.0)  # reversed at peak acceleration
 @quick
-def test_a_move_out_of_a_move_is_smooth_and_no_faster_than_it_must_be(
+def test_move_that_replaces_another_is_smooth_with_bounded_speed(
     a: Any, b: Any, c: Any, share: float, speed: float, factor: float
 ) -> None:
-    """Position, velocity and acceleration go on where they were; it ends at rest; the speed stays bounded."""
+    """Position, velocity and acceleration are continuous; it ends at rest; speed and duration are bounded."""
     first = move_to(stay(a, 0.0), b, 0.0, speed)
     now = share * first.duration_s
     second = move_to(first, c, now, speed * factor)
@@ -84,7 +82,7 @@ def test_velocity_and_acceleration_are_the_positions_derivatives(a: Any, b: Any,
 
 @given(points, points, st.floats(0.0, 1.2))
 @quick
-def test_stop_comes_to_rest_a_little_further_on(a: Any, b: Any, share: float) -> None:
+def test_stop_ends_at_rest_within_bounds(a: Any, b: Any, share: float) -> None:
     first = move_to(stay(a, 0.0), b, 0.0, 0.05)
     now = share * first.duration_s
     stopping = stop(first, now)
@@ -97,24 +95,24 @@ def test_stop_comes_to_rest_a_little_further_on(a: Any, b: Any, share: float) ->
     assert stopping.duration_s <= 3.0
 
 
-def test_one_that_has_ended_is_where_one_about_to_end_goes() -> None:
+def test_ended_move_stays_at_its_goal() -> None:
     move = move_to(stay([0.3, -0.2, 0.7], 2.0), [0.6, 0.1, 0.5], 2.0, 0.03)
     end_s = move.start_s + move.duration_s
     for count in (1, 16):
         later = np.linspace(1e-6, 5.0, count) + end_s
-        # One time on the way: then nothing is taken from what a part remembers.
+        # A time before the end in the array bypasses the cached end state.
         both = [part[1:] for part in move.at(np.array([end_s - 1.0, *later]))]
         for held, expected in zip(move.at(later), both, strict=True):
             np.testing.assert_allclose(held, expected, rtol=0, atol=1e-15)
 
 
-def test_moves_take_their_time() -> None:
+def test_duration_follows_from_distance_and_speed() -> None:
     # The quintic's peak is 15/8 of its mean speed.
     assert move_to(stay([0, 0, 0], 0.0), [0.6, 0, 0], 0.0, 0.03).duration_s == pytest.approx(37.5)
     assert move_to(stay([0, 0, 0], 0.0), [1e-6, 0, 0], 0.0, 0.03).duration_s >= 1.0
 
 
 @pytest.mark.parametrize("speed", [0.0, -1.0, math.nan])
-def test_a_speed_must_be_positive(speed: float) -> None:
+def test_speed_must_be_positive(speed: float) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         move_to(stay([0, 0, 0], 0.0), [1, 0, 0], 0.0, speed)

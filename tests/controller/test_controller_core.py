@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chasers come, go and latch between two ticks, limits change, commands act late: the flight code takes it in its stride."""
+"""Controller core: chasers join, leave and latch between ticks; latency compensation; starts inside keep-out zones."""
 
 from __future__ import annotations
 
@@ -23,18 +23,18 @@ from chaserdock.evaluation.flight_record import record_flight
 from chaserdock.evaluation.perfect_knowledge import PerfectEstimator
 
 
-def three() -> Scenario:
+def three_chasers() -> Scenario:
     places = ([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0], [0.0, 1.2, 0.0])
     chasers = [{"position_m": p, "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for p in places]
     still = {"model": "servicer", "motion": "static"}
     return parse_scenario({"name": "test", "duration_s": 60.0, "target": still, "chasers": chasers}, "test")
 
 
-def step(flight: ControllerCore, tick: int, there: tuple[int, ...], **more: object) -> TickOutputs:
-    """A tick of those who are there, each 5 cm beside its place and at rest."""
+def step(flight: ControllerCore, tick: int, present: tuple[int, ...], **more: object) -> TickOutputs:
+    """Step with the chasers that are present, each at rest and 5 cm from its reference."""
     scenario, now_ns = flight.scenario, flight.scenario.timing.tick_time_ns(tick)
     here = {}
-    for i in there:
+    for i in present:
         c = scenario.chasers[i]
         place = tuple(np.add(c.position_m, (0.0, 0.0, 0.05)).tolist())
         here[i] = odometry(
@@ -49,34 +49,36 @@ def step(flight: ControllerCore, tick: int, there: tuple[int, ...], **more: obje
     return flight.step(TickInputs(tick, now_ns, here, (), **more))  # type: ignore[arg-type]
 
 
-def test_who_comes_and_goes_costs_nobody_a_tick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everyone who is there has a plan in every tick, the first after a change included, and no solver is rebuilt."""
-    mission = three()
-    flight, alone = (ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2))
+def test_joining_and_leaving_chasers_do_not_interrupt_planning(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every present chaser has a plan in every tick, including the first after a change; no solver is rebuilt."""
+    mission = three_chasers()
+    flight, single = (
+        ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target)) for _ in range(2)
+    )
     monkeypatch.setattr(planning, "make_solver", lambda *_: pytest.fail("a solver was built in flight"))
     steady: dict[int, list[Array]] = {}
-    for tick, there in enumerate([(0, 1, 2)] * 4 + [(0, 2)] * 4 + [(2,)] * 4 + [(0, 1, 2)] * 4):
-        out = step(flight, tick, there)
+    for tick, present in enumerate([(0, 1, 2)] * 4 + [(0, 2)] * 4 + [(2,)] * 4 + [(0, 1, 2)] * 4):
+        out = step(flight, tick, present)
         assert out.solver is not None
-        assert out.solver.chasers == there
-        assert out.solver.status == ("solved",) * len(there)
-        assert all(out.wrenches[i].mode == "nmpc" for i in there)
-        assert out.plans.keys() == set(there)
+        assert out.solver.chasers == present
+        assert out.solver.status == ("solved",) * len(present)
+        assert all(out.wrenches[i].mode == "nmpc" for i in present)
+        assert out.plans.keys() == set(present)
         steady.setdefault(2, []).append(np.array(out.wrenches[2].force_N))
-    # Nobody is near: what the others do leaves no trace in the plan of the one that stays.
+    # The chasers are far apart: the plan of chaser 2 does not depend on the others.
     for tick, force in enumerate(steady[2]):
-        np.testing.assert_allclose(np.array(step(alone, tick, (2,)).wrenches[2].force_N), force, atol=1e-6)
+        np.testing.assert_allclose(np.array(step(single, tick, (2,)).wrenches[2].force_N), force, atol=1e-6)
 
 
-def test_who_latches_is_quiet_at_once_and_the_others_have_their_plans() -> None:
+def test_latched_chaser_coasts_while_the_other_is_planned() -> None:
     mission = capture_scenario(2)
     prescribed = mission.target.model_copy(update={"motion": "constant_rates"})
     flight = ControllerCore(mission, lambda: 0.0, PerfectEstimator(prescribed))
-    felt = {"contact": True, "armed": True}
+    contact = {"contact": True, "armed": True}
     for tick, latched in enumerate([False, False, True, True, False]):
         now_ns = mission.timing.tick_time_ns(tick)
         docking = {
-            0: DockingStatus(tick=tick, sim_time_ns=now_ns, chaser=0, latched=latched, **felt),
+            0: DockingStatus(tick=tick, sim_time_ns=now_ns, chaser=0, latched=latched, **contact),
             1: DockingStatus(
                 tick=tick, sim_time_ns=now_ns, chaser=1, contact=False, armed=False, latched=False
             ),
@@ -96,8 +98,8 @@ def test_who_latches_is_quiet_at_once_and_the_others_have_their_plans() -> None:
 LATE = ("time.latency_s=0.2", "duration_s=50.0", "settling_s=40.0")
 
 
-def late_error_m() -> float:
-    """Steady position error, m, at the paper's tumble when a command takes effect three ticks after its exposure."""
+def latency_error_m() -> float:
+    """Return the steady position error, m, at the paper's tumble with a latency of three ticks."""
     mission = load_scenario(
         ROOT / "scenarios/single.toml", (*LATE, "chasers.0.start_offset_m=[-0.1,0.0,0.0]")
     )
@@ -105,9 +107,9 @@ def late_error_m() -> float:
     return float(np.sqrt(np.mean(trace.position_error_m[trace.time_s >= 40.0] ** 2)))
 
 
-def test_the_state_is_predicted_to_when_the_command_acts(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With 0.2 s of latency it tracks as without; the same code on the state at exposure does not."""
-    assert late_error_m() < 5e-5
+def test_latency_compensation_predicts_the_state_at_actuation(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With 0.2 s of latency tracking is as good as without; without the prediction it is not."""
+    assert latency_error_m() < 5e-5
 
     def at_exposure(odometry, history, until_ns, body):  # type: ignore[no-untyped-def]
         return np.array(
@@ -115,11 +117,11 @@ def test_the_state_is_predicted_to_when_the_command_acts(monkeypatch: pytest.Mon
         )
 
     monkeypatch.setattr(ingest, "predict_state", at_exposure)
-    assert late_error_m() > 5e-4
+    assert latency_error_m() > 5e-4
 
 
-def test_who_starts_where_nobody_may_be_comes_out_and_hurts_nobody() -> None:
-    """Chaser 0 begins 0.2 m from the target's centre, chasers 1 and 2 0.4 m apart where 0.6 m are kept."""
+def test_chasers_leave_keep_out_zones_in_which_they_start() -> None:
+    """Chaser 0 starts 0.2 m from the target's centre, chasers 1 and 2 start 0.4 m apart with a limit of 0.6 m."""
     chasers = [
         {"position_m": p, "q_wxyz": [1.0, 0.0, 0.0, 0.0], "start_offset_m": o}
         for p, o in (
@@ -144,8 +146,8 @@ def test_who_starts_where_nobody_may_be_comes_out_and_hurts_nobody() -> None:
     own = np.linalg.norm(trace.states[:, 0, :3] - there, axis=1)
     gap = np.linalg.norm(trace.states[:, 1, :3] - trace.states[:, 2, :3], axis=1)
     for distance, limit in ((own, 0.35), (gap, 0.6)):
-        out = int(np.argmax(distance > limit))
-        assert 0 < out < 8 * mission.time.rate_hz
-        assert (np.diff(distance[2:out]) > 0.0).all()
-        assert distance[out:].min() > limit - 2e-3
+        outside = int(np.argmax(distance > limit))
+        assert 0 < outside < 8 * mission.time.rate_hz
+        assert (np.diff(distance[2:outside]) > 0.0).all()
+        assert distance[outside:].min() > limit - 2e-3
     assert trace.failed_solves == 0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bad input to the controller: one clear error before the flight, or a named refusal and a safe command in flight."""
+"""Invalid input to the controller: one clear error before the flight; in flight an event and a safe command."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ AT_START = [
 
 
 @pytest.mark.parametrize(("changes", "message"), AT_START)
-def test_what_cannot_be_flown_is_one_clear_error_at_the_start(changes: dict[str, Any], message: str) -> None:
+def test_infeasible_scenario_gives_one_error_line(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ScenarioError) as error:
         scenario(**changes)
     (line,) = str(error.value).splitlines()
@@ -49,14 +49,14 @@ def test_what_cannot_be_flown_is_one_clear_error_at_the_start(changes: dict[str,
     assert message in line
 
 
-def test_a_quaternion_that_is_none_is_an_error_at_the_start() -> None:
+def test_quaternion_of_wrong_length_is_a_scenario_error() -> None:
     chasers = [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [0.9, 0.0, 0.0, 0.0]}]
     with pytest.raises(ScenarioError, match=r"test: chasers.0.q_wxyz: .*unit"):
         parse_scenario({"name": "x", "duration_s": 1.0, "chasers": chasers}, "test")
 
 
-def test_a_chaser_may_start_where_it_may_not_stay() -> None:
-    """Inside the keep-out, or too near another: the flight begins with the way out."""
+def test_start_inside_keep_out_is_allowed() -> None:
+    """The flight begins by leaving the keep-out sphere."""
     near = {
         "start_offset_m": [0.75, 0.0, 0.0],
         "position_m": [-1.0, 0.0, 0.0],
@@ -65,12 +65,12 @@ def test_a_chaser_may_start_where_it_may_not_stay() -> None:
     assert nmpc_parameters(scenario(chasers=[near])).stages == 30
 
 
-def flying(mission: Scenario) -> ControllerCore:
+def core_of(mission: Scenario) -> ControllerCore:
     return ControllerCore(mission, lambda: 0.0, PerfectEstimator(mission.target))
 
 
 def step(flight: ControllerCore, tick: int, *commands: OperatorCommand, **changes: Any) -> TickOutputs:
-    """Chaser 0 as given, chaser 1 at its place."""
+    """Step with the given odometry of chaser 0 and chaser 1 at its reference."""
     now_ns = flight.scenario.timing.tick_time_ns(tick)
     here = {
         0: odometry(
@@ -81,7 +81,7 @@ def step(flight: ControllerCore, tick: int, *commands: OperatorCommand, **change
     return flight.step(TickInputs(tick, now_ns, here, (), commands))
 
 
-BAD = [
+INVALID = [
     ({"position_m": (float("nan"), 0.0, 0.0)}, "position_m holds a value that is not finite"),
     ({"velocity_m_s": (0.0, float("inf"), 0.0)}, "velocity_m_s holds a value that is not finite"),
     ({"omega_rad_s": (0.0, 0.0, float("nan"))}, "omega_rad_s holds a value that is not finite"),
@@ -90,12 +90,10 @@ BAD = [
 ]
 
 
-@pytest.mark.parametrize(("changes", "message"), BAD)
-def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
-    changes: dict[str, Any], message: str
-) -> None:
-    """It cannot come over the network (below); should it come about all the same, that chaser coasts, and only it."""
-    flight = flying(scenario())
+@pytest.mark.parametrize(("changes", "message"), INVALID)
+def test_invalid_odometry_makes_only_that_chaser_coast(changes: dict[str, Any], message: str) -> None:
+    """The codec already rejects such messages (below); the core is safe without it."""
+    flight = core_of(scenario())
     assert step(flight, 0).wrenches[0].mode == "nmpc"
     for tick in (1, 2):
         out = step(flight, tick, **changes)
@@ -112,22 +110,22 @@ def test_in_flight_a_bad_state_is_refused_by_name_and_answered_safely(
     assert "chaser 0: planned again" in [e.what for e in again.events]
 
 
-def test_when_every_state_is_bad_everybody_coasts() -> None:
-    flight = flying(scenario())
-    bad = {i: odometry(i, 0, 0, q_wxyz=(0.0,) * 4) for i in (0, 1)}
-    out = flight.step(TickInputs(0, 0, bad, ()))
+def test_all_chasers_coast_without_valid_odometry() -> None:
+    flight = core_of(scenario())
+    invalid = {i: odometry(i, 0, 0, q_wxyz=(0.0,) * 4) for i in (0, 1)}
+    out = flight.step(TickInputs(0, 0, invalid, ()))
     assert [out.wrenches[i].mode for i in (0, 1)] == ["coast", "coast"]
 
 
-@pytest.mark.parametrize("changes", [c for c, _ in BAD])
-def test_a_bad_state_does_not_come_over_the_network(changes: dict[str, Any]) -> None:
+@pytest.mark.parametrize("changes", [c for c, _ in INVALID])
+def test_codec_rejects_invalid_odometry(changes: dict[str, Any]) -> None:
     payload = codec.encode(odometry(0, **changes))
     with pytest.raises(Rejected):
         codec.decode(Odometry, payload, encoding_of(Odometry))
 
 
-def test_a_reference_out_of_reach_is_refused_by_name_and_the_flight_goes_on() -> None:
-    flight = flying(scenario())
+def test_unreachable_goto_is_rejected_with_reason() -> None:
+    flight = core_of(scenario())
     step(flight, 0)
     for offset, message in (
         ((30.0, 0.0, 0.0), "30 m from the target"),

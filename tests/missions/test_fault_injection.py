@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Faults in whole missions over real processes: deterministic in lock-step, told in the log, survived."""
+"""Injected faults in complete missions with separate processes: deterministic in lock-step, logged, survived."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ SHORT = ("duration_s=6.0", "timeline=[]", "success.docked=[]", "settling_s=1.0")
 pytestmark = pytest.mark.slow
 
 
-def flown(
+def fly(
     out: Path, *faults: str, arguments: list[str] | None = None
 ) -> tuple[int, RecordedFlight, dict[str, Any]]:
     listed = ", ".join("{" + fault + "}" for fault in faults)
-    status, said = run(DRILL, out, *SHORT, f"fault=[{listed}]", arguments=arguments or [])
-    assert (out / "summary.json").exists(), said
+    status, output = run(DRILL, out, *SHORT, f"fault=[{listed}]", arguments=arguments or [])
+    assert (out / "summary.json").exists(), output
     return status, load_flight(out / "mission.mcap"), summary(out)
 
 
@@ -42,45 +42,44 @@ MANY = (
 )
 
 
-def test_equal_faults_make_equal_flights(tmp_path: Path) -> None:
-    (_, one, first), (_, other, second) = (flown(tmp_path / name, *MANY) for name in ("one", "other"))
+def test_equal_faults_give_equal_digests(tmp_path: Path) -> None:
+    (_, flight, first), (_, repeated, second) = (fly(tmp_path / name, *MANY) for name in ("first", "second"))
     assert first["digest"] == second["digest"]
-    begun = [e.detail.split(",")[0] for e in one.events if e.what == "fault begins"]
+    begun = [e.detail.split(",")[0] for e in flight.events if e.what == "fault begins"]
     assert len(begun) == len(MANY)
-    assert any(e.what == "process lost" and e.detail == "chaser/1" for e in other.events)
+    assert any(e.what == "process lost" and e.detail == "chaser/1" for e in repeated.events)
     assert first["collisions"] == 0
     assert all(m["lost"] == 0 for m in first["messages"].values())
 
 
-def test_a_frozen_process_changes_nothing_in_lockstep(tmp_path: Path) -> None:
-    status, plain, _ = flown(tmp_path / "plain")
+def test_lockstep_trajectories_are_independent_of_frozen_processes(tmp_path: Path) -> None:
+    status, nominal, _ = fly(tmp_path / "nominal")
     assert status == 0
-    status, frozen, told = flown(
+    status, frozen, result = fly(
         tmp_path / "frozen",
         'kind = "freeze", at_s = 2.0, duration_s = 3.0, process = "controller"',
         'kind = "freeze", at_s = 3.0, duration_s = 1.0, process = "world"',
     )
     assert status == 0
-    assert truth_of(frozen) == truth_of(plain)
-    assert told["wall_time_s"] > 4.0
+    assert truth_of(frozen) == truth_of(nominal)
+    assert result["wall_time_s"] > 4.0
 
 
-def test_killed_recorder_ends_the_log_and_not_the_flight(tmp_path: Path) -> None:
-    status, _, told = flown(tmp_path / "run", 'kind = "kill", at_s = 4.0, process = "recorder"')
+def test_flight_completes_without_recorder(tmp_path: Path) -> None:
+    status, _, result = fly(tmp_path / "run", 'kind = "kill", at_s = 4.0, process = "recorder"')
     assert status == 1
-    assert 3.0 < told["sim_time_s"] <= 4.1
+    assert 3.0 < result["sim_time_s"] <= 4.1
     assert "completed" in (tmp_path / "run" / "processes" / "world.txt").read_text()
 
 
-def test_in_real_time(tmp_path: Path) -> None:
-    """Nobody waits, nothing stands in for what is lost; the flight goes on."""
-    _, flight, told = flown(
+def test_realtime_flight_continues_with_dropped_commands_and_frozen_chaser(tmp_path: Path) -> None:
+    """Realtime mode neither waits for a process nor substitutes lost messages."""
+    _, flight, result = fly(
         tmp_path / "run",
         'kind = "drop", at_s = 2.0, duration_s = 1.5, process = "chaser/0", topic = "wrench"',
         'kind = "freeze", at_s = 4.0, duration_s = 0.5, process = "chaser/1"',
         arguments=["--mode", "realtime"],
     )
-    assert told["sim_time_s"] == 6.0
-    assert told["collisions"] == 0
-    what = [e.what for e in flight.events]
-    assert what.count("fault begins") == 2
+    assert result["sim_time_s"] == 6.0
+    assert result["collisions"] == 0
+    assert [e.what for e in flight.events].count("fault begins") == 2

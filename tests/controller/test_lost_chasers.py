@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A chaser that is lost to the others: an obstacle where it should be, and wider the longer nothing is heard."""
+"""Lost chasers: obstacles at the extrapolated position whose margin grows with time."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def odometry(i: int, time_s: float, position_m: Any, velocity_m_s: Any = (0.0, 0
     )
 
 
-def test_what_is_added_grows_and_is_bounded() -> None:
+def test_margin_grows_and_is_bounded() -> None:
     margins = [margin_m(s) for s in np.linspace(0.0, FORGOTTEN_S, 50)]
     assert margins == sorted(margins)
     assert margins[0] == FIRST_M
@@ -60,44 +60,44 @@ def test_what_is_added_grows_and_is_bounded() -> None:
     assert margins[-1] == MOST_M
 
 
-def test_it_goes_on_as_it_moved_last() -> None:
+def test_position_is_extrapolated_at_constant_velocity() -> None:
     last = odometry(1, 1.0, (1.0, 2.0, 3.0), (0.1, 0.0, -0.1))
     places = coasting(last, 3_000_000_000, np.array([0.0, 1.0]))
     np.testing.assert_allclose(places, [[1.2, 2.0, 2.8], [1.3, 2.0, 2.7]])
 
 
-def test_who_is_away_is_told_once_and_so_is_the_end_of_it() -> None:
-    absent = LostChasers()
-    assert absent.update({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
+def test_loss_expiry_and_return_are_each_reported_once() -> None:
+    lost = LostChasers()
+    assert lost.update({0: odometry(0, 0.0, Q[1:]), 1: odometry(1, 0.0, Q[1:])}, 0) == []
     events = []
     for k in range(1, 200):
         now_s = 0.4 * k
         now = {0: odometry(0, now_s, Q[1:])}
-        events += [(round(now_s, 1), *event) for event in absent.update(now, round(now_s * 1e9))]
+        events += [(round(now_s, 1), *event) for event in lost.update(now, round(now_s * 1e9))]
     assert [(level, text.split(":")[0]) for _, level, text in events] == [("warning", "chaser 1")] * 2
     assert "lost" in events[0][2]
     assert "no obstacle any more" in events[1][2]
     assert events[0][0] == pytest.approx(0.4)
     assert events[1][0] > FORGOTTEN_S
-    absent.update({}, round(81e9))
-    (back,) = absent.update({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
+    lost.update({}, round(81e9))
+    (back,) = lost.update({0: odometry(0, 81.1, Q[1:])}, round(81.1e9))
     assert back == ("info", "chaser 0: odometry received again")
 
 
-def test_a_moment_unheard_of_is_no_absence() -> None:
-    absent = LostChasers()
-    absent.update({0: odometry(0, 1.0, Q[1:])}, 10**9)
-    assert absent.update({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
-    assert absent.obstacles(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
+def test_short_interruption_is_not_a_loss() -> None:
+    lost = LostChasers()
+    lost.update({0: odometry(0, 1.0, Q[1:])}, 10**9)
+    assert lost.update({}, round((1.0 + 0.9 * ABSENT_S) * 1e9)) == []
+    assert lost.obstacles(round((1.0 + 0.9 * ABSENT_S) * 1e9)) == {}
 
 
-def test_nobody_away_leaves_the_problem_as_it_is() -> None:
+def test_problem_is_unchanged_without_lost_chasers() -> None:
     problem: Any = object()
     assert with_lost_chasers(problem, {}, 0, 0.1) is problem
 
 
 @pytest.mark.parametrize("between", [0.35, np.array([[0.0, 0.4], [0.4, 0.0]])])
-def test_an_absent_chaser_is_a_row_that_keeps_nothing_itself(between: Any) -> None:
+def test_lost_chaser_becomes_a_row_without_constraints_of_its_own(between: Any) -> None:
     stages, n = 5, 2
     problem = NmpcInput(
         states=np.zeros((n, 13)),
@@ -110,27 +110,30 @@ def test_an_absent_chaser_is_a_row_that_keeps_nothing_itself(between: Any) -> No
         corridors=np.ones((n, stages + 1, 5)),
     )
     last = odometry(7, 1.0, (1.0, 0.0, 0.0), (0.1, 0.0, 0.0))
-    with_it = with_lost_chasers(problem, {7: last}, 2_000_000_000, 0.1)
-    assert with_it.states.shape == (3, 13)
-    np.testing.assert_allclose(with_it.states[2, :6], [1.1, 0.0, 0.0, 0.1, 0.0, 0.0])
-    np.testing.assert_allclose(with_it.references[2, -1, :3], [1.15, 0.0, 0.0])
-    rows = np.asarray(with_it.min_distance_chasers_m)
+    extended = with_lost_chasers(problem, {7: last}, 2_000_000_000, 0.1)
+    assert extended.states.shape == (3, 13)
+    np.testing.assert_allclose(extended.states[2, :6], [1.1, 0.0, 0.0, 0.1, 0.0, 0.0])
+    np.testing.assert_allclose(extended.references[2, -1, :3], [1.15, 0.0, 0.0])
+    rows = np.asarray(extended.min_distance_chasers_m)
     np.testing.assert_allclose(rows[2, :2], np.max(between) + margin_m(1.5))
     np.testing.assert_array_equal(rows, rows.T)
     np.testing.assert_allclose(rows[0, 1], 0.35 if np.ndim(between) == 0 else 0.4)
-    assert with_it.min_distance_target_m[2] == 0.0
-    assert with_it.input_max[2].max() <= 1e-3
-    assert with_it.corridors is not None
-    assert not with_it.corridors[2].any()
+    assert extended.min_distance_target_m[2] == 0.0
+    assert extended.input_max[2].max() <= 1e-3
+    assert extended.corridors is not None
+    assert not extended.corridors[2].any()
 
 
 def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
-    """How near chaser 0, sent past it, comes to chaser 1, of which nothing is heard after a second; what is events."""
+    """Return the least distance of chaser 0 from chaser 1, whose odometry ends after 1 s, and the events.
+
+    ``blind`` removes lost chasers from the problem.
+    """
     flight = ControllerCore(scenario, lambda: 0.0, PerfectEstimator(scenario.target))
     if blind:
         flight.ingest.lost_chasers.obstacles = lambda now_ns: {}  # type: ignore[method-assign]
     timing, rate_hz = scenario.timing, scenario.time.rate_hz
-    # In the way; the wrenches act at once, as the latency plays no part here.
+    # On chaser 0's path. Wrenches act without latency.
     lost = np.array([0.0, -0.8, -0.1])
     x: Array = np.array([-1.0, 0.0, 0.0, *np.zeros(3), *Q, *np.zeros(3)])
     near_m, events = np.inf, []
@@ -163,11 +166,11 @@ def nearest_m(scenario: Scenario, blind: bool) -> tuple[float, list[str]]:
     return near_m, events
 
 
-def test_the_others_fly_around_where_it_should_be() -> None:
+def test_other_chasers_avoid_the_lost_chaser() -> None:
     scenario = load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml", (*STILL, "timeline=[]"))
-    least_m = scenario.limits.min_distance_chasers_m
-    around_m, events = nearest_m(scenario, blind=False)
-    through_m, _ = nearest_m(scenario, blind=True)
-    assert around_m > least_m
-    assert through_m < 0.8 * least_m
+    limit_m = scenario.limits.min_distance_chasers_m
+    avoiding_m, events = nearest_m(scenario, blind=False)
+    blind_m, _ = nearest_m(scenario, blind=True)
+    assert avoiding_m > limit_m
+    assert blind_m < 0.8 * limit_m
     assert any("chaser 1: lost" in text for text in events)

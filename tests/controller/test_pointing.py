@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where chasers look that search, and that show how their camera is mounted; what the filter makes of the latter."""
+"""Pointing: target search pattern, calibration manoeuvre, and the camera mounting that the filter estimates from it."""
 
 from __future__ import annotations
 
@@ -47,26 +47,24 @@ def _odometry(chaser: int, tick: int, x: np.ndarray) -> Odometry:
     )
 
 
-# --- searching -------------------------------------------------------------------------------------
+# --- search -------------------------------------------------------------------------------------
 
 
 @settings(derandomize=True, max_examples=60, deadline=None)
 @given(st.floats(0.0, 2.0 * math.pi), st.floats(0.0, math.radians(50.0)))
-def test_whatever_is_within_50_degrees_comes_into_the_image_within_14_seconds(
-    azimuth: float, off_axis: float
-) -> None:
+def test_search_covers_50_degrees_within_14_seconds(azimuth: float, off_axis: float) -> None:
     q_goal = rotations.exp(off_axis * np.array([0.0, math.cos(azimuth), math.sin(azimuth)]))
     direction = rotations.rotate(q_goal, [1.0, 0.0, 0.0])
     for t in np.arange(0.0, 14.0, 0.1):
         yaw, pitch = search_angles(float(t), WIDTH, HEIGHT)
         x, y, z = rotations.rotate_inverse(rotations.exp([0.0, pitch, yaw]), direction).tolist()
-        # With 1 degree to spare for what has a size.
+        # One degree of margin for the size of the target.
         if x > 0 and abs(math.atan2(y, x)) < WIDTH / 2 - 0.02 and abs(math.atan2(z, x)) < HEIGHT / 2 - 0.02:
             return
     pytest.fail(f"never seen: {math.degrees(azimuth):.0f}, {math.degrees(off_axis):.0f} deg")
 
 
-def test_rings_grow_and_the_line_of_sight_never_jumps() -> None:
+def test_search_rings_grow_without_jumps_of_the_line_of_sight() -> None:
     at = np.array([search_angles(t, WIDTH, HEIGHT) for t in np.arange(0.0, 120.0, 0.05)])
     assert tuple(at[0]) == (0.0, 0.0)
     assert np.abs(np.diff(at, axis=0)).max() < math.radians(2.5)
@@ -74,7 +72,7 @@ def test_rings_grow_and_the_line_of_sight_never_jumps() -> None:
     assert largest[0] < largest[1] < largest[2] <= math.radians(170.0)
 
 
-def test_a_chaser_follows_the_search_within_its_torque() -> None:
+def test_chaser_tracks_search_pattern_within_torque_limit() -> None:
     s = scenario()
     body = s.chaser
     x = np.concatenate([np.zeros(3), [0.02, 0.0, -0.01], [1.0, 0.0, 0.0, 0.0], np.zeros(3)])
@@ -88,23 +86,23 @@ def test_a_chaser_follows_the_search_within_its_torque() -> None:
         worst = max(worst, float(rotations.angle_between(x[6:10], rotations.exp([0.0, pitch, yaw]))))
         x = propagate(x, u, body, 1 / 15)
     assert worst < math.radians(12.0), math.degrees(worst)
-    assert np.linalg.norm(x[3:6]) < 1e-3  # it has come to rest meanwhile
+    assert np.linalg.norm(x[3:6]) < 1e-3  # braked to rest
 
 
 @settings(derandomize=True, max_examples=40, deadline=None)
 @given(st.lists(st.floats(-3, 3), min_size=3, max_size=3), st.lists(st.floats(-1, 1), min_size=3, max_size=3))
-def test_facing_turns_the_shortest_way(turn: list[float], direction: list[float]) -> None:
+def test_facing_uses_the_smallest_rotation(turn: list[float], direction: list[float]) -> None:
     if np.linalg.norm(direction) < 1e-3:
         return
     q = rotations.exp(turn)
     found = facing(q, direction)
     x = rotations.rotate(found, [1.0, 0.0, 0.0])
     np.testing.assert_allclose(x, np.array(direction) / np.linalg.norm(direction), atol=1e-9)
-    asked = math.acos(float(np.clip(rotations.rotate(q, [1.0, 0.0, 0.0]) @ x, -1.0, 1.0)))
-    assert float(rotations.angle_between(q, found)) == pytest.approx(asked, abs=1e-6)
+    angle = math.acos(float(np.clip(rotations.rotate(q, [1.0, 0.0, 0.0]) @ x, -1.0, 1.0)))
+    assert float(rotations.angle_between(q, found)) == pytest.approx(angle, abs=1e-6)
 
 
-def test_nobody_seen_means_searching_and_then_going_to_its_place_facing_the_target() -> None:
+def test_unknown_target_starts_search_then_goto_facing_the_target() -> None:
     guidance = PhaseMachine(scenario())
     guidance.target_unknown(0.5)
     assert guidance.chasers[0].phase == "acquire"
@@ -113,7 +111,7 @@ def test_nobody_seen_means_searching_and_then_going_to_its_place_facing_the_targ
     answer = guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
     assert not answer.accepted
     guidance.target_acquired(3.0)
-    assert guidance.chasers[0].phase == "searching"  # until its motion is known, too
+    assert guidance.chasers[0].phase == "searching"  # until the target motion is known
     guidance.target_settled(0, 4.0, np.array([-1.2, 0.3, 0.1]))
     c = guidance.chasers[0]
     assert (c.phase, c.faces) == ("goto", True)
@@ -123,10 +121,10 @@ def test_nobody_seen_means_searching_and_then_going_to_its_place_facing_the_targ
     assert guidance.chasers[1].phase == "searching"
 
 
-def test_a_flight_without_sightings_searches_and_says_so() -> None:
+def test_controller_without_sightings_searches_and_reports_it() -> None:
     s = scenario()
     flight = ControllerCore(s, lambda: 0.0)
-    said, modes, torque = [], [], ()
+    events, modes, torque = [], [], ()
     for k in range(40):
         places = [s.start_pose(i) for i in range(2)]
         now = {
@@ -134,19 +132,19 @@ def test_a_flight_without_sightings_searches_and_says_so() -> None:
             for i, (p, q) in enumerate(places)
         }
         out = flight.step(TickInputs(k, now[0].sim_time_ns, now, ()))
-        said += [e.what for e in out.events]
+        events += [e.what for e in out.events]
         modes.append(out.wrenches[0].mode)
         torque = out.wrenches[0].torque_N_m
-    assert said == ["chaser 0: searching (from acquire)", "chaser 1: searching (from acquire)"]
+    assert events == ["chaser 0: searching (from acquire)", "chaser 1: searching (from acquire)"]
     assert modes[0] == "brake"
     assert modes[-1] == "search"
     assert any(torque)
 
 
-# --- calibrating -----------------------------------------------------------------------------------
+# --- calibration -----------------------------------------------------------------------------------
 
 
-def test_the_manoeuvre_begins_and_ends_at_rest_and_keeps_the_target_in_the_image() -> None:
+def test_calibration_manoeuvre_starts_and_ends_at_rest_with_target_in_view() -> None:
     t = np.arange(-1.0, CALIBRATION_S + 1.0, 0.02)
     turns = calibration_turns(t)
     for k in (0, 25, 50, -1, -50):
@@ -160,24 +158,24 @@ def test_the_manoeuvre_begins_and_ends_at_rest_and_keeps_the_target_in_the_image
     assert np.abs(accelerations * body.inertia).max() < 0.8 * body.torque_max_N_m
 
 
-def test_calibrate_is_refused_where_it_makes_no_sense() -> None:
-    def ask(guidance: PhaseMachine, now_s: float) -> str:
+def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_hold() -> None:
+    def reply(guidance: PhaseMachine, now_s: float) -> str:
         return guidance.command(OperatorCommand(command="calibrate", chaser=0), now_s).reason
 
     exact = PhaseMachine(scenario())
-    assert "not been found" in ask(exact, 0.0)
+    assert "not been found" in reply(exact, 0.0)
     exact.target_acquired(1.0)
-    assert "taken as exact" in ask(exact, 2.0)
+    assert "taken as exact" in reply(exact, 2.0)
     guidance = PhaseMachine(scenario(estimator={"camera_bias_attitude_deg": 0.3}))
     guidance.target_acquired(1.0)
     guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
-    assert "hold first" in ask(guidance, 3.0)
+    assert "hold first" in reply(guidance, 3.0)
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_turning_about_shows_the_mounting_and_flying_in_step_does_not(seed: int) -> None:
-    """One camera, white noise of 1 mm and 0.2 degrees an image, mounted 0.3 degrees (one sigma) off."""
-    left = {}
+def test_mounting_rotation_is_observable_with_calibration_manoeuvre_only(seed: int) -> None:
+    """One camera, white noise of 1 mm and 0.2 degrees per image, mounting error of 0.3 degrees (one sigma)."""
+    residual_rad = {}
     for manoeuvre in (True, False):
         rng = np.random.default_rng(seed)
         true = np.concatenate([rng.normal(size=3) * math.radians(0.3), np.zeros(4)])
@@ -188,18 +186,20 @@ def test_turning_about_shows_the_mounting_and_flying_in_step_does_not(seed: int)
             q = rotations.integrate(rotations.IDENTITY, W, t)
             place = V * t + rotations.rotate(q, [-1.0, 0.0, 0.0])
             turned = rotations.multiply(q, calibration_turns([t])[0]) if manoeuvre else q
-            eye = CameraPose(place, rotations.multiply(turned, Q_CRF_IRF_FORWARD_WXYZ))
-            seen = predict_measurement(eye, V * t, q, true)
+            camera = CameraPose(place, rotations.multiply(turned, Q_CRF_IRF_FORWARD_WXYZ))
+            expected = predict_measurement(camera, V * t, q, true)
             noise = rng.normal(size=6) * np.sqrt(np.diag(R))
             h = PoseHypothesis(
-                seen.position_m + noise[:3], rotations.multiply(seen.q_wxyz, rotations.exp(noise[3:])), R
+                expected.position_m + noise[:3],
+                rotations.multiply(expected.q_wxyz, rotations.exp(noise[3:])),
+                R,
             )
-            f.update([Measurement(0, round(t * 1e9), (h,), 4, eye)], round(t * 1e9))
+            f.update([Measurement(0, round(t * 1e9), (h,), 4, camera)], round(t * 1e9))
         (found,) = f.cameras()
-        left[manoeuvre] = float(np.linalg.norm(found.turn_rad - true[:3]))
-        assert left[manoeuvre] < 4.0 * math.sqrt(float(np.trace(found.covariance[:3, :3])))
+        residual_rad[manoeuvre] = float(np.linalg.norm(found.turn_rad - true[:3]))
+        assert residual_rad[manoeuvre] < 4.0 * math.sqrt(float(np.trace(found.covariance[:3, :3])))
         if manoeuvre:
             assert math.sqrt(float(np.trace(found.covariance[:3, :3]))) < math.radians(0.08)
-        else:  # the turn about the line of sight cannot be seen
+        else:  # rotation about the line of sight is unobservable
             assert math.sqrt(float(found.covariance[2, 2])) > math.radians(0.25)
-    assert left[True] < math.radians(0.08)
+    assert residual_rad[True] < math.radians(0.08)

@@ -21,6 +21,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
+from .criteria import nearest_allowed_m
 from .flight import RecordedFlight, Track, load_flight
 from .plots import (
     AXES_XYZ,
@@ -152,11 +153,12 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
             speed = -np.gradient(distance, time_s)
             bottom.plot(time_s[d], speed[d] * 1e3, color=colour(i), linestyle=dashes(i))
     limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
+    keep_out_m = min(nearest_allowed_m(s, i) for i in numbers)
     # The two limits may be close: the label of this one is below its line.
-    top.axhspan(0.0, s.limits.min_distance_target_m, color=LIMIT, alpha=0.10, linewidth=0)
+    top.axhspan(0.0, keep_out_m, color=LIMIT, alpha=0.10, linewidth=0)
     top.annotate(
-        f"keep-out: below {s.limits.min_distance_target_m:g} m",
-        (1.0, s.limits.min_distance_target_m),
+        f"keep-out: below {keep_out_m:g} m",
+        (1.0, keep_out_m),
         xycoords=("axes fraction", "data"),
         xytext=(-2, -10),
         textcoords="offset points",
@@ -164,9 +166,7 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
         fontsize=8,
         color=LIMIT,
     )
-    top.set(
-        ylabel="distance to the target / m", ylim=(min(nearest, s.limits.min_distance_target_m) * 0.5, None)
-    )
+    top.set(ylabel="distance to the target / m", ylim=(min(nearest, keep_out_m) * 0.5, None))
     limit_line(bottom, s.approach.max_speed_m_s * 1e3, "approach speed limit")
     bottom.set(
         ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=(0, max(float(target.time_s[-1]), 1e-3))

@@ -10,17 +10,12 @@ import typer
 
 from .options import (
     ChaserArg,
-    ConfigOpt,
-    ConnectOpt,
     JsonOpt,
-    KeysOpt,
-    NamespaceOpt,
-    NetMode,
-    NetModeOpt,
+    LinkOptions,
     OperatorOpt,
     ReplyTimeoutOpt,
-    link_of,
     print_result,
+    with_link_options,
 )
 
 if TYPE_CHECKING:
@@ -40,6 +35,7 @@ class Command(StrEnum):
     restore = "restore"
 
 
+@with_link_options("listen", "lease")
 def command(
     what: Annotated[Command, typer.Argument(help="command")],
     number: ChaserArg,
@@ -57,19 +53,17 @@ def command(
             min=0, max=7_776_000, help="simulated time, seconds, after which the command is refused"
         ),
     ] = None,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
+    *,
+    link: LinkOptions,
     timeout: ReplyTimeoutOpt = 5.0,
     as_json: JsonOpt = False,
 ) -> None:
     """Send a command to a chaser of a running mission. Status 1 when refused, 2 when there is no reply."""
     from chaserdock.launch.operator import send_command
 
-    link = link_of(namespace, connect, None, net_mode, config, keys=keys)
-    _print_reply(send_command(link, what.value, number, offset, timeout, thruster, operator, before), as_json)
+    _print_reply(
+        send_command(link.link(), what.value, number, offset, timeout, thruster, operator, before), as_json
+    )
 
 
 class FaultKind(StrEnum):
@@ -81,6 +75,7 @@ class FaultKind(StrEnum):
     healthy = "healthy"
 
 
+@with_link_options("listen", "lease")
 def thruster_fault(
     number: ChaserArg,
     thruster: Annotated[int, typer.Argument(min=0, max=254, help="thruster number, from 0")],
@@ -89,11 +84,8 @@ def thruster_fault(
         float | None, typer.Option(min=0.0, max=1.0, help="weak: fraction of the nominal thrust")
     ] = None,
     operator: OperatorOpt = "",
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
+    *,
+    link: LinkOptions,
     timeout: ReplyTimeoutOpt = 5.0,
     as_json: JsonOpt = False,
 ) -> None:
@@ -103,8 +95,9 @@ def thruster_fault(
     """
     from chaserdock.launch.operator import send_thruster_fault
 
-    link = link_of(namespace, connect, None, net_mode, config, keys=keys)
-    _print_reply(send_thruster_fault(link, number, thruster, kind.value, factor, timeout, operator), as_json)
+    _print_reply(
+        send_thruster_fault(link.link(), number, thruster, kind.value, factor, timeout, operator), as_json
+    )
 
 
 def _print_reply(reply: CommandReply, as_json: bool) -> None:
@@ -114,12 +107,10 @@ def _print_reply(reply: CommandReply, as_json: bool) -> None:
     raise typer.Exit(0 if reply.accepted else 1)
 
 
+@with_link_options("listen", "lease")
 def status(
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
+    *,
+    link: LinkOptions,
     duration: Annotated[float, typer.Option(min=0.1, max=3600.0, help="seconds to listen")] = 3.0,
     as_json: JsonOpt = False,
 ) -> None:
@@ -128,7 +119,7 @@ def status(
 
     from chaserdock.launch.status import observe, table_of
 
-    observed = observe(link_of(namespace, connect, None, net_mode, config, keys=keys), duration)
+    observed = observe(link.link(), duration)
     if as_json:
         print_result(True, observed.as_dict(), ())
     else:

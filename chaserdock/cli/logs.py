@@ -13,17 +13,7 @@ import typer
 from chaserdock.exit_codes import DONE, STOPPED
 
 from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
-from .options import (
-    ConfigOpt,
-    ConnectOpt,
-    JsonOpt,
-    ListenOpt,
-    NamespaceOpt,
-    NetMode,
-    NetModeOpt,
-    print_result,
-    server_link,
-)
+from .options import JsonOpt, LinkOptions, print_result, with_link_options
 
 app = typer.Typer(
     name="log",
@@ -121,26 +111,24 @@ def tracks(
         print(f"{out / name}: {points} points")
 
 
+@with_link_options("keys", "lease")
 def play(
     log: LogFilesArg,
     speed: Annotated[
         float | None, typer.Option(min=0.01, help="simulated over wall time; as fast as possible by default")
     ] = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a recorder")] = 60.0,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    listen: ListenOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
+    *,
+    link: LinkOptions,
 ) -> None:
     """Publish a log's messages again, unchanged, in place of a world, once `chaserdock record` has joined."""
     from chaserdock_protocol.process import StopSignal
 
     from chaserdock.logs.player import play as publish
 
-    link = server_link(namespace, connect, listen, net_mode, config)
     stop = StopSignal(watch_parent=False)
-    print(f"{publish(_source(log), link, speed, timeout, stopped=stop)} messages sent")
+    count = publish(_source(log), link.link("world"), speed, timeout, stopped=stop)
+    print(f"{count} messages sent")
     raise typer.Exit(STOPPED if stop() else DONE)
 
 

@@ -10,11 +10,14 @@ import json
 import os
 import re
 import sys
-from collections.abc import Generator, Iterable
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
+from dataclasses import dataclass, fields
 from enum import StrEnum
+from functools import wraps
+from inspect import Parameter, Signature, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from chaserdock_protocol.errors import ChaserdockError
@@ -26,8 +29,6 @@ if TYPE_CHECKING:
     from chaserdock_protocol.transport import Link, Tls
 
     from chaserdock.launch.progress import Show
-
-DEFAULT_LEASE_S = 60.0
 
 
 class Mode(StrEnum):
@@ -70,19 +71,6 @@ ModeOpt = Annotated[
         help="lockstep: simulated time waits for every process (reproducible); realtime: it follows the wall clock"
     ),
 ]
-NamespaceOpt = Annotated[str, typer.Option(help="Zenoh namespace; isolates missions on one network")]
-ConnectOpt = Annotated[
-    list[str] | None,
-    typer.Option("--connect", "-e", metavar="ENDPOINT", help="connect to, e.g. tcp/host:7447; repeatable"),
-]
-ListenOpt = Annotated[
-    list[str] | None,
-    typer.Option("--listen", "-l", metavar="ENDPOINT", help="listen on, e.g. tcp/0.0.0.0:7447; repeatable"),
-]
-NetModeOpt = Annotated[NetMode, typer.Option("--net-mode", "-m", help="Zenoh session mode")]
-ConfigOpt = Annotated[
-    Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
-]
 KeysOpt = Annotated[
     Path | None,
     typer.Option(
@@ -91,9 +79,6 @@ KeysOpt = Annotated[
         metavar="DIR",
         help="keys of the mission or of this process (see `keys init`): connect to a router over TLS",
     ),
-]
-LeaseOpt = Annotated[
-    float, typer.Option(min=0.1, max=86_400.0, help="seconds after which a silent peer counts as lost")
 ]
 JoinTimeoutOpt = Annotated[
     float | None,
@@ -170,51 +155,107 @@ def check_config(config: Path | None) -> None:
         raise fail(f"--config {config}: no such file")
 
 
-def link_of(
-    namespace: str,
-    connect: list[str] | None,
-    listen: list[str] | None,
-    mode: NetMode,
-    config: Path | None,
-    lease_s: float = DEFAULT_LEASE_S,
-    keys: Path | None = None,
-    process: str = "operator",
-) -> Link:
-    """Return the link that the network options describe; with ``keys``, that of ``process`` to a router over TLS."""
-    from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
+@dataclass(frozen=True)
+class LinkOptions:
+    """The network options of a command, declared by the annotations; ``with_link_options`` adds them to a command."""
 
-    check_config(config)
-    check_endpoints("--connect", connect or [], tls=keys is not None)
-    check_endpoints("--listen", listen or [])
-    lease_ms = round(lease_s * 1000)
-    if keys is not None:
-        endpoints = tuple(connect or [DEFAULT_ENDPOINT.replace("tcp/", "tls/")])
-        return Link(namespace, endpoints, (), "client", config, lease_ms, tls_of(keys, process))
-    return Link(
-        namespace=namespace,
-        connect=tuple(connect if connect is not None else [DEFAULT_ENDPOINT]),
-        listen=tuple(listen if listen is not None else ["tcp/127.0.0.1:0"]),
-        mode=mode.value,
-        config=config,
-        lease_ms=lease_ms,
+    namespace: Annotated[str, typer.Option(help="Zenoh namespace; isolates missions on one network")] = (
+        "chaserdock"
     )
+    connect: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--connect", "-e", metavar="ENDPOINT", help="connect to, e.g. tcp/host:7447; repeatable"
+        ),
+    ] = None
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--listen", "-l", metavar="ENDPOINT", help="listen on, e.g. tcp/0.0.0.0:7447; repeatable"
+        ),
+    ] = None
+    net_mode: Annotated[NetMode, typer.Option("--net-mode", "-m", help="Zenoh session mode")] = NetMode.peer
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
+    ] = None
+    keys: KeysOpt = None
+    lease: Annotated[
+        float, typer.Option(min=0.1, max=86_400.0, help="seconds after which a silent peer counts as lost")
+    ] = 60.0
+
+    def link(self, process: str = "operator") -> Link:
+        """Return the link of ``process``; with ``keys``, to a router over TLS. The world listens on the default endpoint."""
+        from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
+
+        connect, listen = self.connect, self.listen
+        if process == "world" and not connect:
+            connect = []
+            if (
+                listen is None
+                and self.connect is None
+                and self.net_mode is NetMode.peer
+                and self.keys is None
+            ):
+                listen = [DEFAULT_ENDPOINT]
+        check_config(self.config)
+        check_endpoints("--connect", connect or [], tls=self.keys is not None)
+        check_endpoints("--listen", listen or [])
+        lease_ms = round(self.lease * 1000)
+        if self.keys is not None:
+            endpoints = tuple(connect or [DEFAULT_ENDPOINT.replace("tcp/", "tls/")])
+            tls = tls_of(self.keys, process)
+            return Link(self.namespace, endpoints, (), "client", self.config, lease_ms, tls)
+        return Link(
+            namespace=self.namespace,
+            connect=tuple(connect if connect is not None else [DEFAULT_ENDPOINT]),
+            listen=tuple(listen if listen is not None else ["tcp/127.0.0.1:0"]),
+            mode=self.net_mode.value,
+            config=self.config,
+            lease_ms=lease_ms,
+        )
+
+    def router_link(self) -> Link:
+        """Return the link of the router."""
+        from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
+
+        check_config(self.config)
+        check_endpoints("--listen", self.listen or [], tls=self.keys is not None)
+        tls = tls_of(self.keys, "router") if self.keys is not None else None
+        endpoints = tuple(
+            self.listen or [DEFAULT_ENDPOINT.replace("tcp/", "tcp/" if tls is None else "tls/")]
+        )
+        return Link(self.namespace, (), endpoints, "router", self.config, round(self.lease * 1000), tls)
 
 
-def server_link(
-    namespace: str,
-    connect: list[str] | None,
-    listen: list[str] | None,
-    mode: NetMode,
-    config: Path | None,
-    lease_s: float = DEFAULT_LEASE_S,
-    keys: Path | None = None,
-) -> Link:
-    """Return the link of the world, or of what replaces it: listens on the default endpoint unless configured."""
-    from chaserdock_protocol.transport import DEFAULT_ENDPOINT
+def with_link_options(*without: str, **defaults: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replace a command's parameter ``link`` by the fields of LinkOptions, but ``without`` some, or with other defaults."""
 
-    if listen is None and connect is None and mode is NetMode.peer and keys is None:
-        listen = [DEFAULT_ENDPOINT]
-    return link_of(namespace, connect or [], listen, mode, config, lease_s, keys, "world")
+    def decorate(command: Callable[..., None]) -> Callable[..., None]:
+        hints = get_type_hints(LinkOptions, include_extras=True)
+        options = [
+            Parameter(
+                f.name,
+                Parameter.KEYWORD_ONLY,
+                default=defaults.get(f.name, f.default),
+                annotation=hints[f.name],
+            )
+            for f in fields(LinkOptions)
+            if f.name not in without
+        ]
+        own = [
+            p.replace(kind=Parameter.KEYWORD_ONLY)
+            for p in signature(command, eval_str=True).parameters.values()
+        ]
+        place = next(i for i, p in enumerate(own) if p.name == "link")
+
+        @wraps(command)
+        def wrapper(**values: Any) -> None:
+            command(link=LinkOptions(**{p.name: values.pop(p.name) for p in options}), **values)
+
+        wrapper.__signature__ = Signature([*own[:place], *options, *own[place + 1 :]])  # type: ignore[attr-defined]
+        return wrapper
+
+    return decorate
 
 
 def tls_of(keys: Path, process: str) -> Tls:

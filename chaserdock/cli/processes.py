@@ -12,30 +12,18 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from .options import (
-    DEFAULT_LEASE_S,
     ChaserArg,
-    ConfigOpt,
-    ConnectOpt,
     JoinTimeoutOpt,
-    KeysOpt,
-    LeaseOpt,
-    ListenOpt,
+    LinkOptions,
     Mode,
     ModeOpt,
-    NamespaceOpt,
-    NetMode,
-    NetModeOpt,
     OutOpt,
     ScenarioArg,
     SeedOpt,
     SetOpt,
     WatchOpt,
-    check_config,
-    check_endpoints,
     fail,
-    link_of,
-    server_link,
-    tls_of,
+    with_link_options,
 )
 
 if TYPE_CHECKING:
@@ -60,19 +48,15 @@ def start_process(name: str, options: ProcessOptions) -> None:
     sys.exit(process(options))
 
 
+@with_link_options()
 def world(
     scenario: ScenarioArg,
     mode: ModeOpt = Mode.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
     recorder: Annotated[bool, typer.Option(help="wait for a recorder before the first tick")] = True,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    listen: ListenOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
-    lease: LeaseOpt = DEFAULT_LEASE_S,
+    *,
+    link: LinkOptions,
     rejoin_timeout: Annotated[
         float, typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost")
     ] = 0.0,
@@ -83,7 +67,7 @@ def world(
     from chaserdock_protocol.shipped_scenarios import find_scenario
 
     options = ProcessOptions(
-        link=server_link(namespace, connect, listen, net_mode, config, lease, keys),
+        link=link.link("world"),
         scenario=find_scenario(scenario),
         overrides=tuple(overrides or ()),
         seed=seed,
@@ -95,60 +79,47 @@ def world(
     start_process("world", options)
 
 
+@with_link_options()
 def chaser(
     number: ChaserArg,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    listen: ListenOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
-    lease: LeaseOpt = DEFAULT_LEASE_S,
+    *,
+    link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Run one chaser: measures the target's pose in its images, drives its actuators."""
     from chaserdock_protocol.process import ProcessOptions
 
-    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, f"chaser/{number}")
-    start_process(
-        "chaser", ProcessOptions(link=link, chaser=number, patience_s=timeout, watch_parent=watch_parent)
+    options = ProcessOptions(
+        link=link.link(f"chaser/{number}"), chaser=number, patience_s=timeout, watch_parent=watch_parent
     )
+    start_process("chaser", options)
 
 
+@with_link_options()
 def controller(
     standby: Annotated[
         bool, typer.Option("--standby", help="run as the hot standby of another controller")
     ] = False,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    listen: ListenOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
-    lease: LeaseOpt = DEFAULT_LEASE_S,
+    *,
+    link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Run the central controller: fuses all chasers' measurements, plans for all chasers."""
     from chaserdock_protocol.process import ProcessOptions
 
-    name = "standby" if standby else "controller"
-    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, name)
-    options = ProcessOptions(link=link, patience_s=timeout, watch_parent=watch_parent, standby=standby)
+    own = link.link("standby" if standby else "controller")
+    options = ProcessOptions(link=own, patience_s=timeout, watch_parent=watch_parent, standby=standby)
     start_process("controller", options)
 
 
+@with_link_options()
 def record(
     out: OutOpt = None,
     by_run: Annotated[bool, typer.Option(help="write into a folder of this run inside OUT")] = False,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    listen: ListenOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
-    lease: LeaseOpt = DEFAULT_LEASE_S,
+    *,
+    link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
     rotate_size: Annotated[
         float | None,
@@ -166,9 +137,8 @@ def record(
     folder = (
         (out or Path("runs")) if by_run else out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
     )
-    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, "recorder")
     options = ProcessOptions(
-        link=link,
+        link=link.link("recorder"),
         out=folder,
         by_run=by_run,
         rotation=Rotation(None if rotate_size is None else round(rotate_size * 1e6), rotate_time),
@@ -179,12 +149,10 @@ def record(
     start_process("record", options)
 
 
+@with_link_options("connect", "net_mode", lease=10.0)
 def router(
-    listen: ListenOpt = None,
-    keys: KeysOpt = None,
-    namespace: NamespaceOpt = "chaserdock",
-    config: ConfigOpt = None,
-    lease: LeaseOpt = 10.0,
+    *,
+    link: LinkOptions,
     until: Annotated[
         str | None, typer.Option(metavar="PROCESS", help="exit when this process has joined and left")
     ] = None,
@@ -193,14 +161,7 @@ def router(
     """Run the router that a mission's processes connect to; with --keys it enforces each process' access rights."""
     from chaserdock_protocol.process import ProcessOptions
     from chaserdock_protocol.topics import is_process_name
-    from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
 
     if until is not None and not is_process_name(until):
         raise fail(f"--until {until}: must be a process, e.g. operator or chaser/0")
-    check_config(config)
-    check_endpoints("--listen", listen or [], tls=keys is not None)
-    scheme = "tls/" if keys is not None else "tcp/"
-    endpoints = tuple(listen or [DEFAULT_ENDPOINT.replace("tcp/", scheme)])
-    tls = tls_of(keys, "router") if keys is not None else None
-    link = Link(namespace, (), endpoints, "router", config, round(lease * 1000), tls)
-    start_process("router", ProcessOptions(link=link, until=until, watch_parent=watch_parent))
+    start_process("router", ProcessOptions(link=link.router_link(), until=until, watch_parent=watch_parent))

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import os
-from enum import StrEnum
 from typing import Annotated
 
 import typer
@@ -17,17 +16,16 @@ ToleranceOpt = Annotated[
 ]
 
 
-class Stage(StrEnum):
-    """Parts of the software that a log is replayed through."""
-
-    perception = "perception"
-    fusion = "fusion"
-    controller = "controller"
-
-
 def replay(
     log: LogArg,
-    through: Annotated[Stage, typer.Option(help="part of the software")],
+    through: Annotated[
+        str,
+        typer.Option(
+            metavar="STAGE",
+            help="part of the software: perception, fusion, controller, or one that a package provides "
+            "(entry points of `chaserdock.replays`)",
+        ),
+    ],
     overrides: SetOpt = None,
     tolerance: ToleranceOpt = 0.0,
     as_json: JsonOpt = False,
@@ -41,7 +39,7 @@ def replay(
     from chaserdock.replay.difference import difference_lines, first_difference
     from chaserdock.replay.run import replay as run
 
-    result = run(log, through.value, tuple(overrides or ()), tolerance)
+    result = run(log, through, tuple(overrides or ()), tolerance)
     first = first_difference(result.topics)
     lines = [*result.notes, *difference_lines(result.topics, ("recorded", "now"))]
     lines.append("equal to the log" if first is None else f"first difference: {first}")

@@ -15,25 +15,19 @@ from typing import Annotated
 import typer
 
 from .options import (
-    DEFAULT_LEASE_S,
-    ConfigOpt,
-    ConnectOpt,
     JsonLinesOpt,
     KeysOpt,
-    LeaseOpt,
+    LinkOptions,
     Mode,
     ModeOpt,
-    NamespaceOpt,
-    NetMode,
-    NetModeOpt,
     OutOpt,
     QuietOpt,
     ScenarioArg,
     SeedOpt,
     SetOpt,
     errors_as_json,
-    link_of,
     show_of,
+    with_link_options,
 )
 
 
@@ -90,14 +84,11 @@ def stop_on_signals() -> Generator[threading.Event]:
             signal.signal(number, handler)
 
 
+@with_link_options("listen")
 def judge(
     out: Annotated[Path, typer.Argument(help="folder that the recorder writes to with --by-run")],
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
-    lease: LeaseOpt = DEFAULT_LEASE_S,
+    *,
+    link: LinkOptions,
     timeout: Annotated[float, typer.Option(min=0.1, help="seconds to wait for a mission")] = 120.0,
     world_timeout: Annotated[
         float, typer.Option(min=0.1, help="seconds after which an absent world counts as lost")
@@ -109,6 +100,5 @@ def judge(
     from chaserdock.launch.judge import judge_mission
 
     show = show_of(quiet, as_json)
-    link = link_of(namespace, connect, None, net_mode, config, lease, keys)
     with errors_as_json(as_json):
-        raise typer.Exit(judge_mission(out, link, timeout, world_timeout, show))
+        raise typer.Exit(judge_mission(out, link.link(), timeout, world_timeout, show))

@@ -104,9 +104,9 @@ def validate(
             fail(str(error))
             failed = True
         else:
-            print(
-                f"{file}: valid: {scenario.name}, {len(scenario.chasers)} chasers, {scenario.duration_s:g} s"
-            )
+            number = len(scenario.chasers)
+            chasers = "1 chaser" if number == 1 else f"{number} chasers"
+            print(f"{file}: valid: {scenario.name}, {chasers}, {scenario.duration_s:g} s")
     if failed:
         raise typer.Exit(BAD_INPUT)
 
@@ -159,7 +159,12 @@ def new(
 
 def as_toml(scenario: Scenario, changes: bool = False) -> str:
     """Return a scenario in TOML's notation; ``changes``: without values that equal the default."""
-    values = scenario.model_dump(mode="json", exclude_none=True, exclude_defaults=changes)
+    from chaserdock_protocol.scenario.camera import REPLACED_BY_INTRINSICS
+
+    unused = set[str](REPLACED_BY_INTRINSICS if scenario.camera.intrinsics is not None else ())
+    values = scenario.model_dump(
+        mode="json", exclude_none=True, exclude_defaults=changes, exclude={"camera": unused}
+    )
     if changes:
         values = {"format": scenario.format, **values, "chaser": _changed_body(scenario)}
     return "\n".join(_table(values, ())).lstrip("\n") + "\n"

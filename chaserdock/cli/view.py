@@ -8,22 +8,10 @@ from typing import Annotated
 
 import typer
 
-from .options import (
-    DEFAULT_LEASE_S,
-    ConfigOpt,
-    ConnectOpt,
-    KeysOpt,
-    LeaseOpt,
-    ListenOpt,
-    NamespaceOpt,
-    NetMode,
-    NetModeOpt,
-    WatchOpt,
-    fail,
-    link_of,
-)
+from .options import LinkOptions, WatchOpt, fail, with_link_options
 
 
+@with_link_options()
 def view(
     log: Annotated[
         list[Path] | None,
@@ -43,13 +31,8 @@ def view(
     at: Annotated[
         float | None, typer.Option(min=0, help="log: pause at this simulated time, seconds")
     ] = None,
-    namespace: NamespaceOpt = "chaserdock",
-    connect: ConnectOpt = None,
-    listen: ListenOpt = None,
-    net_mode: NetModeOpt = NetMode.peer,
-    config: ConfigOpt = None,
-    keys: KeysOpt = None,
-    lease: LeaseOpt = DEFAULT_LEASE_S,
+    *,
+    link: LinkOptions,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Show a running mission, or a log, in a web browser: scene, images, plots, phases, commands."""
@@ -62,5 +45,4 @@ def view(
         raise typer.Exit(view_log(log[0] if len(log) == 1 else log, options, at, watch_parent))
     if at is not None:
         raise fail("--at: needs a log")
-    link = link_of(namespace, connect, listen, net_mode, config, lease, keys, "viewer")
-    raise typer.Exit(view_live(link, options, watch_parent))
+    raise typer.Exit(view_live(link.link("viewer"), options, watch_parent))

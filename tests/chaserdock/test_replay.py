@@ -165,7 +165,7 @@ def test_replay_command(tmp_path: Path) -> None:
     for arguments, words in (
         (
             ["replay", log, "--through", "thought"],
-            "'--through': 'thought' is not one of 'perception', 'fusion', 'controller'",
+            "--through thought: must be one of controller, fusion, perception",
         ),
         (
             ["replay", log, "--through", "fusion", "--set", "limits.nonsense=1"],

@@ -35,7 +35,7 @@ def test_validate_prints_one_line_per_error_and_exits_with_2(tmp_path: Path) -> 
     bad.write_text('extends = "single"\nseed = -1\ncamera.widht_px = 640\n')
     status, out, err = call("validate", "single", str(bad), "nowhere")
     assert status == 2
-    assert out == "single: valid: single, 1 chasers, 120 s\n"
+    assert out == "single: valid: single, 1 chaser, 120 s\n"
     lines = err.splitlines()
     assert len(lines) == 3
     assert f"{bad}: unknown key camera.widht_px; did you mean camera.width_px?" in err

@@ -417,3 +417,17 @@ def test_a_known_target_replaces_the_geometry_of_the_base(file: Path, tmp_path: 
     path = variant(tmp_path, 'extends = "two.toml"\ntarget.model = "servicer"\n')
     assert load_scenario(file).target.geometry is not None
     assert load_scenario(path).target.geometry is None
+
+
+@pytest.mark.parametrize("key", ["width_px=640", "height_px=480", "hfov_deg=50.0"])
+def test_camera_values_replaced_by_intrinsics_are_an_error(tmp_path: Path, key: str) -> None:
+    lens = "{width_px=800,height_px=600,fx_px=700,fy_px=700,cx_px=400,cy_px=300}"
+    error = (
+        f"camera.{key.partition('=')[0]}: not used with camera.intrinsics; change camera.intrinsics instead"
+    )
+    variant = tmp_path / "variant.toml"
+    variant.write_text(f'extends = "single"\n[camera]\nintrinsics = {lens}\n')
+    assert load_scenario(variant).camera_model().width_px == 800
+    assert load_error(variant, f"camera.{key}") == f"--set camera.{key}: {error}"
+    variant.write_text(f'extends = "single"\n[camera]\n{key.replace("=", " = ")}\nintrinsics = {lens}\n')
+    assert load_error(variant) == f"{variant}: {error}"

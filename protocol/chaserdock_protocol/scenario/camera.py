@@ -13,6 +13,7 @@ from pydantic import Field, model_validator
 from .fields import Fraction, NotNegative, Number, Positive, Section, Vector
 
 Pixels = Annotated[int, Field(ge=64, le=4096)]
+REPLACED_BY_INTRINSICS = ("width_px", "height_px", "hfov_deg")
 
 
 class Effects(Section):

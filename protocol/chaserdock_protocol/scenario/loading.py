@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from chaserdock_protocol import plugins
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, shipped_scenario
 
+from .camera import REPLACED_BY_INTRINSICS
 from .errors import ScenarioError, explain, value_text
 from .files import read_toml, resolve_files
 from .migrations import old_format, old_keys
@@ -28,7 +29,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     Paths in a file are relative to it, those in an override to the working directory. The plugins that the scenario
     names must be installed; this is not required of a scenario from the world or a log.
     """
-    steps = [(str(file), _merging(values)) for file, values in _read_with_parents(path)]
+    steps = [(str(file), _merging(values, str(file))) for file, values in _read_with_parents(path)]
     scenario = _validated([*steps, *_override_steps(overrides)], str(path))
     _require_plugins(scenario, str(path))
     return scenario
@@ -84,8 +85,13 @@ def _parent(name: Any, file: Path) -> Path | None:
         raise ScenarioError(f"{file}: extends: {error}") from None
 
 
-def _merging(values: Values) -> Callable[[Values], Values]:
-    return lambda base: merge(base, values)
+def _merging(values: Values, source: str) -> Callable[[Values], Values]:
+    def step(base: Values) -> Values:
+        merged = merge(base, values)
+        _check_camera(base, merged, source)
+        return merged
+
+    return step
 
 
 def _override_steps(overrides: Sequence[str]) -> list[Step]:
@@ -93,8 +99,8 @@ def _override_steps(overrides: Sequence[str]) -> list[Step]:
 
 
 def _overriding(text: str) -> Callable[[Values], Values]:
-    def step(values: Values) -> Values:
-        values = with_override(values, text, lambda v: Scenario.model_validate(v).model_dump(mode="json"))
+    def step(before: Values) -> Values:
+        values = with_override(before, text, lambda v: Scenario.model_validate(v).model_dump(mode="json"))
         _check_format(values, f"--set {text}")
         try:
             resolve_files(values, Path())
@@ -102,9 +108,21 @@ def _overriding(text: str) -> Callable[[Values], Values]:
             raise ScenarioError(
                 "\n".join(f"--set {text}: {line}" for line in str(error).splitlines())
             ) from None
+        _check_camera(before, values, f"--set {text}")
         return values
 
     return step
+
+
+def _check_camera(before: Values, after: Values, source: str) -> None:
+    """Drop the values that ``camera.intrinsics`` replaces, in place. Raise ScenarioError where the source states one."""
+    was, now = (v["camera"] if isinstance(v.get("camera"), dict) else {} for v in (before, after))
+    for key in REPLACED_BY_INTRINSICS if now.get("intrinsics") else ():
+        if now.get(key) != was.get(key):
+            raise ScenarioError(
+                f"{source}: camera.{key}: not used with camera.intrinsics; change camera.intrinsics instead"
+            )
+        now.pop(key, None)
 
 
 def _check_format(values: Values, source: str) -> None:

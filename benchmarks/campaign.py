@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A campaign killed half way, resumed, and flown once more on a cluster: ``python benchmarks/campaign.py [--quick]``.
+"""Resuming and distributing a campaign: ``python benchmarks/campaign.py [--runs N] [--out DIR] [--quick] [--json FILE]``.
 
-200 seeds (``--runs``) of a shortened ``single`` with small images, two at a time. With half of the results there the
-program and all it has started are killed with kill -9; started again it must fly the rest and nothing twice. The same
-file then goes to a Dask cluster of two worker processes on this machine. Tables are compared row by row, whole.
-``--out`` keeps the folders, and what is there already is not flown again.
+200 seeds (``--runs``) of a shortened ``single`` with small images, two at a time. When half of the results exist, all
+processes are killed with SIGKILL. The campaign is then resumed and must complete without repeating a finished run. A Dask
+cluster of two workers on this machine runs the same file; its table must equal that of the first campaign. Status 1
+otherwise. ``--out`` keeps the folders, and finished runs in it are not repeated.
 """
 
 from __future__ import annotations
@@ -13,17 +13,15 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
-from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pyarrow.parquet as pq
-from results import options_of, write_json
+from common import chaserdock_command, make_parser, print_figures, run_chaserdock, write_json
 
 PLAN = """
 name = "killed-and-resumed"
@@ -40,92 +38,69 @@ settling_s = 1.0
 POLL_S = 0.2
 
 
-def command(file: Path, *arguments: str) -> list[str]:
-    return [sys.executable, "-m", "chaserdock", "campaign", str(file), *arguments]
-
-
 def results(folder: Path) -> dict[Path, int]:
-    """The results so far, each with when it was written."""
+    """Return the result files so far with their modification times (ns)."""
     return {path: path.stat().st_mtime_ns for path in folder.glob("runs/*/result.json")}
 
 
 def table(folder: Path) -> list[dict[str, Any]]:
-    """The rows, but for where the logs are."""
+    """Return the rows of the campaign's table without the paths of logs."""
     rows = pq.read_table(folder / "results.parquet").to_pylist()
     return [{name: value for name, value in row.items() if name != "log"} for row in rows]
 
 
 def kill_half_way(file: Path, out: Path, half: int) -> int:
-    """Starts the campaign and kills it and all it has started; how many results are there then."""
-    running = psutil.Popen(command(file, "--out", str(out), "--jobs", "2"), stdout=subprocess.DEVNULL)
+    """Start the campaign, kill all its processes when ``half`` of the results exist, and return the number of results."""
+    command = chaserdock_command("campaign", file, "--out", out, "--jobs", "2")
+    running = psutil.Popen(command, stdout=subprocess.DEVNULL)
     while running.poll() is None and len(results(out)) < half:
         time.sleep(POLL_S)
-    family: Sequence[psutil.Process] = [*running.children(recursive=True), running]
-    for process in family:
+    for process in [*running.children(recursive=True), running]:
         with suppress(psutil.NoSuchProcess):
             process.kill()
     running.wait()
     return len(results(out))
 
 
-def finish(file: Path, out: Path, *arguments: str) -> float:
-    """Flies what is left; seconds of wall time. Raises SystemExit if the program failed."""
-    begun = time.monotonic()
-    done = subprocess.run(
-        command(file, "--out", str(out), *arguments), capture_output=True, text=True, check=False
-    )
-    if done.returncode != 0:
-        raise SystemExit(f"status {done.returncode}:\n{done.stdout}{done.stderr}")
-    return time.monotonic() - begun
-
-
 def main() -> None:
-    parser = options_of(__doc__)
-    parser.add_argument("--runs", type=int, default=200, help="how many")
-    parser.add_argument("--out", type=Path, help="folder to keep; a temporary one by default")
+    parser = make_parser(__doc__)
+    parser.add_argument("--runs", type=int, default=200, help="number of seeds")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder to keep; default: a temporary one")
     options = parser.parse_args()
     runs = 6 if options.quick else options.runs
-    kept = options.out is not None
-    folder = options.out if kept else Path(tempfile.mkdtemp())
+    folder = options.out or Path(tempfile.mkdtemp())
     folder.mkdir(parents=True, exist_ok=True)
-    file, here, there = folder / "campaign.toml", folder / "here", folder / "there"
+    file, local, distributed = folder / "campaign.toml", folder / "local", folder / "cluster"
     file.write_text(PLAN.format(seeds=", ".join(map(str, range(runs)))), encoding="utf-8")
 
-    half = kill_half_way(file, here, runs // 2)
-    before = results(here)
-    print(f"killed with {half} of {runs} results", flush=True)
-    took = finish(file, here, "--jobs", "2")
-    untouched = sum(results(here).get(path) == written for path, written in before.items())
-    rows = table(here)
-    digests = {row["digest"] for row in rows}
-    print(f"resumed: {len(rows)} rows, {len(digests)} distinct flights, {untouched} of {half} as they were")
-    print(f"         {took / max(1, runs - half):.1f} s a run, two at a time", flush=True)
+    killed_with = kill_half_way(file, local, runs // 2)
+    before = results(local)
+    run_chaserdock("campaign", file, "--out", local, "--jobs", "2")
+    kept = sum(results(local).get(path) == written for path, written in before.items())
+    rows = table(local)
 
-    os.environ.setdefault(
-        "DASK_DISTRIBUTED__WORKER__DAEMON", "False"
-    )  # a worker starts a mission's processes
+    # A worker starts the processes of a mission.
+    os.environ.setdefault("DASK_DISTRIBUTED__WORKER__DAEMON", "False")
     from distributed import LocalCluster
 
     cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
     with cluster:
-        took = finish(file, there, "--cluster", cluster.scheduler_address)
-    same = json.dumps(table(there)) == json.dumps(rows)
-    print(
-        f"cluster of two workers: {'the same table' if same else 'ANOTHER TABLE'}, {took / runs:.1f} s a run"
-    )
+        run_chaserdock("campaign", file, "--out", distributed, "--cluster", cluster.scheduler_address)
     figures = {
         "runs": runs,
-        "killed_with": half,
+        "results_when_killed": killed_with,
+        "results_kept": kept,
         "rows": len(rows),
-        "distinct": len(digests),
-        "untouched": untouched,
-        "same_table_on_cluster": same,
+        "distinct_flights": len({row["digest"] for row in rows}),
+        "equal_table_on_cluster": json.dumps(table(distributed)) == json.dumps(rows),  # NaN equals NaN
     }
+    print_figures(figures)
     write_json(options.json, figures)
-    if not kept:
+    if options.out is None:
         shutil.rmtree(folder)
-    if not (same and len(rows) == len(digests) == runs and untouched == half):
-        raise SystemExit("the campaign is not what was asked for")
+    complete = figures["rows"] == figures["distinct_flights"] == runs and kept == killed_with
+    if not (complete and figures["equal_table_on_cluster"]):
+        raise SystemExit("runs are missing or repeated, or the tables differ")
 
 
 if __name__ == "__main__":

@@ -17,7 +17,6 @@ interrupted batch continues.
 from __future__ import annotations
 
 import math
-import subprocess
 import sys
 import time
 from collections import Counter
@@ -28,7 +27,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from results import options_of, print_figures, write_json
+from common import Figures, append_line, commit, make_parser, print_figures, read_lines, write_json
 
 from chaserdock.evaluation.docking_flights import (
     APPROACH_AT_S,
@@ -60,20 +59,11 @@ class Batch:
     settings: str
 
     def __post_init__(self) -> None:
-        self._known: dict[tuple[str, int], Outcome] = {}
-        self.commits: set[str] = set()
-        here = Path(__file__).parent
-        described = subprocess.run(
-            ["git", "describe", "--always", "--dirty"], cwd=here, capture_output=True, text=True, check=False
-        )
-        self._commit = described.stdout.strip()
-        if self.path is None or not self.path.exists():
-            return
-        for line in self.path.read_bytes().splitlines():
-            row = msgspec.json.decode(line, type=Row)
-            if row.settings == self.settings:
-                self._known[row.part, row.outcome.seed] = row.outcome
-                self.commits.add(row.commit)
+        rows = [msgspec.convert(line, Row) for line in read_lines(self.path)]
+        matching = [row for row in rows if row.settings == self.settings]
+        self._known = {(row.part, row.outcome.seed): row.outcome for row in matching}
+        self.commits = {row.commit for row in matching}
+        self._commit = commit()
 
     def fly(self, part: str, seed: int, flight: Callable[[], Outcome]) -> Outcome:
         """Return the outcome of a flight from the results file, or fly it."""
@@ -83,16 +73,14 @@ class Batch:
         outcome = flight()
         self.commits.add(self._commit)
         print(f"{part} {outcome.line()}", file=sys.stderr, flush=True)
-        if self.path is not None:
-            with self.path.open("ab") as file:
-                file.write(msgspec.json.encode(Row(part, self.settings, self._commit, outcome)) + b"\n")
+        append_line(self.path, msgspec.to_builtins(Row(part, self.settings, self._commit, outcome)))
         return outcome
 
 
-def figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
+def figures(name: str, outcomes: list[Outcome]) -> Figures:
     """Return the figures of docking flights by name."""
     touches = [o.touch for o in outcomes if o.touch is not None]
-    out: dict[str, float] = {
+    out: Figures = {
         f"{name}_flights": len(outcomes),
         f"{name}_verified": sum(o.verified for o in outcomes),
         f"{name}_collisions": sum(bool(o.contacts) for o in outcomes),
@@ -118,7 +106,8 @@ def figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
     return out
 
 
-def table(name: str, outcomes: list[Outcome]) -> None:
+def print_causes(name: str, outcomes: list[Outcome]) -> None:
+    """Print the number of flights and their first seeds by cause."""
     print(f"{name}: {len(outcomes)} flights")
     for cause, number in Counter(o.cause for o in outcomes).most_common():
         seeds = [str(o.seed) for o in outcomes if o.cause == cause]
@@ -126,7 +115,7 @@ def table(name: str, outcomes: list[Outcome]) -> None:
         print(f"  {number:4d}  {cause}  (seeds {shown})")
 
 
-def abort_figures(name: str, outcomes: list[Outcome]) -> dict[str, float]:
+def abort_figures(name: str, outcomes: list[Outcome]) -> Figures:
     """Return the figures of aborted flights by name."""
     opened = [o.opened_s for o in outcomes if o.opened_s is not None]
     return {
@@ -145,7 +134,7 @@ def noisy(scenario: Scenario) -> Perception:
 
 
 def main() -> None:
-    parser = options_of(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--flights", type=int, default=100)
     parser.add_argument("--images", type=int, default=100)
     parser.add_argument("--aborts", type=int, default=50)
@@ -174,7 +163,7 @@ def main() -> None:
         f"{o.actuation} rate={o.rate} approach={o.approach_at:g} failed={o.failed_at} set={sorted(o.set)}"
     )
     batch = Batch(o.results, settings)
-    result: dict[str, float] = {}
+    result: Figures = {}
     begin_s = time.perf_counter()
     seeds = range(o.first, o.first + max(flights, images, aborts, aborts_images, failures))
 
@@ -197,7 +186,7 @@ def main() -> None:
             for k in seeds[:number]
         ]
         if outcomes:
-            table(part, outcomes)
+            print_causes(part, outcomes)
             result |= figures(part, outcomes)
     for kind in o.kinds:
         failed = [(k, failure_of(kind, k)) for k in seeds[:failures]]
@@ -206,7 +195,7 @@ def main() -> None:
             for k, f in failed
         ]
         if outcomes:
-            table(kind, outcomes)
+            print_causes(kind, outcomes)
             result |= figures(kind, outcomes)
     for part, number, perception_of in (
         ("aborts", aborts, noisy),
@@ -223,7 +212,7 @@ def main() -> None:
             for k in seeds[:number]
         ]
         if outcomes:
-            table(part, outcomes)
+            print_causes(part, outcomes)
             result |= abort_figures(part, outcomes)
     print_figures(result)
     print(

@@ -1,34 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Seeded random faults at a shortened docking: ``python benchmarks/faults.py [--runs N] [--quick] [--json FILE]``.
+"""Random faults during a shortened docking: ``python benchmarks/faults.py [--runs N] [--quick] [--json FILE]``.
 
-Each run flies the scenario ``fault-drill`` as separate processes with one fault of a kind, a process, a moment and a
-severity drawn from its number, and judges the log: docked; safe, and the log names why it is not docked; collision.
-Results are appended to ``--out`` (JSON lines) and runs found there are not flown again. ``--quick``: one run a kind.
-Status 1 when a run ended in a collision, with no reason named, without its end, or with a log that lacks something.
+Each run flies the scenario ``fault-drill`` as separate processes with one fault; kind, process, time and severity are
+drawn from the number of the run. Outcomes: ``docked``; ``safe`` (not docked, and the log states why); ``no reason named``;
+``collision``; ``stalled``. Results are appended to ``--out`` (JSON lines); runs that it contains are not repeated.
+``--quick``: one run of each kind. Status 1 if a run is neither docked nor safe, or its log is incomplete.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import random
-import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections import Counter, defaultdict
+from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, get_args
 
 from chaserdock_protocol.scenario.faults import FaultKind
-from results import options_of, write_json
+from common import (
+    ROOT,
+    Figures,
+    append_line,
+    chaserdock_command,
+    make_parser,
+    print_figures,
+    read_lines,
+    write_json,
+)
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
 
-ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = "fault-drill"
 KINDS: tuple[str, ...] = get_args(FaultKind)
 CHASERS = [f"chaser/{i}" for i in range(4)]
@@ -38,13 +44,13 @@ RECEIVED = {
     "chaser": ["image", "odometry", "wrench"],
 }
 PUBLISHED = {"world": ["image", "odometry"], "controller": ["wrench"], "chaser": ["sighting", "actuators"]}
-PATIENCE_S = 300.0
+TIMEOUT_S = 300.0
 GOOD = ("docked", "safe")
 
 
 @dataclass(frozen=True)
 class Result:
-    """What became of one run. ``reason``: the first thing that the log says went wrong after the fault began."""
+    """Outcome of one run. ``reason``: the first warning or error in the log after the fault began."""
 
     number: int
     kind: str
@@ -59,18 +65,18 @@ class Result:
     wall_s: float
 
 
-def drawn_fault(number: int) -> dict[str, Any]:
-    """The fault of run ``number``: kinds in turn, everything else drawn."""
+def draw_fault(number: int) -> dict[str, Any]:
+    """Return the fault of a run: kinds in turn, everything else drawn from the number."""
     kind, draw = KINDS[number % len(KINDS)], random.Random(f"fault {number}")
     fault: dict[str, Any] = {"kind": kind, "at_s": round(draw.uniform(0.5, 20.0), 2)}
     duration_s = round(draw.choice([0.3, 1.0, 3.0, 8.0]) * draw.uniform(0.5, 1.5), 2)
     if kind != "kill":
         fault["duration_s"] = min(duration_s, 3.0) if kind == "freeze" else duration_s
-    everybody = ["world", "controller", *CHASERS]
+    processes = ["world", "controller", *CHASERS]
     if kind == "kill":
         fault["process"] = draw.choice(["controller", "recorder", *CHASERS])
     elif kind == "freeze":
-        fault["process"] = draw.choice([*everybody, "recorder"])
+        fault["process"] = draw.choice([*processes, "recorder"])
     elif kind == "cut":
         fault["process"] = draw.choice(CHASERS)
         if draw.random() < 0.5:
@@ -81,7 +87,7 @@ def drawn_fault(number: int) -> dict[str, Any]:
         fault["process"] = draw.choice(["controller", *CHASERS])
         fault["offset_s"] = round(draw.choice([-1, 1]) * 10 ** draw.uniform(-2, 2), 3)
     else:
-        fault["process"] = draw.choice(everybody)
+        fault["process"] = draw.choice(processes)
         topics = PUBLISHED if kind == "flood" else RECEIVED
         fault["topic"] = draw.choice(topics[fault["process"].partition("/")[0]])
     if kind in ("drop", "duplicate", "reorder", "corrupt"):
@@ -97,43 +103,47 @@ def drawn_fault(number: int) -> dict[str, Any]:
 
 
 def toml(value: Any) -> str:
-    """A fault as ``--set fault=[…]`` takes it."""
+    """Return a value as inline TOML."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
     return json.dumps(value)
 
 
 def fly(number: int, mode: str) -> Result:
-    """One run; raises SystemExit when the scenario is refused."""
-    fault = drawn_fault(number)
+    """Fly one run. Raise SystemExit if the scenario is refused."""
+    fault = draw_fault(number)
     with tempfile.TemporaryDirectory() as folder:
-        out, begun_s = Path(folder) / "run", time.monotonic()
-        command = [sys.executable, "-m", "chaserdock", "run", SCENARIO, "--out", str(out), "-q"]
-        command += ["--mode", mode, "--set", f"fault=[{toml(fault)}]"]
+        out, begin_s = Path(folder) / "run", time.monotonic()
+        changes = ("--mode", mode, "--set", f"fault=[{toml(fault)}]")
         process = subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, start_new_session=True
+            chaserdock_command("run", SCENARIO, "--out", out, "-q", *changes),
+            cwd=ROOT,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,
         )
         try:
-            said = process.communicate(timeout=PATIENCE_S)[0].decode(errors="replace")
-            ended = True
+            output, ended = process.communicate(timeout=TIMEOUT_S)[0], True
         except subprocess.TimeoutExpired:
-            os.kill(process.pid, signal.SIGTERM)
-            said, ended = process.communicate(timeout=60)[0].decode(errors="replace"), False
+            process.terminate()
+            output, ended = process.communicate(timeout=60)[0], False
         if process.returncode == 2:
-            raise SystemExit(f"run {number}: {said}")
-        return judged(number, mode, fault, out, ended, time.monotonic() - begun_s)
+            raise SystemExit(f"run {number}: {output}")
+        return evaluate(number, mode, fault, out, ended, time.monotonic() - begin_s)
 
 
-def judged(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool, wall_s: float) -> Result:
-    """The verdict on a run by its log."""
+def evaluate(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool, wall_s: float) -> Result:
+    """Evaluate the log of a run."""
     flight = load_flight(out / "mission.mcap")
     summary = summary_of(flight)
     begins = [k for k, e in enumerate(flight.events) if e.what == "fault begins"]
     later = flight.events[begins[0] :] if begins else []
-    said = [e for e in later if e.level != "info" and not e.what.startswith("fault ")]
-    reason = next((f"{e.process}: {e.what} {e.detail}".strip() for e in said), "")
-    killed_recorder = fault["kind"] == "kill" and fault["process"] == "recorder"
-    if killed_recorder:
+    warnings = [e for e in later if e.level != "info" and not e.what.startswith("fault ")]
+    reason = next((f"{e.process}: {e.what} {e.detail}".strip() for e in warnings), "")
+    recorder_killed = fault["kind"] == "kill" and fault["process"] == "recorder"
+    if recorder_killed:
         reason = f"the log ends at {summary['sim_time_s']:.2f} s with the recorder"
     if not ended:
         outcome = "stalled"
@@ -144,9 +154,7 @@ def judged(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool
     else:
         outcome = "safe" if reason else "no reason named"
     lost = sum(m["lost"] for m in summary["messages"].values())
-    whole = summary["sim_time_s"] > (
-        fault["at_s"] - 1.0 if killed_recorder else flight.scenario.duration_s - 0.2
-    )
+    end_s = fault["at_s"] - 1.0 if recorder_killed else flight.scenario.duration_s - 0.2
     return Result(
         number=number,
         kind=fault["kind"],
@@ -154,7 +162,7 @@ def judged(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool
         mode=mode,
         outcome=outcome,
         reason=reason,
-        log_complete=lost == 0 and whole and (killed_recorder or bool(begins)),
+        log_complete=lost == 0 and summary["sim_time_s"] > end_s and (recorder_killed or bool(begins)),
         nearest_chasers_m=summary["min_distance_chasers_m"],
         nearest_target_m=min(c["min_distance_target_m"] for c in summary["chasers"].values()),
         digest=summary["digest"],
@@ -163,49 +171,32 @@ def judged(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool
 
 
 def read_results(path: Path, mode: str) -> dict[int, Result]:
-    """Runs flown before; a line that was cut off is left out."""
-    found: dict[int, Result] = {}
-    for line in path.read_text().splitlines() if path.exists() else []:
-        try:
-            result = Result(**json.loads(line))
-        except (ValueError, TypeError):
-            continue
-        # A number whose fault is drawn otherwise by now is another run.
-        if result.mode == mode and result.fault == drawn_fault(result.number):
-            found[result.number] = result
-    return found
+    """Return earlier results by number; a result whose fault is no longer that of its number is ignored."""
+    results = [Result(**row) for row in read_lines(path)]
+    return {r.number: r for r in results if r.mode == mode and r.fault == draw_fault(r.number)}
 
 
 def table(results: list[Result]) -> str:
-    """Outcomes by kind of fault."""
+    """Return the outcomes by kind of fault as a table."""
     outcomes = sorted({r.outcome for r in results}, key=lambda o: (o not in GOOD, o))
-    rows: dict[str, Counter[str]] = defaultdict(Counter)
-    for r in results:
-        rows[r.kind][r.outcome] += 1
-        rows[r.kind]["log complete"] += r.log_complete
-        rows[r.kind]["runs"] += 1
-    columns = ["runs", *outcomes, "log complete"]
-    lines = [
-        f"{'':14}" + "".join(f"{c:>17}" for c in columns) + f"{'nearest chasers':>17}{'nearest target':>16}"
-    ]
-    for kind in [*KINDS, "all"]:
-        of = [r for r in results if kind in (r.kind, "all")]
-        if not of:
-            continue
-        counts = rows[kind] if kind != "all" else sum(rows.values(), Counter())
-        near = (
-            f"{min(r.nearest_chasers_m for r in of):>15.3f} m{min(r.nearest_target_m for r in of):>14.3f} m"
-        )
-        lines.append(f"{kind:14}" + "".join(f"{counts[c]:>17}" for c in columns) + near)
+    columns = ["runs", *outcomes, "log complete", "nearest chasers", "nearest target"]
+    lines = [f"{'':14}" + "".join(f"{c:>17}" for c in columns)]
+    for kind in (*KINDS, "all"):
+        if rows := [r for r in results if kind in (r.kind, "all")]:
+            counts = Counter(r.outcome for r in rows)
+            numbers = [len(rows), *(counts[o] for o in outcomes), sum(r.log_complete for r in rows)]
+            near_m = min(r.nearest_chasers_m for r in rows), min(r.nearest_target_m for r in rows)
+            cells = [*map(str, numbers), *(f"{m:.3f} m" for m in near_m)]
+            lines.append(f"{kind:14}" + "".join(f"{c:>17}" for c in cells))
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = options_of(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--first", type=int, default=0, help="number of the first run")
     parser.add_argument("--mode", choices=["lockstep", "realtime"], default="lockstep")
-    parser.add_argument("--out", type=Path, default=Path("runs") / "faults.jsonl")
+    parser.add_argument("--out", type=Path, default=ROOT / "runs" / "faults.jsonl")
     options = parser.parse_args()
     numbers = range(options.first, options.first + (len(KINDS) if options.quick else options.runs))
     options.out.parent.mkdir(parents=True, exist_ok=True)
@@ -214,20 +205,25 @@ def main() -> None:
         if number in results:
             continue
         result = results[number] = fly(number, options.mode)
-        with options.out.open("a") as file:
-            file.write(json.dumps(asdict(result)) + "\n")
-        mark = "" if result.outcome in GOOD and result.log_complete else "  <-- "
-        told = f"{result.outcome}{'' if result.log_complete else ', LOG NOT COMPLETE'}: {result.reason}"
-        print(f"{number:4} {toml(result.fault)}: {told} ({result.wall_s:.0f} s){mark}", flush=True)
-    flown = [results[n] for n in numbers if n in results]
+        append_line(options.out, asdict(result))
+        log = "" if result.log_complete else ", log incomplete"
+        print(
+            f"{number:4} {toml(result.fault)}: {result.outcome}{log}: {result.reason} ({result.wall_s:.0f} s)",
+            flush=True,
+        )
+    flown = [results[n] for n in numbers]
     print(table(flown))
-    outcomes = Counter(r.outcome for r in flown)
     bad = [r for r in flown if r.outcome not in GOOD or not r.log_complete]
-    figures: dict[str, float] = {"runs": len(flown), "bad": len(bad)}
-    figures |= {f"outcome_{name.replace(' ', '_')}": float(count) for name, count in outcomes.items()}
-    figures["log_complete"] = float(sum(r.log_complete for r in flown))
-    figures["nearest_chasers_m"] = min(r.nearest_chasers_m for r in flown)
-    figures["nearest_target_m"] = min(r.nearest_target_m for r in flown)
+    outcomes = Counter(r.outcome for r in flown)
+    figures: Figures = {
+        "runs": len(flown),
+        **{f"outcome_{name.replace(' ', '_')}": number for name, number in outcomes.items()},
+        "log_complete": sum(r.log_complete for r in flown),
+        "bad": len(bad),
+        "nearest_chasers_m": min(r.nearest_chasers_m for r in flown),
+        "nearest_target_m": min(r.nearest_target_m for r in flown),
+    }
+    print_figures(figures)
     write_json(options.json, figures)
     sys.exit(1 if bad else 0)
 

@@ -1,14 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which calibration errors of the cameras show in flight: ``python benchmarks/observability.py [--json FILE]``.
+"""Observability of camera calibration errors in flight: ``python benchmarks/observability.py [--json FILE]``.
 
-The Jacobian of all measured poses of a minute by the target's twelve numbers and the cameras' (mounting's turn alone, or
-turn, lens and focal length), stacked, each row over a measurement's sigma and each column over what is known before.
-Its rank says what can be seen at all; its inverse, how well. Chasers in synchronized flight stand 1 m from the target
-and turn with it; in the calibration manoeuvre, chaser 0 turns about.
+Stacks the Jacobians of all poses measured in a minute with respect to the target's state (12) and the errors of each
+camera (rotation of the mounting: 3; or rotation, position and focal length: 7). Rows are divided by the sigma of a
+measurement, columns multiplied by the prior sigma. Figures: the number of unobservable directions, and the posterior
+sigma of the mounting rotation (prior: 0.3 degrees). In synchronized flight the chasers stay 1 m from the target and
+rotate with it; in the calibration manoeuvre chaser 0 also turns about its line of sight. ``--quick`` changes nothing.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -19,67 +21,60 @@ from chaserdock_controller.guidance.pointing import CALIBRATION_S, calibration_t
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Q_CRF_IRF_FORWARD_WXYZ
-from results import options_of, write_json
+from common import Figures, make_parser, print_figures, write_json
 
-TUMBLE, STILL = np.array([0.015, 0.045, 0.03]), np.zeros(3)
-HZ, LAST_S = 5.0, 60.0
-SIGMA = np.array([5e-4] * 3 + [math.radians(0.05)] * 3)
-# Before: target's place and attitude unknown; turn 0.3 degrees, lens 2 mm, focal length 0.1 %.
-TARGET = np.array([10.0] * 3 + [1.0] * 3 + [3.0] * 3 + [1.0] * 3)
-CAMERA = np.array([math.radians(0.3)] * 3 + [2e-3] * 3 + [1e-3])
-YAWS = (0.0, 90.0, 180.0, 270.0)
+RATES = {"still": np.zeros(3), "tumbling": np.array([0.015, 0.045, 0.03])}
+IMAGE_HZ, DURATION_S = 5.0, 60.0
+MEASUREMENT_SIGMA = np.array([5e-4] * 3 + [math.radians(0.05)] * 3)
+# Prior: the target's state is unknown; 0.3 degrees, 2 mm and 0.1 % of each camera.
+TARGET_SIGMA = np.array([10.0] * 3 + [1.0] * 3 + [3.0] * 3 + [1.0] * 3)
+CAMERA_SIGMA = np.array([math.radians(0.3)] * 3 + [2e-3] * 3 + [1e-3])
+YAWS_DEG = (0.0, 90.0, 180.0, 270.0)
 
 
-def jacobian(chasers: int, omega: Array, numbers: int, manoeuvre: bool) -> Array:
-    """(M, 12 + numbers * chasers), scaled; ``numbers`` of each camera: 3 (turn) or 7."""
+def jacobian(chasers: int, omega: Array, errors: int, manoeuvre: bool) -> Array:
+    """Return the scaled Jacobian (M, 12 + errors * chasers); ``errors`` of each camera: 3 or 7."""
     rows = []
-    looks = [rotations.exp([0.0, 0.0, math.radians(yaw)]) for yaw in YAWS[:chasers]]
-    for t in np.arange(0.0, LAST_S, 1.0 / HZ):
+    yaws = [rotations.exp([0.0, 0.0, math.radians(yaw)]) for yaw in YAWS_DEG[:chasers]]
+    for t in np.arange(0.0, DURATION_S, 1.0 / IMAGE_HZ):
         q, _, transition = constant_rates(rotations.IDENTITY.copy(), omega, float(t))
         motion = np.eye(12)
         motion[0:3, 3:6] = t * np.eye(3)
         motion[6:12, 6:12] = transition
-        for c, look in enumerate(looks):
-            place = rotations.rotate(q, rotations.rotate(look, [-1.0, 0.0, 0.0]))
-            attitude = rotations.multiply(q, look)
+        for c, yaw in enumerate(yaws):
+            position = rotations.rotate(q, rotations.rotate(yaw, [-1.0, 0.0, 0.0]))
+            attitude = rotations.multiply(q, yaw)
             if manoeuvre and c == 0:
-                attitude = rotations.multiply(attitude, calibration_turns([t / LAST_S * CALIBRATION_S])[0])
-            eye = CameraPose(place, rotations.multiply(attitude, Q_CRF_IRF_FORWARD_WXYZ))
-            seen = predict_measurement(eye, np.zeros(3), q, NO_ERROR)
+                turns = calibration_turns([t / DURATION_S * CALIBRATION_S])
+                attitude = rotations.multiply(attitude, turns[0])
+            camera = CameraPose(position, rotations.multiply(attitude, Q_CRF_IRF_FORWARD_WXYZ))
+            predicted = predict_measurement(camera, np.zeros(3), q, NO_ERROR)
             by_target = np.zeros((6, 12))
-            by_target[:3, 0:3], by_target[3:, 6:9] = seen.by_position, np.eye(3)
-            row = np.zeros((6, 12 + numbers * chasers))
+            by_target[:3, 0:3], by_target[3:, 6:9] = predicted.by_position, np.eye(3)
+            row = np.zeros((6, 12 + errors * chasers))
             row[:, :12] = by_target @ motion
-            row[:, 12 + numbers * c : 12 + numbers * (c + 1)] = seen.by_errors[:, :numbers]
-            rows.append(row / SIGMA[:, None])
-    scale = np.concatenate([TARGET, *[CAMERA[:numbers]] * chasers])
-    return np.concatenate(rows) * scale
+            row[:, 12 + errors * c : 12 + errors * (c + 1)] = predicted.by_errors[:, :errors]
+            rows.append(row / MEASUREMENT_SIGMA[:, None])
+    return np.concatenate(rows) * np.concatenate([TARGET_SIGMA, *[CAMERA_SIGMA[:errors]] * chasers])
 
 
 def main() -> None:
-    options = options_of(__doc__).parse_args()
-    figures: dict[str, float] = {}
-    print(
-        "chasers  numbers  target    manoeuvre   unknowns  rank   turn's sigma left, deg (known before: 0.3)"
-    )
-    for numbers in (3, ERRORS):
-        for chasers in (1, 2, 3, 4):
-            for name, omega in (("still", STILL), ("tumbling", TUMBLE)):
-                for manoeuvre in (False, True):
-                    a = jacobian(chasers, omega, numbers, manoeuvre)
-                    values = np.linalg.svd(a, compute_uv=False)
-                    rank = int((values > 1e-9 * values[0]).sum())
-                    left = np.linalg.inv(a.T @ a + np.eye(a.shape[1]))
-                    i = [12 + numbers * c + k for c in range(chasers) for k in range(3)]
-                    sigma = np.sqrt(np.linalg.eigvalsh(left[np.ix_(i, i)])) * math.degrees(CAMERA[0])
-                    key = f"{chasers}_chasers_{numbers}_numbers_{name}_{'turning_about' if manoeuvre else 'synchronized'}"
-                    figures[f"{key}_unobservable"] = a.shape[1] - rank
-                    figures[f"{key}_worst_turn_sigma_deg"] = float(sigma[-1])
-                    figures[f"{key}_best_turn_sigma_deg"] = float(sigma[0])
-                    print(
-                        f"{chasers:7}  {numbers:7}  {name:8}  {manoeuvre!s:9}  {a.shape[1]:9}  {rank:4}   "
-                        + " ".join(f"{s:.4f}" for s in sigma[::-1])
-                    )
+    options = make_parser(__doc__).parse_args()
+    figures: Figures = {}
+    for errors, chasers, rate, manoeuvre in itertools.product(
+        (3, ERRORS), (1, 2, 3, 4), RATES, (False, True)
+    ):
+        a = jacobian(chasers, RATES[rate], errors, manoeuvre)
+        values = np.linalg.svd(a, compute_uv=False)
+        posterior = np.linalg.inv(a.T @ a + np.eye(a.shape[1]))
+        i = [12 + errors * c + k for c in range(chasers) for k in range(3)]
+        sigmas_rad = np.sqrt(np.linalg.eigvalsh(posterior[np.ix_(i, i)])) * CAMERA_SIGMA[0]
+        flight = "calibration" if manoeuvre else "synchronized"
+        key = f"{chasers}_chasers_{errors}_errors_{rate}_{flight}"
+        figures[f"{key}_unobservable"] = int((values <= 1e-9 * values[0]).sum())
+        figures[f"{key}_worst_rotation_sigma_rad"] = float(sigmas_rad[-1])
+        figures[f"{key}_best_rotation_sigma_rad"] = float(sigmas_rad[0])
+    print_figures(figures)
     write_json(options.json, figures)
 
 

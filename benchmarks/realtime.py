@@ -1,17 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--flights 1] [--only SUBJECT] [--seconds 5]
+"""Real time, four chasers at 30 Hz: ``python benchmarks/realtime.py [--only PART ...] [--flights 1] [--seconds 5]
 [--rounds 3] [--keep DIR] [--quick] [--json FILE]``.
 
-Flies ``four-chaser-docking`` in real time with ticks and images at 30 Hz, 640 x 480, every process on this machine, and
-measures from an image's sending to the sending of the actuator command that answers it (both stamps are the senders');
-the images of a tick are sent together, as cameras do that expose at once. Beside it, from the tick's sending, when
-the images have still to be drawn, to that command.
-A flight for each subject, ``recorder`` and ``viewer`` (the recorder runs in both; the viewer is asked for by one client that
-reads all it gets). In windows of ``--seconds`` that take turns in the same flight, the subject is left as it is, frozen
-(SIGSTOP), left as it is, and slow (runs for a tenth of the time): what the machine does meanwhile touches all of them.
-``lost``: ticks of a chaser without any command from the controller; ``missed``: commands later than 33 ms; ``ratio``: the
-99th percentile over that of the windows as it is. Also each process' share of a core. Wall-clock figures: nothing else
-should run beside it.
+Flies ``four-chaser-docking`` in real time with ticks and images at 30 Hz, 640 x 480, all processes on this machine.
+``image_to_command``: from the sending of an image to the sending of the actuator command of that tick, by the senders'
+time stamps; the images of a tick are sent together, as by cameras that expose at once. ``tick_to_command``: the same from
+the sending of the tick, before the images are rendered.
+
+Each part is a flight in which one process is disturbed: the recorder, or a viewer with one client. Windows of
+``--seconds`` alternate between ``undisturbed``, ``frozen`` (SIGSTOP) and ``slow`` (runs a tenth of the time), so that
+other load on the machine affects all conditions. ``lost``: ticks of a chaser without a command of the controller;
+``late``: commands later than 33 ms; ``p99_ratio``: 99th percentile relative to the undisturbed windows. Processor time is
+a share of one core. Measures wall time: run nothing else beside it. Prints medians over ``--flights``.
 """
 
 from __future__ import annotations
@@ -34,20 +34,19 @@ import websockets
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import MissionEnd
 from chaserdock_protocol.transport import Node, RawSample
-from results import options_of, write_json
+from common import ROOT, Figures, make_parser, percentiles, print_figures, run_parts, start_mission
 from websockets.asyncio.client import connect
 
 from chaserdock.launch.launcher import Fleet, free_port, open_hub
 
-ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "four-chaser-docking.toml"
 CHASERS = 4
 RATE_HZ = 30
 SETTLE_S = 6.0
 PAUSE_S = 1.0
-"""Between windows: whoever was stopped catches up."""
+"""Between windows: a stopped process catches up."""
 LATE_S = 0.033
-SUBJECTS = ("recorder", "viewer")
+PARTS = ("recorder", "viewer")
 LEASE_MS = 60_000  # as under `chaserdock run`
 OVERRIDES = (
     f"time.rate_hz={RATE_HZ}",
@@ -60,7 +59,7 @@ OVERRIDES = (
 
 
 class Head(msgspec.Struct):
-    """What is read of a tick, an image or an actuator command."""
+    """Common fields of ticks, images and actuator commands."""
 
     tick: int
     chaser: int = -1
@@ -71,17 +70,16 @@ _head = msgspec.msgpack.Decoder(Head)
 
 
 @dataclass
-class Ear:
-    """When ticks, images and commands were sent, by tick or by chaser and tick (wall clock, ns)."""
+class Observer:
+    """Sending times (wall clock, ns) of ticks by tick, of images and commands by chaser and tick."""
 
     ticks: dict[int, int] = field(default_factory=dict)
     images: dict[tuple[int, int], int] = field(default_factory=dict)
     commands: dict[tuple[int, int], int] = field(default_factory=dict)
     last_tick: int = -1
 
-    def take(self, raw: RawSample) -> None:
-        """Called on Zenoh's thread."""
-        # No more than is needed: what is measured shares the cores with this.
+    def receive(self, raw: RawSample) -> None:
+        """Note a message; called on a thread of Zenoh. Decodes as little as possible: the mission shares the cores."""
         head = _head.decode(raw.payload)
         if raw.key == topics.TICK.key:
             self.ticks.setdefault(head.tick, raw.sent_ns)
@@ -94,7 +92,7 @@ class Ear:
 
 @dataclass(frozen=True)
 class Window:
-    """One condition for a while: ticks of which all answers count, and each process' share of a core."""
+    """A span of ticks under one condition, and the share of a core that each process used."""
 
     condition: str
     first: int
@@ -102,69 +100,32 @@ class Window:
     cpu_share: dict[str, float]
 
 
-@dataclass(frozen=True)
-class Flown:
-    """All windows of one condition: latencies of all commands from image and from tick (s), how many ticks of chasers had
-    no command."""
-
-    latency_s: np.ndarray
-    from_tick_s: np.ndarray
-    ticks: int
-    lost: int
-    cpu_share: dict[str, float]
-
-    @property
-    def missed(self) -> int:
-        return int(np.sum(self.latency_s > LATE_S))
+def undisturbed(process: psutil.Process, stop: threading.Event) -> None:
+    """Do nothing."""
 
 
-def quantile(values_s: np.ndarray, q: float) -> float:
-    return float(np.quantile(values_s, q)) if len(values_s) else float("nan")
-
-
-def as_it_is(subject: psutil.Process, stop: threading.Event) -> None:
-    """Not touched."""
-
-
-def frozen(subject: psutil.Process, stop: threading.Event) -> None:
-    """Stopped until the end."""
-    subject.send_signal(signal.SIGSTOP)
+def frozen(process: psutil.Process, stop: threading.Event) -> None:
+    """Stop the process until the end of the window."""
+    process.send_signal(signal.SIGSTOP)
     stop.wait()
-    subject.send_signal(signal.SIGCONT)
+    process.send_signal(signal.SIGCONT)
 
 
-def slow(subject: psutil.Process, stop: threading.Event) -> None:
-    """It runs for 20 ms of every 200."""
+def slow(process: psutil.Process, stop: threading.Event) -> None:
+    """Let the process run for 20 ms of every 200 ms."""
     while not stop.is_set():
-        subject.send_signal(signal.SIGSTOP)
+        process.send_signal(signal.SIGSTOP)
         stop.wait(0.18)
-        subject.send_signal(signal.SIGCONT)
+        process.send_signal(signal.SIGCONT)
         stop.wait(0.02)
 
 
-CONDITIONS = {"as_it_is": as_it_is, "frozen": frozen, "slow": slow}
-ROUND = ("as_it_is", "frozen", "as_it_is", "slow")
+CONDITIONS = {"undisturbed": undisturbed, "frozen": frozen, "slow": slow}
+ROUND = ("undisturbed", "frozen", "undisturbed", "slow")
 
 
-def start(fleet: Fleet, folder: Path, seconds: float, network: list[str], subject: str) -> None:
-    """All processes of the mission, and the viewer where it is the subject."""
-    words = folder / "processes"
-    words.mkdir()
-    sets = [part for o in (*OVERRIDES, f"duration_s={seconds}") for part in ("--set", o)]
-    world = ["world", str(SCENARIO), "--mode", "realtime", *sets, *network, "-l", "tcp/127.0.0.1:0"]
-    fleet.start("world", world, words)
-    fleet.start("controller", ["controller", *network, "--timeout", "120"], words)
-    for i in range(CHASERS):
-        fleet.start(f"chaser/{i}", ["chaser", str(i), *network, "--timeout", "120"], words)
-    fleet.start("recorder", ["record", "--out", str(folder), *network, "--timeout", "120"], words)
-    if subject == "viewer":
-        port = free_port()
-        fleet.start("viewer", ["view", *network, "--port", str(port)], words)
-        threading.Thread(target=lambda: asyncio.run(look(port)), daemon=True).start()
-
-
-async def look(port: int) -> None:
-    """A client of the viewer that takes whatever it is sent, as a browser elsewhere would."""
+async def read_viewer(port: int) -> None:
+    """Read everything that the viewer sends, as a browser would."""
     offered = [websockets.Subprotocol(f"viser-v{viser.__version__}")]
     while True:
         try:
@@ -172,136 +133,123 @@ async def look(port: int) -> None:
                 async for _ in socket:
                     pass
         except (OSError, websockets.WebSocketException):
-            await asyncio.sleep(0.2)  # the viewer is not there yet
+            await asyncio.sleep(0.2)  # the viewer has not started yet
 
 
-def measured(
-    ear: Ear, fleet: Fleet, hub: Node, subject: psutil.Process, condition: str, seconds: float
+def measure_window(
+    observer: Observer, fleet: Fleet, hub: Node, process: psutil.Process, condition: str, seconds: float
 ) -> Window:
-    """One window, with the subject in that condition."""
+    """Measure one window with the process under a condition."""
     stop = threading.Event()
-    disturbing = threading.Thread(target=CONDITIONS[condition], args=(subject, stop))
-    disturbing.start()
+    disturbance = threading.Thread(target=CONDITIONS[condition], args=(process, stop))
+    disturbance.start()
     try:
-        first = ear.last_tick + 3  # sent after the condition began
-        before, begun_s = cpu_s(fleet), time.monotonic()
-        wait_for(ear, first + round(seconds * RATE_HZ), fleet, hub)
-        after, took_s = cpu_s(fleet), time.monotonic() - begun_s
-        last = ear.last_tick - 5  # whose answers have had their time
+        first = observer.last_tick + 3  # sent after the condition began
+        before, begin_s = cpu_s(fleet), time.monotonic()
+        wait_for_images(observer, first + round(seconds * RATE_HZ), fleet, hub)
+        after, took_s = cpu_s(fleet), time.monotonic() - begin_s
+        last = observer.last_tick - 5  # its commands have been sent
     finally:
         stop.set()
-        disturbing.join()
+        disturbance.join()
     share = {name: (after[name] - before[name]) / took_s for name in after if name in before}
     return Window(condition, first, last, share)
 
 
-def fly(subject: str, seconds: float, rounds: int, keep: Path | None = None) -> dict[str, Flown]:
-    """One flight, by condition of the subject. ``keep``: a folder for its log."""
+def fly(part: str, seconds: float, rounds: int, keep: Path | None) -> Figures:
+    """Fly with one disturbed process. ``keep``: folder for the log."""
     namespace = f"realtime-{uuid.uuid4().hex[:8]}"
     if keep is not None:
         keep.mkdir(parents=True)
     windows: list[Window] = []
     with tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep)) as folder:
         hub, endpoint = open_hub(namespace, LEASE_MS, name="observer", role="analysis")
-        fleet, ear = Fleet(), Ear()
+        fleet, observer = Fleet(), Observer()
         try:
             hub.subscribe(topics.END)
             for topic in (topics.TICK, topics.IMAGE, topics.ACTUATORS):
-                hub.subscribe_raw(topic.key.format(chaser="*"), ear.take)
-            total_s = SETTLE_S + rounds * len(ROUND) * (seconds + PAUSE_S) + 5.0
+                hub.subscribe_raw(topic.key.format(chaser="*"), observer.receive)
+            duration_s = SETTLE_S + rounds * len(ROUND) * (seconds + PAUSE_S) + 5.0
             network = ["-e", endpoint, "--namespace", namespace, "--lease", str(LEASE_MS / 1000)]
-            start(fleet, Path(folder), total_s, network, subject)
-            touched = psutil.Process(next(c.process.pid for c in fleet.children if c.name == subject))
-            wait_for(ear, round(SETTLE_S * RATE_HZ), fleet, hub)
+            changes = [word for o in (*OVERRIDES, f"duration_s={duration_s}") for word in ("--set", o)]
+            world = ["--mode", "realtime", *changes, "-l", "tcp/127.0.0.1:0"]
+            output = start_mission(fleet, Path(folder), SCENARIO, CHASERS, network, world)
+            if part == "viewer":
+                port = free_port()
+                fleet.start("viewer", ["view", *network, "--port", str(port)], output)
+                threading.Thread(target=lambda: asyncio.run(read_viewer(port)), daemon=True).start()
+            process = psutil.Process(next(c.process.pid for c in fleet.children if c.name == part))
+            wait_for_images(observer, round(SETTLE_S * RATE_HZ), fleet, hub)
             for condition in ROUND * rounds:
-                windows.append(measured(ear, fleet, hub, touched, condition, seconds))
-                wait_for(ear, ear.last_tick + round(PAUSE_S * RATE_HZ), fleet, hub)
+                windows.append(measure_window(observer, fleet, hub, process, condition, seconds))
+                wait_for_images(observer, observer.last_tick + round(PAUSE_S * RATE_HZ), fleet, hub)
         finally:
             fleet.end()
             hub.close()
-    return {name: together([w for w in windows if w.condition == name], ear) for name in CONDITIONS}
+    out: Figures = {}
+    for condition in CONDITIONS:
+        chosen = [w for w in windows if w.condition == condition]
+        out |= figures(f"{part}_{condition}", chosen, observer)
+    reference = out[f"{part}_undisturbed_image_to_command_p99_s"]
+    for condition in ("frozen", "slow"):
+        out[f"{part}_{condition}_p99_ratio"] = out[f"{part}_{condition}_image_to_command_p99_s"] / reference
+    return out
 
 
-def together(windows: list[Window], ear: Ear) -> Flown:
-    """What the ear heard in these windows."""
+def figures(name: str, windows: list[Window], observer: Observer) -> Figures:
+    """Return the figures of all windows of one condition."""
     keys = [(i, tick) for w in windows for tick in range(w.first, w.last + 1) for i in range(CHASERS)]
-    latency = [(ear.commands[k] - ear.images[k]) / 1e9 for k in keys if k in ear.commands and k in ear.images]
-    share = {name: float(np.mean([w.cpu_share[name] for w in windows])) for name in windows[0].cpu_share}
-    lost = sum(k not in ear.commands for k in keys)
-    since_tick = [
-        (ear.commands[k] - ear.ticks[k[1]]) / 1e9 for k in keys if k in ear.commands and k[1] in ear.ticks
-    ]
-    return Flown(np.array(latency), np.array(since_tick), len(keys) // CHASERS, lost, share)
+    sent = {key: observer.commands[key] for key in keys if key in observer.commands}
+    latency_s = np.array([(sent[k] - observer.images[k]) / 1e9 for k in sent if k in observer.images])
+    tick_s = np.array([(sent[k] - observer.ticks[k[1]]) / 1e9 for k in sent if k[1] in observer.ticks])
+    out: Figures = {
+        **percentiles(latency_s, f"{name}_image_to_command", "s", "median", "p99", "max"),
+        **percentiles(tick_s, f"{name}_tick_to_command", "s", "median", "p99"),
+        f"{name}_commands": len(latency_s),
+        f"{name}_lost": len(keys) - len(sent),
+        f"{name}_late": int(np.sum(latency_s > LATE_S)),
+    }
+    for process in windows[0].cpu_share:
+        share = float(np.mean([w.cpu_share[process] for w in windows]))
+        out[f"{name}_cpu_{process.replace('/', '_')}_s_per_s"] = share
+    return out
 
 
-def wait_for(ear: Ear, tick: int, fleet: Fleet, hub: Node) -> None:
-    """Waits until a tick's images have been sent; raises SystemExit when a process ends before."""
-    while ear.last_tick < tick:
+def wait_for_images(observer: Observer, tick: int, fleet: Fleet, hub: Node) -> None:
+    """Wait until the images of a tick have been sent. Raise SystemExit if the mission ends before."""
+    while observer.last_tick < tick:
         received = hub.receive(0.05)
-        dead = [c.last_line() for c in fleet.children if c.process.poll() is not None]
-        if dead or (received is not None and isinstance(received.message, MissionEnd)):
-            raise SystemExit(f"the mission ended at tick {ear.last_tick}: {'; '.join(dead)}")
+        exited = [c.last_line() for c in fleet.children if c.process.poll() is not None]
+        if exited or (received is not None and isinstance(received.message, MissionEnd)):
+            raise SystemExit(f"the mission ended at tick {observer.last_tick}: {'; '.join(exited)}")
 
 
 def cpu_s(fleet: Fleet) -> dict[str, float]:
+    """Return the processor time, s, of each process."""
     times = {c.name: psutil.Process(c.process.pid).cpu_times() for c in fleet.running()}
     return {name: t.user + t.system for name, t in times.items()}
 
 
-def show(subject: str, condition: str, flown: Flown) -> dict[str, float]:
-    """Prints and returns the figures of one condition."""
-    name = f"{condition.replace('_', ' ')} {subject}" if condition != "as_it_is" else f"{subject} as it is"
-    shares = "  ".join(f"{process} {share:.2f}" for process, share in flown.cpu_share.items())
-    p50, p99, most = (1e3 * quantile(flown.latency_s, q) for q in (0.5, 0.99, 1.0))
-    print(
-        f"{name:18} exposure to command: p50 {p50:.1f} ms, p99 {p99:.1f} ms, max {most:.1f} ms; "
-        f"{flown.lost} of {flown.ticks * CHASERS} lost, {flown.missed} later than 33 ms"
-    )
-    tick50, tick99 = (1e3 * quantile(flown.from_tick_s, q) for q in (0.5, 0.99))
-    print(f"{'':18} tick to command: p50 {tick50:.1f} ms, p99 {tick99:.1f} ms")
-    print(f"{'':18} CPU: {shares}  together {sum(flown.cpu_share.values()):.2f}", flush=True)
-    return {
-        f"{subject}_{condition}_p50_s": quantile(flown.latency_s, 0.5),
-        f"{subject}_{condition}_p99_s": quantile(flown.latency_s, 0.99),
-        f"{subject}_{condition}_max_s": quantile(flown.latency_s, 1.0),
-        f"{subject}_{condition}_tick_p50_s": quantile(flown.from_tick_s, 0.5),
-        f"{subject}_{condition}_tick_p99_s": quantile(flown.from_tick_s, 0.99),
-        f"{subject}_{condition}_lost": flown.lost,
-        f"{subject}_{condition}_missed": flown.missed,
-        f"{subject}_{condition}_commands": len(flown.latency_s),
-    }
-
-
 def main() -> None:
-    parser = options_of(__doc__)
-    parser.add_argument("--flights", type=int, default=1, help="of each subject")
-    parser.add_argument("--only", choices=SUBJECTS, help="this subject alone")
-    parser.add_argument("--seconds", type=float, default=5.0, help="of each window")
-    parser.add_argument("--rounds", type=int, default=3, help="of four windows each")
-    parser.add_argument("--keep", type=Path, help="keep logs and the processes' words here")
+    parser = make_parser(__doc__, PARTS)
+    parser.add_argument("--flights", type=int, default=1, help="flights of each part")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a window")
+    parser.add_argument("--rounds", type=int, default=3, help="rounds of four windows in a flight")
+    parser.add_argument("--keep", type=Path, metavar="DIR", help="keep logs and the output of the processes")
     options = parser.parse_args()
-    rounds = 1 if options.quick else options.rounds
-    flights: list[dict[str, float]] = []
-    for number in range(1 if options.quick else options.flights):
-        figures: dict[str, float] = {}
-        for subject in [options.only] if options.only else SUBJECTS:
-            keep = options.keep and options.keep / f"{subject}-{number}"
-            flown = fly(subject, options.seconds, rounds, keep)
-            for condition, one in flown.items():
-                figures |= show(subject, condition, one)
-            for condition in ("frozen", "slow"):
-                ratio = quantile(flown[condition].latency_s, 0.99) / quantile(
-                    flown["as_it_is"].latency_s, 0.99
-                )
-                figures[f"{subject}_{condition}_p99_ratio"] = ratio
-                print(f"{condition} {subject}: p99 {ratio:.2f} of that with the {subject} as it is")
-        flights.append(figures)
-    medians = {name: float(np.median([f[name] for f in flights])) for name in flights[0]}
-    if len(flights) > 1:
-        print(
-            f"medians of {len(flights)} flights:", {name: round(value, 4) for name, value in medians.items()}
-        )
-    write_json(options.json, medians)
+    flights, rounds = (1, 1) if options.quick else (options.flights, options.rounds)
+
+    def medians(part: str) -> Figures:
+        flown: list[Figures] = []
+        for number in range(flights):
+            keep = options.keep and options.keep / f"{part}-{number}"
+            flown.append(fly(part, options.seconds, rounds, keep))
+            if flights > 1:
+                print(f"{part}, flight {number}:")
+                print_figures(flown[-1])
+        return {name: float(np.median([f[name] for f in flown])) for name in flown[0]}
+
+    run_parts(options, {part: lambda part=part: medians(part) for part in PARTS})
 
 
 if __name__ == "__main__":

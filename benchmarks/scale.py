@@ -12,11 +12,11 @@ encoding, Zenoh, decoding and waiting. ``--quick``: 1, 2 and 4 chasers. ``--chas
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -25,18 +25,22 @@ import psutil
 from chaserdock_protocol import topics
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_world.rendering.cameras import Cameras
-from results import options_of, write_json
+from common import ROOT, Figures, chaserdock_command, make_parser, write_json
 
 from chaserdock.evaluation import perception
 from chaserdock.evaluation.in_process import InProcessMission
 from chaserdock.evaluation.perception import RenderedImages
 from chaserdock.logs import open_log
 
-ROOT = Path(__file__).resolve().parents[1]
 SCENARIO = ROOT / "scenarios" / "sixteen-chasers.toml"
 WARM_TICKS = 15
 """Excluded from every figure: first calls and the estimator's start."""
 SAMPLE_S = 0.2
+TOLERANT = (
+    "settling_s=1.0",
+    "success.steady_position_rms_m=0.3",
+    "success.steady_orientation_rms_deg=20.0",
+)
 PARTS = ("render", "physics", "perceive", "fuse", "solve", "guide")
 
 
@@ -58,12 +62,12 @@ class Clock:
         work: Callable[..., Any] = getattr(owner, name)
 
         def timed(*args: Any, **more: Any) -> Any:
-            begun = time.thread_time()
+            begin_s = time.thread_time()
             self._inside.append(0.0)
             try:
                 return work(*args, **more)
             finally:
-                took = time.thread_time() - begun
+                took = time.thread_time() - begin_s
                 self.spent[part] += took - self._inside.pop()
                 if self._inside:
                     self._inside[-1] += took
@@ -94,69 +98,59 @@ def parts_of(scenario: Scenario, ticks: int) -> dict[str, float]:
     return dict(zip(PARTS, np.median(rows[WARM_TICKS:], axis=0).tolist(), strict=True))
 
 
-def processes_of(launcher: psutil.Process) -> dict[str, float]:
-    """Return the processor time, s, of the mission's processes so far."""
-    used: dict[str, float] = {}
+def cpu_s_of(launcher: psutil.Process) -> dict[str, float]:
+    """Return the processor time, s, of the mission's processes so far by command."""
+    used: dict[str, float] = defaultdict(float)
     for child in launcher.children():
-        try:
-            words, times = child.cmdline(), child.cpu_times()
-        except (psutil.NoSuchProcess, psutil.AccessDenied):
-            continue
-        if "chaserdock" in words:
-            name = words[words.index("chaserdock") + 1]
-            used[name] = used.get(name, 0.0) + times.user + times.system
+        with suppress(psutil.NoSuchProcess, psutil.AccessDenied):
+            arguments, times = child.cmdline(), child.cpu_times()
+            if "chaserdock" in arguments:
+                used[arguments[arguments.index("chaserdock") + 1]] += times.user + times.system
     return used
 
 
-def fly(n: int, flown_s: float) -> dict[str, float]:
-    """Run the mission with ``n`` chasers: seconds of wall time per tick, and of processor time by kind of process.
+def fly(n: int, duration_s: float) -> dict[str, float]:
+    """Run the mission with ``n`` chasers; return wall time and processor time of each command, s per tick.
 
-    Raises SystemExit if it fails.
+    Raise SystemExit if it fails.
     """
     with tempfile.TemporaryDirectory() as folder:
         path, out = Path(folder) / f"{n}-chasers.toml", Path(folder) / "run"
         path.write_text(first(n), encoding="utf-8")
-        rules = [
-            f"duration_s={flown_s}",
-            "settling_s=1.0",
-            "success.steady_position_rms_m=0.3",
-            "success.steady_orientation_rms_deg=20.0",
-        ]
-        command = [sys.executable, "-m", "chaserdock", "run", str(path), "--out", str(out), "-q"]
-        command += [item for rule in rules for item in ("--set", rule)]
-        said = (Path(folder) / "said.txt").open("w+")
-        done = subprocess.Popen(command, cwd=ROOT, stdout=said, stderr=subprocess.STDOUT)
-        launcher, samples = psutil.Process(done.pid), []
-        while done.poll() is None:
-            try:
-                samples.append((time.time_ns(), processes_of(launcher)))
-            except psutil.NoSuchProcess:
-                break
-            time.sleep(SAMPLE_S)
-        if done.wait() != 0:
-            said.seek(0)
-            raise SystemExit(f"the flight of {n} failed:\n{said.read()}")
-        sent = [record.sent_ns for record in open_log(out).records(topics.TICK)]
-    begun, ended, ticks = sent[WARM_TICKS], sent[-1], len(sent) - 1 - WARM_TICKS
-    figures = {"wall": (ended - begun) / 1e9 / ticks}
-    at = np.array([t for t, _ in samples], dtype=float)
+        overrides = (f"duration_s={duration_s}", *TOLERANT)
+        changes = [word for override in overrides for word in ("--set", override)]
+        command = chaserdock_command("run", path, "--out", out, "-q", *changes)
+        with (Path(folder) / "output.txt").open("w+") as output:
+            launcher = psutil.Popen(command, cwd=ROOT, stdout=output, stderr=subprocess.STDOUT)
+            samples = []
+            while launcher.poll() is None:
+                with suppress(psutil.NoSuchProcess):
+                    samples.append((time.time_ns(), cpu_s_of(launcher)))
+                time.sleep(SAMPLE_S)
+            if launcher.returncode != 0:
+                output.seek(0)
+                raise SystemExit(f"the flight of {n} failed:\n{output.read()}")
+        sent_ns = [record.sent_ns for record in open_log(out).records(topics.TICK)]
+    begin_ns, end_ns, ticks = sent_ns[WARM_TICKS], sent_ns[-1], len(sent_ns) - 1 - WARM_TICKS
+    figures = {"wall": (end_ns - begin_ns) / 1e9 / ticks}
+    times_ns = np.array([t for t, _ in samples], dtype=float)
     for kind in ("world", "chaser", "controller", "record"):
-        # Processes that have ended keep their last sample.
+        # Processes that have exited keep their last sample.
         used = np.maximum.accumulate([s.get(kind, 0.0) for _, s in samples])
-        from_s, to_s = np.interp([begun, ended], at, used)
+        from_s, to_s = np.interp([begin_ns, end_ns], times_ns, used)
         figures[kind] = float(to_s - from_s) / ticks
     return figures
 
 
-def measure(n: int, ticks: int, flown_s: float | None) -> dict[str, float]:
-    """Return seconds per tick with ``n`` chasers by part; without lock-step mission if ``flown_s`` is None."""
+def measure(n: int, ticks: int, duration_s: float | None) -> dict[str, float]:
+    """Return seconds per tick with ``n`` chasers by part; without lock-step mission if ``duration_s`` is None."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scenario.toml"
         path.write_text(first(n), encoding="utf-8")
         out = parts_of(load_scenario(path), ticks)
-    if flown_s is None:
+    if duration_s is None:
         return out | {"sum": sum(out.values())}
-    flown = fly(n, flown_s)
+    flown = fly(n, duration_s)
     processes = flown["world"] + flown["chaser"] + flown["controller"]
     out["transport"] = processes - sum(out.values())
     out["record"] = flown["record"]
@@ -166,7 +160,7 @@ def measure(n: int, ticks: int, flown_s: float | None) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = options_of(__doc__)
+    parser = make_parser(__doc__)
     parser.add_argument("--chasers", type=int, action="append", choices=range(1, 17), metavar="N")
     parser.add_argument("--ticks", type=int, default=60, help="ticks timed in one process")
     parser.add_argument(
@@ -175,20 +169,21 @@ def main() -> None:
     parser.add_argument("--parts-only", action="store_true", help="no lock-step missions")
     options = parser.parse_args()
     sizes = options.chasers or ([1, 2, 4] if options.quick else [1, 2, 4, 8, 16])
-    flown_s = None if options.parts_only else options.seconds
-    names = (*PARTS, *(("sum",) if flown_s is None else ("transport", "record", "cpu", "wall")))
+    duration_s = None if options.parts_only else options.seconds
+    names = (*PARTS, *(("sum",) if duration_s is None else ("transport", "record", "cpu", "wall")))
     legend = "; cpu: all processes; wall: in lock-step, on this machine"
-    print("ms per tick" + ("" if flown_s is None else legend))
+    print("ms per tick" + ("" if duration_s is None else legend))
     print(f"{'N':>3}" + "".join(f"{name:>11}" for name in names))
-    result: dict[str, float] = {}
+    result: Figures = {}
     for n in sizes:
-        row = measure(n, options.ticks, flown_s)
+        row = measure(n, options.ticks, duration_s)
         print(f"{n:3d}" + "".join(f"{1e3 * row[name]:11.2f}" for name in names), flush=True)
-        result |= {f"n{n}_{name}_s": row[name] for name in names}
+        result |= {f"n{n}_{name}_s_per_tick": row[name] for name in names}
     for name in names:
-        if {f"n4_{name}_s", f"n16_{name}_s"} <= result.keys():
-            result[f"{name}_16_over_4"] = result[f"n16_{name}_s"] / result[f"n4_{name}_s"]
-            print(f"{name}: 16 chasers over 4: {result[f'{name}_16_over_4']:.2f}")
+        if {4, 16} <= set(sizes):
+            ratio = result[f"n16_{name}_s_per_tick"] / result[f"n4_{name}_s_per_tick"]
+            result[f"{name}_16_over_4"] = ratio
+            print(f"{name}: 16 chasers over 4: {ratio:.2f}")
     write_json(options.json, result)
 
 

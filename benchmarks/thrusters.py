@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,7 +23,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.thruster_model import Valves
 from chaserdock_protocol.scenario import Scenario, parse_scenario
 from chaserdock_protocol.scenario.thrusters import thrusts_max
-from results import options_of, print_figures, write_json
+from common import Figures, make_parser, run_parts
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
 from chaserdock.evaluation.perception import measurement_model
@@ -50,7 +49,7 @@ def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **chan
         **changes.pop("start", {}),
     }
     values: dict[str, Any] = {
-        "name": "bench",
+        "name": "thrusters",
         "duration_s": duration_s,
         "time": {"rate_hz": rate_hz, "image_hz": rate_hz},
         "chaser": chaser,
@@ -64,9 +63,9 @@ def fly(s: Scenario) -> FlightRecord:
     return record_flight(s, measurement_model(s, 0))
 
 
-def allocation(quick: bool) -> dict[str, float]:
+def allocation(quick: bool) -> Figures:
     """Accuracy and time of the allocation of random feasible wrenches, up to full thrust."""
-    out: dict[str, float] = {}
+    out: Figures = {}
     for body in ("tetra12", "slider"):
         rng = np.random.default_rng(1)
         b = scenario(1.0, body).chaser
@@ -91,13 +90,13 @@ def allocation(quick: bool) -> dict[str, float]:
     return out
 
 
-def pulses(quick: bool) -> dict[str, float]:
+def pulses(quick: bool) -> Figures:
     """Largest difference of delivered and commanded impulse over a second of random thrusts, in minimum pulses.
 
     ``less_late``: without what was commanded within a carrier period after its pulse had been sent, which is zero where
     every tick begins a period.
     """
-    out: dict[str, float] = {}
+    out: Figures = {}
     for rate_hz, carrier_hz in ((10, 10), (15, 10), (30, 10), (15, 15)):
         s = scenario(1.0, rate_hz=rate_hz, chaser={"modulation": {"carrier_hz": carrier_hz}})
         b, timing, rng = s.chaser, s.timing, np.random.default_rng(2)
@@ -146,9 +145,9 @@ class CommandedImpulse:
         return self.until(ends_ns) - self.until(begins) - 1e3 * first
 
 
-def tracking(quick: bool) -> dict[str, float]:
+def tracking(quick: bool) -> Figures:
     """Steady errors and impulse with thrusters, beside ideal actuation."""
-    out: dict[str, float] = {}
+    out: Figures = {}
     duration_s = 40.0 if quick else 120.0
     for body in ("tetra12", "slider"):
         ideal = fly(scenario(duration_s, body, chaser={"actuation": "ideal"}))
@@ -162,7 +161,7 @@ def tracking(quick: bool) -> dict[str, float]:
             name = f"tracking_{body}_{variant}"
             out |= {
                 f"{name}_position_rms_m": position,
-                f"{name}_orientation_rms_deg": math.degrees(angle),
+                f"{name}_orientation_rms_rad": angle,
                 f"{name}_thruster_impulse_N_s": float(record.thruster_impulse_N_s[0]),
                 f"{name}_propellant_kg": float(record.propellant_kg[0]),
             }
@@ -175,9 +174,9 @@ def _isolated_s(record: FlightRecord, thruster: int) -> float:
     return times[0] if times else math.inf
 
 
-def failures(quick: bool) -> dict[str, float]:
+def failures(quick: bool) -> Figures:
     """Every thruster fails at 30 s, not reported: time to isolation, wrongly isolated thrusters, errors afterwards."""
-    out: dict[str, float] = {}
+    out: Figures = {}
     thrusters = (0, 5, 10) if quick else range(12)
     for kind in ("stuck_on", "stuck_off"):
         delays, wrong, peaks, final = [], 0, [], []
@@ -199,13 +198,13 @@ def failures(quick: bool) -> dict[str, float]:
             f"failures_{kind}_median_time_to_isolation_s": float(np.median(delays)),
             f"failures_{kind}_max_time_to_isolation_s": float(max(delays)),
             f"failures_{kind}_max_peak_position_m": float(max(p for p, _ in peaks)),
-            f"failures_{kind}_max_peak_orientation_deg": math.degrees(max(a for _, a in peaks)),
+            f"failures_{kind}_max_peak_orientation_rad": max(a for _, a in peaks),
             f"failures_{kind}_max_final_position_rms_m": float(max(final)),
         }
     return out
 
 
-def healthy(quick: bool) -> dict[str, float]:
+def healthy(quick: bool) -> Figures:
     """False alarms without failures: random starts, up to three times the paper's rates, noisy measurements, both bodies."""
     alarms, flights = 0, 4 if quick else 20
     for seed in range(flights):
@@ -230,7 +229,7 @@ def _randomly_rotated(rng: np.random.Generator, vector: Array) -> list[float]:
     return rotations.rotate(rotations.normalize(rng.normal(size=4)), vector).tolist()
 
 
-PARTS: dict[str, Callable[[bool], dict[str, float]]] = {
+PARTS = {
     "allocation": allocation,
     "pulses": pulses,
     "tracking": tracking,
@@ -240,15 +239,8 @@ PARTS: dict[str, Callable[[bool], dict[str, float]]] = {
 
 
 def main() -> None:
-    parser = options_of(__doc__)
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
-    options = parser.parse_args()
-    result: dict[str, float] = {}
-    for part in options.only:
-        figures = PARTS[part](options.quick)
-        print_figures(figures)
-        result |= figures
-    write_json(options.json, result)
+    options = make_parser(__doc__, PARTS).parse_args()
+    run_parts(options, {name: lambda part=part: part(options.quick) for name, part in PARTS.items()})
 
 
 if __name__ == "__main__":

@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well, how far and how fast the cameras see: ``python benchmarks/vision.py [--quick] [--json FILE]``.
+"""Accuracy, range and speed of perception, and both renderers: ``python benchmarks/vision.py [--quick] [--json FILE]
+[--only PART ...]``.
 
-Random views of both targets with all effects at default strength, by the default perception and by the paper's
-beside it; a lit and a dark face at 1 m; how near and far the servicer is seen; image to pose in time; both
-renderers. Gross errors: over 10 degrees or 10 cm from the truth (of an ambiguous view, its nearer solution).
+Parts: ``rendering`` (time and corner errors of the renderers), ``speed`` (image to pose), ``reach`` (share of detected
+views by distance), ``near`` (the body fills the image), ``metre`` (a lit and a shadowed face at 1 m), ``accuracy`` (random
+views of both targets with all effects at default strength, by the default perception and by the paper's). Gross error:
+more than 10 degrees or 10 cm (for an ambiguous view: of the solution nearer to the truth).
 """
 
 from __future__ import annotations
@@ -25,31 +27,29 @@ from chaserdock_world.rendering.background import Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
+from common import Figures, make_parser, percentiles, run_parts
 from numpy.typing import NDArray
-from results import options_of, write_json
 
-EYE, AHEAD = np.zeros(3), rotations.IDENTITY  # IRF = WRF
+CAMERA_POSITION, CAMERA_ATTITUDE = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)
 GROSS_M, GROSS_RAD = 0.1, np.deg2rad(10.0)
 JPEG_QUALITY = 85
-# A face turned to the camera, upright: its right is the image's right, its up the image's up.
+# Attitude of an upright face that faces the camera.
 FACING = rotations.from_matrix(np.diag([1.0, -1.0, -1.0]))
-
-Figures = dict[str, float]
 
 
 @dataclass
 class View:
-    """One image with the pose of the target (IRF) that it shows."""
+    """An image and the true pose of the target (IRF)."""
 
     image: NDArray[np.uint8]
     position: Array
     q: Array
-    whole_markers: int
+    complete_markers: int
 
 
-class Bench:
-    """A camera and a target in it."""
+class Views:
+    """Views of a target by one camera."""
 
     def __init__(self, target: str, width: int = 1280, height: int = 720):
         self.camera = Camera.from_hfov(width, height, HFOV)
@@ -59,16 +59,18 @@ class Bench:
         self.count = 0
 
     def view(self, position: Array, q: Array, to_sun: Array) -> View:
-        """An image with all default effects, compressed and decompressed as between the processes."""
-        exact = self.renderer.render(EYE, AHEAD, position, q, (), Light(tuple(to_sun.tolist())))
+        """Return an image with all default effects, encoded and decoded as between the processes."""
+        exact = self.renderer.render(
+            CAMERA_POSITION, CAMERA_ATTITUDE, position, q, (), Light(tuple(to_sun.tolist()))
+        )
         taken = self.effects.apply(exact, 0, self.count)
         self.count += 1
         code = cv2.imencode(".jpg", taken, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
         image: Any = cv2.imdecode(code, cv2.IMREAD_GRAYSCALE)
-        return View(image, position, q, self._whole_markers(position, q))
+        return View(image, position, q, self._complete_markers(position, q))
 
-    def _whole_markers(self, position: Array, q: Array) -> int:
-        """How many markers face the camera with all of their corners in the image."""
+    def _complete_markers(self, position: Array, q: Array) -> int:
+        """Return the number of markers that face the camera with all corners in the image."""
         corners = rotations.rotate(q, np.array([m.corners_trf_m() for m in self.model.markers])) + position
         normals = rotations.rotate(q, np.array([m.normal_trf() for m in self.model.markers]))
         px = self.camera.project(corners)
@@ -80,7 +82,7 @@ class Bench:
         return Perception(self.camera, self.model, method)
 
     def random_views(self, count: int, near_m: float, far_m: float, seed: int) -> Iterator[View]:
-        """Any attitude, the centre in the middle 40 % of the image each way, the sun anywhere."""
+        """Yield views at random attitudes, the centre in the middle 40 % of width and height, the sun in a random direction."""
         generator = np.random.default_rng(seed)
         size = np.array([self.camera.width_px, self.camera.height_px])
         for _ in range(count):
@@ -91,10 +93,10 @@ class Bench:
             yield self.view(np.append(ray, 1.0) * z, q, generator.normal(size=3))
 
     def face_views(
-        self, count: int, distance_m: float, tilt_rad: float, lit: bool, seed: int, aside_m: float = 0.0
+        self, count: int, distance_m: float, tilt_rad: float, lit: bool, seed: int, lateral_m: float = 0.0
     ) -> Iterator[View]:
-        """A face at ``distance_m`` (of the body's centre), tilted by up to ``tilt_rad``, turned at will and off the
-        axis by up to ``aside_m``; the sun behind the camera, or behind the target."""
+        """Yield views of a face: the body's centre at ``distance_m``, tilt up to ``tilt_rad``, random roll, lateral offset up
+        to ``lateral_m``; the sun behind the camera, or behind the target."""
         generator = np.random.default_rng(seed)
         for k in range(count):
             tilt = generator.normal(size=3) * (1.0, 1.0, 0.0)
@@ -104,157 +106,153 @@ class Bench:
                 rotations.multiply(rotations.exp(tilt), turn), rotations.conjugate(face_rotation(k % 6))
             )
             sun = np.array([*generator.uniform(-0.5, 0.5, 2), -1.0 if lit else 1.0])
-            position = np.array([*generator.uniform(-aside_m, aside_m, 2), distance_m])
+            position = np.array([*generator.uniform(-lateral_m, lateral_m, 2), distance_m])
             yield self.view(position, q, sun)
 
 
 def errors_of(sighting: Sighting, view: View) -> tuple[float, float]:
-    """Error in metres and radians, of the nearer solution."""
-    each = [
+    """Return the errors (m, rad) of the solution with the smaller angle error."""
+    errors = [
         (
             float(np.linalg.norm(s.position_irf_m - view.position)),
             float(rotations.angle_between(s.q_irf_trf_wxyz, view.q)),
         )
         for s in sighting.solutions
     ]
-    return min(each, key=lambda e: e[1])
+    return min(errors, key=lambda e: e[1])
 
 
-class Tally:
-    """Errors of many views, and their figures."""
+class Results:
+    """Perception results of many views."""
 
     def __init__(self) -> None:
         self.errors: list[tuple[float, float]] = []
-        self.nothing = self.two = self.unmarked = 0
+        self.not_detected = self.ambiguous = self.no_complete_marker = 0
 
     def add(self, sighting: Sighting, view: View) -> None:
         if not sighting.solutions:
-            self.nothing += 1
-            self.unmarked += view.whole_markers == 0
+            self.not_detected += 1
+            self.no_complete_marker += view.complete_markers == 0
             return
-        self.two += len(sighting.solutions) > 1
+        self.ambiguous += len(sighting.solutions) > 1
         self.errors.append(errors_of(sighting, view))
 
     def figures(self, name: str) -> Figures:
         e = np.array(self.errors).reshape(-1, 2)
         gross = (e[:, 0] > GROSS_M) | (e[:, 1] > GROSS_RAD)
         out: Figures = {
-            f"{name}_views": len(e) + self.nothing,
-            f"{name}_nothing_seen": self.nothing,
-            f"{name}_nothing_seen_and_no_whole_marker_in_view": self.unmarked,
-            f"{name}_two_solutions": self.two,
+            f"{name}_views": len(e) + self.not_detected,
+            f"{name}_not_detected": self.not_detected,
+            f"{name}_not_detected_without_complete_marker": self.no_complete_marker,
+            f"{name}_ambiguous": self.ambiguous,
             f"{name}_gross_errors": int(gross.sum()),
         }
-        if len(e):
-            for k, what in enumerate(("position_error", "attitude_error")):
-                unit = ("m", "rad")[k]
-                out[f"{name}_{what}_p50_{unit}"] = float(np.median(e[:, k]))
-                out[f"{name}_{what}_p95_{unit}"] = float(np.percentile(e[:, k], 95))
-                out[f"{name}_{what}_max_{unit}"] = float(e[:, k].max())
+        for k, (what, unit) in enumerate((("position_error", "m"), ("attitude_error", "rad"))):
+            out |= percentiles(e[:, k], f"{name}_{what}", unit, "median", "p95", "max")
         return out
 
 
 def accuracy(count: int) -> Figures:
-    """Random views at 0.5 to 2 m, of both targets, by both methods (the baseline on a tenth of them)."""
+    """Evaluate random views of both targets at 0.5 to 2 m by both methods (the baseline on a tenth of them)."""
     out: Figures = {}
     for target in ("servicer", "paper"):
-        bench = Bench(target)
-        ours, paper = bench.perception(), bench.perception("paper")
-        tally, baseline = Tally(), Tally()
-        for k, view in enumerate(bench.random_views(count, 0.5, 2.0, 4)):
-            tally.add(ours.estimate(view.image), view)
+        views = Views(target)
+        ours, paper = views.perception(), views.perception("paper")
+        results, baseline = Results(), Results()
+        for k, view in enumerate(views.random_views(count, 0.5, 2.0, 4)):
+            results.add(ours.estimate(view.image), view)
             if k % 10 == 0 or count < 1000:
                 baseline.add(paper.estimate(view.image), view)
-        out |= tally.figures(target) | baseline.figures(f"{target}_baseline")
+        out |= results.figures(target) | baseline.figures(f"{target}_baseline")
     return out
 
 
 def at_one_metre(count: int) -> Figures:
-    """A lit face and one in its own shadow, with no brighter one in view."""
+    """Evaluate a lit face and a shadowed face without a brighter one in view."""
     out: Figures = {}
     for target in ("servicer", "paper"):
-        bench = Bench(target)
-        ours, paper = bench.perception(), bench.perception("paper")
+        views = Views(target)
+        ours, paper = views.perception(), views.perception("paper")
         for lit in (True, False):
-            tally, baseline = Tally(), Tally()
-            for view in bench.face_views(count, 1.0, np.deg2rad(40.0), lit, 5, 0.1):
-                tally.add(ours.estimate(view.image), view)
+            results, baseline = Results(), Results()
+            for view in views.face_views(count, 1.0, np.deg2rad(40.0), lit, 5, 0.1):
+                results.add(ours.estimate(view.image), view)
                 baseline.add(paper.estimate(view.image), view)
             name = f"{target}_1m_{'lit' if lit else 'dark'}"
-            out |= tally.figures(name) | baseline.figures(f"{name}_baseline")
+            out |= results.figures(name) | baseline.figures(f"{name}_baseline")
     return out
 
 
 def reach(count: int) -> Figures:
-    """Share of views in which the servicer is seen: gap from the lens to the face (docking: little tilt, the
-    middle of the face within 1 cm of the axis), and far away (up to 40 degrees)."""
+    """Return the share of views in which the servicer is detected without gross error: by the gap from lens to face (docking:
+    up to 5 degrees, 1 cm off the axis), and by distance (up to 40 degrees)."""
     out: Figures = {}
-    bench = Bench("servicer")
-    perception = bench.perception()
+    views = Views("servicer")
+    perception = views.perception()
     half_m = 0.2
 
-    def seen(distance_m: float, tilt_deg: float, aside_m: float, faces: tuple[int, ...]) -> float:
-        tally = Tally()
-        views = bench.face_views(6 * count, distance_m, np.deg2rad(tilt_deg), True, 6, aside_m)
-        for k, view in enumerate(views):
+    def detected(distance_m: float, tilt_deg: float, lateral_m: float, faces: tuple[int, ...]) -> float:
+        results = Results()
+        shown = views.face_views(6 * count, distance_m, np.deg2rad(tilt_deg), True, 6, lateral_m)
+        for k, view in enumerate(shown):
             if k % 6 in faces:
-                tally.add(perception.estimate(view.image), view)
-        wrong = tally.figures("x")["x_gross_errors"]
-        return (len(tally.errors) - wrong) / (len(tally.errors) + tally.nothing)
+                results.add(perception.estimate(view.image), view)
+        gross = results.figures("x")["x_gross_errors"]
+        return (len(results.errors) - gross) / (len(results.errors) + results.not_detected)
 
     for gap_m in (0.08, 0.10, 0.15, 0.20, 0.25):
-        # The faces across x are the ones half_m from the centre.
-        out[f"servicer_seen_at_gap_{gap_m * 100:.0f}_cm_share"] = seen(half_m + gap_m, 5.0, 0.01, (0, 1))
+        # Faces 0 and 1, across x, are half_m from the centre.
+        out[f"servicer_detected_at_gap_{gap_m * 100:.0f}_cm_share"] = detected(
+            half_m + gap_m, 5.0, 0.01, (0, 1)
+        )
     for distance_m in (2.0, 3.0, 4.0, 4.5):
-        out[f"servicer_seen_at_{distance_m:g}_m_share"] = seen(distance_m, 40.0, 0.2, tuple(range(6)))
+        out[f"servicer_detected_at_{distance_m:g}_m_share"] = detected(distance_m, 40.0, 0.2, tuple(range(6)))
     return out
 
 
 def near_views(count: int) -> Figures:
-    """Any attitude with the centre at 0.28 to 0.45 m, where the body fills the image."""
-    bench, tally = Bench("servicer"), Tally()
-    perception = bench.perception()
-    for view in bench.random_views(count, 0.28, 0.45, 8):
-        tally.add(perception.estimate(view.image), view)
-    return tally.figures("servicer_near")
+    """Evaluate random attitudes with the centre at 0.28 to 0.45 m, where the body fills the image."""
+    views, results = Views("servicer"), Results()
+    perception = views.perception()
+    for view in views.random_views(count, 0.28, 0.45, 8):
+        results.add(perception.estimate(view.image), view)
+    return results.figures("servicer_near")
 
 
 def speed(count: int) -> Figures:
-    """Image to pose, medians: from scratch, and with a prediction that is a little off."""
+    """Time image to pose without prediction, with an inexact prediction (tracking), and by the baseline."""
     out: Figures = {}
     for target in ("servicer", "paper"):
         for width, height in ((640, 480), (1280, 720)):
-            bench = Bench(target, width, height)
-            took: dict[str, list[float]] = {"scratch": [], "tracking": [], "baseline": []}
-            ours, paper = bench.perception(), bench.perception("paper")
+            views = Views(target, width, height)
+            took: dict[str, list[float]] = {"no_prediction": [], "tracking": [], "baseline": []}
+            ours, paper = views.perception(), views.perception("paper")
             off = rotations.exp([0.01, -0.01, 0.01])
-            for view in bench.random_views(count, 0.5, 2.0, 9):
-                near = (view.position + 0.005, rotations.multiply(view.q, off))
+            for view in views.random_views(count, 0.5, 2.0, 9):
+                prediction = (view.position + 0.005, rotations.multiply(view.q, off))
                 for name, perception, predicted in (
-                    ("scratch", ours, None),
-                    ("tracking", ours, near),
+                    ("no_prediction", ours, None),
+                    ("tracking", ours, prediction),
                     ("baseline", paper, None),
                 ):
-                    begun = time.thread_time()
+                    begin_s = time.thread_time()
                     perception.estimate(view.image, predicted)
-                    took[name].append(time.thread_time() - begun)
+                    took[name].append(time.thread_time() - begin_s)
             for name, values in took.items():
-                out[f"{target}_{width}x{height}_image_to_pose_{name}_p50_s"] = float(np.median(values))
-                out[f"{target}_{width}x{height}_image_to_pose_{name}_p95_s"] = float(
-                    np.percentile(values, 95)
-                )
+                key = f"{target}_{width}x{height}_image_to_pose_{name}_cpu"
+                out |= percentiles(values, key, "s", "median", "p95")
     return out
 
 
 def rendering(count: int) -> Figures:
-    """640 x 480, the exact renderer and TinyRenderer (its bias undone): time, and error of the fitted corners."""
-    bench = Bench("servicer", 640, 480)
+    """Time the exact renderer and TinyRenderer (bias removed) at 640 x 480, and the errors of the corners fitted in their images."""
+    views = Views("servicer", 640, 480)
     renderers = {
-        "exact": bench.renderer,
-        "tinyrenderer": TinyRenderer(bench.camera, bench.model, supersampled=1),
-        "tinyrenderer_2x": TinyRenderer(bench.camera, bench.model, supersampled=2),
+        "exact": views.renderer,
+        "tinyrenderer": TinyRenderer(views.camera, views.model, supersampled=1),
+        "tinyrenderer_2x": TinyRenderer(views.camera, views.model, supersampled=2),
     }
-    perception = bench.perception()
+    perception = views.perception()
     took: dict[str, list[float]] = {name: [] for name in renderers}
     off: dict[str, list[float]] = {name: [] for name in renderers}
     generator = np.random.default_rng(12)
@@ -263,50 +261,43 @@ def rendering(count: int) -> Figures:
         q = rotations.normalize(generator.normal(size=4))
         light = Light(tuple((generator.normal(size=3) - (0, 0, 1.5)).tolist()))
         for name, renderer in renderers.items():
-            begun = time.thread_time()
-            image = renderer.render(EYE, AHEAD, position, q, (), light)
-            took[name].append(time.thread_time() - begun)
+            begin_s = time.thread_time()
+            image = renderer.render(CAMERA_POSITION, CAMERA_ATTITUDE, position, q, (), light)
+            took[name].append(time.thread_time() - begin_s)
             sighting = perception.estimate(image)
             for i, corners in zip(sighting.marker_ids.tolist(), sighting.corners_px, strict=True):
-                marker = bench.model.marker(i)
+                marker = views.model.marker(i)
                 assert marker is not None
-                truth = bench.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
+                truth = views.camera.project(rotations.rotate(q, marker.corners_trf_m()) + position)
                 off[name] += np.linalg.norm(corners - truth, axis=1).tolist()
     out: Figures = {}
     for name in renderers:
-        out[f"render_640x480_{name}_p50_s"] = float(np.median(took[name]))
-        out[f"render_640x480_{name}_corner_error_p50_px"] = float(np.median(off[name]))
-        out[f"render_640x480_{name}_corner_error_p95_px"] = float(np.percentile(off[name], 95))
-    tiny, exact = "render_640x480_tinyrenderer", "render_640x480_exact"
-    out["render_times_faster_than_tinyrenderer"] = out[f"{tiny}_p50_s"] / out[f"{exact}_p50_s"]
-    for p in ("p50", "p95"):
-        key = f"corner_error_{p}_px"
-        out[f"render_corner_error_{p}_share_of_tinyrenderer"] = out[f"{exact}_{key}"] / out[f"{tiny}_{key}"]
+        out |= percentiles(took[name], f"render_{name}_cpu", "s", "median")
+        out |= percentiles(off[name], f"render_{name}_corner_error", "px", "median", "p95")
+    for key in ("cpu_median_s", "corner_error_median_px", "corner_error_p95_px"):
+        ratio = out[f"render_exact_{key}"] / out[f"render_tinyrenderer_{key}"]
+        out[f"render_exact_{key.rpartition('_')[0]}_over_tinyrenderer"] = ratio
     return out
 
 
 def main() -> None:
-    parser = options_of(__doc__)
-    parser.add_argument("--only", choices=("accuracy", "metre", "reach", "near", "speed", "rendering"))
-    options = parser.parse_args()
-    cv2.setNumThreads(1)
-    quick = options.quick
-    parts = {
-        "rendering": lambda: rendering(20 if quick else 200),
-        "speed": lambda: speed(30 if quick else 200),
-        "reach": lambda: reach(10 if quick else 100),
-        "near": lambda: near_views(60 if quick else 600),
-        "metre": lambda: at_one_metre(100 if quick else 1000),
-        "accuracy": lambda: accuracy(150 if quick else 10_000),
+    counts = {
+        "rendering": (rendering, 200, 20),
+        "speed": (speed, 200, 30),
+        "reach": (reach, 100, 10),
+        "near": (near_views, 600, 60),
+        "metre": (at_one_metre, 1000, 100),
+        "accuracy": (accuracy, 10_000, 150),
     }
-    result: Figures = {}
-    for name, part in parts.items():
-        if options.only in (None, name):
-            figures = part()
-            for key, value in figures.items():
-                print(f"{key:62}  {value:.4g}", flush=True)
-            result |= figures
-    write_json(options.json, result)
+    options = make_parser(__doc__, counts).parse_args()
+    cv2.setNumThreads(1)
+    run_parts(
+        options,
+        {
+            name: lambda part=part, count=quick if options.quick else full: part(count)
+            for name, (part, full, quick) in counts.items()
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Target estimation with rendered images: ``python benchmarks/seeing_flights.py PART [--quick] [--json FILE]``.
+"""Target estimation with rendered images: ``python benchmarks/estimation.py [--only PART ...] [--quick] [--json FILE]``.
 
 Parts: ``exact`` (all image effects, cameras as calibrated; both targets, one and two chasers; the paper's perception and
 estimator on the same images), ``errors`` (calibration errors drawn from each seed, heavy noise), ``calibrate`` (the
 manoeuvre that estimates a camera's mounting), ``acquire`` (starts off the reference, the target often out of view),
-``faults`` (blind cameras, glare, a chaser that reports wrong poses).
+``faults`` (blind cameras, glare, a chaser that reports wrong poses). Figures: mean and worst over the seeds.
 
-Every flight is one line of JSON in ``--flights FILE``; flights that are in the file are not repeated, so that an
+``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it, so that an
 interrupted run continues.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +33,7 @@ from chaserdock_protocol.messages import Image, Sighting, TargetEstimate
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.sensors.errors import true_camera
-from results import options_of, print_figures, write_json
+from common import Figures, append_line, make_parser, read_lines, run_parts
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages, States
@@ -51,10 +51,10 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
         rotations.exp([0.0, 0.0, rng.uniform(-math.pi, math.pi)]), [1.0, 0.0, rng.uniform(-0.6, 0.9)]
     )
     flying = []
-    for place, yaw_deg in SIDES[:number]:
+    for position, yaw_deg in SIDES[:number]:
         flying.append(
             {
-                "position_m": place,
+                "position_m": position,
                 "q_wxyz": tuple(rotations.exp([0.0, 0.0, math.radians(yaw_deg)]).tolist()),
                 "start_offset_m": tuple((0.1 * rng.uniform(-1.0, 1.0, 3)).tolist()),
                 "start_rotation_rad": tuple((0.08 * rng.uniform(-1.0, 1.0, 3)).tolist()),
@@ -62,7 +62,7 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
         )
     return Scenario.model_validate(
         {
-            "name": f"seeing-{target}-{number}",
+            "name": f"estimation-{target}-{number}",
             "duration_s": duration_s,
             "settling_s": 0.0,
             "seed": seed,
@@ -259,16 +259,16 @@ def figures(flown: Flight, from_s: float) -> Row:
     e = flown.estimates
     m, rad = flown.tracking_rms(from_s)
     row: Row = {
-        "fused_m": e.rms("position_m", from_s),
-        "fused_rad": e.rms("angle_rad", from_s),
-        "fused_max_rad_after_1s": e.largest("angle_rad", 1.0),
-        "fused_max_m_after_1s": e.largest("position_m", 1.0),
+        "estimate_m": e.rms("position_m", from_s),
+        "estimate_rad": e.rms("angle_rad", from_s),
+        "estimate_max_rad_after_1s": e.largest("angle_rad", 1.0),
+        "estimate_max_m_after_1s": e.largest("position_m", 1.0),
         "nees": float(e.array("nees", from_s).mean()),
         "inside_3_sigma": float(e.array("inside", from_s).mean()),
         "tracking_m": m,
         "tracking_rad": rad,
-        "reinitialisations": flown.reinitialisations,
-        "seen": float(np.mean([v for each in flown.detections.values() for v in each])),
+        "reinitializations": flown.reinitialisations,
+        "detected": float(np.mean([v for each in flown.detections.values() for v in each])),
         "events": [f"{t:.2f} {text}" for t, _, text in flown.events][:40],
     }
     for name, shadow in flown.shadows.items():
@@ -284,6 +284,7 @@ def paper_of(scenario: Scenario) -> dict[str, Scenario]:
 
 
 def exact(target: str, chasers: int, seed: int) -> Row:
+    """Fly with cameras as calibrated."""
     scenario = scenario_of(target, chasers, seed, 12.0)
     return figures(fly(scenario, paper_of(scenario)), SETTLED_S)
 
@@ -314,8 +315,8 @@ def calibrate(target: str, seed: int) -> Row:
         "mounting_error_before_rad": float(np.linalg.norm(rotations.log(turn))),
         "mounting_error_after_rad": left,
         "mounting_sigma_rad": float(np.linalg.norm(estimate.turn_sigma_rad)),
-        "before_fused_m": flown.estimates.rms("position_m", 3.0, 5.0),
-        "before_fused_rad": flown.estimates.rms("angle_rad", 3.0, 5.0),
+        "before_estimate_m": flown.estimates.rms("position_m", 3.0, 5.0),
+        "before_estimate_rad": flown.estimates.rms("angle_rad", 3.0, 5.0),
         "good": float(left <= math.radians(0.05)),
     }
 
@@ -400,79 +401,62 @@ def fault(which: str, seed: int) -> Row:
     }
 
 
-def _jobs(part: str, seeds: range) -> list[tuple[str, Callable[[], Row]]]:
-    jobs: list[tuple[str, Callable[[], Row]]] = []
-    for seed in seeds:
-        match part:
-            case "exact":
-                for target, n in (("servicer", 2), ("paper", 2), ("servicer", 1), ("paper", 1)):
-                    jobs.append((f"exact {target} {n} {seed}", lambda a=(target, n, seed): exact(*a)))
-            case "errors":
-                for target in ("servicer", "paper"):
-                    jobs.append((f"errors {target} 2 {seed}", lambda a=(target, 2, seed): errors(*a)))
-            case "calibrate":
-                jobs.append((f"calibrate servicer 1 {seed}", lambda seed=seed: calibrate("servicer", seed)))
-            case "acquire":
-                jobs.append((f"acquire {seed}", lambda seed=seed: acquire(seed)))
-            case _:
-                for which in ("one_blind", "both_blind", "sun", "wrong_poses"):
-                    jobs.append((f"faults {which} {seed}", lambda a=(which, seed): fault(*a)))
-    return jobs
+TARGETS = ("servicer", "paper")
+PARTS: dict[str, tuple[int, int, dict[str, Callable[[int], Row]]]] = {
+    "exact": (20, 2, {f"{t} {n}": partial(exact, t, n) for n in (2, 1) for t in TARGETS}),
+    "errors": (20, 2, {f"{t} 2": partial(errors, t, 2) for t in TARGETS}),
+    "calibrate": (20, 2, {"servicer 1": partial(calibrate, "servicer")}),
+    "acquire": (200, 8, {"": acquire}),
+    "faults": (1, 1, {w: partial(fault, w) for w in ("one_blind", "both_blind", "sun", "wrong_poses")}),
+}
+"""Number of seeds, number with ``--quick``, and the kinds of flight of each part."""
+LOWEST_IS_WORST = ("inside_3_sigma", "detected", "found", "good", "named")
 
 
-def _figures(part: str, rows: dict[str, Row]) -> dict[str, float]:
-    """Return the figures of a part: for each kind of flight, mean and worst of all seeds."""
-    out: dict[str, float] = {}
-    kinds = sorted({name.rsplit(" ", 1)[0] for name in rows if name.startswith(part)})
-    for kind in kinds:
-        each = [row for name, row in rows.items() if name.rsplit(" ", 1)[0] == kind]
-        label = kind.replace(" ", "_")
-        out[f"{label}_flights"] = len(each)
-        for key, value in each[0].items():
-            if isinstance(value, int | float):
-                values = np.array([float(row[key]) for row in each])
-                out[f"{label}_{key}_mean"] = float(values.mean())
-                worst = (
-                    values.min()
-                    if key in ("inside_3_sigma", "seen", "found", "good", "named")
-                    else values.max()
+def fly_part(part: str, seeds: range, results: Path | None) -> Figures:
+    """Fly each kind of a part with each seed; return mean and worst of each figure over the seeds."""
+    known = {row.pop("flight"): row for row in read_lines(results)}
+    out: Figures = {}
+    for kind, flight in PARTS[part][2].items():
+        label = f"{part} {kind}".strip()
+        rows: list[Row] = []
+        for seed in seeds:
+            name = f"{label} {seed}"
+            if name not in known:
+                known[name] = flight(seed)
+                append_line(results, {"flight": name} | known[name])
+                shown = {k: round(v, 6) for k, v in known[name].items() if isinstance(v, float)}
+                print(f"  {name} {shown}", flush=True)
+            rows.append(known[name])
+        key = label.replace(" ", "_")
+        out[f"{key}_flights"] = len(rows)
+        for figure, first in rows[0].items():
+            if isinstance(first, int | float):
+                values = [float(row[figure]) for row in rows]
+                worst = min if figure in LOWEST_IS_WORST else max
+                out[f"{key}_{figure}_mean"], out[f"{key}_{figure}_worst"] = (
+                    float(np.mean(values)),
+                    worst(values),
                 )
-                out[f"{label}_{key}_worst"] = float(worst)
     return out
 
 
 def main() -> None:
-    parser = options_of(__doc__)
-    parser.add_argument("part", choices=("exact", "errors", "calibrate", "acquire", "faults"))
+    parser = make_parser(__doc__, PARTS)
     parser.add_argument(
-        "--flights", type=Path, default=None, help="append flights; flights in it are not repeated"
+        "--results", type=Path, metavar="FILE", help="append flights; flights in it are not repeated"
     )
-    parser.add_argument("--seeds", type=int, default=None, help="number of seeds")
+    parser.add_argument("--seeds", type=int, help="number of seeds")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     options = parser.parse_args()
     cv2.setNumThreads(1)
-    most, few = {"acquire": (200, 8), "faults": (1, 1)}.get(options.part, (20, 2))
-    seeds = options.seeds or (few if options.quick else most)
-    rows: dict[str, Row] = {}
-    flights: Path | None = options.flights
-    if flights is not None and flights.exists():
-        for line in flights.read_text(encoding="utf-8").splitlines():
-            row = json.loads(line)
-            rows[row.pop("flight")] = row
-    wanted = _jobs(options.part, range(options.first, options.first + seeds))
-    for name, job in wanted:
-        if name in rows:
-            continue
-        begin = time.monotonic()
-        rows[name] = job()
-        shown = {k: round(v, 6) for k, v in rows[name].items() if isinstance(v, float)}
-        print(f"{name}  ({time.monotonic() - begin:.0f} s wall) {shown}", flush=True)
-        if flights is not None:
-            with flights.open("a", encoding="utf-8") as file:
-                file.write(json.dumps({"flight": name} | rows[name]) + "\n")
-    result = _figures(options.part, {name: rows[name] for name, _ in wanted})
-    print_figures(result)
-    write_json(options.json, result)
+
+    def run(part: str) -> Figures:
+        number, quick, _ = PARTS[part]
+        seeds = options.seeds or (quick if options.quick else number)
+        return fly_part(part, range(options.first, options.first + seeds), options.results)
+
+    run_parts(options, {part: partial(run, part) for part in PARTS})
 
 
 if __name__ == "__main__":

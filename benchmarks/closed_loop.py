@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Controller performance in closed loop: ``python benchmarks/missions.py [--part NAME ...] [--quick] [--json FILE]``.
+"""Controller performance in closed loop: ``python benchmarks/closed_loop.py [--only PART ...] [--quick] [--json FILE]``.
 
-Whole missions in one process (``chaserdock.evaluation.in_process``). Parts:
+Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
 
 - ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360 (``--full-images``: the
   scenario's own, with four times as many pixels), every fourth exactly symmetric;
@@ -18,14 +18,12 @@ Distances are true, between centres, at every tick.
 from __future__ import annotations
 
 import math
-import sys
-import time
 from collections.abc import Callable, Iterable
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import Scenario
-from results import options_of, print_figures, write_json
+from common import Figures, make_parser, run_parts
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
 from chaserdock.evaluation.perception import Perception, RenderedImages, measurement_model
@@ -48,10 +46,9 @@ def variations(
     seeds: Iterable[int],
     scenario_of: Callable[[int], Scenario],
     perception_of: Callable[[Scenario], Perception],
-) -> dict[str, float]:
+) -> Figures:
     """Fly every seed, and return the worst of each figure."""
     outcomes = []
-    print(name)
     for seed in seeds:
         scenario = scenario_of(seed)
         outcomes.append(fly_transfer(seed, scenario, perception_of(scenario)))
@@ -64,11 +61,11 @@ def variations(
     key = name.replace("-", "_")
     return {
         f"{key}_flights": len(outcomes),
-        f"{key}_kept_their_distances": sum(safe),
+        f"{key}_distances_kept": sum(safe),
         f"{key}_reached": sum(not math.isnan(o.reached_s) for o in outcomes),
-        f"{key}_least_distance_to_target_m": min(o.to_target_m for o in outcomes),
-        f"{key}_least_distance_between_chasers_m": min(o.between_m for o in outcomes),
-        f"{key}_longest_time_to_goal_s": max(
+        f"{key}_min_distance_target_m": min(o.to_target_m for o in outcomes),
+        f"{key}_min_distance_chasers_m": min(o.between_m for o in outcomes),
+        f"{key}_max_time_to_goal_s": max(
             math.inf if math.isnan(o.reached_s) else o.reached_s for o in outcomes
         ),
         f"{key}_failed_solves": sum(o.failed for o in outcomes),
@@ -77,21 +74,19 @@ def variations(
 
 
 def steady(flight: FlightRecord) -> tuple[float, float]:
-    """Return the worst chaser's steady RMS errors: position (m), orientation (degrees)."""
+    """Return the worst chaser's steady RMS errors: position (m), orientation (rad)."""
     each = [flight.rms(STEADY_FROM_S, i) for i in range(flight.states.shape[1])]
-    return max(p for p, _ in each), math.degrees(max(a for _, a in each))
+    return max(p for p, _ in each), max(a for _, a in each)
 
 
-def add_errors(out: dict[str, float], name: str, errors: tuple[float, float]) -> None:
-    """Print and store the steady errors of a flight."""
-    out[f"{name}_position_rms_m"], out[f"{name}_orientation_rms_deg"] = errors
-    print(f"  {name:45} {errors[0] * 1e3:9.4f} mm  {errors[1]:8.5f} deg", flush=True)
+def add_errors(out: Figures, name: str, errors: tuple[float, float]) -> None:
+    """Store the steady errors of a flight."""
+    out[f"{name}_position_rms_m"], out[f"{name}_orientation_rms_rad"] = errors
 
 
-def tracking(duration_s: float) -> dict[str, float]:
-    """Steady errors at the paper's tumble with perfect knowledge, from 0.85 m behind the reference."""
-    out: dict[str, float] = {}
-    print(f"tracking, perfect knowledge, RMS from {STEADY_FROM_S:g} s on")
+def tracking(duration_s: float) -> Figures:
+    """Steady errors at the paper's tumble with perfect knowledge, starting 0.85 m behind the reference."""
+    out: Figures = {}
     for name, overrides, gain in (
         ("feed_forward", (), 1.0),
         ("u_ref_0", ("controller.feed_forward=false",), 1.0),
@@ -103,10 +98,9 @@ def tracking(duration_s: float) -> dict[str, float]:
     return out
 
 
-def tracking_with_images(duration_s: float) -> dict[str, float]:
+def tracking_with_images(duration_s: float) -> Figures:
     """Steady errors at the paper's tumble with images; the worst chaser of each flight."""
-    out: dict[str, float] = {}
-    print(f"tracking with images, worst chaser's RMS from {STEADY_FROM_S:g} s on")
+    out: Figures = {}
     length = f"duration_s={duration_s}"
     servicer = load_shipped("single", "target.model='servicer'", length)
     for name, scenario, gain in (
@@ -120,17 +114,15 @@ def tracking_with_images(duration_s: float) -> dict[str, float]:
 
 
 def nearest_m(flight: FlightRecord) -> float:
-    """Return chaser 0's least distance to the target."""
+    """Return chaser 0's minimum distance to the target."""
     relative: Array = flight.states[:, 0, :3] - flight.target_states[:, :3]
     return float(np.linalg.norm(relative, axis=1).min())
 
 
-def table(duration_s: float, quick: bool) -> dict[str, float]:
+def table(duration_s: float, quick: bool) -> Figures:
     """Fly every row of the paper's table, from every start and in both columns of ``chaserdock reproduce``."""
     failed = rows = 0
-    print(
-        "the paper's table, perfect knowledge: position MSE, orientation MSE, failed solves, least distance"
-    )
+    print("  position MSE, orientation MSE, failed solves, minimum distance to the target")
     for start, rotated in STARTS.items():
         for column, settings in COLUMNS.items():
             if quick and (start, column) != ("receding", "paper"):
@@ -156,8 +148,7 @@ PARTS = ("avoidance", "swap", "swap-images", "tracking", "tracking-images", "tab
 
 
 def main() -> None:
-    parser = options_of(__doc__)
-    parser.add_argument("--part", action="append", choices=PARTS, help="repeatable; default: all")
+    parser = make_parser(__doc__, PARTS)
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--flights", type=int, default=20, help="number of seeds")
     parser.add_argument("--images", type=int, default=2, help="number of seeds of swap with images")
@@ -165,7 +156,7 @@ def main() -> None:
     options = parser.parse_args()
     flights, duration_s = (2, 60.0) if options.quick else (options.flights, 120.0)
     seeds = range(options.first, options.first + flights)
-    run: dict[str, Callable[[], dict[str, float]]] = {
+    parts = {
         "avoidance": lambda: variations(
             "avoidance", seeds, lambda seed: avoidance(seed, options.full_images), RenderedImages
         ),
@@ -175,13 +166,7 @@ def main() -> None:
         "tracking-images": lambda: tracking_with_images(min(duration_s, 80.0)),
         "table": lambda: table(duration_s, options.quick),
     }
-    result: dict[str, float] = {}
-    begin_s = time.perf_counter()
-    for part in options.part or PARTS:
-        result |= run[part]()
-    print_figures(result)
-    print(f"{time.perf_counter() - begin_s:.0f} s", file=sys.stderr)
-    write_json(options.json, result)
+    run_parts(options, parts)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The images of docs/cameras.md: ``python benchmarks/images.py [FOLDER]`` (docs/images by default).
+"""Renders the images of docs/cameras.md: ``python docs/make_camera_images.py [FOLDER]`` (default: docs/images).
 
-One image for each effect and target: what chaser 0 of ``harsh-light`` sees at its start, with one thing changed.
+One image for each effect and target: the view of chaser 0 of ``harsh-light`` at its start, with one setting changed.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from chaserdock_world.physics.simulation import TARGET, BodyState, prescribed_st
 from chaserdock_world.rendering.cameras import Cameras
 
 ROOT = Path(__file__).resolve().parents[1]
-PLAIN = (
+WITHOUT_EFFECTS = (
     "camera.effects.gain=1.0",
     "camera.effects.point_spread_px=0.0",
     "camera.effects.read_noise=0.0",
@@ -58,11 +58,11 @@ IMAGES: dict[str, tuple[str, ...]] = {
 def main() -> None:
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
     for name, changes in IMAGES.items():
-        plain = () if name == "camera-harsh-light" else PLAIN
-        scenario = load_scenario(ROOT / "scenarios" / "harsh-light.toml", (*plain, *changes))
+        base = () if name == "camera-harsh-light" else WITHOUT_EFFECTS
+        scenario = load_scenario(ROOT / "scenarios" / "harsh-light.toml", (*base, *changes))
         cameras = Cameras(scenario)
         states = {TARGET: prescribed_state(scenario, 0.0)}
-        # Turned a little, so that three faces show; turning on, so that there is motion to blur.
+        # An attitude that shows three faces, and a rate for the motion blur.
         q = rotations.exp([0.25, 0.35, 0.45])
         states[TARGET] = BodyState(
             states[TARGET].position_m, states[TARGET].velocity_m_s, q, np.array([0.1, 0.2, 0.3])
@@ -71,8 +71,8 @@ def main() -> None:
             position, attitude = scenario.start_pose(i)
             states[f"chaser/{i}"] = BodyState(position, np.zeros(3), attitude, np.zeros(3))
         image = cameras.image(0, 0, 0, 0, states)
-        shown: Any = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
-        small = cv2.resize(shown, (640, 360), interpolation=cv2.INTER_AREA)
+        decoded: Any = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        small = cv2.resize(decoded, (640, 360), interpolation=cv2.INTER_AREA)
         path = folder / f"{name}.jpg"
         cv2.imwrite(str(path), small, [cv2.IMWRITE_JPEG_QUALITY, 80])
         print(f"{path}  {path.stat().st_size} bytes")

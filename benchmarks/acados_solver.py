@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""acados as a peer for `nmpc.py`: SQP-RTI, HPIPM and compiled code, on the problem of `nmpc/problem.py`.
+"""acados on the problem of `nmpc/problem.py`, for comparison in `nmpc.py`: SQP-RTI, HPIPM and compiled code.
 
-"coupled" is one optimal control problem of all chasers; "decoupled" one for each chaser, solved one after the other in one
+"coupled" is one optimal control problem of all chasers; "decoupled" is one for each chaser, solved in sequence in one
 thread, with the others' last plans as moving obstacles. Needs acados_template and its libraries (ACADOS_SOURCE_DIR), and
-a C compiler at run time, as acados does. Two constraints that never matter in the hard case are left out, which is to its
-advantage: the outer bound and the corridors.
+a C compiler at run time. Two constraints that are inactive in the hard case are omitted, which favours acados: the outer
+bound and the corridors.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from chaserdock_controller.nmpc.warm_start import Frame, Task, status_of
 from chaserdock_models.arrays import Array
 
 KINDS = ("coupled", "decoupled")
-# How far a first guess leaves the straight way to its right, m: in exactly head-on pairs no linearization has a way out.
+# Lateral offset of the initial guess, m: the linearization at an exactly head-on path has no descent direction sideways.
 SIDESTEP_M = 0.2
-# SQP iterations of a cold start: after a single one the first seconds are flown on a poor plan, for 4 to 9 % of cost.
+# SQP iterations of a cold start: with a single one the first seconds follow a poor plan, which costs 4 to 9 %.
 COLD_ITERATIONS = 10
 
 
 @dataclass(frozen=True)
-class Spent:
-    """What the last solve took, s: acados' own total time (wall clock), and the thread's processor time around its call."""
+class SolveTime:
+    """Times of a solve: acados' own total time (wall clock), and the processor time of the thread around the call."""
 
     wall_s: float
     cpu_s: float
@@ -44,35 +44,35 @@ def _acados() -> Any:
 
 
 def _model(name: str, own: int, others: int, params: NmpcParameters) -> tuple[Any, int]:
-    """AcadosModel of ``own`` chasers among ``others`` obstacles, and its number of distances.
+    """Return the AcadosModel of ``own`` chasers among ``others`` obstacles, and its number of distances.
 
     Parameters of a stage: target (3), keep-outs (own), distances of own pairs, obstacles (3 others), distances to them.
     """
     step = dynamics(params)
     pairs = [(i, j) for i in range(own) for j in range(i + 1, own)]
     x, u = ca.SX.sym("x", 13 * own), ca.SX.sym("u", 6 * own)
-    target, keep_out, apart = ca.SX.sym("target", 3), ca.SX.sym("d", own), ca.SX.sym("pairs", len(pairs))
+    target, keep_out, distances = ca.SX.sym("target", 3), ca.SX.sym("d", own), ca.SX.sym("pairs", len(pairs))
     obstacles, clear = ca.SX.sym("obstacles", 3, others), ca.SX.sym("clear", own * others)
     at = [x[13 * i : 13 * i + 3] for i in range(own)]
-    rooms = [ca.norm_2(p - target) - keep_out[i] for i, p in enumerate(at)]
-    rooms += [ca.norm_2(at[i] - at[j]) - apart[row] for row, (i, j) in enumerate(pairs)]
-    rooms += [
+    margins = [ca.norm_2(p - target) - keep_out[i] for i, p in enumerate(at)]
+    margins += [ca.norm_2(at[i] - at[j]) - distances[row] for row, (i, j) in enumerate(pairs)]
+    margins += [
         ca.norm_2(p - obstacles[:, j]) - clear[i * others + j]
         for i, p in enumerate(at)
         for j in range(others)
     ]
     model = _acados().AcadosModel()
     model.name, model.x, model.u = name, x, u
-    model.p = ca.vertcat(target, keep_out, apart, ca.vec(obstacles), clear)
+    model.p = ca.vertcat(target, keep_out, distances, ca.vec(obstacles), clear)
     model.disc_dyn_expr = ca.vertcat(
         *(step(x[13 * i : 13 * i + 13], u[6 * i : 6 * i + 6]) for i in range(own))
     )
-    model.con_h_expr = model.con_h_expr_e = ca.vertcat(*rooms)
-    return model, len(rooms)
+    model.con_h_expr = model.con_h_expr_e = ca.vertcat(*margins)
+    return model, len(margins)
 
 
 def _ocp(name: str, own: int, others: int, params: NmpcParameters, folder: str) -> Any:
-    """AcadosOcp of that model, its code to be written to ``folder``."""
+    """Return the AcadosOcp of that model, whose code is generated in ``folder``."""
     d, nx, nu = params.stages, 13 * own, 6 * own
     ocp = _acados().AcadosOcp()
     ocp.model, rows = _model(name, own, others, params)
@@ -107,7 +107,7 @@ def _ocp(name: str, own: int, others: int, params: NmpcParameters, folder: str) 
     options.nlp_solver_type, options.integrator_type = "SQP_RTI", "DISCRETE"
     options.hessian_approx, options.qp_solver = "GAUSS_NEWTON", "PARTIAL_CONDENSING_HPIPM"
     options.qp_tol, options.qp_solver_iter_max = 1e-6, 100
-    # The fastest of what was tried: BALANCE takes 1.3 to 1.7 times as long; condensing pays for small stages only.
+    # The fastest of the options tried: BALANCE takes 1.3 to 1.7 times as long; condensing helps small stages only.
     options.hpipm_mode = "SPEED"
     options.qp_solver_cond_N = d if own > 1 else max(1, d // 5)
     ocp.code_gen_options.ext_fun_compile_flags = "-O3 -march=native"
@@ -117,17 +117,18 @@ def _ocp(name: str, own: int, others: int, params: NmpcParameters, folder: str) 
 
 
 def _orientation_map(q_ref: Array) -> Array:
-    """M (3, 4) with M q = vec(q (x) q_ref*)."""
+    """Return M (3, 4) with M q = vec(q (x) q_ref*)."""
     q = ca.SX.sym("q", 4)
     w, v = q_ref[0], q_ref[1:]
     return np.array(ca.evalf(ca.jacobian(multiply(q, ca.vertcat(w, *(-v)))[1:4], q)))
 
 
-class AcadosPeer:
-    """acados, ``kind`` "coupled" or "decoupled", for exactly ``n`` chasers; offers what `NmpcSolver` does.
+class AcadosSolver:
+    """acados with the interface of `NmpcSolver`, ``kind`` "coupled" or "decoupled", for exactly ``n`` chasers.
 
-    ``spent`` is what the last solve took inside acados, without the Python that hands the problem over; of a cold start,
-    its last SQP iteration. Code is generated and compiled at construction. Raises ValueError for another kind, or a falloff.
+    ``solve_time`` is the time of the last solve inside acados, without the transfer of the problem by Python; of a cold
+    start, that of its last SQP iteration. Code is generated and compiled at construction. Raise ValueError for another kind
+    or a falloff.
     """
 
     def __init__(self, kind: str, params: NmpcParameters, n: int) -> None:
@@ -135,7 +136,7 @@ class AcadosPeer:
             raise ValueError(f"kind must be one of {', '.join(KINDS)}, not {kind!r}")
         if params.falloff:
             raise ValueError("acados is set up for weights that do not fall off")
-        self._frame, self.spent = Frame(params, n), Spent(0.0, 0.0)
+        self._frame, self.solve_time = Frame(params, n), SolveTime(0.0, 0.0)
         self._groups = [list(range(n))] if kind == "coupled" else [[i] for i in range(n)]
         self._q_refs: list[Array] = [np.zeros(0)] * len(self._groups)
         own = len(self._groups[0])
@@ -150,13 +151,13 @@ class AcadosPeer:
                 )
 
     def reset(self) -> None:
-        """Forgets every warm start."""
+        """Discard all warm starts."""
         self._frame.plans = {}
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """One tick; arguments, answer and errors as `RtiSolver.solve`, and ValueError for corridors or other than n chasers.
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`; ValueError for corridors or another number of chasers.
 
-        ``iterations`` counts HPIPM's. The states are the answer's inputs rolled through the model.
+        ``iterations`` are those of HPIPM. The states are the rollout of the inputs through the model.
         """
         frame = self._frame
         cold = not frame.plans
@@ -166,34 +167,34 @@ class AcadosPeer:
         guess = frame.rolled(task, task.start)
         if cold:
             guess[:, :, :3] += sidestep(task)
-        u, words = task.start.copy(), [""] * len(task.start)
+        u, statuses = task.start.copy(), [""] * len(task.start)
         wall_s, cpu_s, iterations = 0.0, 0.0, np.zeros(len(u), dtype=np.int64)
         for row, (group, solver) in enumerate(zip(self._groups, self._solvers, strict=True)):
-            self._hand_over(row, task, guess)
+            self._set_problem(row, task, guess)
             for _ in range(COLD_ITERATIONS - 1 if cold else 0):
                 solver.solve()
-            begun = time.thread_time()
+            begin_s = time.thread_time()
             status = solver.solve()
-            cpu_s += time.thread_time() - begun
+            cpu_s += time.thread_time() - begin_s
             wall_s += float(solver.get_stats("time_tot"))
-            answer = np.array([solver.get(k, "u") for k in range(frame.params.stages)])
-            usable = status == 0 and bool(np.isfinite(answer).all())
+            inputs = np.array([solver.get(k, "u") for k in range(frame.params.stages)])
+            usable = status == 0 and bool(np.isfinite(inputs).all())
             late = bool(np.any(solver.get_stats("qp_stat")))
             if usable:
                 limits = task.problem.input_max[group, None, :]
-                u[group] = np.clip(answer.reshape(-1, len(group), 6).swapaxes(0, 1), -limits, limits)
+                u[group] = np.clip(inputs.reshape(-1, len(group), 6).swapaxes(0, 1), -limits, limits)
             for i in group:
-                words[i], iterations[i] = status_of(usable, late), int(np.sum(solver.get_stats("qp_iter")))
-        self.spent = Spent(wall_s, cpu_s)
-        return frame.finish(task, u, words, iterations)
+                statuses[i], iterations[i] = status_of(usable, late), int(np.sum(solver.get_stats("qp_iter")))
+        self.solve_time = SolveTime(wall_s, cpu_s)
+        return frame.finish(task, u, statuses, iterations)
 
-    def _hand_over(self, row: int, task: Task, guess: Array) -> None:
-        """Group ``row``'s solver is given the tick's problem, and ``guess`` (N, D+1, 13) to start from."""
+    def _set_problem(self, row: int, task: Task, guess: Array) -> None:
+        """Pass the tick's problem and the initial guess (N, D+1, 13) to the solver of group ``row``."""
         solver, group, params = self._solvers[row], self._groups[row], self._frame.params
         p, d, own = task.problem, params.stages, len(group)
         others = [i for i in range(len(p.states)) if i not in group]
         q_refs = p.references[group, :, 3:]
-        if not np.array_equal(self._q_refs[row], q_refs):  # acados factorizes its cost anew
+        if not np.array_equal(self._q_refs[row], q_refs):  # setting it makes acados factorize the cost again
             self._q_refs[row] = q_refs.copy()
             for k in range(d + 1):
                 vx = np.zeros((12 * own if k < d else 6 * own, 13 * own))
@@ -203,7 +204,7 @@ class AcadosPeer:
                     vx[at : at + 3, 13 * i + 6 : 13 * i + 10] = _orientation_map(q_refs[i, k])
                 solver.cost_set(k, "Vx", vx, api="new")
         away_m = np.linalg.norm(p.states[group, :3] - p.references[group, -1, :3], axis=-1)
-        price = slack_l1_weight(params, away_m.max(keepdims=True))
+        slack_weight = slack_l1_weight(params, away_m.max(keepdims=True))
         between = task.between[np.ix_(group, group)][np.triu_indices(own, 1)]
         clear = task.between[np.ix_(group, others)].ravel()
         limits = p.input_max[group].ravel()
@@ -217,7 +218,7 @@ class AcadosPeer:
             solver.set(k, "p", np.concatenate(values))
             solver.set(k, "x", guess[group, k].ravel())
             if k > 0:
-                solver.cost_set(k, "zl", np.full(own + len(between) + len(clear), float(price[0])))
+                solver.cost_set(k, "zl", np.full(own + len(between) + len(clear), float(slack_weight[0])))
             if k < d:
                 y.append(p.u_ref[group, k].ravel())
                 solver.set(k, "u", task.start[group, k].ravel())
@@ -227,12 +228,12 @@ class AcadosPeer:
 
 
 def sidestep(task: Task) -> Array:
-    """What a first guess at rest is moved by (N, D+1, 3), m: straight to the reference, bent to the right of its way."""
+    """Return the offsets (N, D+1, 3), m, of an initial guess at rest: a path to the reference, bent to its right."""
     p = task.problem
-    way = p.references[:, -1, :3] - p.states[:, :3]
-    right = np.cross(way, [0.0, 0.0, 1.0])
+    path = p.references[:, -1, :3] - p.states[:, :3]
+    right = np.cross(path, [0.0, 0.0, 1.0])
     right /= np.maximum(np.linalg.norm(right, axis=-1, keepdims=True), 1e-9)
     along = np.linspace(0.0, 1.0, p.references.shape[1])[None, :, None]
-    return along * way[:, None] + SIDESTEP_M * np.sin(np.pi * along) * right[:, None] * (
-        np.linalg.norm(way, axis=-1)[:, None, None] > SIDESTEP_M
+    return along * path[:, None] + SIDESTEP_M * np.sin(np.pi * along) * right[:, None] * (
+        np.linalg.norm(path, axis=-1)[:, None, None] > SIDESTEP_M
     )

@@ -17,7 +17,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_agents.chaser.perception import Method, Perception, Sighting
+from chaserdock_agents.chaser.perception import Method, Perception, PerceptionResult
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
@@ -110,7 +110,7 @@ class Views:
             yield self.view(position, q, sun)
 
 
-def errors_of(sighting: Sighting, view: View) -> tuple[float, float]:
+def errors_of(sighting: PerceptionResult, view: View) -> tuple[float, float]:
     """Return the errors (m, rad) of the solution with the smaller angle error."""
     errors = [
         (
@@ -129,7 +129,7 @@ class Results:
         self.errors: list[tuple[float, float]] = []
         self.not_detected = self.ambiguous = self.no_complete_marker = 0
 
-    def add(self, sighting: Sighting, view: View) -> None:
+    def add(self, sighting: PerceptionResult, view: View) -> None:
         if not sighting.solutions:
             self.not_detected += 1
             self.no_complete_marker += view.complete_markers == 0

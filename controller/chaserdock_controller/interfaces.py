@@ -9,10 +9,12 @@ from typing import Literal, NamedTuple
 
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import (
+    CameraCalibration,
     CommandReply,
     DockingStatus,
     Event,
     Latch,
+    Level,
     Odometry,
     OperatorCommand,
     Plan,
@@ -23,7 +25,6 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
     WrenchCommand,
 )
-from chaserdock_protocol.messages.fields import CameraCalibration, Level
 
 from .estimation.target_body import TargetBody
 from .estimation.types import TargetState

@@ -3,7 +3,7 @@
 
 import cv2
 import numpy as np
-from chaserdock_agents.chaser.perception import PoseSolution, Sighting
+from chaserdock_agents.chaser.perception import PerceptionResult, TargetPose
 from chaserdock_models import rotations
 
 
@@ -24,12 +24,12 @@ class OwnPerception:
             if int(i) in self.markers
         ]
         if not found:
-            return Sighting((), np.zeros(0, dtype=int), np.zeros((0, 4, 2)), ())
+            return PerceptionResult((), np.zeros(0, dtype=int), np.zeros((0, 4, 2)), ())
         px = np.array([c for _, c in found], dtype=float)
         points = np.concatenate([self.markers[i] for i, _ in found])
         ideal = self.camera.undistort(px).reshape(-1, 2)
         _, turn, position = cv2.solvePnP(points, ideal, self.camera.matrix(), None, flags=cv2.SOLVEPNP_SQPNP)
         q, z = rotations.exp(turn[:, 0]), float(position[2, 0])
         sigma = np.array([0.001, 0.001, 0.004, 0.02, 0.02, 0.02]) * z  # metres and radians at z metres
-        pose = PoseSolution(position[:, 0], q, np.diag(sigma**2), 0.5)
-        return Sighting((pose,), np.array([i for i, _ in found]), px, ())
+        pose = TargetPose(position[:, 0], q, np.diag(sigma**2), 0.5)
+        return PerceptionResult((pose,), np.array([i for i, _ in found]), px, ())

@@ -10,7 +10,7 @@ import msgspec
 import pytest
 from chaserdock_protocol import codec
 from chaserdock_protocol import messages as m
-from chaserdock_protocol.messages.fields import MAX_COUNT
+from chaserdock_protocol.messages import MAX_COUNT
 from fuzzing import boundaries, fuzz_logs, fuzz_messages, fuzz_scenarios, garbage_in, mutate
 from message_samples import BY_TYPE
 

@@ -7,7 +7,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages.fields import CameraCalibration
+from chaserdock_protocol.messages import CameraCalibration
 from chaserdock_protocol.scenario import Scenario
 
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency

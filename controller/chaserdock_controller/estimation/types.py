@@ -9,7 +9,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from chaserdock_models.arrays import Array, Matrix3
-from chaserdock_protocol.messages.fields import Level
+from chaserdock_protocol.messages import Level
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import view_of
 from chaserdock_models.rigid_body import BodyState
-from chaserdock_protocol.messages import CommandReply, Odometry
-from chaserdock_protocol.messages.fields import CameraCalibration
+from chaserdock_protocol.messages import CameraCalibration, CommandReply, Odometry
 from chaserdock_protocol.scenario import Scenario
 
 from chaserdock_controller.estimation.composite_body import pose_in_target

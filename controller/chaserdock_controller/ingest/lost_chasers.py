@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from chaserdock_protocol.messages import Odometry
-from chaserdock_protocol.messages.fields import Level
+from chaserdock_protocol.messages import Level, Odometry
 
 ABSENT_S = 0.3
 """A chaser without odometry for this long is lost."""

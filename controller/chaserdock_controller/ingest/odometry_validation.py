@@ -16,8 +16,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.extrapolation import extrapolate
-from chaserdock_protocol.messages import Odometry
-from chaserdock_protocol.messages.fields import Level
+from chaserdock_protocol.messages import Level, Odometry
 from chaserdock_protocol.scenario import Scenario
 
 PLAUSIBLE_M = 0.02

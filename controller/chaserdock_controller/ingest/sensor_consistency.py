@@ -7,7 +7,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from chaserdock_protocol.messages.fields import Level
+from chaserdock_protocol.messages import Level
 
 DISAGREES_S = 0.6
 """A chaser whose sightings were all rejected for this long is inconsistent."""

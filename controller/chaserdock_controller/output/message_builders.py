@@ -6,6 +6,7 @@ from __future__ import annotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     Event,
+    Level,
     Plan,
     Reference,
     SolverStatus,
@@ -13,7 +14,6 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.messages.fields import Level
 
 from chaserdock_controller.interfaces import Directive, Observation, PlanResult, TargetEstimation
 from chaserdock_controller.nmpc.types import NmpcPlan

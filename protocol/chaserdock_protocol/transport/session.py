@@ -17,8 +17,7 @@ from collections.abc import Callable
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import Farewell, Health, JoinReply, JoinRequest, Presence
-from chaserdock_protocol.messages.fields import MAX_COUNT
+from chaserdock_protocol.messages import MAX_COUNT, Farewell, Health, JoinReply, JoinRequest, Presence
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.topics import Role
 

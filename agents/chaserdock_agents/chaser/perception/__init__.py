@@ -10,7 +10,7 @@ from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import PERCEPTIONS, Scenario
 from numpy.typing import ArrayLike, NDArray
 
-from .pipeline import Method, Perception, PoseSolution, Sighting
+from .pipeline import Method, Perception, PerceptionResult, TargetPose
 
 
 class PerceptionMethod(Protocol):
@@ -18,7 +18,7 @@ class PerceptionMethod(Protocol):
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
-    ) -> Sighting: ...
+    ) -> PerceptionResult: ...
 
 
 def make_perception(scenario: Scenario) -> PerceptionMethod:
@@ -32,4 +32,4 @@ def make_perception(scenario: Scenario) -> PerceptionMethod:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 
 
-__all__ = ["Method", "Perception", "PerceptionMethod", "PoseSolution", "Sighting", "make_perception"]
+__all__ = ["Method", "Perception", "PerceptionMethod", "PerceptionResult", "TargetPose", "make_perception"]

@@ -34,7 +34,7 @@ def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dicti
     )
 
 
-def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple[pnp.PoseSolution, ...]:
+def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple[pnp.TargetPose, ...]:
     """Solve EPnP with all corners (n, 4, 2), ideal pixels, of markers with corners at ``points_trf_m`` (n, 4, 3).
 
     Returns one pose, or none if it is not finite or behind the camera; its covariance is first-order, from its residuals.
@@ -56,4 +56,4 @@ def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple
     if result is None:
         return ()
     rms = pnp.reprojection_rms_px(camera, points, pixels, position, rotation)
-    return (pnp.PoseSolution(position, rotations.from_matrix(rotation), result[0], rms),)
+    return (pnp.TargetPose(position, rotations.from_matrix(rotation), result[0], rms),)

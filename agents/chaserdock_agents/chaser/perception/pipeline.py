@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from . import baseline as paper
 from . import corners, detect, pnp
-from .pnp import PoseSolution
+from .pnp import TargetPose
 
 _ENOUGH = 6
 """Number of markers beyond which further ones hardly improve the pose."""
@@ -23,7 +23,7 @@ Method = Literal["default", "paper"]
 
 
 @dataclass(frozen=True)
-class Sighting:
+class PerceptionResult:
     """Result for one image.
 
     ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous. ``marker_ids`` (n,)
@@ -31,7 +31,7 @@ class Sighting:
     on this target, duplicate, inconsistent with the others, or with an unusable side.
     """
 
-    solutions: tuple[PoseSolution, ...]
+    solutions: tuple[TargetPose, ...]
     marker_ids: NDArray[np.int64]
     corners_px: Array
     rejected_ids: tuple[int, ...]
@@ -58,7 +58,7 @@ class Perception:
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
-    ) -> Sighting:
+    ) -> PerceptionResult:
         """Estimate the target's pose in a grey image (h, w), uint8.
 
         ``predicted``: position in IRF (3,), metres, and rotation TRF to IRF (4,), if known; it selects the region that is
@@ -88,7 +88,7 @@ class Perception:
 
     def _estimate_in(
         self, image: NDArray[np.uint8], region: detect.Region | None, thorough: bool = False
-    ) -> Sighting:
+    ) -> PerceptionResult:
         found = detect.detect(image, self._dictionary, region, thorough, self._enough)
         rows = np.array([self._rows.get(i, -1) for i in found.ids.tolist()], dtype=np.intp)
         known = rows >= 0
@@ -108,7 +108,7 @@ class Perception:
         solutions, used = pnp.solve(self.camera, self._table, rows, px, sigma)
         return self._sighting(found.ids, solutions, self._table.ids[rows[used]], px[used])
 
-    def _estimate_paper(self, image: NDArray[np.uint8]) -> Sighting:
+    def _estimate_paper(self, image: NDArray[np.uint8]) -> PerceptionResult:
         found = paper.detect(image, self.camera, self._dictionary)
         ids, counts = np.unique(found.ids, return_counts=True)
         once = set(ids[counts == 1].tolist()) & self._rows.keys()
@@ -123,11 +123,11 @@ class Perception:
     def _sighting(
         self,
         found_ids: NDArray[np.int64],
-        solutions: tuple[PoseSolution, ...],
+        solutions: tuple[TargetPose, ...],
         ids: NDArray[np.int64],
         ideal_px: Array,
-    ) -> Sighting:
+    ) -> PerceptionResult:
         rejected = found_ids.tolist()
         for i in ids.tolist():
             rejected.remove(i)
-        return Sighting(solutions, ids, self.camera.distort(ideal_px), tuple(sorted(rejected)))
+        return PerceptionResult(solutions, ids, self.camera.distort(ideal_px), tuple(sorted(rejected)))

@@ -22,7 +22,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
-from .refine import Pose, refine, residual_of, rotation_matrix
+from .refine import CameraPose, refine, residual_of, rotation_matrix
 from .views import count_visible_markers, marker_errors, squared_errors
 
 Indices = NDArray[np.intp]
@@ -48,7 +48,7 @@ _FRAME_MARGIN_PX = 8.0
 
 
 @dataclass(frozen=True)
-class PoseSolution:
+class TargetPose:
     """Pose of the target in the camera.
 
     ``position_irf_m`` (3,); ``q_irf_trf_wxyz`` (4,) rotates TRF -> IRF; ``covariance`` (6, 6): position in
@@ -119,7 +119,7 @@ class _DetectedMarkers:
         return np.repeat(1.0 / self.sigma, 8)
 
     @cached_property
-    def plane_poses(self) -> list[Pose]:
+    def plane_poses(self) -> list[CameraPose]:
         """Cached `_plane_poses`: for a single marker both its candidates and its two poses."""
         return _plane_poses(self)
 
@@ -133,7 +133,7 @@ class _DetectedMarkers:
 
 def solve(
     camera: Camera, table: MarkerTable, which: Indices, corners_ideal_px: Array, relative_sigma: Array
-) -> tuple[tuple[PoseSolution, ...], Indices]:
+) -> tuple[tuple[TargetPose, ...], Indices]:
     """Return the poses, best first, that explain the detected markers, and the indices of the detections used.
 
     ``which`` (n,): row of ``table`` of each detection, a row may occur more than once; ``corners_ideal_px``
@@ -142,7 +142,7 @@ def solve(
     that its pose would show, or if two equally large groups of detections contradict each other. Two poses if the markers
     are coplanar and their tilt is ambiguous.
     """
-    nothing: tuple[tuple[PoseSolution, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
+    nothing: tuple[tuple[TargetPose, ...], Indices] = ((), np.zeros(0, dtype=np.intp))
     if not len(which):
         return nothing
     seen = _DetectedMarkers(
@@ -187,13 +187,13 @@ def pose_covariance(
     floor_px: float,
     sigma: Array,
 ) -> tuple[Array, float] | None:
-    """Return the covariance (6, 6), as in `PoseSolution`, and the weighted sum of squared residuals of a pose.
+    """Return the covariance (6, 6), as in `TargetPose`, and the weighted sum of squared residuals of a pose.
 
     The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma`` (n,). It is
     s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``. None if the pose is not
     observable or has points behind the camera.
     """
-    pose = Pose(position, rotation)
+    pose = CameraPose(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
     if found is None:
         return None
@@ -220,14 +220,14 @@ def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
     """Return the root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
-    squares = squared_errors(camera, points_trf_m, pixels, Pose(position, rotation))
+    squares = squared_errors(camera, points_trf_m, pixels, CameraPose(position, rotation))
     return math.sqrt(float(squares.sum()) / len(squares))
 
 
-def _consensus(seen: _DetectedMarkers) -> tuple[Pose, list[int]] | None:
+def _consensus(seen: _DetectedMarkers) -> tuple[CameraPose, list[int]] | None:
     """Return the refined pose with the most inliers, and their indices in ``seen``, ascending."""
     which: list[int] = seen.which.tolist()
-    best: tuple[tuple[int, float], Pose, list[float]] | None = None
+    best: tuple[tuple[int, float], CameraPose, list[float]] | None = None
     for candidate in _candidates(seen):
         candidate_error = _marker_errors(seen, candidate)
         # Distinct ids: of two detections of one id at most one is right.
@@ -262,7 +262,7 @@ def _consensus(seen: _DetectedMarkers) -> tuple[Pose, list[int]] | None:
     return pose, used
 
 
-def _candidates(seen: _DetectedMarkers) -> Iterator[Pose]:
+def _candidates(seen: _DetectedMarkers) -> Iterator[CameraPose]:
     """Yield coarse poses, the most likely first."""
     if len(seen.which) == 1:
         yield from seen.plane_poses
@@ -275,18 +275,18 @@ def _candidates(seen: _DetectedMarkers) -> Iterator[Pose]:
     except cv2.error:  # degenerate corners
         rvecs, tvecs = (), ()
     for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
-        yield Pose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
+        yield CameraPose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
     size = np.abs(seen.pixels[:, (1, 2, 3, 0)] - seen.pixels).sum(axis=-1).min(axis=-1)
     for i in np.argsort(-size, kind="stable")[:_CANDIDATE_MARKERS].tolist():
         yield from seen.part([i]).plane_poses
 
 
-def _refined(seen: _DetectedMarkers, pose: Pose) -> Pose | None:
+def _refined(seen: _DetectedMarkers, pose: CameraPose) -> CameraPose | None:
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     return refine(seen.camera.matrix(), points, pixels, seen.weight, pose)
 
 
-def _plane_poses(seen: _DetectedMarkers) -> list[Pose]:
+def _plane_poses(seen: _DetectedMarkers) -> list[CameraPose]:
     """Return both IPPE poses from points in the plane of the first marker, or SQPnP's pose where IPPE fails."""
     to_trf, origin = seen.table.rotations[seen.which[0]], seen.table.origins[seen.which[0]]
     flat = (seen.points.reshape(-1, 3) - origin) @ to_trf
@@ -304,7 +304,7 @@ def _plane_poses(seen: _DetectedMarkers) -> list[Pose]:
         rotation = rotation_matrix(rvec) @ to_trf.T
         position = np.asarray(tvec, dtype=float).ravel() - rotation @ origin
         if _all_finite(rotation) and _all_finite(position):
-            poses.append(Pose(position, rotation))
+            poses.append(CameraPose(position, rotation))
     return poses
 
 
@@ -312,7 +312,7 @@ def _all_finite(values: Array) -> bool:
     return all(map(math.isfinite, values.ravel().tolist()))
 
 
-def _other_than(pose: Pose, candidates: list[Pose]) -> list[Pose]:
+def _other_than(pose: CameraPose, candidates: list[CameraPose]) -> list[CameraPose]:
     """Return ``candidates`` without the one that converges to the refined ``pose``, if of two one is several times nearer."""
     if len(candidates) != 2:
         return candidates
@@ -328,11 +328,11 @@ def _angle(a: Array, b: Array) -> float:
     return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
 
 
-def _solutions(seen: _DetectedMarkers, poses: list[Pose], floor_px: float) -> list[PoseSolution]:
+def _solutions(seen: _DetectedMarkers, poses: list[CameraPose], floor_px: float) -> list[TargetPose]:
     """Return refined, distinct poses, best first; later ones are about as likely as the first."""
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
-    found: list[tuple[float, PoseSolution]] = []
+    found: list[tuple[float, TargetPose]] = []
     kept: list[Array] = []
     for number, pose in enumerate(poses):
         refined = pose if number == 0 else _refined(seen, pose)  # the first one is refined already
@@ -345,7 +345,7 @@ def _solutions(seen: _DetectedMarkers, poses: list[Pose], floor_px: float) -> li
         kept.append(rotation)
         rms = reprojection_rms_px(seen.camera, points, pixels, position, rotation)
         q = rotations.from_matrix(rotation)
-        found.append((result[1], PoseSolution(position, q, result[0], rms)))
+        found.append((result[1], TargetPose(position, q, result[0], rms)))
     if not found:
         return []
     found.sort(key=lambda item: item[0])
@@ -363,12 +363,12 @@ def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[i
     return sorted(kept.values())
 
 
-def _marker_errors(seen: _DetectedMarkers, pose: Pose) -> list[float]:
+def _marker_errors(seen: _DetectedMarkers, pose: CameraPose) -> list[float]:
     return marker_errors(seen.camera, seen.points, seen.normals, seen.pixels, pose)
 
 
-def _is_single_marker_valid(camera: Camera, table: MarkerTable, row: int, solution: PoseSolution) -> bool:
+def _is_single_marker_valid(camera: Camera, table: MarkerTable, row: int, solution: TargetPose) -> bool:
     """Return whether the pose of a single marker is observable and consistent with no other marker being detected."""
-    pose = Pose(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
+    pose = CameraPose(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
     missing, cosine = count_visible_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)
     return cosine >= MIN_SINGLE_COSINE and missing < _MAX_MISSING

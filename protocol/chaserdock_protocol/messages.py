@@ -1,5 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Messages of a flight: world, chaser and controller."""
+"""Messages that processes exchange and logs store.
+
+On the wire a message is a msgpack map of its field names; the Zenoh encoding carries its type and version (see
+``codec``). A new field gets a default, so that old logs stay readable. A renamed field or a changed meaning gets a new
+``VERSION`` and a migration in ``recording/schema_migrations.py``.
+
+Common fields: ``seq`` numbers the messages of one publisher on one key from 0 (set when published);
+``tick`` is the world's tick of the message; ``sim_time_ns`` is simulated time, and for everything derived from an image
+the time of its *exposure*. No field depends on a wall clock, except those whose name begins with ``wall_``.
+"""
 
 from __future__ import annotations
 
@@ -7,34 +16,111 @@ from functools import cache
 from typing import Annotated, Literal
 
 import msgspec
+from chaserdock_models.arrays import Quaternion as Quaternion
+from chaserdock_models.arrays import Vector3 as Vector3
 from msgspec import Meta, Struct
 
-from .base import Message
-from .fields import (
-    CameraCalibration,
-    ChaserId,
-    ChaserIds,
-    Count,
-    Counts,
-    Latch,
-    Level,
-    MarkerIds,
-    Names,
-    OperatorCommandName,
-    Phase,
-    PoseSolution,
-    ProbeTouch,
-    Quaternion,
-    Square12,
-    Text,
-    ThrusterId,
-    ThrusterPulse,
-    Thrusters,
-    ThrusterState,
-    Vector3,
-)
-from .session import Farewell, JoinReply, JoinRequest, Presence
-from .thruster_fault import ThrusterFaultCommand
+MAX_COUNT = 2**53
+"""Bound of every integer: 104 days in ns, exact as a double, and sums of a few remain encodable."""
+Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
+ChaserId = Annotated[int, Meta(ge=0, le=255)]
+ChaserIds = Annotated[tuple[ChaserId, ...], Meta(max_length=256)]
+MarkerIds = Annotated[tuple[Annotated[int, Meta(ge=0, le=2**31)], ...], Meta(max_length=1024)]
+ThrusterId = Annotated[int, Meta(ge=0, le=254)]
+Thrusters = Annotated[tuple[ThrusterId, ...], Meta(max_length=255)]
+Text = Annotated[str, Meta(max_length=2000)]
+ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
+Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
+Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
+OperatorCommandName = Literal[
+    "approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"
+]
+Level = Literal["info", "warning", "error"]
+Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
+Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
+
+
+Phase = Literal[
+    "acquire",
+    "searching",
+    "hold",
+    "calibrate",
+    "approach",
+    "docked",
+    "retreat",
+    "goto",
+    "abort",
+    "wait",
+    "align",
+    "final",
+    "contact",
+    "latched",
+    "verified",
+]
+"""Phase of a chaser. Those from ``wait`` on occur only if docking ends by capture."""
+Latch = Literal["keep", "arm", "release"]
+"""Command of a probe's latch: no change; close at a valid touch and stay closed; open and stay open."""
+
+
+class PoseSolution(Struct, frozen=True, kw_only=True):
+    """One pose of the target in the camera frame.
+
+    ``position_m`` is TRF's origin in IRF, ``q_wxyz`` takes TRF to IRF. ``covariance`` is row-major (6, 6)
+    over (position in IRF axes, dtheta in TRF axes) with q_true = q (x) exp(dtheta).
+    """
+
+    position_m: Vector3
+    q_wxyz: Quaternion
+    covariance: Square6
+    reprojection_rms_px: float
+
+
+class CameraCalibration(Struct, frozen=True, kw_only=True):
+    """Calibration error of chaser ``chaser``'s camera, as estimated in flight, with standard deviations.
+
+    ``turn_rad``: rotation vector in CRF from the nominal mounting. ``shift_m``: lens position error in CRF.
+    ``focal_share``: relative error of the focal length.
+    """
+
+    chaser: ChaserId
+    turn_rad: Vector3
+    turn_sigma_rad: Vector3
+    shift_m: Vector3
+    shift_sigma_m: Vector3
+    focal_share: float
+    focal_sigma_share: float
+
+
+class ProbeTouch(Struct, frozen=True, kw_only=True):
+    """First contact of a probe's tip with the target at ``sim_time_ns``: position and velocity relative to its port.
+
+    ``latched``: whether the latch closed. ``refused``: the reason if it did not.
+    """
+
+    chaser: ChaserId
+    sim_time_ns: Count
+    lateral_m: float
+    angle_rad: float
+    closing_m_s: float
+    lateral_speed_m_s: float
+    latched: bool
+    refused: Text = ""
+
+
+class ThrusterPulse(Struct, frozen=True, kw_only=True):
+    """Commanded opening interval of a thruster's valve."""
+
+    thruster: ThrusterId
+    open_ns: Count
+    close_ns: Count
+
+
+class Message(Struct, frozen=True, kw_only=True):
+    """Fields that every message has."""
+
+    seq: Count = 0
+    tick: Annotated[int, Meta(ge=-1, le=MAX_COUNT)] = -1
+    sim_time_ns: Count = 0
 
 
 class Tick(Message, frozen=True, kw_only=True):
@@ -329,6 +415,51 @@ class ControllerState(Message, frozen=True, kw_only=True):
     term: Count
     operated: Annotated[tuple[OperatorCommand, ...], Meta(max_length=1024)] = ()
     state: Annotated[bytes, Meta(max_length=4_000_000)] = b""
+
+
+class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
+    """Make a simulated thruster fail or repair it (``healthy``), if the scenario allows it.
+
+    The chaser does not receive it. ``factor``, with ``weak`` only: remaining share of the thrust, 0 to 1.
+    """
+
+    chaser: ChaserId
+    thruster: ThrusterId
+    kind: ThrusterState
+    factor: float | None = None
+    operator: Text = ""
+
+
+class Presence(Message, frozen=True, kw_only=True):
+    """Heartbeat of a process. ``heard``: processes whose presence it has received, name to instance."""
+
+    process: Text
+    instance: Text
+    heard: Names
+
+
+class Farewell(Message, frozen=True, kw_only=True):
+    """Last message of a process: the number of messages that it has published on each key."""
+
+    process: Text
+    published: Counts
+
+
+class JoinRequest(Struct, frozen=True, kw_only=True):
+    """Request of a process to join the mission, before it declares any topic."""
+
+    process: Text
+    instance: Text
+
+
+class JoinReply(Struct, frozen=True, kw_only=True):
+    """The world's reply: the resolved scenario as JSON, or the reason of a rejection."""
+
+    accepted: bool
+    reason: Text
+    run_id: Text = ""
+    mode: Literal["lockstep", "realtime"] = "lockstep"
+    scenario_json: Annotated[str, Meta(max_length=2_000_000)] = ""
 
 
 VERSION: dict[type[Struct], int] = {

@@ -101,6 +101,15 @@ def test_container_mounts_only_its_own_keys() -> None:
         assert mounted == [(owner, "/keys:ro")], service
 
 
+def test_build_context_contains_what_the_image_copies() -> None:
+    """Every source of a COPY instruction is an exception in .dockerignore, which excludes everything else."""
+    instructions = re.findall(r"^COPY (?!--from)(.+) \S+$", (ROOT / "Dockerfile").read_text(), re.MULTILINE)
+    sources = {source.partition("/")[0] for line in instructions for source in line.split()}
+    context = {line[1:] for line in (ROOT / ".dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert {"chaserdock", "docker", "pyproject.toml"} <= sources
+    assert sources == context
+
+
 def test_image_has_a_key_folder_per_process() -> None:
     """A volume takes over the mode of the folder that it is mounted on; without one only root could write there."""
     found = re.search(

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from harness import SHORT, run
+from harness import DRILL, SHORT, run
 
 Fly = Callable[..., Path]
 
@@ -42,6 +42,12 @@ def shared_flight(tmp_path_factory: pytest.TempPathFactory, worker_id: str) -> F
 def short_flight(shared_flight: Fly) -> Path:
     """A two-chaser flight of six seconds, with which others are compared."""
     return shared_flight("short", "two-chaser-tracking", *SHORT)
+
+
+@pytest.fixture(scope="session")
+def drill_flight(shared_flight: Fly) -> Path:
+    """A six-second flight of ``fault-drill`` without faults, with which faulty ones are compared."""
+    return shared_flight("drill", *DRILL)
 
 
 @pytest.fixture(scope="session")

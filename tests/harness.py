@@ -28,6 +28,14 @@ SHORT = (
     "success.steady_orientation_rms_deg=10.0",
 )
 """Turns a shipped scenario into a short one with small images."""
+DRILL = (
+    "fault-drill",
+    "duration_s=6.0",
+    "timeline=[]",
+    "success.docked=[]",
+    "settling_s=1.0",
+)
+"""Four chasers with small images for six seconds: a scenario and its overrides."""
 
 
 def chaserdock(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:

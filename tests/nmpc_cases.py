@@ -61,7 +61,7 @@ def fixed_problem(
     d_target: float = D_MIN_M,
     d_chasers: float = D_MIN_M,
 ) -> NmpcInput:
-    """Poses that do not move: goals (N, 3), attitude ``q_goal``."""
+    """Return a problem with constant references: goals (N, 3), attitude ``q_goal``."""
     n, d = len(states), PARAMS.stages
     pose = np.concatenate([goals, np.tile(q_goal, (n, 1))], axis=1)
     return NmpcInput(
@@ -76,7 +76,7 @@ def fixed_problem(
 
 
 def advance(states: Array, inputs: Array, duration_s: float, parts: int = 4) -> Array:
-    """True motion: a finer integration than the plan's."""
+    """Propagate the states with a finer integration than the plan's."""
     x = np.empty((len(states), parts + 1, 13))
     x[:, 0] = states
     held = np.repeat(inputs[:, None], parts, axis=1)
@@ -85,10 +85,10 @@ def advance(states: Array, inputs: Array, duration_s: float, parts: int = 4) -> 
 
 
 @dataclass
-class ControllerCore:
+class ClosedLoopRun:
     states: Array  # (ticks + 1, N, 13)
     plans: list[NmpcPlan]
-    cost: float  # eq. 6's stage cost along the true motion, times the control period
+    cost: float  # stage cost of eq. 6 along the true motion, times the control period
 
     def between(self) -> float:
         p = self.states[:, :, :3]
@@ -105,7 +105,7 @@ def fly(
     states: Array,
     control_s: float,
     time_s: float,
-) -> ControllerCore:
+) -> ClosedLoopRun:
     history, plans, cost = [states], [], 0.0
     for k in range(round(time_s / control_s)):
         problem = problem_at(states, k * control_s)
@@ -120,11 +120,11 @@ def fly(
             cost += control_s * np.sum(np.array([3.5] * 3 + [40.0] * 3) * (u - free) ** 2)
         states = advance(states, plan.inputs[:, 0], control_s)
         history.append(states)
-    return ControllerCore(np.array(history), plans, float(cost))
+    return ClosedLoopRun(np.array(history), plans, float(cost))
 
 
 def tumbling(n: int, feed: bool = True) -> tuple[Callable[[Array, float], NmpcInput], Array]:
-    """The paper's tracking: problem as a function of state and time, and the states on the references."""
+    """Return the paper's tracking problem as a function of state and time, and states on the references."""
     d = PARAMS.stages
     times = PARAMS.dt_s * np.arange(d + 1)
 
@@ -164,6 +164,6 @@ def far_start(n: int) -> tuple[Callable[[Array, float], NmpcInput], Array]:
 
 
 def swap(side_m: float = 0.0, half_m: float = 0.8) -> tuple[Callable[[Array, float], NmpcInput], Array]:
-    """Two chasers that change places head-on, 2 m from the target."""
+    """Return a problem of two chasers that swap positions head-on, 2 m from the target, and their states."""
     a, b = np.array([-half_m, 2.0, 0.0]), np.array([half_m, 2.0, side_m])
     return (lambda x, _t: fixed_problem(x, np.array([b, a]))), np.array([at_rest(a), at_rest(b)])

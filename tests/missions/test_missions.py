@@ -29,12 +29,6 @@ OTHER_SIMD = {
 """Disables AVX and newer instructions in OpenCV, NumPy and OpenBLAS."""
 
 
-def test_repeated_flight_has_equal_digest(short_flight: Path, tmp_path: Path) -> None:
-    status, output = run(TWO, tmp_path / "again", *SHORT, arguments=["--quiet"])
-    assert status == 0, output
-    assert summary(tmp_path / "again")["digest"] == summary(short_flight)["digest"]
-
-
 def test_other_seed_gives_another_digest(short_flight: Path, tmp_path: Path) -> None:
     status, output = run(TWO, tmp_path / "other", *SHORT, arguments=["--seed", "7"])
     assert status == 0, output
@@ -63,40 +57,31 @@ def test_digest_is_independent_of_start_order(short_flight: Path, tmp_path: Path
 
 @pytest.mark.slow
 def test_digest_is_independent_of_suspended_processes(short_flight: Path, tmp_path: Path) -> None:
-    """Suspend controller, chaser 1 and recorder for ten seconds each."""
+    """Suspend controller, chaser 1 and recorder for five seconds each."""
     mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*SHORT))
     try:
         for words in (("controller",), ("chaser", "1"), ("record",)):
             wait_for_log(tmp_path / "run" / "mission.mcap", 200_000)
             child = find_child(mission, *words)
             child.suspend()
-            time.sleep(10.0)
+            time.sleep(5.0)
             child.resume()
         assert mission.wait(timeout=120) == 0
     finally:
         mission.kill()
         mission.wait()
     assert summary(tmp_path / "run")["digest"] == summary(short_flight)["digest"]
-    assert summary(tmp_path / "run")["wall_time_s"] > 20.0  # they were suspended during the flight
+    assert summary(tmp_path / "run")["wall_time_s"] > 10.0  # they were suspended during the flight
 
 
-def max_separation_m(first: Path, second: Path) -> dict[str, float]:
-    """Return the largest distance between two flights by body, m; the flights must not be bitwise equal."""
+def separations_m(first: Path, second: Path) -> dict[str, float]:
+    """Return the largest distance between two flights by body, m, while the second lasts."""
     a, b = load_flight(first / "mission.mcap"), load_flight(second / "mission.mcap")
-    assert a.digest != b.digest
-    return {
-        name: float(np.linalg.norm(track.position_m - b.truth[name].position_m, axis=1).max())
-        for name, track in a.truth.items()
-    }
-
-
-@pytest.mark.slow
-def test_short_flight_on_another_simd_level_stays_within_a_millimetre(
-    short_flight: Path, tmp_path: Path
-) -> None:
-    status, output = run(TWO, tmp_path / "simd", *SHORT, env=OTHER_SIMD)
-    assert status == 0, output
-    assert max(max_separation_m(short_flight, tmp_path / "simd").values()) < 1e-3
+    separations: dict[str, float] = {}
+    for name, track in b.truth.items():
+        apart_m = a.truth[name].position_m[: len(track.time_s)] - track.position_m
+        separations[name] = float(np.linalg.norm(apart_m, axis=1).max())
+    return separations
 
 
 def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
@@ -168,8 +153,8 @@ def test_realtime_flight_completes(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["single", TWO])
 def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> None:
-    """The scenario's criteria hold; the estimate is never off by more than 1 cm or 1 degree."""
-    status, output = run(scenario, tmp_path / "run", timeout_s=1200)
+    """The scenario's criteria hold after 60 s already; the estimate is never off by more than 1 cm or 1 degree."""
+    status, output = run(scenario, tmp_path / "run", "duration_s=60.0", timeout_s=1200)
     assert status == 0, output
     estimate = summary(tmp_path / "run")["target_estimate"]
     assert estimate["max_position_error_m"] < 0.01
@@ -192,9 +177,12 @@ def test_collision_avoidance_mission(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_four_chaser_docking_on_another_simd_level(main_job: Path, tmp_path: Path) -> None:
-    status, output = run("four-chaser-docking", tmp_path / "run", timeout_s=1800, env=OTHER_SIMD)
+    """Compared for 75 s, of which 15 s are the approach."""
+    changes = ("duration_s=75.0", "success.docked=[]")
+    status, output = run("four-chaser-docking", tmp_path / "run", *changes, timeout_s=1800, env=OTHER_SIMD)
     assert status == 0, output
-    assert max(max_separation_m(main_job, tmp_path / "run").values()) < 1e-3
+    # Not zero, or the variables that disable instructions had no effect.
+    assert 0.0 < max(separations_m(main_job, tmp_path / "run").values()) < 1e-3
 
 
 @pytest.mark.slow

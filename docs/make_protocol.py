@@ -56,8 +56,9 @@ of a process.
 
 ## Joining
 1. Query `{topics.JOIN_KEY}` with a `JoinRequest`: the process' name (`controller`, `chaser/0` …) and its
-   *instance*, a unique id of each start. Repeat until the world replies with a `JoinReply`: the resolved
-   scenario as JSON, or the reason of a rejection.
+   *instance*, a unique id of each start. Repeat until the world replies with a `JoinReply`: the flight
+   scenario as JSON ([flight_scenario.md](flight_scenario.md)), or the reason of a rejection. Recorder, operator, viewer and
+   analysis get the full scenario, with ground truth, on `{topics.SCENARIO_KEY}`.
 2. Declare the liveliness token `{topics.LIVE_KEY.format(process="NAME")}`. The world detects by it that the
    process is alive or lost.
 3. Declare all subscriptions and queryables, the one on `**/presence` last.
@@ -228,6 +229,7 @@ def page() -> str:
     parts += ["Queries: request, answer.", "", "| key | request | answer |", "| --- | --- | --- |"]
     for key, asked, answered in (
         (topics.JOIN_KEY, messages.JoinRequest, messages.JoinReply),
+        (topics.SCENARIO_KEY, messages.ScenarioRequest, messages.ScenarioReply),
         (topics.OPERATE_KEY, messages.OperatorCommand, messages.CommandReply),
         (topics.THRUSTER_FAULT_KEY, messages.ThrusterFaultCommand, messages.CommandReply),
     ):

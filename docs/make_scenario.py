@@ -141,8 +141,9 @@ def sections(path: str, node: Node, root: Node) -> list[str]:
     summary = re.sub(r"``(.+?)``", r"`\1`", " ".join(node["description"].split()))
     out = [f"## {title}", "", summary, ""]
     out += ["| key | type | unit | default | range | description |", "| --- | --- | --- | --- | --- | --- |"]
-    for key, entry in node["properties"].items():
-        inner = resolved(entry, root)
+    entries = [(key, entry, resolved(entry, root)) for key, entry in node["properties"].items()]
+    # As in a file: values before tables.
+    for key, entry, inner in sorted(entries, key=lambda e: type_of(e[2], root).endswith(("table", "tables"))):
         words = (type_of(inner, root), unit_of(key), default_of(entry, key in required, inner))
         item = resolved(item_of(inner) or {}, root) if inner.get("type") == "array" else inner
         cells = [f"`{key}`", *words, range_of(inner, root), description_of(entry, root)]

@@ -124,6 +124,8 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Presence(**HEAD, process="chaser/0", instance="abc", heard={"controller": "c1", "world": "w1"}),
     m.Farewell(**HEAD, process="chaser/0", published={"chaser/0/sighting": 4}),
     m.JoinRequest(process="chaser/0", instance="abc"),
-    m.JoinReply(accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}"),
+    m.JoinReply(accepted=True, reason="", run_id="r", mode="realtime", scenario_json="{}", faults="{}"),
+    m.ScenarioRequest(process="recorder"),
+    m.ScenarioReply(run_id="r", scenario_json="{}"),
 )
 BY_TYPE: dict[type[msgspec.Struct], msgspec.Struct] = {type(s): s for s in SAMPLES}

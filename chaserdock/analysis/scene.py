@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 Grey = int
 """0 black to 255 white, fully lit."""
@@ -95,7 +95,7 @@ def _probe(front_m: float, reach_m: float) -> list[Face]:
     ]
 
 
-def scene_of(scenario: Scenario, view_m: float = 0.22) -> Scene:
+def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
     """Return the faces of a scenario's bodies; ``view_m``: length of the drawn camera frustum."""
     model = scenario.target_model()
     body = scenario.chaser

@@ -13,7 +13,7 @@ from chaserdock_agents.chaser.sighting import BadImage, decode_image
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import Image, Sighting
 from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
-from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.scenario import FlightScenario, scenario_from_json
 from chaserdock_protocol.topics import IMAGE, SIGHTING
 from numpy.typing import NDArray
 
@@ -52,7 +52,7 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
 
 
 def annotated_image(
-    scenario: Scenario, image: Image, sighting: Sighting | None, width_px: int
+    scenario: FlightScenario, image: Image, sighting: Sighting | None, width_px: int
 ) -> NDArray[np.uint8]:
     """Return the image as BGR, ``width_px`` wide, with the sighting's markers and pose. Raise LogError for a bad image."""
     try:
@@ -82,7 +82,7 @@ def annotated_image(
     return np.asarray(canvas, dtype=np.uint8)
 
 
-def _draw_axes(canvas: NDArray[np.uint8], scenario: Scenario, sighting: Sighting, scale: float) -> None:
+def _draw_axes(canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Sighting, scale: float) -> None:
     """Draw the measured target frame: x red, y green, z blue, 8 cm each."""
     best = sighting.solutions[0]
     points = np.vstack([np.zeros(3), 0.08 * np.eye(3)])

@@ -10,7 +10,7 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Image, Tick, encoding_of
 from chaserdock_protocol.recording.log import LogSource, read_log, read_scenario
-from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.scenario import Scenario, flight_scenario_json, scenario_from_json
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
 
@@ -124,7 +124,7 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
         raise CheckError(
             f"{log}: its first tick expects no answer of {process}; give a log that begins at tick 0"
         )
-    return Recorded(scenario, text, played)
+    return Recorded(scenario, flight_scenario_json(scenario), played)
 
 
 def _places(number: int | None, chasers: int) -> range | tuple[int]:

@@ -17,13 +17,15 @@ import msgspec
 import numpy as np
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
+from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, OperatorCommand, ProbeTouch, Sighting
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import Scenario, flight_scenario
+from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_world.actuators.ideal import ActuatorOutput, fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
@@ -84,10 +86,14 @@ class InProcessMission:
         self.perception = perception
         self.chasers = range(len(scenario.chasers))
         estimator = PerfectEstimator(scenario.target) if perception is None else None
-        self.controller = ControllerCore(scenario, time.perf_counter, estimator)
+        flight = flight_scenario(scenario)
+        self.controller = ControllerCore(flight, time.perf_counter, estimator)
         self.physics = Physics(scenario)
         self.actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in self.chasers}
-        self.thrusters = {} if ideal else {i: ThrusterController(scenario, i) for i in self.chasers}
+        self.thrusters = {} if ideal else {i: ThrusterController(flight, i) for i in self.chasers}
+        self._reports = {
+            i: FailureReports(faults_of(scenario, f"chaser/{i}").reported_failures) for i in self.chasers
+        }
         self.tick = 0
         self.contacts: set[tuple[str, str]] = set()
         self.touches: list[ProbeTouch] = []
@@ -97,7 +103,7 @@ class InProcessMission:
         self._gain, self._solve_delay_s = actuator_gain, solve_delay_s
         self._busy_until_ns = 0
         self._odometry_sensor = OdometrySensor(scenario)
-        self._validation = OdometryValidation(scenario)
+        self._validation = OdometryValidation(flight)
 
     def __enter__(self) -> Self:
         return self
@@ -137,6 +143,7 @@ class InProcessMission:
         reports = {}
         for i, thrusters in self.thrusters.items():
             touched = i in docking and (docking[i].contact or docking[i].latched)
+            self._reports[i].deliver(thrusters, time_ns)
             reports[i] = thrusters.observe(odometry[i], touched)
             self._note_thruster_events(i, time_ns)
         sightings = ()

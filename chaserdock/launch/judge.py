@@ -15,7 +15,7 @@ from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Link, Node
-from chaserdock_protocol.transport.session import join, new_instance
+from chaserdock_protocol.transport.session import join, new_instance, request_scenario
 
 from chaserdock.exit_codes import STOPPED
 
@@ -44,7 +44,10 @@ def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_
         if mission is None:
             return STOPPED
         folder = out / run_name(mission)
-        scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
+        full = request_scenario(node, mission, stop)
+        if full is None:
+            return STOPPED
+        scenario = scenario_from_json(full, "the world's scenario")
         reporter = ProgressReporter(scenario, show)
         reporter.report(start_line(scenario, mission.mode, folder))
         try:

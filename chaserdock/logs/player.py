@@ -8,9 +8,10 @@ from collections.abc import Callable, Iterator
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
+from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence, ScenarioReply, ScenarioRequest
 from chaserdock_protocol.recording.log import LogSource, read_scenario
 from chaserdock_protocol.recording.scan import VIEWER_PREFIX, log_files, stored_messages
+from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
 from chaserdock_protocol.transport import Link, Node, RawSample
 
 
@@ -41,6 +42,8 @@ def play(
     published. Raises LogError, TransportError, or PlayError when no recorder joins within ``timeout_s``.
     """
     text, run = read_scenario(log)
+    scenario = scenario_from_json(text, f"{log}: scenario")
+    full = ScenarioReply(run_id=run.get("run_id", ""), scenario_json=text)
     node = Node("world", "analysis", link)
     try:
         node.subscribe(topics.PRESENCE)
@@ -49,7 +52,11 @@ def play(
             if request.process == "recorder":
                 mode = "realtime" if run.get("mode") == "realtime" else "lockstep"
                 answer = JoinReply(
-                    accepted=True, reason="", run_id=run.get("run_id", ""), mode=mode, scenario_json=text
+                    accepted=True,
+                    reason="",
+                    run_id=full.run_id,
+                    mode=mode,
+                    scenario_json=flight_scenario_json(scenario),
                 )
             else:
                 answer = JoinReply(
@@ -57,6 +64,7 @@ def play(
                 )
             reply(answer)
 
+        node.declare_queryable(topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full))
         node.declare_queryable(topics.JOIN_KEY, JoinRequest, admit)
         _wait_for_recorder(node, timeout_s, stopped)
         number, start_s, first_ns = 0, time.monotonic(), None

@@ -11,7 +11,7 @@ import msgspec
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError, LogSource, read_log, read_scenario
 from chaserdock_protocol.replay_node import Stage, order_by_tick
-from chaserdock_protocol.scenario import parse_scenario
+from chaserdock_protocol.scenario import flight_scenario, parse_scenario
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import ReceivedMessage
 
@@ -73,7 +73,7 @@ def replay(log: LogSource, through: str, overrides: tuple[str, ...] = (), tolera
     lockstep = run.get("mode") != "realtime"
     played = 0
     for topic, place, message in stage.play(
-        scenario, order_by_tick(stage, recorded()) if lockstep else recorded()
+        flight_scenario(scenario), order_by_tick(stage, recorded()) if lockstep else recorded()
     ):
         if id(topic) in answers:
             comparison.add(1, topic.key_of(place), message)

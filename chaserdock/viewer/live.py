@@ -21,7 +21,7 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, OperatorCommand
 from chaserdock_protocol.process import StopSignal, print_status
-from chaserdock_protocol.scenario import scenario_from_json
+from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.transport import Link, Node, ReceivedMessage
 from chaserdock_protocol.transport.session import new_instance
 
@@ -139,7 +139,7 @@ class _MissionView:
         self, connect: Callable[[], Node], server: viser.ViserServer, mission: JoinReply, options: ViewOptions
     ) -> None:
         self._open_node, self._mission, self._truth = connect, mission, options.truth
-        scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
+        scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         chasers = len(scenario.chasers)
         self._state, self._history = MissionState.empty(chasers), History(chasers)
         self._seen: set[str] = set()

@@ -14,7 +14,7 @@ import numpy as np
 import viser
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.recording.log import LogError
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock.analysis.snapshot import annotated_image
 
@@ -55,7 +55,7 @@ class Page:
     def __init__(
         self,
         server: viser.ViserServer,
-        scenario: Scenario,
+        scenario: FlightScenario,
         *,
         dark: bool,
         truth: bool,

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 import viser
 from chaserdock_models import rotations
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock.analysis.scene import scene_of
 
@@ -35,7 +35,7 @@ def _rgb(colour: str) -> tuple[int, int, int]:
 class SceneView:
     """Scene of one mission. The pose of the root node ``/scene`` realizes the fixed frame."""
 
-    def __init__(self, server: viser.ViserServer, scenario: Scenario) -> None:
+    def __init__(self, server: viser.ViserServer, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self._scene = scene = server.scene
         scene.configure_default_lights(cast_shadow=False)

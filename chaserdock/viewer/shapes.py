@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import centre_offset
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
 
 from chaserdock.analysis.scene import Face
@@ -96,7 +96,7 @@ def sphere(radius_m: float) -> NDArray[np.float32]:
     return (radius_m * np.concatenate([polyline(c) for c in circles])).astype(np.float32)
 
 
-def corridor_of(scenario: Scenario, chaser: int) -> NDArray[np.float32] | None:
+def corridor_of(scenario: FlightScenario, chaser: int) -> NDArray[np.float32] | None:
     """Return a chaser's approach corridor in TRF as segments (K, 2, 3), or None.
 
     With capture: the region allowed for its centre from the corridor entry to the port, narrower in the final approach.

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from .history import History, Line
 from .snapshot import ChaserState, MissionState
@@ -15,7 +15,7 @@ _FRESH_S = 2.0
 _GOOD_SOLVES = frozenset({"solved", "iteration_limit"})
 
 
-def head(scenario: Scenario, state: MissionState, mode: str, speed: float | None) -> str:
+def head(scenario: FlightScenario, state: MissionState, mode: str, speed: float | None) -> str:
     """Return time, speed, estimator status, and how the mission ended."""
     lines = [f"**{scenario.name}** · {mode}", f"**{state.time_s():.1f} s** of {scenario.duration_s:g} s"]
     if speed is not None:

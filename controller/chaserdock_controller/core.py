@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from chaserdock_protocol.messages import TargetEstimate
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
@@ -28,7 +28,7 @@ class ControllerCore:
 
     def __init__(
         self,
-        scenario: Scenario,
+        scenario: FlightScenario,
         now_s: Callable[[], float],
         estimator: Estimator | None = None,
         realtime: bool = False,

@@ -7,7 +7,7 @@ import math
 from typing import Any
 
 from chaserdock_protocol import plugins
-from chaserdock_protocol.scenario import ESTIMATORS, Scenario
+from chaserdock_protocol.scenario import ESTIMATORS, FlightScenario
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from chaserdock_protocol.scenario.schema import Controller, Limits
 
@@ -18,7 +18,7 @@ from .estimation import make_estimator
 from .nmpc import NmpcParameters
 
 
-def nmpc_parameters(scenario: Scenario) -> NmpcParameters:
+def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
     """Return the NMPC's parameters, which the scenario has validated."""
     body = scenario.chaser
     ix, iy, iz = body.inertia
@@ -39,9 +39,9 @@ def nmpc_settings(controller: Controller, limits: Limits) -> dict[str, Any]:
     return {**settings, "max_reference_distance_m": limits.max_reference_distance_m}
 
 
-def estimator_of(scenario: Scenario) -> Estimator:
+def estimator_of(scenario: FlightScenario) -> Estimator:
     """Return the estimator that the scenario names: a built-in one, or an installed ``chaserdock.estimators`` entry point,
-    called with the scenario. Raises PluginError if there is none of that name."""
+    called with the flight scenario. Raises PluginError if there is none of that name."""
     if scenario.estimator.name == "paper":
         return make_estimator("paper")
     if scenario.estimator.name != "mekf":

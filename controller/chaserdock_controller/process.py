@@ -26,7 +26,8 @@ from chaserdock_protocol.messages import (
     Tick,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup
-from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
+from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.transport import Node, ReceivedMessage
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
@@ -49,10 +50,11 @@ def main(options: ProcessOptions) -> int:
     """Run the controller; return 0 when the mission ended, 1 when stopped before, 2 when it could not join."""
 
     def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
-        scenario = scenario_from_json(mission.scenario_json, "the world's scenario")
-        core = ControllerCore(scenario, time.perf_counter, realtime=mission.mode == "realtime")
-        controller = Controller(node, scenario, core, mission.mode == "realtime")
-        node.message_filter = create_fault_layer(scenario, node.name, lockstep=mission.mode == "lockstep")
+        scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
+        faults, realtime = process_faults_from_json(mission.faults), mission.mode == "realtime"
+        core = ControllerCore(scenario, time.perf_counter, realtime=realtime)
+        controller = Controller(node, scenario, core, realtime)
+        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep=not realtime)
         controller.open(instance)
         finish_startup()
         while not (controller.ended or stop()):
@@ -74,7 +76,7 @@ class Controller:
     def __init__(
         self,
         node: Node,
-        scenario: Scenario,
+        scenario: FlightScenario,
         core: ControllerCore,
         realtime: bool = False,
         replaying: bool = False,

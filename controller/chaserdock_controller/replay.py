@@ -10,7 +10,7 @@ from typing import Any, cast
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbeat, Stage
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .core import ControllerCore
@@ -29,7 +29,7 @@ class _EstimationOnly:
         return TickOutputs(target=self._core.estimate(inputs))
 
 
-def _core_of(scenario: Scenario) -> ControllerCore:
+def _core_of(scenario: FlightScenario) -> ControllerCore:
     return ControllerCore(scenario, now_s=lambda: 0.0)
 
 
@@ -55,7 +55,7 @@ def _with_leader(recorded: Iterable[ReceivedMessage]) -> Iterator[tuple[str, lis
 
 
 def _play(
-    scenario: Scenario, recorded: Iterable[ReceivedMessage], core_of: Callable[[], Any]
+    scenario: FlightScenario, recorded: Iterable[ReceivedMessage], core_of: Callable[[], Any]
 ) -> Iterator[Published]:
     """Return the outputs of the leader. A new leader keeps the state of the one before; a restarted process does not."""
     node, controller, last_seq, last_leader = ReplayNode("controller"), None, -1, ""
@@ -82,12 +82,12 @@ def _play(
         last_leader = leader
 
 
-def play_controller(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
+def play_controller(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """Return everything that the controller publishes."""
     return _play(scenario, recorded, lambda: _core_of(scenario))
 
 
-def play_fusion(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
+def play_fusion(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """Return the target's estimates only."""
     return _play(scenario, recorded, lambda: _EstimationOnly(_core_of(scenario)))
 

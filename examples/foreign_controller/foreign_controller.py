@@ -169,7 +169,7 @@ class Controller:
         self.session.put(key, msgpack.packb(fields), encoding=encoding(kind), timestamp=stamp)
 
     def join(self):
-        """Send join requests until the world replies; return the resolved scenario."""
+        """Send join requests until the world replies; return the flight scenario."""
         request = msgpack.packb({"process": NAME, "instance": self.instance})
         while True:
             for answer in self.session.get(

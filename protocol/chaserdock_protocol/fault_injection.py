@@ -3,7 +3,8 @@
 
 Network faults (loss, delay, corruption) apply at the *receiver*: the log holds the message as sent, and receivers may
 lose different messages. Faults of a process (false odometry, clock jump, flood) apply at the *publisher*, so that the
-log holds the faulty message. Random draws depend only on the scenario's seed, the key and the tick.
+log holds the faulty message. Random draws depend only on the seed of the
+process' faults, the key and the tick.
 
 In lock-step a tick waits for its messages. A lost, late or damaged message is therefore replaced by a ``LostMessage``,
 which tells the reader not to wait. Real-time readers do not wait, and get none.
@@ -26,12 +27,11 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.clock import Timing
 
-from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, ON_PUBLISHING, ON_RECEIPT, Fault
+from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, ON_PUBLISHING, ON_RECEIPT, Fault, ProcessFaults
 
 from . import codec, topics
 from .codec import Rejected
 from .messages import Message, Odometry, PoseSolution, Sighting, WrenchCommand
-from .scenario import Scenario
 from .topics import Topic
 
 _CORRUPTED_BYTES = 4
@@ -230,11 +230,9 @@ class FaultLayer:
         return damaged if same else None
 
 
-def create_fault_layer(scenario: Scenario, name: str, lockstep: bool) -> FaultLayer | None:
-    """Return the fault layer of process ``name``, or None if the scenario has no faults."""
-    if not scenario.fault:
-        return None
-    return FaultLayer(scenario.fault, name, scenario.timing, scenario.seed, lockstep)
+def create_fault_layer(faults: ProcessFaults, name: str, timing: Timing, lockstep: bool) -> FaultLayer | None:
+    """Return the fault layer of process ``name``, or None without faults."""
+    return FaultLayer(faults.faults, name, timing, faults.seed, lockstep) if faults.faults else None
 
 
 def _rotation(fault: Fault) -> Array:

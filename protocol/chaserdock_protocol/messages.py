@@ -29,6 +29,7 @@ MarkerIds = Annotated[tuple[Annotated[int, Meta(ge=0, le=2**31)], ...], Meta(max
 ThrusterId = Annotated[int, Meta(ge=0, le=254)]
 Thrusters = Annotated[tuple[ThrusterId, ...], Meta(max_length=255)]
 Text = Annotated[str, Meta(max_length=2000)]
+ScenarioText = Annotated[str, Meta(max_length=2_000_000)]
 ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
 Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
 Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
@@ -453,13 +454,30 @@ class JoinRequest(Struct, frozen=True, kw_only=True):
 
 
 class JoinReply(Struct, frozen=True, kw_only=True):
-    """The world's reply: the resolved scenario as JSON, or the reason of a rejection."""
+    """The world's reply: the flight scenario as JSON, or the reason of a rejection.
+
+    ``faults``: JSON of what the test bed injects at this process. For the code around the flight software only.
+    """
 
     accepted: bool
     reason: Text
     run_id: Text = ""
     mode: Literal["lockstep", "realtime"] = "lockstep"
-    scenario_json: Annotated[str, Meta(max_length=2_000_000)] = ""
+    scenario_json: ScenarioText = ""
+    faults: ScenarioText = "{}"
+
+
+class ScenarioRequest(Struct, frozen=True, kw_only=True):
+    """Request for the full scenario, ground truth included."""
+
+    process: Text
+
+
+class ScenarioReply(Struct, frozen=True, kw_only=True):
+    """The world's reply: the full scenario as JSON, and the run that it belongs to."""
+
+    run_id: Text
+    scenario_json: ScenarioText
 
 
 VERSION: dict[type[Struct], int] = {
@@ -489,6 +507,8 @@ VERSION: dict[type[Struct], int] = {
     Farewell: 1,
     JoinRequest: 1,
     JoinReply: 1,
+    ScenarioRequest: 1,
+    ScenarioReply: 1,
 }
 """Version of every top-level message type."""
 

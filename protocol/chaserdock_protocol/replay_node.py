@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from .messages import Message
-from .scenario import Scenario
+from .scenario import FlightScenario
 from .topics import Topic
 from .transport import ReceivedMessage, TrafficCounters
 
@@ -67,7 +67,7 @@ class Stage:
     process: str
     inputs: tuple[Topic, ...]
     outputs: tuple[Topic, ...]
-    play: Callable[[Scenario, Iterable[ReceivedMessage]], Iterator[Published]]
+    play: Callable[[FlightScenario, Iterable[ReceivedMessage]], Iterator[Published]]
 
 
 # Upper bound on the delay of a lock-step message in a log, in ticks: the flight waits for the recorder.

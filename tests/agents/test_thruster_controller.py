@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.command_gate import passed_on
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
+from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.thruster_commands import ThrusterCommandHandler
 from chaserdock_controller.ingest.latency_compensation import (
@@ -19,7 +21,9 @@ from chaserdock_controller.ingest.latency_compensation import (
 )
 from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import OperatorCommand, ThrusterReport
+from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.faults import faults_of
 from flight_cases import odometry
 from thruster_cases import at_rest, box, mission, wrench
 
@@ -31,16 +35,28 @@ def limits(report: ThrusterReport) -> np.ndarray:
     return np.array([*report.force_max_N, *report.torque_max_N_m])
 
 
+def reporting(s: Scenario) -> tuple[ThrusterController, Callable[[Odometry], ThrusterReport]]:
+    """Chaser 0's thrusters, and their ``observe`` after the test bed's reports."""
+    pilot = ThrusterController(s, 0)
+    reports = FailureReports(faults_of(s, "chaser/0").reported_failures)
+
+    def observe(odometry: Odometry) -> ThrusterReport:
+        reports.deliver(pilot, odometry.sim_time_ns)
+        return pilot.observe(odometry)
+
+    return pilot, observe
+
+
 @pytest.mark.parametrize("kind", ["stuck_off", "stuck_on", "weak"])
 def test_reported_failure_takes_effect_immediately(kind: str) -> None:
     factor = {"factor": 0.5} if kind == "weak" else {}
     s = mission(
         thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.1, "kind": kind, "reported": True, **factor}]
     )
-    thrusters = ThrusterController(s, 0)
-    np.testing.assert_allclose(limits(thrusters.observe(at_rest(s, 0))), box(s))
-    assert thrusters.observe(at_rest(s, 1)).thrusters == ("healthy",) * 12
-    report = thrusters.observe(at_rest(s, 2))
+    thrusters, observe = reporting(s)
+    np.testing.assert_allclose(limits(observe(at_rest(s, 0))), box(s))
+    assert observe(at_rest(s, 1)).thrusters == ("healthy",) * 12
+    report = observe(at_rest(s, 2))
     assert report.thrusters[4] == kind
     assert report.isolated == (() if kind == "weak" else (4,))
     scale = limits(report) / box(s)
@@ -54,8 +70,8 @@ def test_reported_failure_takes_effect_immediately(kind: str) -> None:
 
 def test_unreported_failure_is_unknown_at_first() -> None:
     s = mission(thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_on"}])
-    thrusters = ThrusterController(s, 0)
-    assert thrusters.observe(at_rest(s, 0)).isolated == ()
+    _, observe = reporting(s)
+    assert observe(at_rest(s, 0)).isolated == ()
 
 
 def test_operator_isolates_and_restores_thruster() -> None:
@@ -78,8 +94,8 @@ def test_operator_restores_thruster_that_the_chaser_isolated() -> None:
     s = mission(
         thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}]
     )
-    thrusters = ThrusterController(s, 0)
-    assert thrusters.observe(at_rest(s, 0)).isolated == (4,)
+    thrusters, observe = reporting(s)
+    assert observe(at_rest(s, 0)).isolated == (4,)
     thrusters.apply_command(wrench(s, 0, trusted=(4,)))
     thrusters.add_pulses(passed_on(wrench(s, 0)))
     report = thrusters.observe(at_rest(s, 1))

@@ -21,7 +21,7 @@ from chaserdock_protocol.process import Rotation
 from chaserdock_protocol.recording import schema_migrations as upgrades
 from chaserdock_protocol.recording.log import LogError, LogWriter, count_messages, read_log, read_scenario
 from chaserdock_protocol.recording.scan import FileState, log_files, stored_messages
-from chaserdock_protocol.scenario import scenario_from_json
+from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
 from chaserdock_protocol.transport import RawSample
 from harness import finished
 from mcap.reader import make_reader
@@ -51,8 +51,11 @@ def raws(log: Path) -> list[tuple[RawSample, Any]]:
 def recorded(folder: Path, rotation: Rotation = ONE_FILE, viewer: bool = True, repeat: int = 1) -> Path:
     """The golden flight, recorded again without a network; ``repeat`` times over."""
     text, run = read_scenario(GOLDEN)
-    mission = m.JoinReply(accepted=True, reason="", run_id=run["run_id"], scenario_json=text)
-    recording = Recording(folder, mission, rotation, scenario_from_json(text, "golden") if viewer else None)
+    scenario = scenario_from_json(text, "golden")
+    mission = m.JoinReply(
+        accepted=True, reason="", run_id=run["run_id"], scenario_json=flight_scenario_json(scenario)
+    )
+    recording = Recording(folder, mission, text, rotation, scenario if viewer else None)
     for raw, message in raws(GOLDEN) * repeat:
         recording.write(raw, message)
     recording.close()

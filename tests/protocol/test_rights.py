@@ -138,6 +138,28 @@ def test_only_its_answerer_answers_a_query_and_only_those_meant_may_ask(
         queryable.undeclare()
 
 
+def test_flight_identities_cannot_query_the_full_scenario_by_any_expression(mission: Mission) -> None:
+    def reply(query: zenoh.Query) -> None:
+        query.reply(topics.SCENARIO_KEY, "full scenario")
+        query.drop()
+
+    served = mission.sessions["world"].declare_queryable(topics.SCENARIO_KEY, reply)
+    time.sleep(SETTLE_S)
+
+    def answers(name: str, expression: str) -> set[str]:
+        replies = mission.sessions[name].get(expression, timeout=0.5, target=zenoh.QueryTarget.ALL)
+        return {r.ok.payload.to_string() for r in replies if r.ok is not None}
+
+    deadline = time.monotonic() + PATIENCE_S
+    while not answers("recorder", topics.SCENARIO_KEY) and time.monotonic() < deadline:
+        pass
+    assert answers("recorder", topics.SCENARIO_KEY) == {"full scenario"}
+    for name in (*topics.CONTROLLERS, *(f"chaser/{i}" for i in range(CHASERS))):
+        for expression in (topics.SCENARIO_KEY, "truth/*", "truth/**", "*/scenario", "**"):
+            assert answers(name, expression) == set(), (name, expression)
+    served.undeclare()
+
+
 def test_nobody_lives_under_anothers_name(mission: Mission) -> None:
     tokens = [
         session.liveliness().declare_token(topics.LIVE_KEY.format(process=other))

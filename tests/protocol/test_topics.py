@@ -80,6 +80,7 @@ def test_the_table_holds_every_topic_of_the_module_once() -> None:
         "**",
         "live/world",
         topics.JOIN_KEY,
+        topics.SCENARIO_KEY,
         topics.OPERATE_KEY,
         topics.THRUSTER_FAULT_KEY,
     ],

@@ -14,9 +14,17 @@ import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.fault_injection import create_fault_layer
-from chaserdock_protocol.messages import JoinReply, JoinRequest, MissionEnd, ThrusterFaultCommand
+from chaserdock_protocol.messages import (
+    JoinReply,
+    JoinRequest,
+    MissionEnd,
+    ScenarioReply,
+    ScenarioRequest,
+    ThrusterFaultCommand,
+)
 from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup, print_status
-from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
+from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario_json, load_scenario
+from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_protocol.transport import Node, TransportError
 from chaserdock_protocol.transport.session import Heartbeat, new_instance
 
@@ -80,7 +88,8 @@ class World:
         self._faults = ThrusterFaultHandler(scenario, self._actuators)
         self._contacts: set[tuple[str, str]] = set()
         self._started_s = 0.0
-        faults = create_fault_layer(scenario, "world", lockstep=not self._realtime)
+        own = faults_of(scenario, "world")
+        faults = create_fault_layer(own, "world", scenario.timing, lockstep=not self._realtime)
         node.message_filter = faults
         self._barrier = self._open_mission()
         self._barrier.faults = faults
@@ -92,13 +101,16 @@ class World:
             chasers=len(scenario.chasers),
             run_id=uuid.uuid4().hex[:12],
             mode=options.mode,
-            scenario_json=scenario.model_dump_json(),
+            scenario_json=flight_scenario_json(scenario),
+            faults_of=lambda process: faults_of(scenario, process).model_dump_json(),
             instance=new_instance(),
         )
         node.blocking = not self._realtime
         node.subscribe(topics.ACTUATORS)
         node.subscribe(topics.ACK)
         node.watch_liveliness(membership.set_alive)
+        full = ScenarioReply(run_id=membership.run_id, scenario_json=scenario.model_dump_json())
+        node.declare_queryable(topics.SCENARIO_KEY, ScenarioRequest, lambda _, reply: reply(full))
         node.declare_queryable(
             topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
         )

@@ -18,7 +18,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.bodies import Body
 
 FallbackMode = Literal["plan", "brake", "hold"]
@@ -105,7 +105,7 @@ def extrapolate_target(target: TargetEstimate | None, time_ns: int) -> Array | N
     return np.asarray(target.position_m) + elapsed_s * np.asarray(target.velocity_m_s)
 
 
-def clearance_m(scenario: Scenario, chaser: int) -> float:
+def clearance_m(scenario: FlightScenario, chaser: int) -> float:
     """Return the distance from the target (m, centre to centre) at which a chaser is outside of its corridor.
 
     The corridor begins at the entry to the chaser's port or, for docking at a distance, at its nominal position.

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import msgspec
@@ -29,12 +29,14 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup
-from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
+from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
+from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 
 from .command_gate import autonomous_command, brake_command, passed_on, refusal, stale_term
 from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, next_state
@@ -48,11 +50,12 @@ def main(options: ProcessOptions) -> int:
     number = int(options.chaser or 0)
 
     def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
-        chaser = Chaser(node, scenario_from_json(mission.scenario_json, "the world's scenario"), number)
-        node.message_filter = create_fault_layer(
-            chaser.scenario, node.name, lockstep=mission.mode == "lockstep"
-        )
-        chaser.open(instance, realtime=mission.mode == "realtime")
+        scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
+        faults = process_faults_from_json(mission.faults)
+        lockstep = mission.mode == "lockstep"
+        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep)
+        chaser = Chaser(node, scenario, number, reports=FailureReports(faults.reported_failures))
+        chaser.open(instance, realtime=not lockstep)
         finish_startup()
         while not (chaser.ended or stop()):
             chaser.listen()
@@ -67,11 +70,11 @@ class Chaser:
     """The state of one chaser process: latest messages, last executed command and fallback.
 
     ``executed_tick`` and ``executed_ns``: tick of the last actuator command for which the world need not wait any more, and
-    time of the last executed command of the controller.
+    time of the last executed command of the controller. ``reports``: the thruster failures that the test bed reports.
     """
 
     node: Node
-    scenario: Scenario
+    scenario: FlightScenario
     number: int
     ended: bool = False
     odometry: Odometry | None = None
@@ -81,6 +84,7 @@ class Chaser:
     executed_tick: int = -1
     executed_ns: int | None = None
     realtime: bool = False
+    reports: FailureReports = field(default_factory=FailureReports)
 
     def __post_init__(self) -> None:
         self.name = f"chaser/{self.number}"
@@ -237,6 +241,7 @@ class Chaser:
         if self._has_port and (docking is None or docking.tick != tick.tick):
             return
         self._thrusters_tick = tick.tick
+        self.reports.deliver(self._thrusters, odometry.sim_time_ns)
         touched = docking is not None and (docking.contact or docking.latched)
         self.node.publish(topics.THRUSTERS, self._thrusters.observe(odometry, touched), self.number)
         for level, what, detail in self._thrusters.drain_events():

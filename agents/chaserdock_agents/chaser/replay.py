@@ -9,13 +9,13 @@ from typing import Any, cast
 import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbeat, Stage
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .process import Chaser
 
 
-def play_perception(scenario: Scenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
+def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """Return the sightings of all chasers."""
     cv2.setNumThreads(1)
     chasers: dict[int, tuple[ReplayNode, Chaser]] = {}

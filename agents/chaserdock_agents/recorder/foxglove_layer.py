@@ -28,7 +28,7 @@ from chaserdock_protocol.messages import (
     Vector3,
 )
 from chaserdock_protocol.recording.scan import VIEWER_PREFIX
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 Write = Callable[[str, tuple[str, str, bytes], bytes, int], None]
 """``LogWriter.write_view``: topic, schema, payload, simulated time in ns."""
@@ -49,7 +49,7 @@ _CHASER_COLOUR = fox.Color(r=0.35, g=0.55, b=0.85, a=0.6)
 class ViewerLayer:
     """Converts messages to the viewer layer of one file; every file of a rotated log has its own."""
 
-    def __init__(self, scenario: Scenario, write: Write) -> None:
+    def __init__(self, scenario: FlightScenario, write: Write) -> None:
         self._write = write
         self._scenario = scenario
         self._schemas: dict[type, tuple[str, str, bytes]] = {}

@@ -30,10 +30,11 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.run_name import run_name
-from chaserdock_protocol.scenario import scenario_from_json
+from chaserdock_protocol.scenario import flight_scenario_from_json
+from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.transport import Node, RawSample
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
-from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
+from chaserdock_protocol.transport.session import Heartbeat, create_health, request_scenario, run_member
 
 from .foxglove_layer import SHOWN
 from .rotation import Recording
@@ -66,13 +67,16 @@ def _limit_heap() -> None:
 
 def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
     """Record until the mission has ended and all published messages are in the file; return the exit status."""
-    source = "the world's scenario"
-    scenario = scenario_from_json(mission.scenario_json, source) if options.viewer_layer else None
+    full = request_scenario(node, mission, stop)
+    if full is None:
+        return 1
+    scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
     out = options.out / run_name(mission) if options.by_run else options.out
-    recording = Recording(out, mission, options.rotation, scenario)
+    recording = Recording(out, mission, full, options.rotation, scenario if options.viewer_layer else None)
     try:
-        flown = scenario or scenario_from_json(mission.scenario_json, source)
-        faults = create_fault_layer(flown, node.name, lockstep=mission.mode == "lockstep")
+        injected = process_faults_from_json(mission.faults)
+        lockstep = mission.mode == "lockstep"
+        faults = create_fault_layer(injected, node.name, scenario.timing, lockstep)
         node.message_filter = faults
         recorder = Recorder(node, recording, faults)
         recorder.open(instance)

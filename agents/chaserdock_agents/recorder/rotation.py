@@ -10,22 +10,28 @@ from chaserdock_protocol.messages import JoinReply
 from chaserdock_protocol.process import Rotation
 from chaserdock_protocol.recording.log import LogError, LogWriter
 from chaserdock_protocol.recording.scan import LOG_NAME, part_name
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import RawSample
 
 from .foxglove_layer import ViewerLayer
 
 
 class Recording:
-    """Writes a mission's log to ``folder``, which is created; every file is self-contained.
+    """Writes a mission's log to ``folder``, which is created; every file is self-contained and holds the full scenario.
 
     Without ``scenario`` there is no viewer layer. Raises LogError if a file cannot be created or written.
     """
 
     def __init__(
-        self, folder: Path, mission: JoinReply, rotation: Rotation, scenario: Scenario | None
+        self,
+        folder: Path,
+        mission: JoinReply,
+        full_scenario_json: str,
+        rotation: Rotation,
+        scenario: FlightScenario | None,
     ) -> None:
         self._folder, self._mission, self._rotation, self._scenario = folder, mission, rotation, scenario
+        self._full_scenario_json = full_scenario_json
         self._part = 0
         self._from_ns: int | None = None
         try:
@@ -47,7 +53,7 @@ class Recording:
         if self._rotation.wanted:
             name, run["part"] = part_name(self._part), str(self._part)
         self._writer = LogWriter(self._folder / name)
-        self._writer.describe(self._mission.scenario_json, run)
+        self._writer.describe(self._full_scenario_json, run)
         self._viewer = ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
         self._from_ns = None
 

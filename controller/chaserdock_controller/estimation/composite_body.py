@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import DockingStatus, Odometry
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.bodies import cuboid_inertia
 
 from chaserdock_controller.interfaces import AppliedImpulse
@@ -26,7 +26,7 @@ _MEASURED_UNKNOWN = 1.0
 """Share of a measured impulse that may act in any other direction: an undetected thruster failure."""
 
 
-def target_body(scenario: Scenario) -> TargetBody:
+def target_body(scenario: FlightScenario) -> TargetBody:
     """Return the scenario's target without any chaser."""
     target = scenario.target
     inertia = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
@@ -42,7 +42,7 @@ def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Arra
 class CompositeBody:
     """Chasers whose latch holds the target (``latched``), and the body that they form with it."""
 
-    def __init__(self, scenario: Scenario, estimator: Estimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self._scenario = scenario
         self._estimator = estimator
         self._target_alone = target_body(scenario)

@@ -8,7 +8,7 @@ from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CameraCalibration
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.interfaces import LogEntry, Observation, TargetEstimation
@@ -22,7 +22,7 @@ from .types import Estimator
 class EstimationStage:
     """The estimator, with the body that the target forms with latched chasers."""
 
-    def __init__(self, scenario: Scenario, estimator: Estimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
         self.estimator = estimator
         self.composite = CompositeBody(scenario, estimator)
         self.consistency = SensorConsistency()

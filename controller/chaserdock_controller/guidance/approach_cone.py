@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import ArrayLike
 
 from .docking import dock_of
@@ -46,7 +46,7 @@ def cone_about(axis: ArrayLike, innermost_m: float, aside_m: float, half_angle_r
     return Cone(direction, half_angle_rad, innermost_m - aside_m / math.tan(half_angle_rad))
 
 
-def cone_of(scenario: Scenario, chaser: int) -> Cone:
+def cone_of(scenario: FlightScenario, chaser: int) -> Cone:
     """Return a chaser's corridor: about its port's axis, or about its nominal direction if it docks at a distance. The inner
     end is wide enough for the path and for the permitted lateral error."""
     docking, dock = scenario.docking, dock_of(scenario, chaser)

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import ArrayLike
 
 from .approach_cone import BESIDE_LINE_M
@@ -29,7 +29,7 @@ def why_unknown_chaser(chaser: int, chasers: int) -> str:
     return "" if chaser < chasers else f"there is no chaser {chaser}; this mission has 0 to {chasers - 1}"
 
 
-def why_not_along(scenario: Scenario, chaser: int, offset_m: Array) -> str:
+def why_not_along(scenario: FlightScenario, chaser: int, offset_m: Array) -> str:
     """Check that a reference at ``offset_m`` (3,), TRF, is on the approach line through the nominal offset."""
     nominal = np.asarray(scenario.chasers[chaser].position_m)
     along = float(offset_m @ nominal) / math.hypot(*nominal)
@@ -39,7 +39,7 @@ def why_not_along(scenario: Scenario, chaser: int, offset_m: Array) -> str:
     return ""
 
 
-def why_not_calibrate(scenario: Scenario, phase: Phase, at_rest: bool) -> str:
+def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> str:
     """Check that a chaser can fly the calibration manoeuvre."""
     if phase is not Phase.HOLD or not at_rest:
         return f"in phase {phase}; hold first"
@@ -48,7 +48,7 @@ def why_not_calibrate(scenario: Scenario, phase: Phase, at_rest: bool) -> str:
     return ""
 
 
-def why_not_offset(scenario: Scenario, offset_m: ArrayLike) -> str:
+def why_not_offset(scenario: FlightScenario, offset_m: ArrayLike) -> str:
     """Check the distance of an offset (3,), TRF, from the target."""
     distance = float(np.linalg.norm(offset_m))
     nearest = scenario.limits.min_distance_target_m
@@ -57,7 +57,7 @@ def why_not_offset(scenario: Scenario, offset_m: ArrayLike) -> str:
     return ""
 
 
-def why_not_goto(scenario: Scenario, offset_m: ArrayLike | None, ends_m: Mapping[int, Array]) -> str:
+def why_not_goto(scenario: FlightScenario, offset_m: ArrayLike | None, ends_m: Mapping[int, Array]) -> str:
     """Check an offset (3,), TRF, against the target and the goals ``ends_m`` of the other chasers."""
     if offset_m is None:
         return "goto needs an offset"

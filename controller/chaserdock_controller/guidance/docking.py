@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import PortView, centre_offset, segments_apart
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.docking import Docking, Port
 
 from .phases import CORRIDOR, Phase, Trigger
@@ -48,7 +48,7 @@ class Dock:
         return max(0.0, float(np.linalg.norm(self.offset(-self.docking.overdrive_m))) - _KEEP_OUT_MARGIN_M)
 
 
-def dock_of(scenario: Scenario, chaser: int) -> Dock | None:
+def dock_of(scenario: FlightScenario, chaser: int) -> Dock | None:
     """Return the dock of a chaser, or None if it does not dock by capture."""
     port = scenario.docking.port_of(chaser)
     return None if port is None else Dock(port, scenario.chaser.probe_reach_m, scenario.docking)

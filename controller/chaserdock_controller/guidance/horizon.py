@@ -7,7 +7,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, predict_path
 from chaserdock_controller.estimation.types import TargetState
@@ -40,7 +40,7 @@ def target_path(
 class ReferenceBuilder:
     """Computes references from the moves and phases of a phase machine."""
 
-    def __init__(self, scenario: Scenario, machine: PhaseMachine) -> None:
+    def __init__(self, scenario: FlightScenario, machine: PhaseMachine) -> None:
         self._scenario, self._machine = scenario, machine
         self._step_s = scenario.controller.dt_s
         self._stages = round(scenario.controller.horizon_s / scenario.controller.dt_s)

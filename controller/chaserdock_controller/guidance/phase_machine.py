@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Latch, OperatorCommand
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import ArrayLike
 
 from . import command_validation as validation
@@ -54,7 +54,7 @@ _OUTSIDE_M = 0.02
 class PhaseMachine:
     """Phases of all chasers (``chasers``, by number)."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self._changes: list[PhaseChange] = []
         self.chasers = [ChaserGuidance(Phase.ACQUIRE, 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]

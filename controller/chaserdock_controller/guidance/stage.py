@@ -8,7 +8,7 @@ from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import view_of
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import CameraCalibration, CommandReply, Odometry
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.composite_body import pose_in_target
 from chaserdock_controller.interfaces import (
@@ -33,7 +33,7 @@ from .thruster_commands import THRUSTER_COMMANDS, ThrusterCommandHandler
 class GuidanceStage:
     """Phases, thruster commands and searches of all chasers."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self.machine = PhaseMachine(scenario)
         self.thrusters = ThrusterCommandHandler(scenario)

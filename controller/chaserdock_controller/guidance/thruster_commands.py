@@ -6,7 +6,7 @@ from __future__ import annotations
 import math
 
 from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from . import command_validation as validation
 from .chaser_state import CommandResult
@@ -17,7 +17,7 @@ THRUSTER_COMMANDS = ("isolate", "restore")
 class ThrusterCommandHandler:
     """Thrusters that operators have isolated or restored, by chaser."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self._chasers = len(scenario.chasers)
         body = scenario.chaser
         self._thrusters = len(body.thrusters) if body.actuation == "thrusters" else 0

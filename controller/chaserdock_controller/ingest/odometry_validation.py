@@ -17,7 +17,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import Level, Odometry
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 PLAUSIBLE_M = 0.02
 PLAUSIBLE_RAD = math.radians(2.0)
@@ -52,7 +52,7 @@ class Known:
 class OdometryValidation:
     """Removes jumps from the odometry of all chasers."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         body, o = scenario.chaser, scenario.odometry
         # Six sigma of the difference of two.
         self._noise_m = 6 * math.sqrt(2.0) * o.position_noise_m

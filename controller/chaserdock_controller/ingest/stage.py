@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import AppliedImpulse, Observation, TickInputs
 
@@ -19,7 +19,7 @@ from .thruster_reports import ThrusterReports
 class IngestStage:
     """Keeps the newest thruster report and odometry of every chaser."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self.thrusters = ThrusterReports(scenario)
         self.lost_chasers = LostChasers()

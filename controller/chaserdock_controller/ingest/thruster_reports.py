@@ -8,13 +8,13 @@ from collections.abc import Mapping
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import ThrusterReport
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 
 class ThrusterReports:
     """Reports by chaser."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         body = scenario.chaser
         self._nominal = np.array([body.force_max_N] * 3 + [body.torque_max_N_m] * 3)
         self._reports: dict[int, ThrusterReport] = {}

@@ -15,7 +15,7 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
     Tick,
 )
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.topics import Topic
 
 from chaserdock_controller.interfaces import LogEntry, TickInputs
@@ -28,7 +28,7 @@ _REMEMBERED_TICKS = 256
 class TickInputCollector:
     """The newest message of every chaser on every topic, the sightings since the tick before, and the lost messages."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self.odometry_validation = OdometryValidation(scenario)
         self._odometry: dict[int, Odometry] = {}
         self._thrusters: dict[int, ThrusterReport] = {}

@@ -9,7 +9,7 @@ from typing import cast
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.plugins import PluginError
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import (
     GuidanceResult,
@@ -34,7 +34,7 @@ class PlanningStage:
     """
 
     def __init__(
-        self, scenario: Scenario, parameters: NmpcParameters, now_s: Callable[[], float], realtime: bool
+        self, scenario: FlightScenario, parameters: NmpcParameters, now_s: Callable[[], float], realtime: bool
     ) -> None:
         c = scenario.controller
         self._parameters, self._now_s = parameters, now_s

@@ -6,7 +6,7 @@ from __future__ import annotations
 from chaserdock_models.braking import brake_wrench
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import WrenchCommand
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import CommandHistory
 from chaserdock_controller.interfaces import (
@@ -32,7 +32,7 @@ from .quantization import in_steps
 class OutputStage:
     """Keeps the commands sent so far, and which chasers have no plan."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: FlightScenario) -> None:
         self._scenario = scenario
         self.history = CommandHistory()
         self._without_plan: set[int] = set()

@@ -14,8 +14,8 @@ from .target import Geometry
 from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
 
-class Target(Oriented):
-    """The target: shape, initial state, and motion."""
+class FlightTarget(Section):
+    """The target as flight software knows it: shape, motion model, and assumed mass properties."""
 
     model: Name = Field(
         default="paper",
@@ -30,6 +30,33 @@ class Target(Oriented):
         description="`constant_rates`: prescribed constant velocity and angular velocity, as in the paper. `static`: "
         "prescribed, at rest. `torque_free`: a rigid body, which contact forces can move.",
     )
+    mass_kg: Positive = Field(default=1.25, description="Mass, kg. Used by `torque_free` only.")
+    inertia_kg_m2: PositiveVector | None = Field(
+        default=None,
+        description="Principal moments of inertia about the axes of TRF, kg m². Used by `torque_free` only. Without it: "
+        "those of a homogeneous cuboid of the model's size.",
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> FlightTarget:
+        if self.geometry is None:
+            target_model(self.model)
+        elif self.model in target_names():
+            raise ValueError(
+                f"model: {self.model!r} is the name of a known target; choose another one for this geometry"
+            )
+        if self.inertia_kg_m2 is not None:
+            _check_inertia(self.inertia_kg_m2)
+        return self
+
+    def shape(self) -> TargetModel:
+        """Return geometry and markers."""
+        return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
+
+
+class Target(FlightTarget, Oriented):
+    """The target: shape, initial state, and motion."""
+
     position_m: Vector = Field(
         default=(0.0, 0.0, 0.0), description="Initial position of its centre (WRF), m."
     )
@@ -44,28 +71,6 @@ class Target(Oriented):
         default=(0.015, 0.045, 0.03),
         description="Initial angular velocity (TRF), rad/s. Ignored by `static`.",
     )
-    mass_kg: Positive = Field(default=1.25, description="Mass, kg. Used by `torque_free` only.")
-    inertia_kg_m2: PositiveVector | None = Field(
-        default=None,
-        description="Principal moments of inertia about the axes of TRF, kg m². Used by `torque_free` only. Without it: "
-        "those of a homogeneous cuboid of the model's size.",
-    )
-
-    @model_validator(mode="after")
-    def _known(self) -> Target:
-        if self.geometry is None:
-            target_model(self.model)
-        elif self.model in target_names():
-            raise ValueError(
-                f"model: {self.model!r} is the name of a known target; choose another one for this geometry"
-            )
-        if self.inertia_kg_m2 is not None:
-            _check_inertia(self.inertia_kg_m2)
-        return self
-
-    def shape(self) -> TargetModel:
-        """Return geometry and markers."""
-        return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
 
 
 def _check_inertia(i: tuple[float, float, float]) -> None:

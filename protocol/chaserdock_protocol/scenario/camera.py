@@ -120,14 +120,9 @@ class EarthSection(Section):
         return self
 
 
-class CameraSection(Section):
-    """The camera of every chaser, and the light. The camera looks along +X of CRF, its top towards +Z."""
+class FlightCamera(Section):
+    """The calibration of every chaser's camera. It looks along +X of CRF, its top towards +Z."""
 
-    renderer: Literal["exact", "pybullet"] = Field(
-        default="exact",
-        description="`exact`: analytic edges, for cuboids and markers. `pybullet`: PyBullet's renderer, which also draws "
-        "meshes.",
-    )
     width_px: Pixels = Field(default=1280, description="Image width, pixels.")
     height_px: Pixels = Field(default=720, description="Image height, pixels.")
     hfov_deg: float = Field(
@@ -136,18 +131,44 @@ class CameraSection(Section):
     intrinsics: Intrinsics | None = Field(
         default=None, description="Calibrated camera, in place of `width_px`, `height_px` and `hfov_deg`."
     )
-    calibration: str | None = Field(
-        default=None,
-        exclude=True,
-        description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, JSON or XML) to read "
-        "`intrinsics` from.",
-    )
     position_m: Vector = Field(
         default=(0.07, 0.0, 0.075), description="Position of the optical centre (CRF), m."
     )
     mounting_rotation_deg: Vector = Field(
         default=(0.0, 0.0, 0.0),
         description="Rotation from looking along +X to the camera's mounting: rotation vector (CRF), degrees.",
+    )
+
+    def model(self) -> Camera:
+        """Return the camera as calibrated."""
+        i = self.intrinsics
+        q = Q_CRF_IRF_FORWARD_WXYZ
+        if any(self.mounting_rotation_deg):
+            turn = rotations.exp([math.radians(v) for v in self.mounting_rotation_deg])
+            qw, qx, qy, qz = rotations.multiply(turn, q).tolist()
+            q = (qw, qx, qy, qz)
+        if i is None:
+            c = Camera.from_hfov(self.width_px, self.height_px, math.radians(self.hfov_deg), self.position_m)
+            return Camera(c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px, (), self.position_m, q)
+        distortion = i.distortion if any(i.distortion) else ()
+        return Camera(
+            i.width_px, i.height_px, i.fx_px, i.fy_px, i.cx_px, i.cy_px, distortion, self.position_m, q
+        )
+
+
+class CameraSection(FlightCamera):
+    """The camera of every chaser, and the light. The camera looks along +X of CRF, its top towards +Z."""
+
+    renderer: Literal["exact", "pybullet"] = Field(
+        default="exact",
+        description="`exact`: analytic edges, for cuboids and markers. `pybullet`: PyBullet's renderer, which also draws "
+        "meshes.",
+    )
+    calibration: str | None = Field(
+        default=None,
+        exclude=True,
+        description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, JSON or XML) to read "
+        "`intrinsics` from.",
     )
     calibration_error: CalibrationError = CalibrationError()
     sun_direction: Vector = Field(
@@ -172,19 +193,3 @@ class CameraSection(Section):
         if self.calibration is not None:
             raise ValueError("calibration is resolved in scenario files only; give intrinsics")
         return self
-
-    def model(self) -> Camera:
-        """Return the camera as calibrated, without ``calibration_error``."""
-        i = self.intrinsics
-        q = Q_CRF_IRF_FORWARD_WXYZ
-        if any(self.mounting_rotation_deg):
-            turn = rotations.exp([math.radians(v) for v in self.mounting_rotation_deg])
-            qw, qx, qy, qz = rotations.multiply(turn, q).tolist()
-            q = (qw, qx, qy, qz)
-        if i is None:
-            c = Camera.from_hfov(self.width_px, self.height_px, math.radians(self.hfov_deg), self.position_m)
-            return Camera(c.width_px, c.height_px, c.fx_px, c.fy_px, c.cx_px, c.cy_px, (), self.position_m, q)
-        distortion = i.distortion if any(i.distortion) else ()
-        return Camera(
-            i.width_px, i.height_px, i.fx_px, i.fy_px, i.cx_px, i.cy_px, distortion, self.position_m, q
-        )

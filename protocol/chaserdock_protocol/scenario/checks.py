@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,22 +14,27 @@ from .faults import check_faults
 from .thrusters import check_pulses
 
 if TYPE_CHECKING:
-    from . import Scenario
+    from . import FlightScenario, Scenario
+
+
+def check_flight(scenario: FlightScenario) -> None:
+    """Run the checks of what flight software knows."""
+    _check_references(scenario)
+    _check_named_chasers(scenario)
+    if scenario.chaser.actuation == "thrusters":
+        check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
+    if scenario.docking.kind == "capture":
+        _check_capture(scenario)
 
 
 def check_consistent(scenario: Scenario) -> None:
-    """Run all checks."""
+    """Run the other checks, which need the full scenario."""
     _check_start_positions(scenario)
-    _check_references(scenario)
     _check_mesh(scenario)
-    _check_chaser_numbers(scenario)
+    _check_success(scenario)
     _check_reached(scenario)
-    if scenario.chaser.actuation == "thrusters":
-        check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
     _check_thruster_failures(scenario)
     _check_latched(scenario)
-    if scenario.docking.kind == "capture":
-        _check_capture(scenario)
     check_faults(scenario.fault, scenario)
 
 
@@ -45,7 +51,7 @@ def _check_start_positions(scenario: Scenario) -> None:
                 )
 
 
-def _check_references(scenario: Scenario) -> None:
+def _check_references(scenario: FlightScenario) -> None:
     limits = scenario.limits
     for i, c in enumerate(scenario.chasers):
         distance = math.hypot(*c.position_m)
@@ -73,14 +79,22 @@ def _check_mesh(scenario: Scenario) -> None:
         raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
 
 
-def _check_chaser_numbers(scenario: Scenario) -> None:
-    last = len(scenario.chasers) - 1
+def _check_named_chasers(scenario: FlightScenario) -> None:
     named = [(f"timeline.{i}.chasers", entry.chasers) for i, entry in enumerate(scenario.timeline)]
     named += [(f"docking.ports.{i}.chaser", (port.chaser,)) for i, port in enumerate(scenario.docking.ports)]
-    named += [(f"success.{key}", getattr(scenario.success, key)) for key in ("docked", "latched", "reached")]
-    for path, chasers in named:
-        if max(chasers, default=0) > last:
-            raise ValueError(f"{path}: there is no chaser {max(chasers)}; this mission has 0 to {last}")
+    _check_chaser_numbers(named, len(scenario.chasers))
+
+
+def _check_success(scenario: Scenario) -> None:
+    named = [(f"success.{key}", getattr(scenario.success, key)) for key in ("docked", "latched", "reached")]
+    _check_chaser_numbers(named, len(scenario.chasers))
+
+
+def _check_chaser_numbers(named: Iterable[tuple[str, tuple[int, ...]]], chasers: int) -> None:
+    last = chasers - 1
+    for path, numbers in named:
+        if max(numbers, default=0) > last:
+            raise ValueError(f"{path}: there is no chaser {max(numbers)}; this mission has 0 to {last}")
 
 
 def _check_reached(scenario: Scenario) -> None:
@@ -117,7 +131,7 @@ def _check_latched(scenario: Scenario) -> None:
             )
 
 
-def _check_capture(scenario: Scenario) -> None:
+def _check_capture(scenario: FlightScenario) -> None:
     if scenario.target.motion != "torque_free":
         raise ValueError(
             f"target.motion: docking by capture needs torque_free, which contact forces can move, "

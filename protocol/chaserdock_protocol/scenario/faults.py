@@ -3,14 +3,17 @@
 
 from __future__ import annotations
 
+import hashlib
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.topics import Role, Topic
 
+from .errors import ScenarioError, explain
 from .fields import Number, Positive, Section, Vector
+from .thrusters import ThrusterFailure
 
 if TYPE_CHECKING:
     from . import Scenario
@@ -168,6 +171,46 @@ class Fault(Section):
             if value is not None and name not in ("kind", "process", "at_s"):
                 parts.append(f"{name} {value}")
         return ", ".join(parts)
+
+
+class ProcessFaults(Section):
+    """What the test bed injects at one process. Read by the process' shell, not by its flight software.
+
+    ``seed``: of the random draws, a hash, so that it does not give away the scenario's. ``reported_failures``: thruster
+    failures that the chaser's hardware reports when they happen.
+    """
+
+    seed: int = Field(default=0, ge=0, lt=2**64)
+    faults: tuple[Fault, ...] = ()
+    reported_failures: tuple[ThrusterFailure, ...] = ()
+
+
+def faults_of(scenario: Scenario, process: str) -> ProcessFaults:
+    """Return the faults that a process injects into its own messages; the world announces, and so gets, all."""
+    faults = tuple(f for f in scenario.fault if process == "world" or _concerns(f, process))
+    digest = hashlib.sha256(f"{scenario.seed}/faults/{process}".encode()).digest()
+    return ProcessFaults(
+        seed=int.from_bytes(digest[:8], "big") if faults else 0,
+        faults=faults,
+        reported_failures=tuple(
+            f for f in scenario.thruster_failure if f.reported and process == f"chaser/{f.chaser}"
+        ),
+    )
+
+
+def _concerns(fault: Fault, process: str) -> bool:
+    if fault.kind == "cut" and fault.process != process:
+        return fault.peer in (None, process)
+    return fault.process == process and fault.kind != "odometry_lie"  # which the world publishes
+
+
+def process_faults_from_json(text: str) -> ProcessFaults:
+    """Return the faults of a join reply. Raises ScenarioError."""
+    try:
+        return ProcessFaults.model_validate_json(text)
+    except ValidationError as error:
+        lines = explain(error, ProcessFaults)
+        raise ScenarioError("\n".join(f"the world's faults: {line}" for line in lines)) from None
 
 
 def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:

@@ -16,8 +16,9 @@ from .camera import REPLACED_BY_INTRINSICS
 from .errors import ScenarioError, explain, value_text
 from .files import read_toml, resolve_files
 from .migrations import old_format, old_keys
+from .mission import Scenario
 from .overrides import Values, merge, with_override
-from .schema import ESTIMATORS, PERCEPTIONS, SOLVERS, Scenario
+from .schema import ESTIMATORS, PERCEPTIONS, SOLVERS
 
 Step = tuple[str, Callable[[Values], Values]]
 """Source of values (file or override), and the function that applies them to what precedes."""

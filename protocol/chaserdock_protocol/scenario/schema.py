@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Schema of a scenario: every key with type, default, range and description.
+"""Sections of a scenario: every key with type, default, range and description.
 
 Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF target, IRF image (docs/frames.md).
 """
@@ -8,20 +8,10 @@ from __future__ import annotations
 
 from typing import Literal
 
-from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
-from chaserdock_models.camera import Camera
-from chaserdock_models.clock import Timing
-from chaserdock_models.targets import TargetModel
 from pydantic import Field, model_validator
 
 from chaserdock_protocol.messages import OperatorCommandName
 
-from .bodies import Body, Target
-from .camera import CameraSection
-from .checks import check_consistent
-from .docking import Docking
-from .faults import Fault
 from .fields import (
     Fraction,
     Index,
@@ -34,9 +24,6 @@ from .fields import (
     UnitQuaternion,
     Vector,
 )
-from .migrations import FORMAT
-from .odometry import OdometrySection
-from .thrusters import ThrusterFailure
 
 PERCEPTIONS = ("default", "paper")
 ESTIMATORS = ("mekf", "paper")
@@ -215,8 +202,8 @@ class Approach(Section):
     )
 
 
-class Chaser(Oriented):
-    """One chaser: its reference pose, and its initial state relative to that. It starts without rotation in WRF."""
+class FlightChaser(Oriented):
+    """One chaser as flight software knows it: its reference pose."""
 
     position_m: Vector = Field(description="Reference position (TRF), m. Not the origin.")
     q_wxyz: UnitQuaternion = Field(
@@ -227,17 +214,9 @@ class Chaser(Oriented):
         exclude=True,
         description="Alternative to `q_wxyz`: point +X, and so the camera, at the target's centre, without roll.",
     )
-    start_offset_m: Vector = Field(
-        default=(0.0, 0.0, 0.0), description="Initial position relative to the reference position (TRF), m."
-    )
-    start_rotation_rad: Vector = Field(
-        default=(0.0, 0.0, 0.0),
-        description="Initial attitude relative to the reference attitude: rotation vector (CRF), rad.",
-    )
-    start_velocity_m_s: Vector = Field(default=(0.0, 0.0, 0.0), description="Initial velocity (WRF), m/s.")
 
     @model_validator(mode="after")
-    def _check_position(self) -> Chaser:
+    def _check_position(self) -> FlightChaser:
         if not any(self.position_m):
             raise ValueError("position_m must not be the target's origin: the approach line begins there")
         return self
@@ -265,125 +244,3 @@ class TimelineEntry(Section):
         if (self.command in ("isolate", "restore")) != (self.thruster is not None):
             raise ValueError("thruster goes with the commands isolate and restore, and these need it")
         return self
-
-
-class Success(Section):
-    """Criteria of a successful mission, evaluated on ground truth. Omitted criteria are not evaluated."""
-
-    docked: tuple[Index, ...] = Field(default=(), description="Chasers that must be docked at the end.")
-    reached: tuple[Index, ...] = Field(
-        default=(), description="Chasers that must be at the destination of their last `goto` at the end."
-    )
-    reached_position_m: Positive = Field(default=0.02, description="Tolerance of `reached`, m.")
-    reached_within_s: Positive | None = Field(
-        default=None, description="Longest time from that `goto` until a chaser is there to stay, s."
-    )
-    latched: tuple[Index, ...] = Field(default=(), description="Chasers that must be latched at the end.")
-    max_collisions: int = Field(default=0, ge=0, description="Largest number of collisions.")
-    keep_distances: bool = Field(
-        default=True, description="Whether the distances of `[limits]` must be kept."
-    )
-    steady_position_rms_m: Positive | None = Field(
-        default=None, description="Largest RMS of each chaser's position error in the steady interval, m."
-    )
-    steady_orientation_rms_deg: Positive | None = Field(
-        default=None,
-        description="Largest RMS of each chaser's attitude error in the steady interval, degrees.",
-    )
-    max_estimate_position_m: Positive | None = Field(
-        default=None, description="Largest error of the target's estimated position after `settling_s`, m."
-    )
-    max_estimate_orientation_deg: Positive | None = Field(
-        default=None,
-        description="Largest error of the target's estimated attitude after `settling_s`, degrees.",
-    )
-
-
-class Scenario(Section):
-    """A mission. Every process receives it from the world in resolved form."""
-
-    format: Literal[2] = Field(
-        default=FORMAT,
-        description=f"Version of the format of this file. Without it: {FORMAT}, the present one.",
-    )
-    extends: str | None = Field(
-        default=None,
-        exclude=True,
-        description="Scenario that this one is a variant of: the name of a shipped scenario, or the path of a file "
-        "relative to this one.",
-    )
-    name: Name = Field(description="Name of the scenario; the names of run folders begin with it.")
-    description: str = Field(default="", description="One sentence for lists and reports.")
-    duration_s: float = Field(
-        gt=0,
-        le=MAX_DURATION_S,
-        allow_inf_nan=False,
-        description="Length of the mission, s of simulated time.",
-    )
-    settling_s: NotNegative = Field(
-        default=20.0, description="Begin of the steady interval, s of mission time."
-    )
-    steady_until_s: Positive | None = Field(
-        default=None,
-        description="End of the steady interval, s of mission time. Without it: the end of the mission.",
-    )
-    seed: int = Field(default=0, ge=0, lt=2**32, description="Seed of everything random.")
-    time: Time = Time()
-    target: Target = Target()
-    chaser: Body = Body()
-    camera: CameraSection = CameraSection()
-    odometry: OdometrySection = OdometrySection()
-    perception: PerceptionSection = PerceptionSection()
-    estimator: EstimatorSection = EstimatorSection()
-    controller: Controller = Controller()
-    limits: Limits = Limits()
-    approach: Approach = Approach()
-    docking: Docking = Docking()
-    chasers: tuple[Chaser, ...] = Field(min_length=1, max_length=16)
-    timeline: tuple[TimelineEntry, ...] = ()
-    thruster_failure: tuple[ThrusterFailure, ...] = ()
-    fault: tuple[Fault, ...] = Field(default=(), max_length=100)
-    success: Success = Success()
-
-    @model_validator(mode="after")
-    def _check_consistent(self) -> Scenario:
-        if self.extends is not None:
-            raise ValueError("extends: is resolved in scenario files only")
-        check_consistent(self)
-        return self
-
-    def goal_of(self, chaser: int) -> tuple[float, Vector] | None:
-        """Return time (s) and destination (TRF, m) of a chaser's last ``goto`` in the timeline, or None."""
-        goals = [
-            (e.at_s, e.offset_m) for e in self.timeline if chaser in e.chasers and e.offset_m is not None
-        ]
-        return max(goals, key=lambda goal: goal[0], default=None)
-
-    @property
-    def timing(self) -> Timing:
-        return Timing(
-            physics_hz=self.time.physics_hz,
-            rate_hz=self.time.rate_hz,
-            image_hz=self.time.image_hz,
-            latency_steps=round(self.time.latency_s * self.time.physics_hz),
-        )
-
-    def camera_model(self) -> Camera:
-        """Return the camera as calibrated, which perception and estimation use."""
-        return self.camera.model()
-
-    def target_model(self) -> TargetModel:
-        """Return geometry and markers of the target."""
-        return self.target.shape()
-
-    @property
-    def ticks(self) -> int:
-        return self.timing.ticks_in(self.duration_s)
-
-    def start_pose(self, chaser: int) -> tuple[Array, Array]:
-        """Return position (3,) in WRF and attitude (4,), CRF to WRF, of a chaser at time zero."""
-        c = self.chasers[chaser]
-        offset = [a + b for a, b in zip(c.position_m, c.start_offset_m, strict=True)]
-        position = self.target.position_m + rotations.rotate(self.target.q_wxyz, offset)
-        attitude = rotations.multiply(self.target.q_wxyz, c.q_wxyz)
-        return position, rotations.multiply(attitude, rotations.exp(c.start_rotation_rad))

@@ -27,6 +27,7 @@ class Query:
 # A starting world also queries the join key, to detect another world.
 QUERIES = (
     Query(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
+    Query(topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"),
     Query(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
     Query(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
 )

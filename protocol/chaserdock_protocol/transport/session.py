@@ -17,7 +17,16 @@ from collections.abc import Callable
 
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import MAX_COUNT, Farewell, Health, JoinReply, JoinRequest, Presence
+from chaserdock_protocol.messages import (
+    MAX_COUNT,
+    Farewell,
+    Health,
+    JoinReply,
+    JoinRequest,
+    Presence,
+    ScenarioReply,
+    ScenarioRequest,
+)
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.topics import Role
 
@@ -53,6 +62,26 @@ def join(
         if patience_s is not None and time.monotonic() - begun > patience_s:
             raise JoinRefused(
                 f"no world answered within {patience_s:.0f} s; is it running, and on the same namespace?"
+            )
+        time.sleep(0.02)
+    return None
+
+
+def request_scenario(
+    node: Node, mission: JoinReply, stopped: Callable[[], bool], patience_s: float = 10.0
+) -> str | None:
+    """Return the JSON of the mission's full scenario, which flight processes may not have. Return None if ``stopped``.
+
+    Raises JoinRefused when the world gives none within ``patience_s`` of wall time.
+    """
+    begun = time.monotonic()
+    while not stopped():
+        reply = node.query(topics.SCENARIO_KEY, ScenarioRequest(process=node.name), ScenarioReply, 0.5)
+        if reply is not None and reply.run_id == mission.run_id:
+            return reply.scenario_json
+        if time.monotonic() - begun > patience_s:
+            raise JoinRefused(
+                f"the world gave no scenario on {topics.SCENARIO_KEY} within {patience_s:.0f} s; may {node.name} read it?"
             )
         time.sleep(0.02)
     return None

@@ -22,13 +22,15 @@ class Membership:
     """The processes of a mission as the world knows them. Thread-safe: called from Zenoh's threads and the main loop.
 
     ``instance``: the world's own; ``flying``: set at the first tick, from when on connected processes no longer wait for
-    processes that are only joining (see ``connected``).
+    processes that are only joining (see ``connected``). ``scenario_json``: the flight scenario; ``faults_of``: JSON of the
+    faults to inject at a process, by its name.
     """
 
     chasers: int
     run_id: str
     mode: str
     scenario_json: str
+    faults_of: Callable[[str], str] = lambda process: "{}"
     instance: str = ""
     now_s: Callable[[], float] = time.monotonic
     flying: bool = False
@@ -59,6 +61,7 @@ class Membership:
             run_id=self.run_id,
             mode="realtime" if self.realtime else "lockstep",
             scenario_json=self.scenario_json,
+            faults=self.faults_of(request.process),
         )
 
     def _refusal(self, request: JoinRequest) -> str:

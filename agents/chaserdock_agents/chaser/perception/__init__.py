@@ -7,7 +7,7 @@ from typing import Protocol
 
 import numpy as np
 from chaserdock_protocol import plugins
-from chaserdock_protocol.scenario import PERCEPTIONS, Scenario
+from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
 from numpy.typing import ArrayLike, NDArray
 
 from .pipeline import Method, Perception, PerceptionResult, TargetPose
@@ -21,7 +21,7 @@ class PerceptionMethod(Protocol):
     ) -> PerceptionResult: ...
 
 
-def make_perception(scenario: Scenario) -> PerceptionMethod:
+def make_perception(scenario: FlightScenario) -> PerceptionMethod:
     """Return the perception that the scenario names: a built-in one, or an installed ``chaserdock.perceptions`` entry point,
     a function of (camera: Camera, target: TargetModel). Raises PluginError if it is not installed."""
     camera, target = scenario.camera_model(), scenario.target_model()

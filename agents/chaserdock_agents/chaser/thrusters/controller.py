@@ -17,7 +17,7 @@ from chaserdock_protocol.messages import (
     ThrusterState,
     WrenchCommand,
 )
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.thrusters import FailureKind, thrusts_max
 
 from .allocation import allocator_of
@@ -41,7 +41,7 @@ class ThrusterController:
     ``events`` (level, what, detail) accumulate until ``drain_events``.
     """
 
-    def __init__(self, scenario: Scenario, chaser: int, noise: ImpulseNoise | None = None) -> None:
+    def __init__(self, scenario: FlightScenario, chaser: int, noise: ImpulseNoise | None = None) -> None:
         body = scenario.chaser
         self._body, self._timing, self._chaser = body, scenario.timing, chaser
         self._allocator = allocator_of(body)
@@ -67,7 +67,6 @@ class ThrusterController:
             SUFFICIENT_INFORMATION,
         )
         self._test_allowed = False
-        self._reported_failures = [f for f in scenario.thruster_failure if f.reported and f.chaser == chaser]
         self._failed: dict[int, ThrusterFault] = {}
         self._commanded_isolated: frozenset[int] = frozenset()
         self._trusted: frozenset[int] = frozenset()
@@ -92,11 +91,6 @@ class ThrusterController:
         """
         before, self._odometry = self._odometry, odometry
         now_ns = odometry.sim_time_ns
-        for failure in [f for f in self._reported_failures if round(f.at_s * 1e9) <= now_ns]:
-            self._reported_failures.remove(failure)
-            factor = 1.0 if failure.kind == "stuck_on" else failure.factor or 0.0
-            fault = ThrusterFault(failure.thruster, failure.kind, factor)
-            self._add_fault(fault, round(failure.at_s * 1e9), "reported")
         given = np.zeros(len(self._full_N))
         if before is not None and before.sim_time_ns < now_ns:
             given = self._impulses(before.sim_time_ns, now_ns)
@@ -108,6 +102,10 @@ class ThrusterController:
             self._pruned_ns = now_ns
             self._valves.forget_before(now_ns - _HISTORY_NS)
         return self._report(odometry, self._matrix @ given)
+
+    def report_failure(self, thruster: int, kind: FailureKind, factor: float, at_ns: int) -> None:
+        """Take over a failure that the hardware reports; ``factor``: remaining share of the thrust."""
+        self._add_fault(ThrusterFault(thruster, kind, factor), at_ns, "reported")
 
     def _detect_faults(self, before: Odometry, after: Odometry, thrusters: Array) -> None:
         if self._free_since_ns is None or before.sim_time_ns < self._free_since_ns:

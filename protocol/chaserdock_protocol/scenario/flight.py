@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The part of a scenario that flight software receives: chasers, controller and standby (docs/flight_scenario.md).
+
+Ground truth, what is random and what is planned to fail are not in it. A section that flight software may know is a field
+of ``FlightScenario``; any other one is a field of ``Scenario`` (mission.py).
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from chaserdock_models.camera import Camera
+from chaserdock_models.clock import Timing
+from chaserdock_models.targets import TargetModel
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+
+from .bodies import Body, FlightTarget
+from .camera import FlightCamera
+from .checks import check_flight
+from .docking import Docking
+from .errors import ScenarioError, explain
+from .fields import Name, Section
+from .migrations import FORMAT
+from .odometry import OdometrySection
+from .schema import (
+    MAX_DURATION_S,
+    Approach,
+    Controller,
+    EstimatorSection,
+    FlightChaser,
+    Limits,
+    PerceptionSection,
+    Time,
+    TimelineEntry,
+)
+
+
+class FlightScenario(Section):
+    """A mission as its flight software knows it."""
+
+    format: Literal[2] = Field(
+        default=FORMAT,
+        description=f"Version of the format of this file. Without it: {FORMAT}, the present one.",
+    )
+    name: Name = Field(description="Name of the scenario; the names of run folders begin with it.")
+    duration_s: float = Field(
+        gt=0,
+        le=MAX_DURATION_S,
+        allow_inf_nan=False,
+        description="Length of the mission, s of simulated time.",
+    )
+    time: Time = Time()
+    target: FlightTarget = FlightTarget()
+    chaser: Body = Body()
+    camera: FlightCamera = FlightCamera()
+    odometry: OdometrySection = OdometrySection()
+    perception: PerceptionSection = PerceptionSection()
+    estimator: EstimatorSection = EstimatorSection()
+    controller: Controller = Controller()
+    limits: Limits = Limits()
+    approach: Approach = Approach()
+    docking: Docking = Docking()
+    chasers: tuple[FlightChaser, ...] = Field(min_length=1, max_length=16)
+    timeline: tuple[TimelineEntry, ...] = ()
+
+    @model_validator(mode="after")
+    def _check_flight(self) -> FlightScenario:
+        check_flight(self)
+        return self
+
+    @property
+    def timing(self) -> Timing:
+        return Timing(
+            physics_hz=self.time.physics_hz,
+            rate_hz=self.time.rate_hz,
+            image_hz=self.time.image_hz,
+            latency_steps=round(self.time.latency_s * self.time.physics_hz),
+        )
+
+    def camera_model(self) -> Camera:
+        """Return the camera as calibrated."""
+        return self.camera.model()
+
+    def target_model(self) -> TargetModel:
+        """Return geometry and markers of the target."""
+        return self.target.shape()
+
+    @property
+    def ticks(self) -> int:
+        return self.timing.ticks_in(self.duration_s)
+
+
+_FLIGHT: TypeAdapter[FlightScenario] = TypeAdapter(FlightScenario)
+
+
+def flight_scenario(scenario: FlightScenario) -> FlightScenario:
+    """Return what flight software may know of a scenario: an object that holds nothing else."""
+    return FlightScenario.model_validate_json(flight_scenario_json(scenario))
+
+
+def flight_scenario_json(scenario: FlightScenario) -> str:
+    """Return the JSON of the flight scenario of a scenario."""
+    # Serialized by the declared types, which leaves out the fields of their subclasses.
+    return _FLIGHT.dump_json(scenario).decode()
+
+
+def flight_scenario_from_json(text: str, source: str) -> FlightScenario:
+    """Return a flight scenario from JSON. Raises ScenarioError, also for a full scenario, whose keys are unknown."""
+    try:
+        return FlightScenario.model_validate_json(text)
+    except ValidationError as error:
+        raise ScenarioError(
+            "\n".join(f"{source}: {line}" for line in explain(error, FlightScenario))
+        ) from None

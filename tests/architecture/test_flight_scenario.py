@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Flight software cannot hold ground truth: what a FlightScenario can contain, and what the flying packages import."""
+
+from __future__ import annotations
+
+import ast
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, get_args
+
+import pytest
+from chaserdock_protocol.scenario import (
+    FlightScenario,
+    Scenario,
+    ScenarioError,
+    flight_scenario,
+    flight_scenario_from_json,
+    flight_scenario_json,
+    load_scenario,
+    parse_scenario,
+)
+from chaserdock_protocol.scenario.bodies import Target
+from chaserdock_protocol.scenario.camera import (
+    CalibrationError,
+    CameraSection,
+    EarthSection,
+    Eclipse,
+    Effects,
+)
+from chaserdock_protocol.scenario.faults import Fault, ProcessFaults
+from chaserdock_protocol.scenario.mission import Chaser, Success
+from chaserdock_protocol.scenario.schema import TimelineEntry
+from chaserdock_protocol.scenario.thrusters import ThrusterFailure
+from chaserdock_protocol.shipped_scenarios import shipped_names, shipped_scenario
+from pydantic import BaseModel, Field
+from source_tree import MODULES, imported, short, tree_of
+
+FORBIDDEN_TYPES = {
+    Scenario, Target, Chaser, CameraSection, CalibrationError, Effects, Eclipse, EarthSection, Fault, ProcessFaults,
+    ThrusterFailure, Success,
+}  # fmt: skip
+FORBIDDEN_ANYWHERE = {
+    "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
+    "thruster_failure", "fault", "reported_failures", "success", "settling_s", "calibration_error", "effects",
+    "renderer", "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
+}  # fmt: skip
+FORBIDDEN_PATHS = {"target.position_m", "target.q_wxyz", "target.attitude_deg"}
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Models in a type, within tuples, unions and Annotated."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from models_in(inner)
+
+
+def fields_of(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, type[BaseModel]]]:
+    """Path of every field that can be reached, and the model that has it."""
+    for name, info in model.model_fields.items():
+        yield f"{path}{name}", model
+        for inner in models_in(info.annotation):
+            yield from fields_of(inner, f"{path}{name}.")
+
+
+def truth_in(model: type[BaseModel]) -> set[str]:
+    """Fields that flight software must not have."""
+    return {
+        path
+        for path, owner in fields_of(model)
+        if owner in FORBIDDEN_TYPES
+        or path.rpartition(".")[2] in FORBIDDEN_ANYWHERE
+        or path in FORBIDDEN_PATHS
+        or ("at_s" in path.split(".") and owner is not TimelineEntry)
+    }
+
+
+def test_no_ground_truth_is_reachable_in_a_flight_scenario() -> None:
+    assert truth_in(FlightScenario) == set()
+
+
+def test_the_walk_reaches_nested_fields_and_finds_truth() -> None:
+    paths = {path for path, _ in fields_of(FlightScenario)}
+    assert {"chaser.thrusters.thrust_N", "docking.ports.axis", "target.geometry.markers.side_m"} <= paths
+    found = truth_in(Scenario)
+    forbidden = FORBIDDEN_PATHS | {
+        "seed",
+        "camera.effects.gain",
+        "fault.kind",
+        "chasers.start_offset_m",
+        "success",
+    }
+    assert forbidden <= found
+
+    class Leaky(FlightScenario):
+        spare: tuple[dict[str, Effects | None], ...] = Field(default=())
+
+    assert "spare.gain" in truth_in(Leaky)
+
+
+def test_every_field_that_is_not_shared_is_known_to_be_truth_or_bookkeeping() -> None:
+    """A new key of the full scenario is hidden unless it is declared in the flight scenario."""
+    only_full = set(Scenario.model_fields) - set(FlightScenario.model_fields)
+    assert only_full - {"extends", "steady_until_s"} <= FORBIDDEN_ANYWHERE
+
+
+# -- values -----------------------------------------------------------------------------------------------
+
+TRUTH = {
+    "seed": 77,
+    "description": "x",
+    "settling_s": 3.0,
+    "target": {
+        "position_m": [4.0, 5.0, 6.0],
+        "q_wxyz": [0.6, 0.8, 0.0, 0.0],
+        "velocity_m_s": [0.1, 0.2, 0.3],
+        "omega_rad_s": [0.3, 0.2, 0.1],
+    },
+    "camera": {
+        "sun_direction": [1.0, 2.0, 3.0],
+        "ambient": 0.2,
+        "lamp": 9.0,
+        "eclipses": [{"from_s": 1.0, "to_s": 2.0}],
+        "earth": {"direction": [0.0, 0.0, -1.0]},
+        "effects": {"gain": 2.0, "read_noise": 9.0},
+    },
+    "fault": [{"kind": "drop", "process": "chaser/0", "topic": "image", "at_s": 1.0, "duration_s": 2.0}],
+    "success": {"docked": [0], "max_collisions": 3},
+}
+CHASER = {"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
+START = {
+    "start_offset_m": [0.1, 0.2, 0.3],
+    "start_rotation_rad": [0.1, 0.0, 0.2],
+    "start_velocity_m_s": [0.1, 0, 0],
+}
+
+
+def scenario(chaser: dict[str, Any], **values: Any) -> Scenario:
+    return parse_scenario({"name": "mine", "duration_s": 10.0, "chasers": [chaser], **values}, "test")
+
+
+def test_flight_scenario_does_not_depend_on_truth() -> None:
+    plain, other = scenario(CHASER), scenario({**CHASER, **START}, **TRUTH)
+    assert plain != other
+    assert flight_scenario_json(plain) == flight_scenario_json(other)
+    assert flight_scenario(plain) == flight_scenario(other)
+
+
+@pytest.mark.parametrize("name", shipped_names())
+def test_flight_scenario_keeps_its_values_and_types(name: str) -> None:
+    full = load_scenario(shipped_scenario(name))
+    flight = flight_scenario(full)
+    assert type(flight) is FlightScenario
+    assert {type(c) for c in flight.chasers} == {type(flight).model_fields["chasers"].annotation.__args__[0]}  # type: ignore[union-attr]
+    assert type(flight.target) is FlightScenario.model_fields["target"].annotation
+    assert type(flight.camera) is FlightScenario.model_fields["camera"].annotation
+    assert flight.camera_model() == full.camera_model()
+    assert flight.target_model() == full.target_model()
+    assert (flight.timing, flight.chaser, flight.docking) == (full.timing, full.chaser, full.docking)
+    assert flight_scenario_from_json(flight_scenario_json(full), "test") == flight == flight_scenario(flight)
+
+
+def test_flight_software_refuses_a_full_scenario() -> None:
+    with pytest.raises(ScenarioError, match=r"unknown key seed"):
+        flight_scenario_from_json(scenario(CHASER).model_dump_json(), "test")
+
+
+def test_error_in_a_flight_scenario_names_the_path() -> None:
+    values = json.loads(flight_scenario_json(scenario(CHASER)))
+    values["limits"]["min_distance_target_m"] = 5.0
+    with pytest.raises(ScenarioError, match=r"test: .*chasers.0.position_m: 1 m from the target, nearer"):
+        flight_scenario_from_json(json.dumps(values), "test")
+
+
+# -- imports ----------------------------------------------------------------------------------------------
+
+FULL_SCENARIO = {
+    "Scenario", "load_scenario", "parse_scenario", "scenario_from_json", "mission", "loading", "Target", "Chaser",
+    "CameraSection", "faults_of", "request_scenario", "SCENARIO_KEY",
+}  # fmt: skip
+FLYING_PACKAGES = [
+    path for package, path in MODULES if package in ("chaserdock_agents", "chaserdock_controller")
+]
+RECORDER = Path("recorder/process.py")
+
+
+@pytest.mark.parametrize("path", FLYING_PACKAGES, ids=short)
+def test_flying_packages_do_not_load_the_full_scenario(path: Path) -> None:
+    of_protocol = {name for name in imported(path) if name.startswith("chaserdock_protocol.")}
+    found = {name.rpartition(".")[2] for name in of_protocol} & FULL_SCENARIO
+    used = {node.attr for node in ast.walk(tree_of(path)) if isinstance(node, ast.Attribute)} & FULL_SCENARIO
+    # The recorder stores the full scenario in the log, as text.
+    recorder = path.parts[-2:] == RECORDER.parts
+    assert found | used == ({"request_scenario"} if recorder else set())

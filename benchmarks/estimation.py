@@ -66,6 +66,7 @@ def scenario_of(target: str, number: int, seed: int, duration_s: float, **more: 
             "duration_s": duration_s,
             "settling_s": 0.0,
             "seed": seed,
+            "navigation": {"grade": "exact"},
             "target": {
                 "model": target,
                 "q_wxyz": tuple(rotations.exp(rng.uniform(-0.2, 0.2, 3)).tolist()),
@@ -232,7 +233,12 @@ def changed(scenario: Scenario, **sections: Any) -> Scenario:
     return Scenario.model_validate(values)
 
 
-ERRORS = {"focal_length_share": 1e-3, "centre_px": 0.5, "mounting_deg": 0.3}
+ERRORS = {
+    "camera_focal_share": 1e-3,
+    "camera_centre_px": 0.5,
+    "camera_turn_deg": 0.3,
+    "camera_shift_m": 5e-4,
+}
 HEAVY = {
     "exposure_s": 0.003,
     "glare": 500.0,
@@ -241,17 +247,11 @@ HEAVY = {
     "point_spread_px": 0.9,
     "jpeg_quality": 75,
 }
-BIAS_SIGMAS = {
-    "camera_bias_attitude_deg": 0.3,
-    "camera_bias_focal_share": 1e-3,
-    "camera_bias_position_m": 5e-4,
-}
 
 
 def with_errors(scenario: Scenario) -> Scenario:
     """Return the scenario with calibration errors and heavy noise, whose sigmas the filter has as parameters."""
-    camera = scenario.camera.model_dump() | {"calibration_error": ERRORS, "effects": HEAVY}
-    return changed(scenario, camera=camera, estimator=BIAS_SIGMAS)
+    return changed(scenario, camera={"effects": HEAVY}, navigation=ERRORS)
 
 
 def figures(flown: Flight, from_s: float) -> Row:
@@ -292,18 +292,16 @@ def exact(target: str, chasers: int, seed: int) -> Row:
 def errors(target: str, chasers: int, seed: int) -> Row:
     """Fly with errors; ``naive`` is the same filter with zero calibration sigmas."""
     scenario = with_errors(scenario_of(target, chasers, seed, 12.0))
-    naive = changed(scenario, estimator=dict.fromkeys(BIAS_SIGMAS, 0.0))
+    naive = changed(scenario, navigation=dict.fromkeys(ERRORS, 0.0))
     return figures(fly(scenario, {"naive": naive}), SETTLED_S)
 
 
 def calibrate(target: str, seed: int) -> Row:
     """Fly one chaser with a mounting error of 0.3 degrees (one sigma, each axis); it calibrates from 5 s on, for 30 s."""
     scenario = scenario_of(target, 1, seed, 46.0)
-    camera = scenario.camera.model_dump() | {"calibration_error": {"mounting_deg": 0.3}}
     scenario = changed(
         scenario,
-        camera=camera,
-        estimator={"camera_bias_attitude_deg": 0.3},
+        navigation={"camera_turn_deg": 0.3},
         timeline=[{"at_s": 5.0, "command": "calibrate", "chasers": (0,)}],
     )
     flown = fly(scenario)

@@ -53,6 +53,7 @@ def scenario(duration_s: float, body: str = "tetra12", rate_hz: int = 15, **chan
         "duration_s": duration_s,
         "time": {"rate_hz": rate_hz, "image_hz": rate_hz},
         "chaser": chaser,
+        "navigation": {"grade": "exact"},
         "chasers": [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0], **start}],
     }
     return parse_scenario(values | changes, "benchmark")

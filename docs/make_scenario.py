@@ -47,7 +47,7 @@ chaserdock run single --set seed=3 --set 'chasers.0.position_m=[-1.5, 0.0, 0.0]'
   variant. The world sends, and logs store, the resolved scenario.
 - **Attitudes.** `q_wxyz` is a unit quaternion, scalar first. Instead of it a table may have `attitude_deg`, and a chaser
   `look_at = "target"`; two of them are an error.
-- **Format.** `format = 2` states the version of the file's format. Without it, the present one is assumed. A key of an older
+- **Format.** `format = 3` states the version of the file's format. Without it, the present one is assumed. A key of an older
   format is an error that names the present key. Scenarios in old logs are converted.
 - **Editors.** `chaserdock scenario schema` prints a JSON schema. With taplo or VS Code's Even Better TOML, save it beside the
   file and begin the file with `#:schema ./scenario.schema.json`.

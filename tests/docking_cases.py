@@ -36,6 +36,7 @@ def values(chasers: int = 1, **changes: Any) -> dict[str, Any]:
     out: dict[str, Any] = {
         "name": "test",
         "duration_s": 60.0,
+        "navigation": {"grade": "exact"},
         "target": {
             "model": "servicer",
             "motion": "torque_free",

@@ -25,6 +25,7 @@ def scenario(**changes: Any) -> Scenario:
     values: dict[str, Any] = {
         "name": "test",
         "duration_s": 100.0,
+        "navigation": {"grade": "exact"},
         "approach": {"dock_distance_m": 0.4, "max_speed_m_s": 0.03},
         "chasers": [
             {"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},

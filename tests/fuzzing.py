@@ -157,7 +157,7 @@ def garbage_in(message: msgspec.Struct) -> str | None:
             return f"{type(message).__name__}.{name}: {wrong}"
         if name == "q_wxyz" and abs(math.hypot(*value) - 1.0) > 1e-6:
             return f"{type(message).__name__}.{name}: not of unit length"
-        if name == "covariance" and any(
+        if "covariance" in name and any(
             value[k] < 0.0 for k in range(0, len(value), math.isqrt(len(value)) + 1)
         ):
             return f"{type(message).__name__}.{name}: a negative variance"

@@ -11,7 +11,7 @@ from chaserdock_protocol import messages as m
 from chaserdock_protocol.recording.log import LogWriter
 
 V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
-SCENARIO = '{"format": 2, "name": "a scenario"}'
+SCENARIO = '{"format": 3, "name": "a scenario"}'
 
 
 class Clock:

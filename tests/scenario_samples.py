@@ -11,6 +11,9 @@ name = "two"
 duration_s = 10.0
 seed = 3
 
+[navigation]
+grade = "exact"
+
 [target]
 model = "paper"
 

@@ -18,6 +18,7 @@ def mission(body: str = "tetra12", **changes: Any) -> Scenario:
     values: dict[str, Any] = {
         "name": "thrusters",
         "duration_s": 10.0,
+        "navigation": {"grade": "exact"},
         "chaser": chaser,
         "chasers": [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
     }

@@ -16,6 +16,7 @@ def scenario(**changes: Any) -> Scenario:
     values: dict[str, Any] = {
         "name": "test",
         "duration_s": 10.0,
+        "navigation": {"grade": "exact"},
         "chasers": [{"position_m": [-5.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
     }
     return parse_scenario(values | changes, "test")

@@ -32,7 +32,7 @@ _NEW = """\
 #   chaserdock scenario validate {file}
 # and run it with
 #   chaserdock run {file}
-format = 2
+format = 3
 name = "{name}"
 description = "One chaser synchronizes with the tumbling target."
 duration_s = 40.0
@@ -44,6 +44,10 @@ settling_s = 20.0
 model = "paper"
 velocity_m_s = [0.015, 0.0075, 0.03]
 omega_rad_s = [0.015, 0.045, 0.03]
+
+# What the chasers know of their own motion and cameras: `exact`, `lab`, `orbit` or `poor`.
+[navigation]
+grade = "exact"
 
 [camera]
 width_px = 960

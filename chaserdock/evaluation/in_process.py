@@ -163,8 +163,7 @@ class InProcessMission:
         return record
 
     def _odometry(self, chaser: int, time_ns: int, states: States) -> Odometry:
-        sensed = self._odometry_sensor.measure(chaser, self.tick, states[f"chaser/{chaser}"])
-        return odometry_of(chaser, sensed, self.tick, time_ns)
+        return odometry_of(self._odometry_sensor, chaser, states[f"chaser/{chaser}"], self.tick, time_ns)
 
     def _validated(self, odometry: Odometry) -> Odometry:
         validated, events = self._validation.update(odometry)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 from chaserdock_protocol import plugins
@@ -46,7 +45,7 @@ def estimator_of(scenario: FlightScenario) -> Estimator:
         return make_estimator("paper")
     if scenario.estimator.name != "mekf":
         return plugins.load("estimator", scenario.estimator.name, ESTIMATORS)(scenario)
-    target, e = scenario.target, scenario.estimator
+    target, errors = scenario.target, scenario.navigation.errors()
     size_m = scenario.target_model().size_m
     ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, size_m)
     return make_estimator(
@@ -54,8 +53,8 @@ def estimator_of(scenario: FlightScenario) -> Estimator:
         MekfParameters(
             motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
             inertia_ratios=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
-            bias_position_m=e.camera_bias_position_m,
-            bias_attitude_rad=math.radians(e.camera_bias_attitude_deg),
-            bias_focal_share=e.camera_bias_focal_share,
+            bias_position_m=errors.camera_shift_m,
+            bias_attitude_rad=errors.camera_turn_rad,
+            bias_focal_share=errors.camera_focal_share,
         ),
     )

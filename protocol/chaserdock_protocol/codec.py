@@ -124,7 +124,7 @@ def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
                     quaternions.append(field.name)
                     continue
                 rows.append(field.name)
-                if field.name == "covariance":
+                if "covariance" in field.name:
                     covariances.append(field.name)
             case other if holds_floats(other):
                 return None
@@ -169,8 +169,8 @@ def _check_tuple(name: str, values: tuple[float, ...]) -> None:
     if name == "q_wxyz":
         if abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
             raise Rejected("not_unit_quaternion", f"{name} has length {length}")
-    elif name == "covariance":
-        _check_covariance(values)
+    elif "covariance" in name:
+        _check_covariance(name, values)
 
 
 @cache
@@ -205,11 +205,11 @@ def _bad_number(name: str, value: float) -> Rejected:
     return Rejected(reason, f"{name} holds {value}, beyond {MAX_MAGNITUDE:g}")
 
 
-def _check_covariance(values: tuple[float, ...]) -> None:
+def _check_covariance(name: str, values: tuple[float, ...]) -> None:
     """Reject negative variances. Users that invert the matrix check that it is positive semi-definite."""
     step = isqrt(len(values)) + 1
     if min(values[::step]) < 0.0:
-        raise Rejected("not_a_covariance", "covariance has a negative variance")
+        raise Rejected("not_a_covariance", f"{name} has a negative variance")
 
 
 def vector(array: Any) -> Any:

@@ -37,6 +37,7 @@ OperatorCommandName = Literal[
     "approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"
 ]
 Level = Literal["info", "warning", "error"]
+Square3 = Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)]
 Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 
@@ -159,14 +160,26 @@ class Image(Message, frozen=True, kw_only=True):
     data: Annotated[bytes, Meta(max_length=16_000_000)]
 
 
+_EXACT = (0.0,) * 9
+
+
 class Odometry(Message, frozen=True, kw_only=True):
-    """A chaser's own navigation solution: position and velocity in WRF, attitude CRF to WRF, rate in CRF."""
+    """A chaser's own navigation solution: position and velocity in WRF, attitude CRF to WRF, rate in CRF.
+
+    Covariances are row-major (3, 3), of position and velocity in WRF, of attitude (q_true = q (x) exp(dtheta)) and rate in
+    CRF. They describe the white noise, which is new in every tick; zero is exact. The scenario's ``[navigation]`` states
+    errors that are correlated in time.
+    """
 
     chaser: ChaserId
     position_m: Vector3
     velocity_m_s: Vector3
     q_wxyz: Quaternion
     omega_rad_s: Vector3
+    position_covariance_m2: Square3 = _EXACT
+    velocity_covariance_m2_s2: Square3 = _EXACT
+    attitude_covariance_rad2: Square3 = _EXACT
+    omega_covariance_rad2_s2: Square3 = _EXACT
 
 
 class DockingStatus(Message, frozen=True, kw_only=True):
@@ -484,7 +497,7 @@ VERSION: dict[type[Struct], int] = {
     Tick: 2,
     MissionEnd: 1,
     Image: 1,
-    Odometry: 1,
+    Odometry: 2,
     DockingStatus: 1,
     BodyTruth: 2,
     WorldTruth: 1,

@@ -134,7 +134,14 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
 
 
 def test_the_scenarios_odometry_is_the_pilots_noise() -> None:
-    s = mission(odometry={"velocity_noise_m_s": 0.002, "omega_noise_deg_s": 0.1, "attitude_noise_deg": 0.3})
+    s = mission(
+        navigation={
+            "grade": "exact",
+            "velocity_noise_m_s": 0.002,
+            "omega_noise_deg_s": 0.1,
+            "attitude_noise_deg": 0.3,
+        }
+    )
     assert noise_of(s.odometry) == ImpulseNoise(0.002, np.radians(0.1), np.radians(0.3))
     assert noise_of(mission().odometry) == ImpulseNoise()
 

@@ -92,9 +92,9 @@ def test_burns_are_apart_and_only_where_there_is_room() -> None:
     assert Bench(every_s=0.0).burn(0) is None
 
 
-def fired(odometry: dict[str, float] | None = None, chaser: Any = None, **command_as: Any) -> set[int]:
+def fired(navigation: dict[str, float] | None = None, chaser: Any = None, **command_as: Any) -> set[int]:
     """Thrusters that open within three seconds in which a pilot is asked for nothing."""
-    s = mission(chaser=chaser or {}, odometry=odometry or {})
+    s = mission(chaser=chaser or {}, navigation={"grade": "exact", **(navigation or {})})
     pilot, out = ThrusterController(s, 0), set()
     for tick in range(45):
         pilot.observe(at_rest(s, tick))

@@ -29,6 +29,7 @@ def scenario(jpeg_quality: int = 92) -> Scenario:
         {
             "name": "eye",
             "duration_s": 10.0,
+            "navigation": {"grade": "exact"},
             "target": {"model": "servicer"},
             "camera": {"width_px": WIDTH, "height_px": HEIGHT, "effects": {"jpeg_quality": jpeg_quality}},
             "chasers": [{"position_m": [-1.5, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],

@@ -22,7 +22,6 @@ from chaserdock_protocol.scenario import (
 )
 from chaserdock_protocol.scenario.bodies import Target
 from chaserdock_protocol.scenario.camera import (
-    CalibrationError,
     CameraSection,
     EarthSection,
     Eclipse,
@@ -37,12 +36,12 @@ from pydantic import BaseModel, Field
 from source_tree import MODULES, imported, short, tree_of
 
 FORBIDDEN_TYPES = {
-    Scenario, Target, Chaser, CameraSection, CalibrationError, Effects, Eclipse, EarthSection, Fault, ProcessFaults,
+    Scenario, Target, Chaser, CameraSection, Effects, Eclipse, EarthSection, Fault, ProcessFaults,
     ThrusterFailure, Success,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
-    "thruster_failure", "fault", "reported_failures", "success", "settling_s", "calibration_error", "effects",
+    "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
     "renderer", "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
 }  # fmt: skip
 FORBIDDEN_PATHS = {"target.position_m", "target.q_wxyz", "target.attitude_deg"}

@@ -27,7 +27,16 @@ def three_chasers() -> Scenario:
     places = ([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0], [0.0, 1.2, 0.0])
     chasers = [{"position_m": p, "q_wxyz": [1.0, 0.0, 0.0, 0.0]} for p in places]
     still = {"model": "servicer", "motion": "static"}
-    return parse_scenario({"name": "test", "duration_s": 60.0, "target": still, "chasers": chasers}, "test")
+    return parse_scenario(
+        {
+            "name": "test",
+            "duration_s": 60.0,
+            "navigation": {"grade": "exact"},
+            "target": still,
+            "chasers": chasers,
+        },
+        "test",
+    )
 
 
 def step(flight: ControllerCore, tick: int, present: tuple[int, ...], **more: object) -> TickOutputs:
@@ -135,6 +144,7 @@ def test_chasers_leave_keep_out_zones_in_which_they_start() -> None:
             "name": "test",
             "duration_s": 20.0,
             "settling_s": 1.0,
+            "navigation": {"grade": "exact"},
             "chasers": chasers,
             "limits": {"min_distance_chasers_m": 0.6},
         },

@@ -85,14 +85,23 @@ INVALID = [
     ({"position_m": (float("nan"), 0.0, 0.0)}, "position_m holds a value that is not finite"),
     ({"velocity_m_s": (0.0, float("inf"), 0.0)}, "velocity_m_s holds a value that is not finite"),
     ({"omega_rad_s": (0.0, 0.0, float("nan"))}, "omega_rad_s holds a value that is not finite"),
+    ({"position_covariance_m2": (float("nan"),) * 9}, "position_covariance_m2 is not a covariance"),
     ({"q_wxyz": (0.0, 0.0, 0.0, 0.0)}, "q_wxyz has length 0, not 1"),
     ({"q_wxyz": (0.8, 0.0, 0.0, 0.0)}, "q_wxyz has length 0.8, not 1"),
 ]
+# Receivers check variances only.
+INVALID_COVARIANCES: list[tuple[dict[str, Any], str]] = [
+    ({"attitude_covariance_rad2": (1.0, 0.5, *(0.0,) * 7)}, "attitude_covariance_rad2 is not a covariance"),
+    (
+        {"velocity_covariance_m2_s2": (1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0)},
+        "velocity_covariance_m2_s2 is not a covariance",
+    ),
+]
 
 
-@pytest.mark.parametrize(("changes", "message"), INVALID)
+@pytest.mark.parametrize(("changes", "message"), [*INVALID, *INVALID_COVARIANCES])
 def test_invalid_odometry_makes_only_that_chaser_coast(changes: dict[str, Any], message: str) -> None:
-    """The codec already rejects such messages (below); the core is safe without it."""
+    """The codec already rejects most of these messages (below); the core is safe without it."""
     flight = core_of(scenario())
     assert step(flight, 0).wrenches[0].mode == "nmpc"
     for tick in (1, 2):

@@ -166,7 +166,7 @@ def test_calibrate_is_rejected_without_target_without_bias_states_and_outside_ho
     assert "not been found" in reply(exact, 0.0)
     exact.target_acquired(1.0)
     assert "taken as exact" in reply(exact, 2.0)
-    guidance = PhaseMachine(scenario(estimator={"camera_bias_attitude_deg": 0.3}))
+    guidance = PhaseMachine(scenario(navigation={"grade": "exact", "camera_turn_deg": 0.3}))
     guidance.target_acquired(1.0)
     guidance.command(OperatorCommand(command="approach", chaser=0), 2.0)
     assert "hold first" in reply(guidance, 3.0)

@@ -22,7 +22,7 @@ SMALL = (
     "success.steady_position_rms_m=9.0",
     "success.steady_orientation_rms_deg=180.0",
 )
-ODOMETRY = "odometry={position_noise_m=0.001,velocity_noise_m_s=0.0005,attitude_noise_deg=0.05,position_bias_m=0.002}"
+NAVIGATION = "navigation={grade='orbit',position_bias_m=0.002}"
 CASES = {
     "ideal": ("two-chaser-tracking", ("duration_s=2.0",)),
     "errors": (
@@ -32,9 +32,8 @@ CASES = {
             "chaser.actuation='thrusters'",
             "chaser.body='tetra12'",
             "thruster_failure=[{chaser=0,thruster=4,at_s=0.5,kind='stuck_on'}]",
-            "camera.calibration_error={focal_length_share=0.001,mounting_deg=0.3}",
             "camera.effects={read_noise=3.0,jpeg_quality=80}",
-            ODOMETRY,
+            NAVIGATION,
         ),
     ),
 }
@@ -66,12 +65,18 @@ def test_truth_equals_lockstep_mission(case: str, tmp_path: Path) -> None:
 def mission(**changes: object) -> dict[str, object]:
     still = {"motion": "static"}
     chasers = [{"position_m": [-1.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}]
-    return {"name": "test", "duration_s": 2.0, "target": still, "chasers": chasers, **changes}
+    return {
+        "name": "test",
+        "duration_s": 2.0,
+        "navigation": {"grade": "exact"},
+        "target": still,
+        "chasers": chasers,
+    } | changes
 
 
 def test_odometry_errors_of_the_scenario_apply() -> None:
     scenario = parse_scenario(
-        mission(odometry={"position_bias_m": 0.01, "velocity_noise_m_s": 0.001}), "test"
+        mission(navigation={"grade": "exact", "position_bias_m": 0.01, "velocity_noise_m_s": 0.001}), "test"
     )
     with InProcessMission(scenario) as flight:
         records = list(flight.ticks())

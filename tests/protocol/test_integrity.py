@@ -53,7 +53,7 @@ def test_honest_odometry_is_handed_on_as_it_is() -> None:
 
 def test_noise_that_the_scenario_admits_is_no_jump() -> None:
     noisy = SCENARIO.model_copy(
-        update={"odometry": SCENARIO.odometry.model_copy(update={"position_noise_m": 0.02})}
+        update={"navigation": SCENARIO.navigation.model_copy(update={"position_noise_m": 0.02})}
     )
     watch = OdometryValidation(noisy)
     assert [watch.update(flown(tick, 0.02))[1] for tick in range(200)] == [[]] * 200

@@ -33,6 +33,7 @@ PRESENT: dict[str, msgspec.Struct] = {
 OLD_NAMES: dict[str, dict[str, str]] = {
     "Tick": {"images": "pictures"},
     "BodyTruth": {"thruster_impulse_N_s": "jet_impulse_N_s", "thruster_open_s": "jet_open_s"},
+    "Odometry": {},
     "Sighting": {},
     "ActuatorCommand": {},
     "ThrusterReport": {"thrusters": "jets"},
@@ -50,6 +51,8 @@ def version_1(message: msgspec.Struct) -> tuple[dict[str, Any], str]:
     fields = {OLD_NAMES.get(name, {}).get(field, field): value for field, value in fields.items()}
     if fields.get("status") == "bad_image":
         fields["status"] = "bad_picture"
+    if name == "Odometry":
+        fields = {field: value for field, value in fields.items() if "covariance" not in field}
     for field in ("pulses", "operated"):
         for item in fields.get(field, ()):
             item["jet"] = item.pop("thruster")
@@ -128,7 +131,7 @@ FORMAT_1: dict[str, Any] = {
     "jet_failure": [{"jet": 1, "kind": "weak", "told": False}],
     "fault": [{"kind": "drop", "topic": "jets"}, {"kind": "drop", "topic": "wrench"}],
 }
-FORMAT_2: dict[str, Any] = {
+FORMAT_3: dict[str, Any] = {
     "format": FORMAT,
     "name": "old",
     "time": {"image_hz": 15, "rate_hz": 15},
@@ -136,20 +139,45 @@ FORMAT_2: dict[str, Any] = {
     "timeline": [{"at_s": 1.0, "command": "isolate", "thruster": 3}, {"at_s": 2.0, "command": "approach"}],
     "thruster_failure": [{"thruster": 1, "kind": "weak", "reported": False}],
     "fault": [{"kind": "drop", "topic": "thrusters"}, {"kind": "drop", "topic": "wrench"}],
+    "navigation": {"grade": "exact"},
 }
 
 
 def test_scenario_of_format_1_is_migrated() -> None:
-    assert json.loads(migrated(json.dumps(FORMAT_1))) == FORMAT_2
+    assert json.loads(migrated(json.dumps(FORMAT_1))) == FORMAT_3
+
+
+def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
+    text = json.dumps(
+        {
+            "format": 2,
+            "odometry": {"position_noise_m": 0.003, "attitude_noise_deg": 0.05, "attitude_bias_deg": 0.0},
+            "camera": {"calibration_error": {"mounting_deg": 0.5, "centre_px": 1.0}, "width_px": 640},
+            "estimator": {"name": "mekf", "camera_bias_attitude_deg": 0.3, "camera_bias_position_m": 0.0},
+        }
+    )
+    assert json.loads(migrated(text)) == {
+        "format": FORMAT,
+        "camera": {"width_px": 640},
+        "estimator": {"name": "mekf"},
+        "navigation": {
+            "grade": "exact",
+            "position_noise_m": 0.003,
+            "attitude_noise_deg": 0.05,
+            "attitude_roll_noise_deg": 0.05,
+            "camera_turn_deg": 0.3,
+            "camera_centre_px": 1.0,
+        },
+    }
 
 
 def test_scenario_of_the_present_format_stays_as_it_is() -> None:
-    for text in (json.dumps(FORMAT_2), "no JSON", "[1, 2]"):
+    for text in (json.dumps(FORMAT_3), "no JSON", "[1, 2]"):
         assert migrated(text) == text
 
 
 def test_old_keys_are_named_with_their_present_names() -> None:
-    assert old_keys(FORMAT_2) == []
+    assert old_keys(FORMAT_3) == []
     lines = old_keys(FORMAT_1)
     for path, new in (
         ("time.picture_hz", "image_hz"),
@@ -179,4 +207,4 @@ def test_log_of_version_1_reads_as_present_messages(tmp_path: Path) -> None:
     rejected: Counter[str] = Counter()
     assert [(r.key, r.message) for r in read_log(path, rejected=rejected)] == written
     assert not rejected
-    assert json.loads(read_scenario(path)[0]) == FORMAT_2
+    assert json.loads(read_scenario(path)[0]) == FORMAT_3

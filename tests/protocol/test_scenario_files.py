@@ -225,16 +225,25 @@ def test_deep_nesting_is_one_line(file: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "error"),
     [
-        ("format = 1", "format: 1 is not supported any more; set format = 2 and change: no key"),
+        ("format = 1", "format: 1 is not supported any more; set format = 3 and change: no key"),
         (
             "format = 1\ntime.picture_hz = 5",
-            "set format = 2 and change: time.picture_hz: is now called time.image_hz",
+            "set format = 3 and change: time.picture_hz: is now called time.image_hz",
         ),
-        ("format = 3", "format: must be 2, the format that this version of chaserdock reads (got 3)"),
-        ('format = "2"', "format: must be 2, the format that this version of chaserdock reads (got '2')"),
+        ("format = 4", "format: must be 3, the format that this version of chaserdock reads (got 4)"),
+        ('format = "3"', "format: must be 3, the format that this version of chaserdock reads (got '3')"),
         ("time.picture_hz = 5", "time.picture_hz: is now called time.image_hz"),
         ("chaser.jet_test_s = 5", "chaser.jet_test_s: is now called chaser.thruster_test_s"),
         ("jet_failure = []", "jet_failure: is now called thruster_failure"),
+        ("odometry.position_noise_m = 0.1", "odometry: is now called navigation; state the grade, too"),
+        (
+            "camera.calibration_error.mounting_deg = 0.1",
+            "camera.calibration_error.mounting_deg: is now called navigation.camera_turn_deg",
+        ),
+        (
+            "format = 2\nestimator.camera_bias_position_m = 0.1",
+            "set format = 3 and change: estimator.camera_bias_position_m: is now called navigation.camera_shift_m",
+        ),
     ],
 )
 def test_an_older_format_is_one_line_that_names_the_new_key(file: Path, line: str, error: str) -> None:
@@ -243,8 +252,8 @@ def test_an_older_format_is_one_line_that_names_the_new_key(file: Path, line: st
 
 
 def test_the_present_format_may_be_stated(file: Path) -> None:
-    file.write_text(f"format = 2\n{GOOD}")
-    assert load_scenario(file).format == 2
+    file.write_text(f"format = 3\n{GOOD}")
+    assert load_scenario(file).format == 3
 
 
 def test_a_renamed_shipped_scenario_is_an_error_with_its_new_name() -> None:

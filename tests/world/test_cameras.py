@@ -107,7 +107,7 @@ def test_earth_is_drawn_at_its_direction():
 
 
 def test_calibration_errors_have_the_stated_sigma_per_chaser_and_seed():
-    error = "camera.calibration_error={focal_length_share=0.001, centre_px=0.5, mounting_deg=0.3, mounting_m=0.002}"
+    error = "navigation={grade='exact', camera_focal_share=0.001, camera_centre_px=0.5, camera_turn_deg=0.3, camera_shift_m=0.002}"
     drawn = []
     for seed in range(80):
         scenario = scenario_with(error, f"seed={seed}")
@@ -134,7 +134,8 @@ def test_calibration_errors_have_the_stated_sigma_per_chaser_and_seed():
 
 def test_odometry_has_the_stated_noise_and_bias():
     scenario = scenario_with(
-        "odometry={position_noise_m=0.002, attitude_noise_deg=0.1, position_bias_m=0.01}"
+        "navigation={grade='exact', position_noise_m=0.002, attitude_noise_deg=0.1, attitude_roll_noise_deg=0.1, "
+        "position_bias_m=0.01}"
     )
     state = states_of(scenario)["chaser/0"]
     navigation = OdometrySensor(scenario)

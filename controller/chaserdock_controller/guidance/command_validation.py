@@ -43,8 +43,8 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     """Check that a chaser can fly the calibration manoeuvre."""
     if phase is not Phase.HOLD or not at_rest:
         return f"in phase {phase}; hold first"
-    if not scenario.estimator.estimates_cameras:
-        return "the cameras are taken as exact: set estimator.camera_bias_attitude_deg (and name = mekf)"
+    if scenario.estimator.name != "mekf" or not scenario.navigation.errors().uncertain_mounting:
+        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = mekf)"
     return ""
 
 

@@ -24,15 +24,37 @@ PLAUSIBLE_RAD = math.radians(2.0)
 LONGEST_S = 1.0
 """After a longer gap every state is accepted."""
 _UNIT_WITHIN = 0.1
+_ROUNDING = 1e-9
+
+COVARIANCES = (
+    "position_covariance_m2",
+    "velocity_covariance_m2_s2",
+    "attitude_covariance_rad2",
+    "omega_covariance_rad2_s2",
+)
+"""Covariance fields of ``Odometry``."""
 
 
 def why_invalid(odometry: Odometry) -> str:
-    """Return why an odometry is not the state of a rigid body, or an empty string."""
+    """Return why an odometry is not the state of a rigid body with covariances, or an empty string."""
     for name in ("position_m", "velocity_m_s", "q_wxyz", "omega_rad_s"):
         if not all(map(math.isfinite, getattr(odometry, name))):
             return f"{name} holds a value that is not finite"
     length = math.hypot(*odometry.q_wxyz)
-    return f"q_wxyz has length {length:.3g}, not 1" if abs(length - 1.0) > _UNIT_WITHIN else ""
+    if abs(length - 1.0) > _UNIT_WITHIN:
+        return f"q_wxyz has length {length:.3g}, not 1"
+    return next(
+        (f"{name} is not a covariance" for name in COVARIANCES if not _is_covariance(odometry, name)), ""
+    )
+
+
+def _is_covariance(odometry: Odometry, name: str) -> bool:
+    """Return whether a field is a symmetric positive semi-definite (3, 3) matrix, up to rounding."""
+    matrix = np.array(getattr(odometry, name)).reshape(3, 3)
+    largest = np.abs(matrix).max()
+    if not math.isfinite(largest) or np.abs(matrix - matrix.T).max() > _ROUNDING * largest:
+        return False
+    return bool(np.linalg.eigvalsh(matrix)[0] >= -_ROUNDING * largest)
 
 
 @dataclass
@@ -53,11 +75,11 @@ class OdometryValidation:
     """Removes jumps from the odometry of all chasers."""
 
     def __init__(self, scenario: FlightScenario) -> None:
-        body, o = scenario.chaser, scenario.odometry
+        body, errors = scenario.chaser, scenario.navigation.errors()
         # Six sigma of the difference of two.
-        self._noise_m = 6 * math.sqrt(2.0) * o.position_noise_m
-        self._noise_rad = 6 * math.sqrt(2.0) * math.radians(o.attitude_noise_deg)
-        self._velocity_noise_m_s = 6 * o.velocity_noise_m_s
+        self._noise_m = 6 * math.sqrt(2.0) * errors.position_noise_m
+        self._noise_rad = 6 * math.sqrt(2.0) * max(errors.attitude_noise_rad, errors.attitude_roll_noise_rad)
+        self._velocity_noise_m_s = 6 * errors.velocity_noise_m_s
         self._acceleration_m_s2 = math.sqrt(3.0) * body.force_max_N / body.mass_kg
         self._alpha_rad_s2 = math.sqrt(3.0) * body.torque_max_N_m / min(body.inertia)
         self._known: dict[int, Known] = {}

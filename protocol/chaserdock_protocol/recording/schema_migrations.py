@@ -36,8 +36,20 @@ def _bad_image(fields: dict[str, Any]) -> dict[str, Any]:
     return {**fields, "status": "bad_image"} if fields.get("status") == "bad_picture" else fields
 
 
+def _exact_odometry(fields: dict[str, Any]) -> dict[str, Any]:
+    exact = (0.0,) * 9
+    names = (
+        "position_covariance_m2",
+        "velocity_covariance_m2_s2",
+        "attitude_covariance_rad2",
+        "omega_covariance_rad2_s2",
+    )
+    return fields | dict.fromkeys(names, exact)
+
+
 UPGRADES: dict[tuple[str, int], Upgrade] = {
     ("Tick", 1): _renamed(pictures="images"),
+    ("Odometry", 1): _exact_odometry,
     ("BodyTruth", 1): _renamed(jet_impulse_N_s="thruster_impulse_N_s", jet_open_s="thruster_open_s"),
     ("Sighting", 1): _bad_image,
     ("ActuatorCommand", 1): _each("pulses", _renamed(jet="thruster")),

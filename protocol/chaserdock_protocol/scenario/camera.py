@@ -70,24 +70,6 @@ class Intrinsics(Section):
         return self
 
 
-class CalibrationError(Section):
-    """Difference between each true camera and the calibration that flight software uses, one standard deviation, drawn
-    per camera from the seed."""
-
-    focal_length_share: NotNegative = Field(default=0.0, description="Relative error of the focal length.")
-    centre_px: NotNegative = Field(default=0.0, description="Error of the principal point per axis, pixels.")
-    mounting_deg: NotNegative = Field(
-        default=0.0, description="Error of the mounting rotation per axis, degrees."
-    )
-    mounting_m: NotNegative = Field(
-        default=0.0, description="Error of the mounting position per axis (CRF), m."
-    )
-
-    @property
-    def any(self) -> bool:
-        return any((self.focal_length_share, self.centre_px, self.mounting_deg, self.mounting_m))
-
-
 class Eclipse(Section):
     """An interval in which the target is in the Earth's shadow and the sun gives no light."""
 
@@ -170,7 +152,6 @@ class CameraSection(FlightCamera):
         description="Path, relative to the scenario file, of an OpenCV calibration file (YAML, JSON or XML) to read "
         "`intrinsics` from.",
     )
-    calibration_error: CalibrationError = CalibrationError()
     sun_direction: Vector = Field(
         default=(-0.4, -0.5, 0.77), description="Direction to the sun (WRF), any length but 0."
     )

@@ -21,7 +21,7 @@ from .docking import Docking
 from .errors import ScenarioError, explain
 from .fields import Name, Section
 from .migrations import FORMAT
-from .odometry import OdometrySection
+from .navigation import NavigationSection
 from .schema import (
     MAX_DURATION_S,
     Approach,
@@ -38,7 +38,7 @@ from .schema import (
 class FlightScenario(Section):
     """A mission as its flight software knows it."""
 
-    format: Literal[2] = Field(
+    format: Literal[3] = Field(
         default=FORMAT,
         description=f"Version of the format of this file. Without it: {FORMAT}, the present one.",
     )
@@ -53,7 +53,7 @@ class FlightScenario(Section):
     target: FlightTarget = FlightTarget()
     chaser: Body = Body()
     camera: FlightCamera = FlightCamera()
-    odometry: OdometrySection = OdometrySection()
+    navigation: NavigationSection = NavigationSection()
     perception: PerceptionSection = PerceptionSection()
     estimator: EstimatorSection = EstimatorSection()
     controller: Controller = Controller()

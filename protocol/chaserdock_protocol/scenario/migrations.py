@@ -7,8 +7,9 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-FORMAT = 2
-"""Present format of scenario files. Format 1 called thrusters jets, and images pictures."""
+FORMAT = 3
+"""Present format of scenario files. Format 1 called thrusters jets, and images pictures. Up to format 2, odometry and cameras
+were exact unless the scenario stated errors."""
 
 _RENAMED_KEYS: dict[tuple[str, ...], str] = {
     ("time", "picture_hz"): "image_hz",
@@ -20,6 +21,27 @@ _RENAMED_KEYS: dict[tuple[str, ...], str] = {
     ("jet_failure",): "thruster_failure",
 }
 """Path of a key in format 1 (``*``: every element of an array) -> its present name. Parents follow their children."""
+
+_CAMERA_PRIORS = {
+    "camera_bias_attitude_deg": "camera_turn_deg",
+    "camera_bias_position_m": "camera_shift_m",
+    "camera_bias_focal_share": "camera_focal_share",
+}
+"""Key of ``[estimator]`` in format 2 -> key of ``[navigation]``: what the estimator knew of the cameras' errors."""
+_CAMERA_ERRORS = {
+    "mounting_deg": "camera_turn_deg",
+    "mounting_m": "camera_shift_m",
+    "focal_length_share": "camera_focal_share",
+    "centre_px": "camera_centre_px",
+}
+"""Key of ``[camera.calibration_error]`` in format 2 -> key of ``[navigation]``."""
+
+_MOVED_KEYS: dict[tuple[str, ...], str] = {
+    ("odometry",): 'navigation; state the grade, too ("exact": all other errors are 0)',
+    **{("camera", "calibration_error", old): f"navigation.{new}" for old, new in _CAMERA_ERRORS.items()},
+    **{("estimator", old): f"navigation.{new}" for old, new in _CAMERA_PRIORS.items()},
+}
+"""Path of a key in format 2 -> its present path."""
 
 
 def _holders(
@@ -42,6 +64,8 @@ def old_keys(values: dict[str, Any]) -> list[str]:
     for old, new in _RENAMED_KEYS.items():
         for _, path in _holders(values, old):
             lines.append(f"{path}: is now called {path.rpartition('.')[0]}.{new}".replace(" .", " "))
+    for old, new in _MOVED_KEYS.items():
+        lines += [f"{path}: is now called {new}" for _, path in _holders(values, old)]
     for table, path in _holders(values, ("fault", "*", "topic")):
         if table["topic"] == "jets":
             lines.append(f"{path}: 'jets' is now called 'thrusters'")
@@ -53,9 +77,14 @@ def old_format(values: dict[str, Any]) -> list[str]:
     stated = values.get("format", FORMAT)
     if stated == FORMAT:
         return []
-    if stated == 1:
-        changes = "; ".join(old_keys(values)) or "no key of this file has another name"
-        return [f"format: 1 is not supported any more; set format = {FORMAT} and change: {changes}"]
+    if stated in (1, 2):
+        lines = old_keys(values)
+        if "navigation" not in values and "odometry" not in values:
+            lines.append(
+                'odometry and cameras are not exact by default any more (navigation.grade = "exact")'
+            )
+        changes = "; ".join(lines) or "no key of this file has another name"
+        return [f"format: {stated} is not supported any more; set format = {FORMAT} and change: {changes}"]
     return [f"format: must be {FORMAT}, the format that this version of chaserdock reads (got {stated!r})"]
 
 
@@ -65,12 +94,46 @@ def migrated(text: str) -> str:
         values = json.loads(text)
     except (json.JSONDecodeError, RecursionError):
         return text
-    if not isinstance(values, dict) or values.get("format", 1) != 1:
+    if not isinstance(values, dict) or values.get("format", 1) not in (1, 2):
         return text
+    if values.get("format", 1) == 1:
+        _rename_keys(values)
+    _state_navigation(values)
+    return json.dumps({**values, "format": FORMAT})
+
+
+def _rename_keys(values: dict[str, Any]) -> None:
+    """Migrate from format 1 to 2, in place."""
     for old, new in _RENAMED_KEYS.items():
         for table, _ in _holders(values, old):
             table[new] = table.pop(old[-1])
     for fault, _ in _holders(values, ("fault", "*", "topic")):
         if fault["topic"] == "jets":
             fault["topic"] = "thrusters"
-    return json.dumps({"format": FORMAT, **values})
+
+
+def _state_navigation(values: dict[str, Any]) -> None:
+    """Migrate from format 2 to 3, in place: exact navigation with the errors that the scenario states.
+
+    The camera's figures are those that the estimator knew, so that it replays as it flew.
+    """
+    navigation: dict[str, Any] = {"grade": "exact"}
+    navigation |= {key: value for key, value in _table(values, "odometry").items() if value}
+    if "attitude_noise_deg" in navigation:
+        navigation["attitude_roll_noise_deg"] = navigation["attitude_noise_deg"]
+    camera = values.get("camera")
+    errors = _table(camera, "calibration_error") if isinstance(camera, dict) else {}
+    if errors.get("centre_px"):
+        navigation["camera_centre_px"] = errors["centre_px"]
+    estimator = values.get("estimator")
+    for old, new in _CAMERA_PRIORS.items():
+        if isinstance(estimator, dict) and (prior := estimator.pop(old, 0.0)):
+            navigation[new] = prior
+    values.pop("odometry", None)
+    values["navigation"] = navigation
+
+
+def _table(values: dict[str, Any], key: str) -> dict[str, Any]:
+    """Remove and return a table, empty if there is none."""
+    table = values.pop(key, None)
+    return table if isinstance(table, dict) else {}

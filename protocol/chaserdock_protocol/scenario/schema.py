@@ -68,24 +68,6 @@ class EstimatorSection(Section):
         default="mekf",
         description="`mekf`: multiplicative extended Kalman filter. `paper`: the paper's average. Or an installed plugin.",
     )
-    camera_bias_position_m: NotNegative = Field(
-        default=0.0,
-        description="Prior standard deviation of each camera's mounting position, m. Above 0, `mekf` estimates it.",
-    )
-    camera_bias_attitude_deg: NotNegative = Field(
-        default=0.0,
-        description="Prior standard deviation of each camera's mounting attitude, degrees. Above 0, `mekf` estimates it.",
-    )
-    camera_bias_focal_share: NotNegative = Field(
-        default=0.0,
-        description="Prior standard deviation of each camera's relative focal length. Above 0, `mekf` estimates it.",
-    )
-
-    @property
-    def estimates_cameras(self) -> bool:
-        """Whether calibration errors of the cameras are estimated."""
-        biases = (self.camera_bias_position_m, self.camera_bias_attitude_deg, self.camera_bias_focal_share)
-        return self.name == "mekf" and any(biases)
 
 
 class PerceptionSection(Section):

@@ -19,9 +19,12 @@ from chaserdock_world.physics.simulation import BodyState
 from .errors import OdometrySensor
 
 
-def odometry_of(chaser: int, state: BodyState, tick: int, time_ns: int) -> Odometry:
-    """Return the odometry message of a chaser whose measured state is ``state``."""
-    return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **_state_fields(state))
+def odometry_of(
+    sensor: OdometrySensor, chaser: int, true_state: BodyState, tick: int, time_ns: int
+) -> Odometry:
+    """Return a chaser's odometry message, as ``sensor`` measures its state."""
+    measured = _state_fields(sensor.measure(chaser, tick, true_state))
+    return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **measured, **sensor.covariances)
 
 
 def publish_odometry(
@@ -32,8 +35,8 @@ def publish_odometry(
         if not name.startswith("chaser/"):
             continue
         chaser = int(name.partition("/")[2])
-        measured = sensor.measure(chaser, tick, state)
-        node.publish(topics.ODOMETRY, odometry_of(chaser, measured, tick, timing.tick_time_ns(tick)), chaser)
+        message = odometry_of(sensor, chaser, state, tick, timing.tick_time_ns(tick))
+        node.publish(topics.ODOMETRY, message, chaser)
 
 
 def docking_status(latch: ProbeLatch, tick: int, time_ns: int) -> DockingStatus:

@@ -53,7 +53,7 @@ class ThrusterController:
         self._valves = Valves(body.thrusters)  # the chaser's model of the real valves
         min_pulse_N_s = self._full_N * [t.min_on_s for t in body.thrusters]
         self._detector = ThrusterFaultDetector(self._matrix, self._full_N, min_pulse_N_s)
-        self._noise = noise or noise_of(scenario.odometry)
+        self._noise = noise or noise_of(scenario.navigation.errors())
         variance = quiescent_variance(self._noise, body)
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
         # Neither pulses of whole periods nor pulses below the noise can test a single thruster.

@@ -11,7 +11,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.bodies import Body
-from chaserdock_protocol.scenario.odometry import OdometrySection
+from chaserdock_protocol.scenario.navigation import NavigationErrors
 
 
 @dataclass(frozen=True)
@@ -30,12 +30,16 @@ class ImpulseNoise:
     floor_N_m_s: float = 2e-4
 
 
-def noise_of(odometry: OdometrySection) -> ImpulseNoise:
-    """Return the noise for the odometry errors of a scenario."""
+def noise_of(errors: NavigationErrors) -> ImpulseNoise:
+    """Return the noise for the errors of the odometry."""
     return ImpulseNoise(
-        odometry.velocity_noise_m_s,
-        math.radians(odometry.omega_noise_deg_s),
-        math.radians(math.hypot(odometry.attitude_noise_deg, odometry.attitude_bias_deg)),
+        errors.velocity_noise_m_s,
+        errors.omega_noise_rad_s,
+        math.hypot(
+            max(errors.attitude_noise_rad, errors.attitude_roll_noise_rad),
+            errors.attitude_drift_rad,
+            errors.attitude_bias_rad,
+        ),
     )
 
 

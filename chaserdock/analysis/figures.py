@@ -42,6 +42,32 @@ from .plots import (
 from .summary import estimate_errors, known_estimates, tracking_errors
 from .time_series import OUTCOMES, ImageOutcome, ImageOutcomes, Traces, load_traces
 
+Drawing = Callable[[RecordedFlight, Traces], Figure]
+
+
+@dataclass(frozen=True)
+class FigureKind:
+    """A figure: file name, title, caption and drawing function."""
+
+    name: str
+    title: str
+    caption: str
+    draw: Drawing
+
+
+FIGURES: list[FigureKind] = []
+"""All figures, in the order of the report."""
+
+
+def _figure(title: str, caption: str) -> Callable[[Drawing], Drawing]:
+    """Register a drawing function, whose name is the file name."""
+
+    def register(draw: Drawing) -> Drawing:
+        FIGURES.append(FigureKind(draw.__name__, title, caption, draw))
+        return draw
+
+    return register
+
 
 def flown(flight: RecordedFlight) -> list[int]:
     """Return the chasers whose motion is in the log. Raise MissingData without any, or without target."""
@@ -61,6 +87,7 @@ def _path(own: Track, target: Track) -> tuple[Array, Array]:
     return position, rotations.rotate_inverse(target.q_wxyz[rows], position - target.position_m[rows])
 
 
+@_figure("Trajectories", "Paths of the centres of mass; dot: start, triangle: end.")
 def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     target = flight.truth["target"]
@@ -114,6 +141,11 @@ def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
             )
 
 
+@_figure(
+    "Tracking errors",
+    "Distance and angle of each chaser from its reference pose on the true target. Shaded: steady-state "
+    "interval.",
+)
 def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, (top, bottom) = new_figure(2, sharex=True)
@@ -137,6 +169,7 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure("Docking", "Distance between the centres of chaser and target, and the closing speed.")
 def docking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, (top, bottom) = new_figure(2, sharex=True)
@@ -179,6 +212,7 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure("Separation of the chasers", "Distance between the centres of each pair of chasers.")
 def separation(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     if len(numbers) < 2:
@@ -198,6 +232,10 @@ def separation(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure(
+    "Actuator forces and torques",
+    "Applied force and torque, body axes, mean over each tick; dashed: actuator limits.",
+)
 def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     if not traces.inputs:
         raise MissingData("the log holds fewer than two ticks of every chaser")
@@ -223,6 +261,7 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     return figure
 
 
+@_figure("Thruster firings", "Share of each tick during which each valve was open.")
 def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
     firing = {i: t for i, t in traces.inputs.items() if t.thruster_duty.shape[1]}
     if not firing:
@@ -277,6 +316,11 @@ def component_errors(flight: RecordedFlight) -> tuple[Array, Array, Array]:
     return e.time_s[a], errors, np.sqrt(np.maximum(flight.variances(a), 0.0))
 
 
+@_figure(
+    "Errors of the target estimate",
+    "Truth minus estimate by axis, with the filter's three-sigma bounds (position and velocity WRF, "
+    "attitude and rate TRF).",
+)
 def estimate(flight: RecordedFlight, _: Traces) -> Figure:
     time_s, errors, sigmas = component_errors(flight)
     figure, axes = new_figure(4, 3, height=1.45, sharex=True, sharey="row")
@@ -306,6 +350,12 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure(
+    "Consistency of the target estimate",
+    "Normalized estimation error squared (NEES) of the pose, six degrees of freedom. A consistent filter "
+    "has 95 % of its values within the band; values above it indicate an overconfident filter, values "
+    "below it a conservative one.",
+)
 def consistency(flight: RecordedFlight, _: Traces) -> Figure:
     from scipy.stats import chi2
 
@@ -334,6 +384,7 @@ def _bars(axes: Axes, outcomes: ImageOutcomes, row: float, period_s: float) -> N
         axes.broken_barh(bars, (row - 0.36, 0.72), facecolor=_OUTCOME_COLOURS[outcome], linewidth=0)
 
 
+@_figure("Camera images", "Top: outcome of each image. Bottom: number of markers used for the pose.")
 def cameras(flight: RecordedFlight, traces: Traces) -> Figure:
     if not traces.image_outcomes:
         raise MissingData("the log holds no image")
@@ -388,6 +439,10 @@ def _time_and_distribution(quantity: str) -> tuple[Figure, Axes, Axes]:
     return figure, left, right
 
 
+@_figure(
+    "Solve times",
+    "Wall-clock time of the controller's solve on the machine of this flight; dashed: tick period.",
+)
 def solver(flight: RecordedFlight, _: Traces) -> Figure:
     solves = flight.solves
     if not len(solves.time_s):
@@ -408,6 +463,11 @@ def solver(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure(
+    "Latency",
+    "Wall-clock time from the publication of an image to the actuator command of its tick. In lock-step "
+    "it reflects the load of the machine and does not affect the flight.",
+)
 def latency(_: RecordedFlight, traces: Traces) -> Figure:
     if not traces.latency:
         raise MissingData("no image in the log led to an actuator command")
@@ -419,86 +479,6 @@ def latency(_: RecordedFlight, traces: Traces) -> Figure:
         _distribution(right, values, i)
     legend_above(left)
     return figure
-
-
-@dataclass(frozen=True)
-class FigureKind:
-    """A figure: file name, title, caption and drawing function."""
-
-    name: str
-    title: str
-    caption: str
-    draw: Callable[[RecordedFlight, Traces], Figure]
-
-
-FIGURES: tuple[FigureKind, ...] = (
-    FigureKind(
-        "trajectories",
-        "Trajectories",
-        "Paths of the centres of mass; dot: start, triangle: end.",
-        trajectories,
-    ),
-    FigureKind(
-        "tracking",
-        "Tracking errors",
-        "Distance and angle of each chaser from its reference pose on the true target. Shaded: steady-state interval.",
-        tracking,
-    ),
-    FigureKind(
-        "docking",
-        "Docking",
-        "Distance between the centres of chaser and target, and the closing speed.",
-        docking,
-    ),
-    FigureKind(
-        "separation",
-        "Separation of the chasers",
-        "Distance between the centres of each pair of chasers.",
-        separation,
-    ),
-    FigureKind(
-        "inputs",
-        "Actuator forces and torques",
-        "Applied force and torque, body axes, mean over each tick; dashed: actuator limits.",
-        inputs,
-    ),
-    FigureKind(
-        "thrusters", "Thruster firings", "Share of each tick during which each valve was open.", thrusters
-    ),
-    FigureKind(
-        "estimate",
-        "Errors of the target estimate",
-        "Truth minus estimate by axis, with the filter's three-sigma bounds (position and velocity WRF, attitude and rate "
-        "TRF).",
-        estimate,
-    ),
-    FigureKind(
-        "consistency",
-        "Consistency of the target estimate",
-        "Normalized estimation error squared (NEES) of the pose, six degrees of freedom. A consistent filter has 95 % of its "
-        "values within the band; values above it indicate an overconfident filter, values below it a conservative one.",
-        consistency,
-    ),
-    FigureKind(
-        "cameras",
-        "Camera images",
-        "Top: outcome of each image. Bottom: number of markers used for the pose.",
-        cameras,
-    ),
-    FigureKind(
-        "solver",
-        "Solve times",
-        "Wall-clock time of the controller's solve on the machine of this flight; dashed: tick period.",
-        solver,
-    ),
-    FigureKind(
-        "latency",
-        "Latency",
-        "Wall-clock time from the publication of an image to the actuator command of its tick. In lock-step it reflects "
-        "the load of the machine and does not affect the flight.",
-        latency,
-    ),
-)
 
 
 def draw_figures(flight: RecordedFlight, traces: Traces) -> Iterator[tuple[FigureKind, Figure | str]]:

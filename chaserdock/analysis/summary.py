@@ -21,12 +21,12 @@ from .criteria import (
     capture_failures,
     capture_of,
     capture_text,
+    judged_criteria,
     nearest_allowed_m,
     not_reached,
     reached_time,
 )
 from .flight import RecordedFlight, Track, load_flight
-from .judged_criteria import judged_criteria
 
 _BLOCK = 1 << 14  # rows processed at a time
 

@@ -14,19 +14,15 @@ from typer.exceptions import TyperException
 
 from chaserdock.exit_codes import FAILED
 
-from . import keys, logs, scenario
+from . import logs, scenario
 from .analysis import figures, report, snapshot, summary, video
-from .calibration import calibrate, markers
-from .campaign import campaign
-from .command import command, status, thruster_fault
-from .conformance import check
+from .compare import check, compare, replay, reproduce, study
 from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .operate import command, status, thruster_fault, view
 from .options import fail
 from .processes import chaser, controller, record, router, world
-from .replay import compare, replay
-from .reproduce import reproduce, study
-from .run import judge, run
-from .view import view
+from .run import campaign, judge, run
+from .setup import calibrate, keys, markers
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Fly": (run, campaign),
@@ -36,7 +32,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Look at a flight": (summary, report, figures, video, snapshot),
     "Logs": (logs.app,),
     "Reproduce and compare": (replay, compare, reproduce, study, check),
-    "Setup": (markers, calibrate, keys.app),
+    "Setup": (markers, calibrate, keys),
 }
 """Commands (functions) and groups of commands (apps) by the section of the help that lists them."""
 

@@ -45,6 +45,18 @@ OF_ALL = (topics.TICK, topics.TARGET, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
 
 _KEPT = 32
+_FIELDS = {
+    Odometry: "odometry",
+    Reference: "reference",
+    Plan: "plan",
+    DockingStatus: "docking",
+    Image: "image",
+    Sighting: "sighting",
+    WrenchCommand: "wrench",
+    ActuatorCommand: "actuators",
+    ThrusterReport: "thrusters",
+}
+"""Fields of ``ChaserState`` by the type of their message."""
 
 
 @dataclass(frozen=True)
@@ -78,27 +90,11 @@ class ChaserState:
 
     def update(self, message: Any) -> None:
         """Store a message of this chaser."""
-        match message:
-            case Odometry():
-                self.odometry = message
-                _keep(self._odometries, message.tick, message)
-            case Reference():
-                self.reference = message
-            case Plan():
-                self.plan = message
-            case DockingStatus():
-                self.docking = message
-            case Image():
-                self.image = message
-            case Sighting():
-                self.sighting = message
-                _keep(self._sightings, message.sim_time_ns, message)
-            case WrenchCommand():
-                self.wrench = message
-            case ActuatorCommand():
-                self.actuators = message
-            case ThrusterReport():
-                self.thrusters = message
+        setattr(self, _FIELDS[type(message)], message)
+        if isinstance(message, Odometry):
+            _keep(self._odometries, message.tick, message)
+        elif isinstance(message, Sighting):
+            _keep(self._sightings, message.sim_time_ns, message)
 
     def error(self) -> tuple[float, float] | None:
         """Return distance (m) and angle (rad) from the reference, by odometry; None while unknown."""

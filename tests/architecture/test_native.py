@@ -160,7 +160,7 @@ def copied(folder: Path) -> KernelLibrary:
     """A copy of the NMPC's sources and library, to be tampered with."""
     target = folder / "native"
     shutil.copytree(nmpc_native.LIBRARY.path.parent, target, ignore=shutil.ignore_patterns("__pycache__"))
-    return KernelLibrary(target)
+    return KernelLibrary(str(target / "__init__.py"))
 
 
 def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
@@ -169,7 +169,7 @@ def test_a_library_of_other_sources_is_refused(tmp_path: Path) -> None:
     with (copy.path.parent / "cost.c").open("a") as file:
         file.write("\n/* an edit */\n")
     with pytest.raises(ImportError, match=r"compiled from other sources.*pip install"):
-        _ = KernelLibrary(copy.path.parent).library
+        _ = KernelLibrary(str(copy.path)).library
 
 
 def test_a_library_that_is_missing_or_broken_is_named(tmp_path: Path) -> None:

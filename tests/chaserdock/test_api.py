@@ -24,7 +24,7 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from harness import ROOT
 
 import chaserdock as cd
-from chaserdock.analysis.judged_criteria import judged_criteria
+from chaserdock.analysis.criteria import judged_criteria
 from chaserdock.analysis.summary import summarize
 from chaserdock.api import override_texts
 

@@ -9,23 +9,21 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .casadi_nlp import pack, row_floor
+from .casadi_nlp import SingleShootingSolver
 from .problem import Nlp, build_nlp
-from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, status_of
+from .types import Array, NmpcParameters
 
 MAX_OUTER, MAX_INNER = 10, 100
 # For inputs scaled by their limits: gradient in units of cost (initially about 1e3), and metres.
 TOLERANCE, DISTANCE_TOLERANCE = 0.5, 1e-3
 
 
-class AlpaqaSolver:
+class AlpaqaSolver(SingleShootingSolver):
     """Solve with alpaqa for up to ``n_chasers`` chasers, warm-started from the last plans.
 
     ``max_iterations`` bounds the inner iterations of one outer step, MAX_INNER if None. Raises ValueError for
@@ -39,7 +37,6 @@ class AlpaqaSolver:
             raise ValueError(
                 "solver 'alpaqa' needs the package alpaqa: pip install 'chaserdock[alpaqa]'"
             ) from None
-        self._frame = Frame(params, n_chasers)
         inner = MAX_INNER if max_iterations is None else max_iterations
         inner_solver: Any = alpaqa.PANOCSolver({"max_iter": inner}, {"memory": 30})
         self._solver: Any = alpaqa.ALMSolver(
@@ -58,39 +55,22 @@ class AlpaqaSolver:
             alpaqa.SolverStatus.Converged,
             (alpaqa.SolverStatus.MaxIter, alpaqa.SolverStatus.NoProgress),
         )
-        self._programs: dict[int, tuple[Nlp, Any]] = {}
-        for n in range(1, n_chasers + 1):
+
+        def program(n: int) -> tuple[Nlp, Any]:
             nlp = build_nlp(n, params, shooting="single")
-            self._programs[n] = nlp, _callbacks(alpaqa, nlp)
+            return nlp, _callbacks(alpaqa, nlp)
 
-    def reset(self) -> None:
-        """Discard all warm starts."""
-        self._frame.plans = {}
+        super().__init__(params, n_chasers, program)
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
-
-        ``iterations`` counts inner iterations.
-        """
-        frame = self._frame
-        task = frame.begin(problem, shift_s, ids)
-        u, limits = task.start.copy(), task.problem.input_max
-        n, d = len(u), frame.params.stages
-        nlp, program = self._programs[n]
-        program.parameters = np.concatenate([pack(frame.params, task), limits.ravel()])
-        program.general_bounds.lower = row_floor(nlp, task).ravel()
-        scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
-        start = (u / scale).transpose(1, 0, 2).ravel()
+    def _run(
+        self, nlp: Nlp, program: Any, parameters: Array, floor: Array, start: Array
+    ) -> tuple[Array, bool, bool, int]:
+        program.parameters, program.general_bounds.lower = parameters, floor
         w, _, stats = self._solver(
-            self._alpaqa.Problem(program), x=start, y=np.zeros(d * nlp.rows), asynchronous=False
+            self._alpaqa.Problem(program), x=start, y=np.zeros(len(floor)), asynchronous=False
         )
-        solution = np.asarray(w).reshape(d, n, 6).transpose(1, 0, 2)
-        late = stats["status"] in self._late
-        usable = (late or stats["status"] == self._converged) and bool(np.isfinite(solution).all())
-        if usable:
-            u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
-        iterations = np.full(n, int(stats["inner"]["iterations"]), dtype=np.int64)
-        return frame.finish(task, u, [status_of(usable, late)] * n, iterations)
+        converged, late = stats["status"] == self._converged, stats["status"] in self._late
+        return w, converged, late, int(stats["inner"]["iterations"])
 
 
 def _callbacks(alpaqa: Any, nlp: Nlp) -> Any:

@@ -8,7 +8,8 @@ time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import casadi as ca
@@ -69,7 +70,53 @@ def _options(name: str, nlp: Nlp, max_iterations: int) -> dict[str, Any]:
     }
 
 
-class NlpSolver:
+class CoupledSolver:
+    """Base of the back ends that solve one problem for all chasers, warm-started from the last plans."""
+
+    def __init__(
+        self, params: NmpcParameters, n_chasers: int, program: Callable[[int], tuple[Nlp, Any]]
+    ) -> None:
+        self._frame = Frame(params, n_chasers)
+        self._programs = {n: program(n) for n in range(1, n_chasers + 1)}
+
+    def reset(self) -> None:
+        """Discard all warm starts."""
+        self._frame.plans = {}
+
+
+class SingleShootingSolver(CoupledSolver, ABC):
+    """Base of the back ends without states: inputs, by stage, scaled by their limits to -1 to 1."""
+
+    @abstractmethod
+    def _run(
+        self, nlp: Nlp, program: Any, parameters: Array, floor: Array, start: Array
+    ) -> tuple[Array, bool, bool, int]:
+        """Return solution, whether it converged, whether the iterations were used up, and their number."""
+
+    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
+        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
+
+        ``iterations`` counts inner iterations.
+        """
+        frame = self._frame
+        task = frame.begin(problem, shift_s, ids)
+        u, limits = task.start.copy(), task.problem.input_max
+        n, d = len(u), frame.params.stages
+        nlp, program = self._programs[n]
+        scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
+        parameters = np.concatenate([pack(frame.params, task), limits.ravel()])
+        start = (u / scale).transpose(1, 0, 2).ravel()
+        w, converged, late, iterations = self._run(
+            nlp, program, parameters, row_floor(nlp, task).ravel(), start
+        )
+        usable = (converged or late) and bool(np.isfinite(w).all())
+        if usable:
+            solution = np.asarray(w).reshape(d, n, 6).transpose(1, 0, 2)
+            u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
+        return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+
+
+class NlpSolver(CoupledSolver):
     """Solve with `ipopt` or `fatrop` (``name``) for up to ``n_chasers`` chasers, warm-started from the last plans.
 
     The constructor builds a program for every number of chasers, so that a change of the number delays no tick.
@@ -79,16 +126,13 @@ class NlpSolver:
     def __init__(
         self, name: str, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None
     ) -> None:
-        self._frame = Frame(params, n_chasers)
         limit = MAX_ITERATIONS if max_iterations is None else max_iterations
-        self._programs: dict[int, tuple[Nlp, Any]] = {}
-        for n in range(1, n_chasers + 1):
-            nlp = build_nlp(n, params)
-            self._programs[n] = nlp, ca.nlpsol("nmpc", name, nlp.problem, _options(name, nlp, limit))
 
-    def reset(self) -> None:
-        """Discard all warm starts."""
-        self._frame.plans = {}
+        def program(n: int) -> tuple[Nlp, Any]:
+            nlp = build_nlp(n, params)
+            return nlp, ca.nlpsol("nmpc", name, nlp.problem, _options(name, nlp, limit))
+
+        super().__init__(params, n_chasers, program)
 
     def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
         """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.

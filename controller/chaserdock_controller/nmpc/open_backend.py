@@ -19,17 +19,15 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from .casadi_nlp import pack, row_floor
+from .casadi_nlp import SingleShootingSolver
 from .problem import Nlp, build_nlp
-from .types import NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, status_of
+from .types import Array, NmpcParameters
 
 MAX_INNER = 500
 TOLERANCE = 1e-3
@@ -42,7 +40,7 @@ _LIBRARY_SUFFIXES = (".so", ".dylib", ".dll")
 _SUFFIX = {"win32": ".pyd"}
 
 
-class OpenSolver:
+class OpenSolver(SingleShootingSolver):
     """Solve with OpEn for up to ``n_chasers`` chasers, warm-started from the last plans.
 
     ``max_iterations`` bounds the iterations of a solve, MAX_INNER if None. Raises ValueError for
@@ -50,7 +48,6 @@ class OpenSolver:
     """
 
     def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
-        self._frame = Frame(params, n_chasers)
         if importlib.util.find_spec("opengen") is None:
             raise ValueError("solver 'open' needs the package opengen: pip install 'chaserdock[open]'")
         if shutil.which("cargo") is None:
@@ -58,41 +55,22 @@ class OpenSolver:
                 "solver 'open' needs cargo, Rust's build tool, on the PATH: see https://rustup.rs"
             )
         inner = MAX_INNER if max_iterations is None else max_iterations
-        self._programs: dict[int, tuple[Nlp, Any]] = {}
-        for n in range(1, n_chasers + 1):
+
+        def program(n: int) -> tuple[Nlp, Any]:
             nlp = build_nlp(n, params, shooting="single", symbol=ca.MX.sym)
-            self._programs[n] = nlp, _load_solver(nlp, inner)
+            return nlp, _load_solver(nlp, inner)
 
-    def reset(self) -> None:
-        """Discard all warm starts."""
-        self._frame.plans = {}
+        super().__init__(params, n_chasers, program)
 
-    def solve(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None = None) -> NmpcPlan:
-        """Solve one tick; arguments, result and errors as `RtiSolver.solve`. The chasers share one status.
-
-        ``iterations`` counts inner iterations.
-        """
-        frame = self._frame
-        task = frame.begin(problem, shift_s, ids)
-        u, limits = task.start.copy(), task.problem.input_max
-        n, d = len(u), frame.params.stages
-        scale = np.where(limits > 0.0, limits, 1.0)[:, None, :]
-        nlp, program = self._programs[n]
-        floor = row_floor(nlp, task)
-        answer = program.run(
-            p=np.concatenate([pack(frame.params, task), limits.ravel(), floor.ravel()]).tolist(),
-            initial_guess=(u / scale).transpose(1, 0, 2).ravel().tolist(),
-        )
-        usable, late, iterations = False, False, 0
-        if answer.is_ok():
-            status = answer.get()
-            solution = np.array(status.solution).reshape(d, n, 6).transpose(1, 0, 2)
-            late = status.exit_status != "Converged"
-            usable = bool(np.isfinite(solution).all())
-            iterations = int(status.num_inner_iterations)
-            if usable:
-                u = np.ascontiguousarray(np.clip(solution, -1.0, 1.0) * limits[:, None, :])
-        return frame.finish(task, u, [status_of(usable, late)] * n, np.full(n, iterations, dtype=np.int64))
+    def _run(
+        self, nlp: Nlp, program: Any, parameters: Array, floor: Array, start: Array
+    ) -> tuple[Array, bool, bool, int]:
+        answer = program.run(p=np.concatenate([parameters, floor]).tolist(), initial_guess=start.tolist())
+        if not answer.is_ok():
+            return start, False, False, 0
+        status = answer.get()
+        converged = status.exit_status == "Converged"
+        return np.array(status.solution), converged, not converged, int(status.num_inner_iterations)
 
 
 def _evaluate(nlp: Nlp, x: Any, p: Any) -> tuple[Any, Any]:

@@ -25,10 +25,10 @@ _INSTALL = "reinstall chaserdock (in a clone: pip install --no-deps -e .), which
 
 
 class KernelLibrary:
-    """The compiled kernels of one package, loaded on first use from ``folder`` (its ``native`` folder)."""
+    """The compiled kernels of one package, loaded on first use from the folder of ``file``, its ``native/__init__.py``."""
 
-    def __init__(self, folder: Path) -> None:
-        self.path = folder / LIBRARY_NAME
+    def __init__(self, file: str) -> None:
+        self.path = Path(file).with_name(LIBRARY_NAME)
         self._functions: dict[tuple[str, int], Any] = {}
 
     @cached_property
@@ -74,5 +74,5 @@ def scratch(doubles: int) -> NDArray[np.float64]:
     return np.empty(doubles)
 
 
-LIBRARY = KernelLibrary(Path(__file__).parent)
+LIBRARY = KernelLibrary(__file__)
 function = LIBRARY.function

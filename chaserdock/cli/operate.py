@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operator commands to a running mission, and its status."""
+"""Commands to a running mission, its status, and the web viewer."""
 
 from __future__ import annotations
 
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -14,6 +15,8 @@ from .options import (
     LinkOptions,
     OperatorOpt,
     ReplyTimeoutOpt,
+    WatchOpt,
+    fail,
     print_result,
     with_link_options,
 )
@@ -124,3 +127,40 @@ def status(
         print_result(True, observed.as_dict(), ())
     else:
         Console().print(table_of(observed))
+
+
+@with_link_options()
+def view(
+    log: Annotated[
+        list[Path] | None,
+        typer.Argument(
+            metavar="[LOG]",
+            help="folder of a run, its mission.mcap, or the files of a rotated log; the running mission by default",
+        ),
+    ] = None,
+    host: Annotated[
+        str, typer.Option(help="address to serve the page on; every client can command the mission")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="port; the first free one from 8080 by default")
+    ] = None,
+    dark: Annotated[bool, typer.Option("--dark", help="start with dark colours")] = False,
+    truth: Annotated[bool, typer.Option(help="show ground truth where it is readable")] = True,
+    at: Annotated[
+        float | None, typer.Option(min=0, help="log: pause at this simulated time, seconds")
+    ] = None,
+    *,
+    link: LinkOptions,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """Show a running mission, or a log, in a web browser: scene, images, plots, phases, commands."""
+    from chaserdock.viewer.live import ViewOptions, view_live
+
+    options = ViewOptions(host, port, dark, truth)
+    if log:
+        from chaserdock.viewer.player import view_log
+
+        raise typer.Exit(view_log(log[0] if len(log) == 1 else log, options, at, watch_parent))
+    if at is not None:
+        raise fail("--at: needs a log")
+    raise typer.Exit(view_live(link.link("viewer"), options, watch_parent))

@@ -332,7 +332,7 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
             child.send_signal(signal.SIGKILL)
     before = {p: p.stat().st_mtime_ns for p in here.glob("runs/*/result.json")}
     assert 1 <= len(before) < 3
-    status, said = finished("campaign", str(file), "--out", str(here), "--jobs", "2")
+    status, said = finished("campaign", str(file), "--out", str(here), "--jobs", "2", timeout_s=600.0)
     assert status == 0, said
     assert {p: p.stat().st_mtime_ns for p in before} == before
     assert len(table(here)) == len({row["digest"] for row in table(here)}) == 3
@@ -343,7 +343,13 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
     cluster: Any = LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address="")
     with cluster:
         status, said = finished(
-            "campaign", str(file), "--out", str(there), "--cluster", cluster.scheduler_address
+            "campaign",
+            str(file),
+            "--out",
+            str(there),
+            "--cluster",
+            cluster.scheduler_address,
+            timeout_s=600.0,
         )
     assert status == 0, said
     assert json.dumps(table(there)) == json.dumps(table(here))

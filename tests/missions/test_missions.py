@@ -164,7 +164,8 @@ def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> N
 @pytest.mark.slow
 def test_collision_avoidance_mission(tmp_path: Path) -> None:
     """Chaser 0 passes the target at 0.35 m or more within 60 s, guided by the sightings of chaser 1."""
-    status, output = run("collision-avoidance", tmp_path / "run")
+    images = ("camera.width_px=800", "camera.height_px=450")
+    status, output = run("collision-avoidance", tmp_path / "run", *images)
     assert status == 0, output
     result = summary(tmp_path / "run")
     assert result["chasers"]["0"]["min_distance_target_m"] >= 0.35

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Takes out of the installed packages what no process of a mission loads. Run in the layer that installs them.
+"""Removes what no process of a mission loads from the installed packages. Runs in the image layer that installs them.
 
-What goes: PyBullet's models and examples, tests of packages, and what only a compiler needs.
-What lies there several times (wheels cannot hold symbolic links, so libraries come under each of their names) stays
-once, with hard links. test_compose.py holds the image's size, and a mission is flown in it.
+Removed: PyBullet's models and examples, test suites, compiler headers and static libraries. Identical files (wheels cannot
+contain symbolic links, so libraries are stored under each of their names) become hard links. tests/chaserdock/test_compose.py
+limits the size of the image and flies a mission in it.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ UNUSED = (
     "pyarrow/tests",
     "**/*.a",
 )
-_WORTH_A_LINK_BYTES = 100_000
+_MIN_LINKED_BYTES = 100_000
 
 
 def remove() -> None:
@@ -41,7 +41,7 @@ def remove() -> None:
 def link_copies() -> None:
     kept: dict[tuple[int, str], Path] = {}
     for path in sorted(PACKAGES.rglob("*.so*")):
-        if path.is_symlink() or not path.is_file() or path.stat().st_size < _WORTH_A_LINK_BYTES:
+        if path.is_symlink() or not path.is_file() or path.stat().st_size < _MIN_LINKED_BYTES:
             continue
         content = (path.stat().st_size, hashlib.sha256(path.read_bytes()).hexdigest())
         first = kept.setdefault(content, path)

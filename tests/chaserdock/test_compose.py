@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compose builds the image and flies a short mission, where a Docker engine runs; compose.yaml is checked everywhere."""
+"""Compose builds the image and flies a short mission if a Docker engine runs; static checks of compose.yaml and Dockerfile."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from harness import ROOT, SHORT
 
 
 def why_no_docker() -> str:
-    """Why missions cannot fly in containers here, or nothing."""
+    """Return why no mission can fly in containers on this machine; empty if one can."""
     if shutil.which("docker") is None:
         return "no docker program"
     if subprocess.run(["docker", "info"], capture_output=True, check=False).returncode != 0:
@@ -26,20 +26,20 @@ def why_no_docker() -> str:
         compose_command()
     except SystemExit as reason:
         return str(reason)
-    ways = ("image inspect", "pull")
+    commands = ("image inspect", "pull")
     if all(
         subprocess.run(
-            ["docker", *way.split(), "python:3.11-slim"], capture_output=True, check=False
+            ["docker", *command.split(), "python:3.11-slim"], capture_output=True, check=False
         ).returncode
-        for way in ways
+        for command in commands
     ):
-        return "no image python:3.11-slim, and none can be had"
+        return "the image python:3.11-slim cannot be pulled"
     return ""
 
 
 @pytest.fixture(scope="module")
 def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clone as a user has it, of the files as they are here."""
+    """A copy of the working tree without ignored files."""
     if reason := why_no_docker():
         pytest.skip(reason)
     folder = tmp_path_factory.mktemp("clone")
@@ -55,7 +55,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.slow
 @pytest.mark.timeout(2400)
 def test_short_mission_by_compose(clone: Path) -> None:
-    """Built, flown with rights on to success, its status passed on, its files the owner's; the image is small enough."""
+    """Mission succeeds with access control; exit status, file owners, absence of keys in the image and its size."""
     owner = (clone / "compose.yaml").stat()
     project = Project("two-chaser-tracking", " ".join(SHORT), clone)
     try:
@@ -86,7 +86,7 @@ def test_short_mission_by_compose(clone: Path) -> None:
 
 
 def test_container_mounts_only_its_own_keys() -> None:
-    """Secrets: every service but the router, which makes them, sees one volume of keys, and that read-only."""
+    """Every service mounts one volume of keys, read-only; only the router, which creates them, mounts all."""
     service, mounts = "", {}
     for line in (ROOT / "compose.yaml").read_text(encoding="utf-8").splitlines():
         if found := re.match(r"  ([a-z0-9-]+):", line):
@@ -111,7 +111,7 @@ def test_build_context_contains_what_the_image_copies() -> None:
 
 
 def test_image_has_a_key_folder_per_process() -> None:
-    """A volume takes over the mode of the folder that it is mounted on; without one only root could write there."""
+    """A volume inherits the mode of the folder at its mount point; without that folder only root could write."""
     found = re.search(
         r"for name in ([a-z \\\n]+) \$\(seq -f chaser-%g 0 15\); do mkdir /keys",
         (ROOT / "Dockerfile").read_text(),

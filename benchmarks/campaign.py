@@ -55,7 +55,8 @@ def kill_half_way(file: Path, out: Path, half: int) -> int:
     running = psutil.Popen(command, stdout=subprocess.DEVNULL)
     while running.poll() is None and len(results(out)) < half:
         time.sleep(POLL_S)
-    for process in [*running.children(recursive=True), running]:
+    # Parents first: a surviving parent would record a failed run.
+    for process in [running, *running.children(recursive=True)]:
         with suppress(psutil.NoSuchProcess):
             process.kill()
     running.wait()

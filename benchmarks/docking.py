@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -27,7 +26,16 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from chaserdock_protocol.scenario import Scenario
-from common import Figures, append_line, commit, make_parser, print_figures, read_lines, write_json
+from common import (
+    Figures,
+    append_line,
+    commit,
+    make_parser,
+    percentiles,
+    print_figures,
+    read_lines,
+    write_json,
+)
 
 from chaserdock.evaluation.docking_flights import (
     APPROACH_AT_S,
@@ -39,6 +47,7 @@ from chaserdock.evaluation.docking_flights import (
 )
 from chaserdock.evaluation.perception import Perception, RenderedImages, measurement_model
 
+PerceptionOf = Callable[[Scenario], Perception]
 KINDS = ("stuck_on", "stuck_off")
 
 
@@ -65,19 +74,19 @@ class Batch:
         self.commits = {row.commit for row in matching}
         self._commit = commit()
 
-    def fly(self, part: str, seed: int, flight: Callable[[], Outcome]) -> Outcome:
+    def fly(self, part: str, seed: int, flight: Callable[[int], Outcome]) -> Outcome:
         """Return the outcome of a flight from the results file, or fly it."""
         known = self._known.get((part, seed))
         if known is not None:
             return known
-        outcome = flight()
+        outcome = flight(seed)
         self.commits.add(self._commit)
         print(f"{part} {outcome.line()}", file=sys.stderr, flush=True)
         append_line(self.path, msgspec.to_builtins(Row(part, self.settings, self._commit, outcome)))
         return outcome
 
 
-def figures(name: str, outcomes: list[Outcome]) -> Figures:
+def docking_figures(name: str, outcomes: list[Outcome]) -> Figures:
     """Return the figures of docking flights by name."""
     touches = [o.touch for o in outcomes if o.touch is not None]
     out: Figures = {
@@ -88,21 +97,24 @@ def figures(name: str, outcomes: list[Outcome]) -> Figures:
     }
     if any(o.failure for o in outcomes):
         out[f"{name}_detected"] = sum(o.detection_delay_s() is not None for o in outcomes)
-    for key, values in {
-        "contact_lateral_m": [t.lateral_m for t in touches],
-        "contact_angle_rad": [t.angle_rad for t in touches],
-        "contact_closing_m_s": [t.closing_m_s for t in touches],
-        "contact_lateral_speed_m_s": [t.lateral_speed_m_s for t in touches],
-        "momentum_error": [o.linear_error for o in outcomes if o.linear_error is not None],
-        "angular_momentum_error": [o.angular_error for o in outcomes if o.angular_error is not None],
-        "verified_s": [o.verified_s for o in outcomes if o.verified_s is not None],
-        "detection_delay_s": [t for o in outcomes if (t := o.detection_delay_s()) is not None],
-        "peak_error_m": [o.peak_m for o in outcomes if o.peak_m is not None],
-        "propellant_kg": [o.propellant_kg for o in outcomes if o.verified and o.propellant_kg],
-    }.items():
+    for key, unit, values in (
+        ("contact_lateral", "m", [t.lateral_m for t in touches]),
+        ("contact_angle", "rad", [t.angle_rad for t in touches]),
+        ("contact_closing", "m_s", [t.closing_m_s for t in touches]),
+        ("contact_lateral_speed", "m_s", [t.lateral_speed_m_s for t in touches]),
+        ("momentum_error", "share", [o.linear_error for o in outcomes if o.linear_error is not None]),
+        (
+            "angular_momentum_error",
+            "share",
+            [o.angular_error for o in outcomes if o.angular_error is not None],
+        ),
+        ("verified_after", "s", [o.verified_s for o in outcomes if o.verified_s is not None]),
+        ("detection_delay", "s", [t for o in outcomes if (t := o.detection_delay_s()) is not None]),
+        ("peak_error", "m", [o.peak_m for o in outcomes if o.peak_m is not None]),
+        ("propellant", "kg", [o.propellant_kg for o in outcomes if o.verified and o.propellant_kg]),
+    ):
         if values:
-            out[f"{name}_{key}_median"] = float(np.median(values))
-            out[f"{name}_{key}_max"] = float(np.max(values))
+            out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
     return out
 
 
@@ -119,9 +131,9 @@ def abort_figures(name: str, outcomes: list[Outcome]) -> Figures:
     """Return the figures of aborted flights by name."""
     opened = [o.opened_s for o in outcomes if o.opened_s is not None]
     return {
-        name: len(outcomes),
+        f"{name}_flights": len(outcomes),
         f"{name}_opened": len(opened),
-        f"{name}_opened_max_s": max(opened, default=math.nan),
+        f"{name}_opened_after_max_s": max(opened, default=math.nan),
         f"{name}_collisions": sum(bool(o.contacts) for o in outcomes),
         f"{name}_second_approaches": sum(o.verified_again is not None for o in outcomes),
         f"{name}_verified_again": sum(o.verified_again is True for o in outcomes),
@@ -151,21 +163,15 @@ def main() -> None:
         "--results", type=Path, metavar="FILE", help="append flights; flights in it are not repeated"
     )
     o = parser.parse_args()
-    numbers = {
-        "flights": (o.flights, 4),
-        "images": (o.images, 1),
-        "aborts": (o.aborts, 4),
-        "aborts_images": (o.aborts_images, 0),
-    }
-    flights, images, aborts, aborts_images = (quick if o.quick else n for n, quick in numbers.values())
+    flights, images, aborts, aborts_images = (
+        (4, 1, 4, 0) if o.quick else (o.flights, o.images, o.aborts, o.aborts_images)
+    )
     failures = 0 if o.actuation == "ideal" else min(o.failures, 2) if o.quick else o.failures
     settings = (
         f"{o.actuation} rate={o.rate} approach={o.approach_at:g} failed={o.failed_at} set={sorted(o.set)}"
     )
     batch = Batch(o.results, settings)
     result: Figures = {}
-    begin_s = time.perf_counter()
-    seeds = range(o.first, o.first + max(flights, images, aborts, aborts_images, failures))
 
     def scenario_of(seed: int, failure: Failure | None = None) -> Scenario:
         return docking_scenario(seed, o.actuation, o.rate, failure, tuple(o.set))
@@ -174,50 +180,29 @@ def main() -> None:
         at_s = o.failed_at or float(np.random.default_rng([seed, 0xFA1]).uniform(2.0, 24.0))
         return kind, seed % 12, at_s
 
-    for part, number, perception_of in (("noise", flights, noisy), ("vision", images, RenderedImages)):
-        outcomes = [
-            batch.fly(
-                part,
-                k,
-                lambda k=k, perception_of=perception_of: dock(
-                    k, scenario_of(k), perception_of, approach_at_s=o.approach_at
-                ),
-            )
-            for k in seeds[:number]
-        ]
-        if outcomes:
-            print_causes(part, outcomes)
-            result |= figures(part, outcomes)
-    for kind in o.kinds:
-        failed = [(k, failure_of(kind, k)) for k in seeds[:failures]]
-        outcomes = [
-            batch.fly(kind, k, lambda k=k, f=f: dock(k, scenario_of(k, f), noisy, f, o.approach_at))
-            for k, f in failed
-        ]
-        if outcomes:
-            print_causes(kind, outcomes)
-            result |= figures(kind, outcomes)
-    for part, number, perception_of in (
-        ("aborts", aborts, noisy),
-        ("aborts_images", aborts_images, RenderedImages),
+    def dock_with(perception_of: PerceptionOf, kind: str | None = None) -> Callable[[int], Outcome]:
+        def flight(seed: int) -> Outcome:
+            failure = None if kind is None else failure_of(kind, seed)
+            return dock(seed, scenario_of(seed, failure), perception_of, failure, o.approach_at)
+
+        return flight
+
+    def abort_with(perception_of: PerceptionOf) -> Callable[[int], Outcome]:
+        return lambda seed: abort(seed, scenario_of(seed), perception_of, again=seed % 5 == 0)
+
+    for part, number, flight, evaluate in (
+        ("noise", flights, dock_with(noisy), docking_figures),
+        ("images", images, dock_with(RenderedImages), docking_figures),
+        *((kind, failures, dock_with(noisy, kind), docking_figures) for kind in o.kinds),
+        ("aborts", aborts, abort_with(noisy), abort_figures),
+        ("aborts_images", aborts_images, abort_with(RenderedImages), abort_figures),
     ):
-        outcomes = [
-            batch.fly(
-                part,
-                k,
-                lambda k=k, perception_of=perception_of: abort(
-                    k, scenario_of(k), perception_of, again=k % 5 == 0
-                ),
-            )
-            for k in seeds[:number]
-        ]
+        outcomes = [batch.fly(part, seed, flight) for seed in range(o.first, o.first + number)]
         if outcomes:
             print_causes(part, outcomes)
-            result |= abort_figures(part, outcomes)
+            result |= evaluate(part, outcomes)
     print_figures(result)
-    print(
-        f"{time.perf_counter() - begin_s:.0f} s, flown by {', '.join(sorted(batch.commits))}", file=sys.stderr
-    )
+    print(f"flown by {', '.join(sorted(batch.commits))}", file=sys.stderr)
     write_json(o.json, result)
 
 

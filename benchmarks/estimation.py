@@ -135,11 +135,11 @@ class EstimatorErrors:
 
 @dataclass
 class Flight:
-    """A flight: errors of its estimator and of the shadows, tracking errors as (time s, m, rad) of all chasers, events as
+    """A flight: errors of its estimator and of the parallel estimators, tracking errors as (time s, m, rad) of all chasers, events as
     (time s, level, text), whether each image had a detection by chaser, the last outputs, and reinitializations."""
 
     estimates: EstimatorErrors
-    shadows: dict[str, EstimatorErrors]
+    parallel: dict[str, EstimatorErrors]
     tracking: list[tuple[float, float, float]]
     events: list[tuple[float, str, str]]
     detections: dict[int, list[bool]]
@@ -153,7 +153,7 @@ class Flight:
         return m, rad
 
 
-class Shadow:
+class ParallelEstimator:
     """Perception and estimator of another scenario on the images of a flight, without influence on it."""
 
     def __init__(self, scenario: Scenario, own_perception: bool) -> None:
@@ -173,7 +173,7 @@ class Shadow:
 
 def fly(
     scenario: Scenario,
-    shadows: Mapping[str, Scenario] | None = None,
+    parallel: Mapping[str, Scenario] | None = None,
     on_image: Callable[[Image], Image] = lambda image: image,
     on_sighting: Callable[[Sighting], Sighting] = lambda sighting: sighting,
     until: Callable[[EstimatorErrors], bool] = lambda errors: False,
@@ -193,9 +193,9 @@ def fly(
     def perception(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
         return on_sighting(rendered(chaser, tick, time_ns, states))
 
-    beside = {
-        name: Shadow(s, own_perception=s.perception.name != scenario.perception.name)
-        for name, s in (shadows or {}).items()
+    estimators = {
+        name: ParallelEstimator(s, own_perception=s.perception.name != scenario.perception.name)
+        for name, s in (parallel or {}).items()
     }
     errors, tracking = EstimatorErrors(), []
     detections: dict[int, list[bool]] = {i: [] for i in range(len(scenario.chasers))}
@@ -205,8 +205,8 @@ def fly(
             outputs = record.outputs
             assert outputs is not None
             errors.add(record.time_s, outputs.target, record.states["target"])
-            for shadow in beside.values():
-                shadow.update(record, images)
+            for estimator in estimators.values():
+                estimator.update(record, images)
             for sighting in record.sightings:
                 detections[sighting.chaser].append(bool(sighting.solutions))
             tracking += [(record.time_s, *record.tracking_errors[i]) for i in outputs.references]
@@ -215,7 +215,7 @@ def fly(
         assert outputs is not None
         return Flight(
             errors,
-            {name: shadow.errors for name, shadow in beside.items()},
+            {name: estimator.errors for name, estimator in estimators.items()},
             tracking,
             mission.events,
             detections,
@@ -255,31 +255,31 @@ def with_errors(scenario: Scenario) -> Scenario:
 
 
 def figures(flown: Flight, from_s: float) -> Row:
-    """Return the figures of a flight."""
+    """Return the figures of a flight: RMS from ``from_s`` on, maxima from 1 s on."""
     e = flown.estimates
     m, rad = flown.tracking_rms(from_s)
     row: Row = {
-        "estimate_m": e.rms("position_m", from_s),
-        "estimate_rad": e.rms("angle_rad", from_s),
-        "estimate_max_rad_after_1s": e.largest("angle_rad", 1.0),
-        "estimate_max_m_after_1s": e.largest("position_m", 1.0),
+        "estimate_position_rms_m": e.rms("position_m", from_s),
+        "estimate_angle_rms_rad": e.rms("angle_rad", from_s),
+        "estimate_angle_max_rad": e.largest("angle_rad", 1.0),
+        "estimate_position_max_m": e.largest("position_m", 1.0),
         "nees": float(e.array("nees", from_s).mean()),
         "inside_3_sigma": float(e.array("inside", from_s).mean()),
-        "tracking_m": m,
-        "tracking_rad": rad,
+        "tracking_position_rms_m": m,
+        "tracking_angle_rms_rad": rad,
         "reinitializations": flown.reinitialisations,
         "detected": float(np.mean([v for each in flown.detections.values() for v in each])),
         "events": [f"{t:.2f} {text}" for t, _, text in flown.events][:40],
     }
-    for name, shadow in flown.shadows.items():
-        row[f"{name}_m"] = shadow.rms("position_m", from_s)
-        row[f"{name}_rad"] = shadow.rms("angle_rad", from_s)
-        row[f"{name}_max_rad_after_1s"] = shadow.largest("angle_rad", 1.0)
+    for name, other in flown.parallel.items():
+        row[f"{name}_position_rms_m"] = other.rms("position_m", from_s)
+        row[f"{name}_angle_rms_rad"] = other.rms("angle_rad", from_s)
+        row[f"{name}_angle_max_rad"] = other.largest("angle_rad", 1.0)
     return row
 
 
 def paper_of(scenario: Scenario) -> dict[str, Scenario]:
-    """Return, as shadow, the paper's perception and estimator."""
+    """Return the scenario of a parallel estimator with the paper's perception and estimator."""
     return {"paper": changed(scenario, perception={"name": "paper"}, estimator={"name": "paper"})}
 
 
@@ -313,8 +313,8 @@ def calibrate(target: str, seed: int) -> Row:
         "mounting_error_before_rad": float(np.linalg.norm(rotations.log(turn))),
         "mounting_error_after_rad": left,
         "mounting_sigma_rad": float(np.linalg.norm(estimate.turn_sigma_rad)),
-        "before_estimate_m": flown.estimates.rms("position_m", 3.0, 5.0),
-        "before_estimate_rad": flown.estimates.rms("angle_rad", 3.0, 5.0),
+        "estimate_before_position_rms_m": flown.estimates.rms("position_m", 3.0, 5.0),
+        "estimate_before_angle_rms_rad": flown.estimates.rms("angle_rad", 3.0, 5.0),
         "good": float(left <= math.radians(0.05)),
     }
 
@@ -393,7 +393,6 @@ def fault(which: str, seed: int) -> Row:
     flown = fly(scenario, on_image=on_image, on_sighting=on_sighting)
     named = any(level == "warning" and "chaser 2" in text for _, level, text in flown.events)
     return figures(flown, SETTLED_S) | {
-        "max_m": flown.estimates.largest("position_m", 1.0),
         "lost_ticks": sum(s == "lost" for s in flown.estimates.status),
         "named": float(named),
     }

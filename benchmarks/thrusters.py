@@ -86,7 +86,7 @@ def allocation(quick: bool) -> Figures:
             f"allocation_{body}_worst_relative_error": worst,
             f"allocation_{body}_inexact": float(inexact),
             f"allocation_{body}_beyond_limits_N": over,
-            f"allocation_{body}_median_s": float(np.median(took)),
+            f"allocation_{body}_wall_median_s": float(np.median(took)),
         }
     return out
 
@@ -196,11 +196,11 @@ def failures(quick: bool) -> Figures:
             f"failures_{kind}_flights": float(len(delays)),
             f"failures_{kind}_isolated": float(np.isfinite(delays).sum()),
             f"failures_{kind}_wrong_thrusters": float(wrong),
-            f"failures_{kind}_median_time_to_isolation_s": float(np.median(delays)),
-            f"failures_{kind}_max_time_to_isolation_s": float(max(delays)),
-            f"failures_{kind}_max_peak_position_m": float(max(p for p, _ in peaks)),
-            f"failures_{kind}_max_peak_orientation_rad": max(a for _, a in peaks),
-            f"failures_{kind}_max_final_position_rms_m": float(max(final)),
+            f"failures_{kind}_time_to_isolation_median_s": float(np.median(delays)),
+            f"failures_{kind}_time_to_isolation_max_s": float(max(delays)),
+            f"failures_{kind}_peak_position_error_max_m": float(max(p for p, _ in peaks)),
+            f"failures_{kind}_peak_orientation_error_max_rad": max(a for _, a in peaks),
+            f"failures_{kind}_final_position_rms_max_m": float(max(final)),
         }
     return out
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import Any
 
 import msgspec
+from chaserdock_protocol.messages import DrawnBody
 from msgspec import Struct
 
 
@@ -123,6 +124,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     digest: str
     peak_memory_bytes: int | None = None
     cpu_s: dict[str, float] | None = None
+    drawn: list[DrawnBody] = []
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Summary:

@@ -17,6 +17,8 @@ from chaserdock_protocol.codec import without_wall_time
 from chaserdock_protocol.messages import (
     BodyTruth,
     CommandReply,
+    DrawnBody,
+    DrawnTruth,
     Event,
     Health,
     ProbeTouch,
@@ -141,6 +143,7 @@ class RecordedFlight:
     sightings: dict[int, SightingHistory]
     solves: SolverHistory
     world: WorldHistory
+    drawn: tuple[DrawnBody, ...]
     events: list[Event]
     replies: list[CommandReply]
     counts: dict[str, int]
@@ -215,6 +218,7 @@ class _Collector:
     statuses: Counter[str] = field(default_factory=Counter)
     solver: str | None = None
     world: WorldHistory = field(default_factory=WorldHistory)
+    drawn: tuple[DrawnBody, ...] = ()
     events: list[Event] = field(default_factory=list)
     replies: list[CommandReply] = field(default_factory=list)
     health: dict[str, Health] = field(default_factory=dict)
@@ -255,11 +259,13 @@ class _Collector:
                 self._add_solve(message)
             case WorldTruth():
                 self.world.add(message)
-            case Event() | CommandReply() | Health():
+            case Event() | CommandReply() | Health() | DrawnTruth():
                 self._add_report(message)
 
-    def _add_report(self, message: Event | CommandReply | Health) -> None:
+    def _add_report(self, message: Event | CommandReply | Health | DrawnTruth) -> None:
         match message:
+            case DrawnTruth():
+                self.drawn = message.bodies
             case Event():
                 self.events.append(message)
             case CommandReply():
@@ -345,6 +351,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
             c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses
         ),
         world=c.world,
+        drawn=c.drawn,
         events=c.events,
         replies=c.replies,
         counts=dict(sorted(c.counts.items())),

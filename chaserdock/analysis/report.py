@@ -77,6 +77,7 @@ def report_of(log: Path) -> str:
         _outcome(result),
         _chasers(flight, result),
         _numbers(flight, result),
+        _drawn(flight),
         replay,
         '<h2 id="figures">Figures</h2>',
         f'<p class="faint">Long flight: figures show one of {every} ticks; tables use all.</p>'
@@ -219,6 +220,39 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         f"{flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
     )
+
+
+def _drawn(flight: RecordedFlight) -> str:
+    """Return a table of the true bodies and sensors beside what the flight software was told."""
+    stated = {"target": flight.scenario.target.mass_kg} | {
+        f"chaser/{i}": flight.scenario.chaser.mass_kg for i in range(len(flight.scenario.chasers))
+    }
+    rows = [
+        (
+            b.body,
+            f"{b.mass_kg:.4g} ({stated.get(b.body, math.nan):.4g})",
+            _numbers_text(b.inertia_kg_m2[::4], 1.0),
+            _numbers_text(b.centre_of_mass_m, 1e3),
+            _numbers_text(b.force_N, 1e3),
+            _numbers_text(b.torque_N_m, 1e3),
+            _numbers_text(b.thrust_share, 100.0),
+            _numbers_text(b.camera_turn_rad, 180.0 / math.pi),
+            _numbers_text(b.camera_shift_m, 1e3),
+            _numbers_text((b.camera_focal_share,), 100.0),
+            _numbers_text(b.gyro_bias_rad_s, 180.0 / math.pi),
+        )
+        for b in flight.drawn
+    ]
+    head = (
+        "body", "mass, kg (stated)", "inertia xx, yy, zz, kg m²", "centre of mass, mm", "force, mN", "torque, mN m",
+        "thrust, %", "camera turn, deg", "camera shift, mm", "focal length, %", "gyro bias, deg/s",
+    )  # fmt: skip
+    return f'<h2 id="drawn">True bodies and sensors</h2>{table(head, rows)}' if rows else ""
+
+
+def _numbers_text(values: Iterable[float], factor: float) -> str:
+    numbers = [value * factor for value in values]
+    return " ".join(f"{number:.3g}" for number in numbers) if any(numbers) else "0"
 
 
 def _replay(data: dict[str, Any]) -> str:

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -232,6 +233,7 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             "failures": flight.solves.statuses["failed"],
             "relaxed": flight.solves.statuses["infeasible_relaxed"],
         },
+        "drawn": [msgspec.to_builtins(body) for body in flight.drawn],
         "messages": _messages(flight),
         "rejected": flight.rejected,
         "digest": flight.digest,

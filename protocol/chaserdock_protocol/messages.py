@@ -227,6 +227,40 @@ class WorldTruth(Message, frozen=True, kw_only=True):
     latched: ChaserIds = ()
 
 
+class DrawnBody(Struct, frozen=True, kw_only=True):
+    """What the scenario drew for one body (``target`` or ``chaser/0``), body axes unless stated otherwise.
+
+    ``inertia_kg_m2``: row-major (3, 3) about the centre of mass. ``thrust_share``: relative error of each thruster (with
+    ideal actuation: of force and torque per axis); ``thrust_turn_rad``: three numbers each (with ideal actuation: of force
+    and torque). Odometry biases: position in WRF. ``camera_*``: error against the calibration. ``marker_shift_m``: three
+    numbers a marker.
+    """
+
+    body: Text
+    mass_kg: float
+    inertia_kg_m2: Square3
+    centre_of_mass_m: Vector3 = (0.0, 0.0, 0.0)
+    force_N: Vector3 = (0.0, 0.0, 0.0)
+    torque_N_m: Vector3 = (0.0, 0.0, 0.0)
+    thrust_share: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
+    thrust_turn_rad: Annotated[tuple[float, ...], Meta(max_length=765)] = ()
+    clock_offset_s: float = 0.0
+    position_bias_m: Vector3 = (0.0, 0.0, 0.0)
+    attitude_bias_rad: Vector3 = (0.0, 0.0, 0.0)
+    gyro_bias_rad_s: Vector3 = (0.0, 0.0, 0.0)
+    camera_turn_rad: Vector3 = (0.0, 0.0, 0.0)
+    camera_shift_m: Vector3 = (0.0, 0.0, 0.0)
+    camera_focal_share: float = 0.0
+    camera_centre_px: Annotated[tuple[float, ...], Meta(min_length=2, max_length=2)] = (0.0, 0.0)
+    marker_shift_m: Annotated[tuple[float, ...], Meta(max_length=3072)] = ()
+
+
+class DrawnTruth(Message, frozen=True, kw_only=True):
+    """True bodies, actuators and sensors, as drawn from the seed; published once, at the first tick."""
+
+    bodies: Annotated[tuple[DrawnBody, ...], Meta(max_length=257)]
+
+
 class Sighting(Message, frozen=True, kw_only=True):
     """Target poses that a chaser measured in one image; empty ``solutions`` if it detected nothing.
 
@@ -501,6 +535,7 @@ VERSION: dict[type[Struct], int] = {
     DockingStatus: 1,
     BodyTruth: 2,
     WorldTruth: 1,
+    DrawnTruth: 1,
     Sighting: 2,
     TargetEstimate: 1,
     Reference: 1,

@@ -72,6 +72,7 @@ DOCKING = _topic(
 )
 TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _TRUTH_READERS, "tick", "state")
+TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event", "state")
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
 THRUSTERS = _topic("chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state")
@@ -100,6 +101,7 @@ TOPICS: tuple[Topic, ...] = (
     DOCKING,
     TRUTH_BODY,
     TRUTH_WORLD,
+    TRUTH_DRAWN,
     SIGHTING,
     ACTUATORS,
     THRUSTERS,

@@ -31,13 +31,21 @@ from chaserdock_protocol.scenario.faults import Fault, ProcessFaults
 from chaserdock_protocol.scenario.mission import Chaser, Success
 from chaserdock_protocol.scenario.schema import TimelineEntry
 from chaserdock_protocol.scenario.thrusters import ThrusterFailure
+from chaserdock_protocol.scenario.truth import (
+    CameraTruth,
+    ChaserTruth,
+    SensorTruth,
+    TargetTruth,
+    TruthSection,
+    TruthValues,
+)
 from chaserdock_protocol.shipped_scenarios import shipped_names, shipped_scenario
 from pydantic import BaseModel, Field
 from source_tree import MODULES, imported, short, tree_of
 
 FORBIDDEN_TYPES = {
     Scenario, Target, Chaser, CameraSection, Effects, Eclipse, EarthSection, Fault, ProcessFaults,
-    ThrusterFailure, Success,
+    ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth, TruthValues,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",

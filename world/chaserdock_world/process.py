@@ -36,7 +36,7 @@ from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.rendering.cameras import Cameras, States
 from chaserdock_world.sensors.errors import OdometrySensor
-from chaserdock_world.sensors.publish import publish_docking, publish_odometry, publish_truth
+from chaserdock_world.sensors.publish import drawn_truth, publish_docking, publish_odometry, publish_truth
 
 _REALTIME_SLICES_HZ = 240
 
@@ -114,7 +114,7 @@ class World:
         node.declare_queryable(
             topics.JOIN_KEY, JoinRequest, lambda request, reply: reply(membership.admit(request))
         )
-        for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD):
+        for topic in (topics.TICK, topics.END, topics.TRUTH_WORLD, topics.TRUTH_DRAWN):
             node.advertise(topic)
         for i in range(len(scenario.chasers)):
             node.advertise(topics.ODOMETRY, i)
@@ -142,6 +142,7 @@ class World:
         if not self._wait_for_processes(stop):
             return self._end_mission(0, "stopped before the first tick", complete=False)
         finish_startup()
+        self._node.publish(topics.TRUTH_DRAWN, drawn_truth(self._scenario, self._odometry))
         self._started_s, tick = time.monotonic(), 0
         while True:
             states = self._publish_state(tick)

@@ -36,6 +36,7 @@ def check_consistent(scenario: Scenario) -> None:
     _check_thruster_failures(scenario)
     _check_latched(scenario)
     check_faults(scenario.fault, scenario)
+    _check_truth(scenario)
 
 
 def _check_start_positions(scenario: Scenario) -> None:
@@ -121,6 +122,31 @@ def _check_thruster_failures(scenario: Scenario) -> None:
         if (failure.chaser, failure.thruster) in failed:
             raise ValueError(f"{path}: thruster {failure.thruster} of chaser {failure.chaser} fails twice")
         failed.add((failure.chaser, failure.thruster))
+
+
+def _check_truth(scenario: Scenario) -> None:
+    body, chasers = scenario.chaser, len(scenario.chasers)
+    moves_freely = scenario.target.motion == "torque_free"
+    given = scenario.truth.target.model_fields_set - {"marker_m"}
+    if not moves_freely and (
+        key := next((k for k in sorted(given) if getattr(scenario.truth.target, k)), None)
+    ):
+        raise ValueError(f'truth.target.{key}: needs target.motion = "torque_free"')
+    named: set[int | None] = set()
+    for k, values in enumerate(scenario.truth.values):
+        path, name = f"truth.values.{k}", "the target" if values.target else f"chaser {values.chaser}"
+        if values.chaser is not None and values.chaser >= chasers:
+            raise ValueError(f"{path}.chaser: there is no {name}; this mission has 0 to {chasers - 1}")
+        if values.target and not moves_freely:
+            raise ValueError(f'{path}.target: needs target.motion = "torque_free"')
+        if values.chaser in named:
+            raise ValueError(f"{path}: {name} has values already")
+        named.add(values.chaser)
+        count = len(body.thrusters) if body.actuation == "thrusters" else 6
+        if values.thrust_share is not None and len(values.thrust_share) != count:
+            raise ValueError(
+                f"{path}.thrust_share: must have {count} numbers (got {len(values.thrust_share)})"
+            )
 
 
 def _check_latched(scenario: Scenario) -> None:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -29,16 +30,16 @@ _CAMERA_PRIORS = {
 }
 """Key of ``[estimator]`` in format 2 -> key of ``[navigation]``: what the estimator knew of the cameras' errors."""
 _CAMERA_ERRORS = {
-    "mounting_deg": "camera_turn_deg",
-    "mounting_m": "camera_shift_m",
-    "focal_length_share": "camera_focal_share",
-    "centre_px": "camera_centre_px",
+    "mounting_deg": ("camera_turn_deg", "turn_deg"),
+    "mounting_m": ("camera_shift_m", "shift_m"),
+    "focal_length_share": ("camera_focal_share", "focal_share"),
+    "centre_px": ("camera_centre_px", "centre_px"),
 }
-"""Key of ``[camera.calibration_error]`` in format 2 -> key of ``[navigation]``."""
+"""Key of ``[camera.calibration_error]`` in format 2 -> keys of ``[navigation]`` and of ``[truth.camera]``."""
 
 _MOVED_KEYS: dict[tuple[str, ...], str] = {
     ("odometry",): 'navigation; state the grade, too ("exact": all other errors are 0)',
-    **{("camera", "calibration_error", old): f"navigation.{new}" for old, new in _CAMERA_ERRORS.items()},
+    **{("camera", "calibration_error", old): f"navigation.{new}" for old, (new, _) in _CAMERA_ERRORS.items()},
     **{("estimator", old): f"navigation.{new}" for old, new in _CAMERA_PRIORS.items()},
 }
 """Path of a key in format 2 -> its present path."""
@@ -115,7 +116,7 @@ def _rename_keys(values: dict[str, Any]) -> None:
 def _state_navigation(values: dict[str, Any]) -> None:
     """Migrate from format 2 to 3, in place: exact navigation with the errors that the scenario states.
 
-    The camera's figures are those that the estimator knew, so that it replays as it flew.
+    The camera's figures are those that the estimator knew, so that it replays as it flew; errors beyond are ``[truth]``.
     """
     navigation: dict[str, Any] = {"grade": "exact"}
     navigation |= {key: value for key, value in _table(values, "odometry").items() if value}
@@ -129,8 +130,13 @@ def _state_navigation(values: dict[str, Any]) -> None:
     for old, new in _CAMERA_PRIORS.items():
         if isinstance(estimator, dict) and (prior := estimator.pop(old, 0.0)):
             navigation[new] = prior
-    values.pop("odometry", None)
+    unknown: dict[str, float] = {}
+    for old, (new, hidden) in _CAMERA_ERRORS.items():
+        if new != "camera_centre_px" and errors.get(old, 0.0) > (known := navigation.get(new, 0.0)):
+            unknown[hidden] = math.sqrt(errors[old] ** 2 - known**2)
     values["navigation"] = navigation
+    if unknown:
+        values["truth"] = {"camera": unknown}
 
 
 def _table(values: dict[str, Any], key: str) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from .fields import Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
 from .schema import FlightChaser
 from .thrusters import ThrusterFailure
+from .truth import TruthSection
 
 
 class Chaser(FlightChaser):
@@ -89,6 +90,7 @@ class Scenario(FlightScenario):
     thruster_failure: tuple[ThrusterFailure, ...] = ()
     fault: tuple[Fault, ...] = Field(default=(), max_length=100)
     success: Success = Success()
+    truth: TruthSection = TruthSection()
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Scenario:

@@ -12,11 +12,13 @@ from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.scenario.bodies import Body
 
 from chaserdock_world.physics.simulation import Physics
+from chaserdock_world.plant import ActuationErrors
 
 
 class ActuatorOutput(NamedTuple):
@@ -65,9 +67,11 @@ class Actuators(Protocol):
 
 @dataclass
 class IdealActuators:
-    """Actuators that give the commanded wrench within the body's limits."""
+    """Actuators that give the commanded wrench within the body's limits, up to ``errors``."""
 
     body: Body
+    errors: ActuationErrors | None = None
+    physics_hz: int = 960
     wrench: Array = field(default_factory=lambda: np.zeros(6))
     impulse: Array = field(default_factory=lambda: np.zeros(6))
     absolute_impulse_N_s: float = 0.0
@@ -75,6 +79,7 @@ class IdealActuators:
     late: int = 0
     _queue: list[tuple[int, int, int, Array]] = field(default_factory=list)
     _received: int = 0
+    _last_step: int = 0
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
         """See ``Actuators.command``."""
@@ -84,8 +89,13 @@ class IdealActuators:
         self.late += effective_step < now_step
         # A restarted chaser counts ``seq`` from zero again; the order of arrival decides, and arrays are never compared.
         self._received += 1
-        entry = (effective_step, command.seq, self._received, np.clip(wrench, -limit, limit))
-        heapq.heappush(self._queue, entry)
+        wrench = np.clip(wrench, -limit, limit)
+        if self.errors is not None:
+            wrench = _given(self.errors, wrench, effective_step)
+            delayed = effective_step + round(self.errors.delay(effective_step) * self.physics_hz)
+            # Jitter does not change the order of commands.
+            effective_step = self._last_step = max(delayed, now_step, self._last_step)
+        heapq.heappush(self._queue, (effective_step, command.seq, self._received, wrench))
 
     def next_change(self, step: int) -> int | None:
         """See ``Actuators.next_change``."""
@@ -111,13 +121,23 @@ class IdealActuators:
         return output
 
 
+def _given(errors: ActuationErrors, wrench: Array, step: int) -> Array:
+    """Return what actuators with errors give for a command (6,) that acts from ``step`` on."""
+    wrench = wrench * (1.0 + errors.thrust_share)
+    if errors.scatter_share:
+        wrench = wrench * errors.scatter(0, step, 6)
+    turns = errors.thrust_turn_rad
+    parts = (rotations.rotate(rotations.exp(turns[k]), wrench[3 * k : 3 * k + 3]) for k in range(2))
+    return np.concatenate(list(parts))
+
+
 def fly_to(
     end_step: int, physics: Physics, actuators: Mapping[str, Actuators], step_s: float
 ) -> set[tuple[str, str]]:
     """Advance the physics to ``end_step`` under the actuators' wrenches; return the pairs of bodies that touched."""
     touched: set[tuple[str, str]] = set()
     while (step := physics.step_count) < end_step:
-        changes = (a.next_change(step) for a in actuators.values())
+        changes = (physics.next_change(step), *(a.next_change(step) for a in actuators.values()))
         until = min((c for c in changes if c is not None), default=end_step)
         steps = min(until, end_step) - step
         touched |= physics.advance(steps, {name: a.act(step, steps, step_s) for name, a in actuators.items()})

@@ -8,14 +8,17 @@ Propellant consumption is computed; the body's mass stays constant.
 from __future__ import annotations
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.clock import Timing
 from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import ActuatorCommand
+from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.bodies import Body
-from chaserdock_protocol.scenario.thrusters import FailureKind, ThrusterFailure
+from chaserdock_protocol.scenario.thrusters import FailureKind, Thruster, ThrusterFailure
+
+from chaserdock_world.plant import ActuationErrors, actuation_errors
 
 from .ideal import ActuatorOutput, Actuators, IdealActuators
 
@@ -28,10 +31,18 @@ class ThrusterActuators:
     Pulses have absolute times. The part of a pulse that has passed when a late command arrives is lost.
     """
 
-    def __init__(self, body: Body, timing: Timing, failures: tuple[ThrusterFailure, ...]) -> None:
-        self._timing = timing
-        self._matrix = wrench_matrix(body.thrusters)
-        self._valves = Valves(body.thrusters)
+    def __init__(
+        self,
+        body: Body,
+        timing: Timing,
+        failures: tuple[ThrusterFailure, ...],
+        errors: ActuationErrors | None = None,
+    ) -> None:
+        self._timing, self._errors = timing, errors
+        thrusters = body.thrusters if errors is None else true_thrusters(body.thrusters, errors)
+        self._shortest_ns = [round(t.min_on_s * 1e9) for t in thrusters]
+        self._matrix = wrench_matrix(thrusters)
+        self._valves = Valves(thrusters)
         for failure in failures:
             self._valves.fail(failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor)
         self._wrenches: Array = np.zeros((0, 6))
@@ -53,13 +64,23 @@ class ThrusterActuators:
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
         """See ``Actuators.command``. A pulse that the valve cannot execute counts as saturated."""
         now_ns = self._timing.time_ns(max(now_step, effective_step))
+        delay_ns = 0 if self._errors is None else round(self._errors.delay(effective_step) * 1e9)
         for p in command.pulses:
-            begin_ns = max(p.open_ns, now_ns)
-            if p.close_ns > begin_ns and not self._valves.pulse(p.thruster, begin_ns, p.close_ns):
-                self._saturated |= begin_ns == p.open_ns
+            open_ns = p.open_ns + delay_ns
+            begin_ns, close_ns = max(open_ns, now_ns), open_ns + self._width_ns(p)
+            if close_ns > begin_ns and not self._valves.pulse(p.thruster, begin_ns, close_ns):
+                self._saturated |= begin_ns == open_ns
         self._valves.set_shut(command.isolated, now_ns)
         self._late += effective_step < now_step
         self._wrenches = np.zeros((0, 6))
+
+    def _width_ns(self, pulse: ThrusterPulse) -> int:
+        """Return how long a pulse opens its valve: as commanded, up to scatter."""
+        width, k = pulse.close_ns - pulse.open_ns, pulse.thruster
+        if self._errors is None or not self._errors.scatter_share or k >= len(self._shortest_ns):
+            return width
+        scattered = round(width * float(self._errors.scatter(k, pulse.open_ns, 1)[0]))
+        return scattered if width < self._shortest_ns[k] else max(scattered, self._shortest_ns[k])
 
     def _wrenches_after(self, step: int) -> Array:
         """Return mean wrenches (K, 6) of the physics steps from ``step`` on, at least two."""
@@ -110,9 +131,24 @@ class ThrusterActuators:
         return output
 
 
+def true_thrusters(stated: tuple[Thruster, ...], errors: ActuationErrors) -> tuple[Thruster, ...]:
+    """Return the thrusters with their true thrust and direction."""
+    return tuple(
+        t.model_copy(
+            update={
+                "thrust_N": t.thrust_N * (1.0 + share),
+                "direction": tuple(rotations.rotate(rotations.exp(turn), t.direction).tolist()),
+            }
+        )
+        for t, share, turn in zip(stated, errors.thrust_share.tolist(), errors.thrust_turn_rad, strict=True)
+    )
+
+
 def make_actuators(scenario: Scenario, chaser: int) -> Actuators:
     """Return the actuators that the scenario gives to a chaser."""
+    drawn = actuation_errors(scenario, chaser)
+    errors = None if drawn.none else drawn
     if scenario.chaser.actuation == "ideal":
-        return IdealActuators(scenario.chaser)
+        return IdealActuators(scenario.chaser, errors, scenario.time.physics_hz)
     failures = tuple(f for f in scenario.thruster_failure if f.chaser == chaser)
-    return ThrusterActuators(scenario.chaser, scenario.timing, failures)
+    return ThrusterActuators(scenario.chaser, scenario.timing, failures, errors)

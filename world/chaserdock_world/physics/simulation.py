@@ -17,7 +17,9 @@ from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.bodies import cuboid_inertia
+
+from chaserdock_world.plant import Plant, chaser_plant, target_plant
+from chaserdock_world.random_draws import GaussMarkov, Stream
 
 from .bullet import connect, pybullet
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
@@ -43,13 +45,19 @@ class Physics:
         self._client: int = self._bullet._client  # direct calls: the wrapper is too slow for every step
         self._bullet.setGravity(0, 0, 0)
         self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)
+        chasers = {f"chaser/{i}": i for i in range(len(scenario.chasers))}
+        self.plants = {TARGET: target_plant(scenario)}
+        self.plants |= {name: chaser_plant(scenario, i) for name, i in chasers.items()}
         self._bodies: dict[str, int] = {TARGET: self._add_target(scenario)}
-        for i in range(len(scenario.chasers)):
-            self._bodies[f"chaser/{i}"] = self._add_chaser(scenario, i)
-        # Bodies that Bullet integrates, with their principal moments of inertia.
-        self._free = {f"chaser/{i}": scenario.chaser.inertia for i in range(len(scenario.chasers))}
+        for name, i in chasers.items():
+            self._bodies[name] = self._add_chaser(scenario, i)
+        # Bodies that Bullet integrates.
+        self._free = {name: self.plants[name] for name in chasers}
         if not self._prescribed:
-            self._free[TARGET] = self._target_inertia(scenario)
+            self._free[TARGET] = self.plants[TARGET]
+        self._noise = {
+            name: _disturbance_noise(scenario, i) for name, i in chasers.items() if _has_noise(scenario)
+        }
         self._names = {number: name for name, number in self._bodies.items()}
         hz, docking = scenario.time.physics_hz, scenario.docking
         ports = docking.ports if docking.kind == "capture" else ()
@@ -63,7 +71,8 @@ class Physics:
         """Names of all bodies: ``target``, ``chaser/0``, ..."""
         return tuple(self._bodies)
 
-    def _add(self, shape: int, mass_kg: float, inertia: tuple[float, float, float], state: BodyState) -> int:
+    def _add(self, shape: int, plant: Plant, mass_kg: float, body_state: BodyState) -> int:
+        state = body_state if plant.frame is None else plant.frame.from_body(body_state)
         body = self._bullet.createMultiBody(
             baseMass=mass_kg,
             baseCollisionShapeIndex=shape,
@@ -72,7 +81,7 @@ class Physics:
         )
         self._bullet.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6)
         if mass_kg > 0:
-            self._bullet.changeDynamics(body, -1, localInertiaDiagonal=list(inertia))
+            self._bullet.changeDynamics(body, -1, localInertiaDiagonal=list(plant.moments_kg_m2))
         if self._scenario.docking.kind == "capture":
             self._bullet.changeDynamics(body, -1, **_CONTACT)
         self._set_velocity(body, state)
@@ -83,44 +92,44 @@ class Physics:
         pybullet.resetBaseVelocity(body, state.velocity_m_s.tolist(), omega_world.tolist(), self._client)
 
     def _add_target(self, scenario: Scenario) -> int:
-        target, model = scenario.target, scenario.target_model()
-        mass = 0.0 if self._prescribed else target.mass_kg
-        inertia = self._target_inertia(scenario)
-        return self._add(self._box_shape(model), mass, inertia, prescribed_state(scenario, 0.0))
+        plant = self.plants[TARGET]
+        mass = 0.0 if self._prescribed else plant.mass_kg
+        shape = self._box_shape(scenario.target_model(), plant)
+        return self._add(shape, plant, mass, prescribed_state(scenario, 0.0))
 
-    @staticmethod
-    def _target_inertia(scenario: Scenario) -> tuple[float, float, float]:
-        target, model = scenario.target, scenario.target_model()
-        return target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, model.size_m)
-
-    def _box_shape(self, model: TargetModel) -> int:
+    def _box_shape(self, model: TargetModel, plant: Plant) -> int:
         boxes = model.boxes
+        places = [_place(plant, list(box.position_m), _xyzw(np.asarray(box.q_wxyz))) for box in boxes]
         return self._bullet.createCollisionShapeArray(
             shapeTypes=[pybullet.GEOM_BOX] * len(boxes),
             halfExtents=[[s / 2 for s in box.size_m] for box in boxes],
-            collisionFramePositions=[list(box.position_m) for box in boxes],
-            collisionFrameOrientations=[_xyzw(np.asarray(box.q_wxyz)) for box in boxes],
+            collisionFramePositions=[position for position, _ in places],
+            collisionFrameOrientations=[xyzw for _, xyzw in places],
         )
 
     def _add_chaser(self, scenario: Scenario, i: int) -> int:
-        body = scenario.chaser
+        body, plant = scenario.chaser, self.plants[f"chaser/{i}"]
         half = [s / 2 for s in body.size_m]
+        box_m, box_xyzw = _place(plant, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
         if scenario.docking.kind == "capture":
             # The probe: a massless capsule from the body's front to the tip.
             length = body.probe_reach_m - half[0] - PROBE_RADIUS_M
+            probe_m, probe_xyzw = _place(plant, [half[0] + length / 2, 0.0, 0.0], _Z_TO_X_XYZW)
             shape = self._bullet.createCollisionShapeArray(
                 shapeTypes=[pybullet.GEOM_BOX, pybullet.GEOM_CAPSULE],
                 halfExtents=[half, [0.0, 0.0, 0.0]],
                 radii=[0.0, PROBE_RADIUS_M],
                 lengths=[0.0, length],
-                collisionFramePositions=[[0.0, 0.0, 0.0], [half[0] + length / 2, 0.0, 0.0]],
-                collisionFrameOrientations=[[0.0, 0.0, 0.0, 1.0], _Z_TO_X_XYZW],
+                collisionFramePositions=[box_m, probe_m],
+                collisionFrameOrientations=[box_xyzw, probe_xyzw],
             )
         else:
-            shape = self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half)
+            place = {"collisionFramePosition": box_m, "collisionFrameOrientation": box_xyzw}
+            place = {} if plant.frame is None else place
+            shape = self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **place)
         position, attitude = scenario.start_pose(i)
         state = BodyState(position, np.asarray(scenario.chasers[i].start_velocity_m_s), attitude, np.zeros(3))
-        return self._add(shape, body.mass_kg, body.inertia, state)
+        return self._add(shape, plant, plant.mass_kg, state)
 
     def state(self, name: str) -> BodyState:
         """Return the current state of a body; that of a prescribed target is exact."""
@@ -128,27 +137,52 @@ class Physics:
             return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
         body = self._bodies[name]
         client = self._client
-        return _state_of(
-            pybullet.getBasePositionAndOrientation(body, client), pybullet.getBaseVelocity(body, client)
-        )
+        pose = pybullet.getBasePositionAndOrientation(body, client)
+        return self._body_state(name, pose, pybullet.getBaseVelocity(body, client))
+
+    def _body_state(self, name: str, pose: Any, rates: Any) -> BodyState:
+        """Return the state of a body's frame from Bullet's pose, velocity and rate."""
+        state, frame = _state_of(pose, rates), self.plants[name].frame
+        return state if frame is None else frame.to_body(state)
+
+    def _bullet_state(self, name: str, state: BodyState) -> BodyState:
+        """Return the state of the frame that Bullet integrates from that of a body's frame."""
+        frame = self.plants[name].frame
+        return state if frame is None else frame.from_body(state)
 
     def place(self, name: str, state: BodyState) -> None:
         """Set the state of a body. Contacts are not checked."""
-        body = self._bodies[name]
+        body, state = self._bodies[name], self._bullet_state(name, state)
         position, attitude = state.position_m.tolist(), _xyzw(state.q_wxyz)
         pybullet.resetBasePositionAndOrientation(body, position, attitude, self._client)
         self._set_velocity(body, state)
 
+    def next_change(self, step: int) -> int | None:
+        """Return the first step after ``step`` at which a disturbance changes, None if all are constant."""
+        per_tick = self._scenario.timing.steps_per_tick
+        return (step // per_tick + 1) * per_tick if self._noise else None
+
+    def _wrench_on(self, name: str, wrench: Array) -> Array:
+        """Return force and torque (6,), in Bullet's frame of a body, of its actuators and its present disturbances."""
+        plant = self.plants[name]
+        if plant.disturbance.any():
+            wrench = wrench + plant.disturbance
+        if name in self._noise:
+            noise, sigma = self._noise[name]
+            wrench = wrench + sigma * noise.at(self.step_count // self._scenario.timing.steps_per_tick)
+        return wrench if plant.frame is None else plant.frame.wrench(wrench)
+
     def advance(self, steps: int, wrenches: dict[str, Array]) -> set[tuple[str, str]]:
         """Make ``steps`` physics steps under constant wrenches; return the pairs of bodies that touched.
 
-        ``wrenches`` maps a chaser's name to force and torque (6,) in its body axes, N and N m.
+        ``wrenches`` maps a chaser's name to force and torque (6,) at its origin in its body axes, N and N m. Disturbances
+        must not change in between (see ``next_change``).
         """
         zero = np.zeros(6)
         loads = []
-        for name, inertia in self._free.items():
-            wrench = wrenches.get(name, zero)
-            loads.append((self._bodies[name], inertia, wrench[:3].tolist(), wrench[3:].tolist()))
+        for name, plant in self._free.items():
+            wrench = self._wrench_on(name, wrenches.get(name, zero))
+            loads.append((self._bodies[name], plant.moments_kg_m2, wrench[:3].tolist(), wrench[3:].tolist()))
         step_s = 1.0 / self._scenario.time.physics_hz
         moves = self._prescribed and self._scenario.target.motion != "static"
         touched: set[tuple[str, str]] = set()
@@ -219,7 +253,7 @@ class Physics:
     def _update_latches(self, tips: set[str]) -> None:
         """Pass the contacts of the last step to the latches of these chasers."""
         for name in sorted(tips):
-            chaser, target = (_state_of(*self._before[self._bodies[n]]) for n in (name, TARGET))
+            chaser, target = (self._body_state(n, *self._before[self._bodies[n]]) for n in (name, TARGET))
             latch = self.latches[name]
             q_off = np.asarray(self._scenario.chasers[latch.chaser].q_wxyz)
             reach_m = self._scenario.chaser.probe_reach_m
@@ -229,9 +263,12 @@ class Physics:
 
     def _add_joint(self, name: str) -> None:
         """Fix a chaser's probe tip to the target in their current relative pose."""
-        chaser, target = self.state(name), self.state(TARGET)
+        chaser = self.state(name)
         tip = np.array([self._scenario.chaser.probe_reach_m, 0.0, 0.0])
         tip_world = chaser.position_m + rotations.rotate(chaser.q_wxyz, tip)
+        chaser, target = self._bullet_state(name, chaser), self._bullet_state(TARGET, self.state(TARGET))
+        if self.plants[name].frame is not None:
+            tip = rotations.rotate_inverse(chaser.q_wxyz, tip_world - chaser.position_m)
         relative = rotations.multiply(rotations.conjugate(target.q_wxyz), chaser.q_wxyz)
         a, b = self._bodies[TARGET], self._bodies[name]
         self._joints[name] = self._bullet.createConstraint(
@@ -259,6 +296,27 @@ class Physics:
     def close(self) -> None:
         """Disconnect the PyBullet client."""
         self._bullet.disconnect()
+
+
+def _has_noise(scenario: Scenario) -> bool:
+    sigma = scenario.truth.mismatch("chaser")
+    return bool(sigma.force_noise_N or sigma.torque_noise_N_m)
+
+
+def _disturbance_noise(scenario: Scenario, chaser: int) -> tuple[GaussMarkov, Array]:
+    """Return the processes of a chaser's disturbance and their standard deviations (6,), N and N m."""
+    sigma, period_s = scenario.truth.mismatch("chaser"), 1.0 / scenario.time.rate_hz
+    times_s = [sigma.disturbance_time_s] * 6
+    noise = GaussMarkov(scenario.seed, Stream.DISTURBANCE, chaser, times_s, period_s)
+    return noise, np.repeat([sigma.force_noise_N, sigma.torque_noise_N_m], 3)
+
+
+def _place(plant: Plant, position_m: list[float], xyzw: list[float]) -> tuple[list[float], list[float]]:
+    """Return position and attitude (Bullet's order) of a part in Bullet's frame of a body, from those in the body's frame."""
+    if plant.frame is None:
+        return position_m, xyzw
+    position, q = plant.frame.place(np.array(position_m), np.array([xyzw[3], *xyzw[:3]]))
+    return position.tolist(), _xyzw(q)
 
 
 def _state_of(pose: Any, rates: Any) -> BodyState:

@@ -19,6 +19,7 @@ from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
 from chaserdock_world.physics.simulation import TARGET, BodyState
+from chaserdock_world.plant import true_target
 from chaserdock_world.sensors.errors import true_camera
 
 from .background import Earth, Light
@@ -41,7 +42,7 @@ class Cameras:
     def __init__(self, scenario: Scenario) -> None:
         self._scenario, section = scenario, scenario.camera
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
-        self._target = scenario.target_model()
+        self._target = true_target(scenario)
         effects, earth = section.effects, section.earth
         self._exposure_s = effects.exposure_s
         background = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))

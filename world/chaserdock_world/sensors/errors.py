@@ -7,43 +7,62 @@ number and the tick only.
 
 from __future__ import annotations
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Square3
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 
-from chaserdock_world.physics.simulation import BodyState
-
-# Separate the random streams from each other and from that of the image noise.
-_CALIBRATION, _BIAS, _NOISE, _DRIFT = 101, 102, 103, 104
+from chaserdock_world.random_draws import GaussMarkov, Stream, generator
 
 
-def _generator(*key: int) -> np.random.Generator:
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(key)))
+@dataclass(frozen=True, eq=False)
+class CameraErrors:
+    """Errors of one camera against its calibration: rotation vector (3,) and shift (3,) in CRF, relative focal length,
+    principal point (2,) in pixels."""
+
+    turn_rad: Array
+    shift_m: Array
+    focal_share: float
+    centre_px: Array
+
+
+def camera_errors(scenario: Scenario, chaser: int) -> CameraErrors:
+    """Return the errors of a chaser's camera: those of ``[navigation]`` and those of ``[truth.camera]``."""
+    stated, unknown = scenario.navigation.errors(), scenario.truth.camera
+    known = generator(scenario.seed, Stream.CALIBRATION, chaser).standard_normal(9)
+    beyond = generator(scenario.seed, Stream.UNKNOWN_CALIBRATION, chaser).standard_normal(9)
+    return CameraErrors(
+        stated.camera_turn_rad * known[3:6] + math.radians(unknown.turn_deg) * beyond[3:6],
+        stated.camera_shift_m * known[6:9] + unknown.shift_m * beyond[6:9],
+        float(stated.camera_focal_share * known[0] + unknown.focal_share * beyond[0]),
+        stated.camera_centre_px * known[1:3] + unknown.centre_px * beyond[1:3],
+    )
 
 
 def true_camera(scenario: Scenario, chaser: int) -> Camera:
-    """Return the true camera of a chaser: the calibrated one with the errors of ``[navigation]``."""
-    calibrated, error = scenario.camera_model(), scenario.navigation.errors()
-    if error.exact_camera:
+    """Return the true camera of a chaser: the calibrated one with its errors."""
+    calibrated, error = scenario.camera_model(), camera_errors(scenario, chaser)
+    if not (error.turn_rad.any() or error.shift_m.any() or error.focal_share or error.centre_px.any()):
         return calibrated
-    draw = _generator(scenario.seed, _CALIBRATION, chaser).standard_normal(9)
-    scale = 1.0 + error.camera_focal_share * draw[0]
-    turn = rotations.exp(error.camera_turn_rad * draw[3:6])
-    qw, qx, qy, qz = rotations.multiply(turn, calibrated.q_crf_irf_wxyz).tolist()
-    x, y, z = (np.array(calibrated.position_crf_m) + error.camera_shift_m * draw[6:9]).tolist()
+    scale = 1.0 + error.focal_share
+    turned = rotations.multiply(rotations.exp(error.turn_rad), calibrated.q_crf_irf_wxyz)
+    qw, qx, qy, qz = turned.tolist()
+    x, y, z = (np.array(calibrated.position_crf_m) + error.shift_m).tolist()
+    cx, cy = error.centre_px.tolist()
     return replace(
         calibrated,
         fx_px=calibrated.fx_px * scale,
         fy_px=calibrated.fy_px * scale,
-        cx_px=calibrated.cx_px + error.camera_centre_px * float(draw[1]),
-        cy_px=calibrated.cy_px + error.camera_centre_px * float(draw[2]),
+        cx_px=calibrated.cx_px + cx,
+        cy_px=calibrated.cy_px + cy,
         position_crf_m=(x, y, z),
         q_crf_irf_wxyz=(qw, qx, qy, qz),
     )
@@ -65,47 +84,44 @@ class OdometrySensor:
     """Measures the chasers' states with the errors of ``[navigation]``."""
 
     def __init__(self, scenario: Scenario):
-        self._seed, self._errors = scenario.seed, scenario.navigation.errors()
-        self._period_s = 1.0 / scenario.time.rate_hz
-        chasers = range(len(scenario.chasers))
-        self._bias = [_generator(scenario.seed, _BIAS, i).standard_normal(9) for i in chasers]
-        # Tick and value (6,) of the drift of each chaser: position (3,), attitude (3,), in standard deviations.
-        self._drifts: dict[int, tuple[int, Array]] = {}
+        seed, chasers = scenario.seed, range(len(scenario.chasers))
+        self._seed, self._errors = seed, scenario.navigation.errors()
+        self._noise_factor = scenario.truth.sensors.noise_factor
+        self._bias = [generator(seed, Stream.BIAS, i).standard_normal(9) for i in chasers]
+        # In standard deviations: position (3), attitude (3).
+        times_s = np.repeat([self._errors.position_drift_time_s, self._errors.attitude_drift_time_s], 3)
+        period_s = 1.0 / scenario.time.rate_hz
+        self._drift = [GaussMarkov(seed, Stream.DRIFT, i, times_s.tolist(), period_s) for i in chasers]
+        self._drifts = bool(self._errors.position_drift_m or self._errors.attitude_drift_rad)
         self.covariances = white_covariances(self._errors)
+
+    def biases(self, chaser: int) -> tuple[Array, Array, Array]:
+        """Return the constant errors of a chaser: position (3,), m, attitude (3,), rad, and rate (3,), rad/s."""
+        errors, bias = self._errors, self._bias[chaser]
+        return (
+            errors.position_bias_m * bias[:3],
+            errors.attitude_bias_rad * bias[3:6],
+            errors.gyro_bias_rad_s * bias[6:],
+        )
 
     def measure(self, chaser: int, tick: int, state: BodyState) -> BodyState:
         """Return the measured ``state`` of a chaser; ``state`` itself if odometry is exact."""
         errors = self._errors
         if errors.exact_odometry:
             return state
-        noise = _generator(self._seed, _NOISE, chaser, tick).standard_normal(12)
-        bias, drift = self._bias[chaser], self._drift(chaser, tick)
-        attitude_noise = np.array(
-            [errors.attitude_roll_noise_rad, errors.attitude_noise_rad, errors.attitude_noise_rad]
+        noise = generator(self._seed, Stream.NOISE, chaser, tick).standard_normal(12) * self._noise_factor
+        position_bias, attitude_bias, gyro_bias = self.biases(chaser)
+        drift = self._drift[chaser].at(tick) if self._drifts else np.zeros(6)
+        cross, roll = errors.attitude_noise_rad, errors.attitude_roll_noise_rad
+        turn = (
+            attitude_bias
+            + np.array([roll, cross, cross]) * noise[3:6]
+            + errors.attitude_drift_rad * drift[3:]
         )
-        turn = errors.attitude_bias_rad * bias[3:6] + attitude_noise * noise[3:6]
-        offset = errors.position_bias_m * bias[:3] + errors.position_drift_m * drift[:3]
+        offset = position_bias + errors.position_drift_m * drift[:3]
         return BodyState(
             state.position_m + offset + errors.position_noise_m * noise[:3],
             state.velocity_m_s + errors.velocity_noise_m_s * noise[6:9],
-            rotations.multiply(state.q_wxyz, rotations.exp(turn + errors.attitude_drift_rad * drift[3:])),
-            state.omega_rad_s + errors.gyro_bias_rad_s * bias[6:] + errors.omega_noise_rad_s * noise[9:],
+            rotations.multiply(state.q_wxyz, rotations.exp(turn)),
+            state.omega_rad_s + gyro_bias + errors.omega_noise_rad_s * noise[9:],
         )
-
-    def _drift(self, chaser: int, tick: int) -> Array:
-        """Return the drift (6,) of a chaser in standard deviations: the exact discretization of a stationary Gauss-Markov
-        process, which depends on the tick only."""
-        errors = self._errors
-        if not (errors.position_drift_m or errors.attitude_drift_rad):
-            return np.zeros(6)
-        times_s = np.repeat([errors.position_drift_time_s, errors.attitude_drift_time_s], 3)
-        kept = np.exp(-self._period_s / times_s)
-        new = np.sqrt(-np.expm1(-2.0 * self._period_s / times_s))
-        at, value = self._drifts.get(chaser, (-1, np.zeros(6)))
-        if at < 0 or at > tick:
-            at, value = 0, _generator(self._seed, _DRIFT, chaser, 0).standard_normal(6)
-        while at < tick:
-            at += 1
-            value = kept * value + new * _generator(self._seed, _DRIFT, chaser, at).standard_normal(6)
-        self._drifts[chaser] = at, value
-        return value

@@ -9,14 +9,16 @@ from typing import Any
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import BodyTruth, DockingStatus, Odometry, WorldTruth
+from chaserdock_protocol.messages import BodyTruth, DockingStatus, DrawnBody, DrawnTruth, Odometry, WorldTruth
+from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import Node
 
 from chaserdock_world.actuators.ideal import Actuators
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import BodyState
+from chaserdock_world.plant import Plant, actuation_errors, chaser_plant, target_plant, true_target
 
-from .errors import OdometrySensor
+from .errors import OdometrySensor, camera_errors
 
 
 def odometry_of(
@@ -96,6 +98,46 @@ def publish_truth(
         touches=tuple(touch for latch in latches.values() for touch in latch.take_touches()),
     )
     node.publish(topics.TRUTH_WORLD, world)
+
+
+def drawn_truth(scenario: Scenario, sensor: OdometrySensor) -> DrawnTruth:
+    """Return everything that was drawn once for this mission."""
+    chasers = tuple(_drawn_chaser(scenario, sensor, i) for i in range(len(scenario.chasers)))
+    pairs = zip(scenario.target_model().markers, true_target(scenario).markers, strict=True)
+    shifts = tuple(b - a for x, y in pairs for a, b in zip(x.position_trf_m, y.position_trf_m, strict=True))
+    target = DrawnBody(
+        body="target", marker_shift_m=shifts if any(shifts) else (), **_plant_fields(target_plant(scenario))
+    )
+    return DrawnTruth(tick=0, bodies=(target, *chasers))
+
+
+def _drawn_chaser(scenario: Scenario, sensor: OdometrySensor, chaser: int) -> DrawnBody:
+    actuation, camera = actuation_errors(scenario, chaser), camera_errors(scenario, chaser)
+    position_bias, attitude_bias, gyro_bias = sensor.biases(chaser)
+    return DrawnBody(
+        body=f"chaser/{chaser}",
+        **_plant_fields(chaser_plant(scenario, chaser)),
+        thrust_share=vector(actuation.thrust_share),
+        thrust_turn_rad=vector(actuation.thrust_turn_rad),
+        clock_offset_s=actuation.clock_offset_s,
+        position_bias_m=vector(position_bias),
+        attitude_bias_rad=vector(attitude_bias),
+        gyro_bias_rad_s=vector(gyro_bias),
+        camera_turn_rad=vector(camera.turn_rad),
+        camera_shift_m=vector(camera.shift_m),
+        camera_focal_share=camera.focal_share,
+        camera_centre_px=vector(camera.centre_px),
+    )
+
+
+def _plant_fields(plant: Plant) -> dict[str, Any]:
+    return {
+        "mass_kg": plant.mass_kg,
+        "inertia_kg_m2": vector(plant.inertia_kg_m2),
+        "centre_of_mass_m": vector(plant.centre_of_mass_m),
+        "force_N": vector(plant.disturbance[:3]),
+        "torque_N_m": vector(plant.disturbance[3:]),
+    }
 
 
 def _state_fields(state: BodyState) -> dict[str, Any]:

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""True bodies and actuators: what ``[truth]`` makes of the bodies that the flight software is told of.
+
+Everything is drawn from the scenario's seed and the chaser's number. Without ``[truth]`` a plant is the stated body.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_models.targets import Marker, TargetModel
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.bodies import cuboid_inertia
+from chaserdock_protocol.scenario.truth import Mismatch, TruthValues
+
+from .random_draws import TARGET_KEY, Stream, generator
+
+Moments = tuple[float, float, float]
+_LARGEST_SIGMA = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class PrincipalFrame:
+    """Principal axes at the centre of mass, in which Bullet integrates: ``q_wxyz`` (4,) principal to body axes, and the
+    centre of mass ``offset_m`` (3,) in body axes."""
+
+    q_wxyz: Array
+    offset_m: Array
+
+    def from_body(self, s: BodyState) -> BodyState:
+        """Return the state of this frame from that of the body's frame."""
+        arm = rotations.rotate(s.q_wxyz, self.offset_m)
+        turning = rotations.rotate(s.q_wxyz, np.cross(s.omega_rad_s, self.offset_m))
+        return BodyState(
+            s.position_m + arm,
+            s.velocity_m_s + turning,
+            rotations.multiply(s.q_wxyz, self.q_wxyz),
+            rotations.rotate_inverse(self.q_wxyz, s.omega_rad_s),
+        )
+
+    def to_body(self, s: BodyState) -> BodyState:
+        """Return the state of the body's frame from that of this frame."""
+        q = rotations.multiply(s.q_wxyz, rotations.conjugate(self.q_wxyz))
+        omega = rotations.rotate(self.q_wxyz, s.omega_rad_s)
+        return BodyState(
+            s.position_m - rotations.rotate(q, self.offset_m),
+            s.velocity_m_s - rotations.rotate(q, np.cross(omega, self.offset_m)),
+            q,
+            omega,
+        )
+
+    def wrench(self, wrench: Array) -> Array:
+        """Return force and torque (6,) about the centre of mass, principal axes, of a wrench at the body's origin."""
+        torque = wrench[3:] - np.cross(self.offset_m, wrench[:3])
+        return np.concatenate([rotations.rotate_inverse(self.q_wxyz, part) for part in (wrench[:3], torque)])
+
+    def place(self, position_m: Array, q_wxyz: Array) -> tuple[Array, Array]:
+        """Return the pose in this frame of a part with this pose in the body's frame."""
+        inverse = rotations.conjugate(self.q_wxyz)
+        return rotations.rotate(inverse, position_m - self.offset_m), rotations.multiply(inverse, q_wxyz)
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """True mass properties of a body and its constant disturbance (6,), N and N m, at its origin in body axes.
+
+    ``frame``: None if the principal axes at the centre of mass are the body's frame.
+    """
+
+    mass_kg: float
+    moments_kg_m2: Moments
+    frame: PrincipalFrame | None = None
+    disturbance: Array = field(default_factory=lambda: np.zeros(6))
+
+    @property
+    def centre_of_mass_m(self) -> Array:
+        """Centre of mass (3,), body axes."""
+        return np.zeros(3) if self.frame is None else self.frame.offset_m
+
+    @property
+    def inertia_kg_m2(self) -> Array:
+        """Inertia tensor (3, 3) about the centre of mass, body axes."""
+        turn = np.eye(3) if self.frame is None else rotations.to_matrix(self.frame.q_wxyz)
+        return turn @ np.diag(self.moments_kg_m2) @ turn.T
+
+
+@dataclass(frozen=True, eq=False)
+class ActuationErrors:
+    """Errors of one chaser's actuators.
+
+    ``thrust_share`` (n,) and ``thrust_turn_rad`` (n, 3): of each thruster. With ideal actuation, the shares (6,) of force
+    and torque per axis, and the turns (2, 3) of force and torque.
+    """
+
+    seed: int
+    chaser: int
+    thrust_share: Array
+    thrust_turn_rad: Array
+    scatter_share: float
+    delay_s: float
+    delay_jitter_s: float
+    clock_offset_s: float
+
+    @property
+    def none(self) -> bool:
+        """Whether there are no errors."""
+        figures = (self.scatter_share, self.delay_s, self.delay_jitter_s, self.clock_offset_s)
+        return not (any(figures) or self.thrust_share.any() or self.thrust_turn_rad.any())
+
+    def delay(self, step: int) -> float:
+        """Return the time, s, after which a command for this physics step acts; negative if the clock is ahead."""
+        jitter = 0.0
+        if self.delay_jitter_s:
+            draw = generator(self.seed, Stream.DELAY, self.chaser, step).standard_normal()
+            jitter = self.delay_jitter_s * float(np.clip(draw, -_LARGEST_SIGMA, _LARGEST_SIGMA))
+        return max(0.0, self.delay_s + jitter) - self.clock_offset_s
+
+    def scatter(self, key: int, time: int, count: int) -> Array:
+        """Return factors (count,) that scatter around 1. ``key``: of the thruster; ``time``: of the pulse or command."""
+        draw = generator(self.seed, Stream.SCATTER, self.chaser, key, time).standard_normal(count)
+        return 1.0 + self.scatter_share * np.clip(draw, -_LARGEST_SIGMA, _LARGEST_SIGMA)
+
+
+def _normal(seed: int, stream: Stream, key: int, count: int) -> Array:
+    draw = generator(seed, stream, key).standard_normal(count)
+    return np.clip(draw, -_LARGEST_SIGMA, _LARGEST_SIGMA)
+
+
+def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Moments:
+    """Return principal moments with relative errors of standard deviation ``share`` that a rigid body can have.
+
+    What violates the triangle inequality is drawn again, each time with a slightly smaller deviation, which ends for every
+    nominal body.
+    """
+    while share:
+        draw = np.clip(rng.standard_normal(3), -_LARGEST_SIGMA, _LARGEST_SIGMA)
+        a, b, c = (np.asarray(nominal) * (1.0 + share * draw)).tolist()
+        if min(a, b, c) > 0.0 and 2.0 * max(a, b, c) <= a + b + c:
+            return a, b, c
+        share = share * 0.98 if share > 1e-12 else 0.0
+    return nominal
+
+
+def _plant(
+    seed: int, key: int, mass_kg: float, moments: Moments, sigma: Mismatch, explicit: TruthValues | None
+) -> Plant:
+    draw = _normal(seed, Stream.PLANT, key, 13)
+    mass = mass_kg * (1.0 + sigma.mass_share * float(draw[0]))
+    offset, turn = sigma.centre_of_mass_m * draw[1:4], sigma.inertia_turn_rad * draw[4:7]
+    disturbance = np.concatenate([sigma.force_N * draw[7:10], sigma.torque_N_m * draw[10:13]])
+    moments = draw_moments(moments, sigma.inertia_share, generator(seed, Stream.INERTIA, key))
+    q = rotations.exp(turn)
+    if explicit is not None:
+        mass = explicit.mass_kg or mass
+        if explicit.inertia is not None:
+            values, axes = np.linalg.eigh(explicit.inertia)
+            axes[:, 2] *= np.sign(np.linalg.det(axes))
+            ia, ib, ic = values.tolist()
+            moments, q = (ia, ib, ic), rotations.from_matrix(axes)
+        if explicit.centre_of_mass_m is not None:
+            offset = np.array(explicit.centre_of_mass_m)
+        if explicit.force_N is not None:
+            disturbance[:3] = explicit.force_N
+        if explicit.torque_N_m is not None:
+            disturbance[3:] = explicit.torque_N_m
+    shifted = offset.any() or q[0] != 1.0
+    return Plant(mass, moments, PrincipalFrame(q, offset) if shifted else None, disturbance)
+
+
+def chaser_plant(scenario: Scenario, chaser: int) -> Plant:
+    """Return the true body of a chaser."""
+    body, truth = scenario.chaser, scenario.truth
+    sigma, explicit = truth.mismatch("chaser"), truth.values_of(chaser)
+    return _plant(scenario.seed, chaser, body.mass_kg, body.inertia, sigma, explicit)
+
+
+def target_plant(scenario: Scenario) -> Plant:
+    """Return the true body of the target. A prescribed motion needs none: then it is the stated one."""
+    target = scenario.target
+    stated = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
+    if target.motion != "torque_free":
+        return Plant(target.mass_kg, stated)
+    sigma, explicit = scenario.truth.mismatch("target"), scenario.truth.values_of(None)
+    return _plant(scenario.seed, TARGET_KEY, target.mass_kg, stated, sigma, explicit)
+
+
+def actuation_errors(scenario: Scenario, chaser: int) -> ActuationErrors:
+    """Return the errors of a chaser's actuators."""
+    sigma, explicit = scenario.truth.mismatch("chaser"), scenario.truth.values_of(chaser)
+    ideal = scenario.chaser.actuation == "ideal"
+    shares, turns = (6, 2) if ideal else (len(scenario.chaser.thrusters),) * 2
+    draw = _normal(scenario.seed, Stream.THRUST, chaser, 1 + shares + 3 * turns)
+    share = sigma.thrust_share * draw[1 : 1 + shares] + 0.0  # no negative zeros
+    clock_offset_s = sigma.clock_offset_s * float(draw[0])
+    if explicit is not None and explicit.thrust_share is not None:
+        share = np.array(explicit.thrust_share)
+    if explicit is not None and explicit.clock_offset_s is not None:
+        clock_offset_s = explicit.clock_offset_s
+    return ActuationErrors(
+        seed=scenario.seed,
+        chaser=chaser,
+        thrust_share=share,
+        thrust_turn_rad=sigma.thrust_turn_rad * draw[1 + shares :].reshape(turns, 3),
+        scatter_share=sigma.pulse_scatter_share,
+        delay_s=sigma.delay_s,
+        delay_jitter_s=sigma.delay_jitter_s,
+        clock_offset_s=clock_offset_s,
+    )
+
+
+def true_target(scenario: Scenario) -> TargetModel:
+    """Return the target as it is: its markers displaced in their planes."""
+    model, sigma = scenario.target_model(), scenario.truth.mismatch("target").marker_m
+    if not sigma:
+        return model
+    draw = sigma * _normal(scenario.seed, Stream.MARKERS, TARGET_KEY, 2 * len(model.markers)).reshape(-1, 2)
+    markers = tuple(_moved(m, off) for m, off in zip(model.markers, draw, strict=True))
+    return replace(model, markers=markers)
+
+
+def _moved(marker: Marker, offset: Array) -> Marker:
+    """Return a marker displaced by ``offset`` (2,), m, to its right and up."""
+    shift = rotations.rotate(marker.q_trf_marker_wxyz, np.array([*offset.tolist(), 0.0]))
+    x, y, z = (np.array(marker.position_trf_m) + shift).tolist()
+    return replace(marker, position_trf_m=(x, y, z))

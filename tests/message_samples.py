@@ -31,6 +31,10 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Odometry(**HEAD, chaser=255, position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
     m.DockingStatus(**HEAD, chaser=1, contact=True, armed=True, latched=False),
     m.BodyTruth(**HEAD, body="chaser/0", position_m=V, velocity_m_s=V, q_wxyz=Q, omega_rad_s=V),
+    m.DrawnTruth(
+        **HEAD,
+        bodies=(m.DrawnBody(body="chaser/0", mass_kg=12.5, inertia_kg_m2=(0.25,) * 9, centre_of_mass_m=V),),
+    ),
     m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
     m.Sighting(
         **HEAD,

@@ -168,6 +168,7 @@ def test_errors_of_format_2_become_figures_of_exact_navigation() -> None:
             "camera_turn_deg": 0.3,
             "camera_centre_px": 1.0,
         },
+        "truth": {"camera": {"turn_deg": 0.4}},
     }
 
 

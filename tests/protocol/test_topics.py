@@ -112,7 +112,7 @@ def test_a_key_with_a_place_needs_one_and_one_without_takes_none() -> None:
 
 def test_nobody_who_flies_may_read_the_truth() -> None:
     truths = [t for t in TOPICS if t.key.startswith("truth")]
-    assert {t.key for t in truths} == {"truth/body/{process}", "truth/world"}
+    assert {t.key for t in truths} == {"truth/body/{process}", "truth/world", "truth/drawn"}
     for topic in truths:
         assert topic.writer == "world"
         assert [r for r in ROLES if topics.may_read(r, topic)] == ["recorder", "analysis", "viewer"]

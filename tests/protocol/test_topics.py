@@ -117,8 +117,8 @@ def test_nobody_who_flies_may_read_the_truth() -> None:
         assert topic.writer == "world"
         assert [r for r in ROLES if topics.may_read(r, topic)] == ["recorder", "analysis", "viewer"]
     # Nor by another name: the types of the truth travel on its own branch alone.
-    assert {t.kind for t in truths} == {m.BodyTruth, m.WorldTruth}
-    assert not any(t.kind in (m.BodyTruth, m.WorldTruth) for t in TOPICS if t not in truths)
+    assert {t.kind for t in truths} == {m.BodyTruth, m.WorldTruth, m.DrawnTruth}
+    assert not any(t.kind in (m.BodyTruth, m.WorldTruth, m.DrawnTruth) for t in TOPICS if t not in truths)
     assert {"chaser", "controller"} == FLYING
 
 

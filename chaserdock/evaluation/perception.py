@@ -14,6 +14,7 @@ from chaserdock_protocol.messages import Image, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.rendering.cameras import Cameras
+from chaserdock_world.sensors.errors import true_camera
 
 States = dict[str, BodyState]
 Perception = Callable[[int, int, int, States], Sighting]
@@ -52,17 +53,21 @@ def measurement_model(
 ) -> Perception:
     """Return a perception that measures the target's true pose with white noise of these sigmas per axis.
 
-    ``dropout``: the share of images without a detection. Of the scenario's camera only the nominal mounting counts.
+    ``dropout``: the share of images without a detection. Each camera has the errors that the world gives it.
     """
     rng = np.random.default_rng([seed, 0xE1E])
-    camera = scenario.camera_model()
+    nominal = scenario.camera_model()
+    cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
     sigmas = [max(position_sigma_m, _LEAST_SIGMA)] * 3 + [max(attitude_sigma_rad, _LEAST_SIGMA)] * 3
     covariance = vector(np.diag(np.square(sigmas)))
 
     def measure(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
         own, target = states[f"chaser/{chaser}"], states[TARGET]
+        camera = cameras[chaser]
         eye, attitude = camera.irf_pose_in_world(own.position_m, own.q_wxyz)
         position = rotations.rotate_inverse(attitude, target.position_m - eye)
+        # With a longer focal length than calibrated, the target seems nearer.
+        position = position * [1.0, 1.0, nominal.fx_px / camera.fx_px]
         position = position + rng.normal(0.0, position_sigma_m, 3)
         q_world = rotations.multiply(target.q_wxyz, rotations.exp(rng.normal(0.0, attitude_sigma_rad, 3)))
         solution = PoseSolution(

@@ -45,7 +45,7 @@ class ControllerCore:
         observation = self.ingest.run(inputs, self.output.history)
         estimation = self.estimation.run(observation)
         guidance = self.guidance.run(observation, estimation)
-        plan = self.planning.run(observation, guidance)
+        plan = self.planning.run(observation, estimation, guidance)
         return self.output.run(observation, estimation, guidance, plan)
 
     def estimate(self, inputs: TickInputs) -> TargetEstimate:

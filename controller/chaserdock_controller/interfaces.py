@@ -27,7 +27,7 @@ from chaserdock_protocol.messages import (
 )
 
 from .estimation.target_body import TargetBody
-from .estimation.types import TargetState
+from .estimation.types import RelativePose, TargetState
 from .guidance.phases import Phase
 from .nmpc.types import NmpcPlan
 
@@ -74,8 +74,8 @@ class Observation:
     """Result of ingest: checked inputs and what follows from them about the chasers; mappings by chaser.
 
     ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states; ``invalid``: why a state is not.
-    ``lost``: last odometry of chasers that are obstacles to the others. ``predicted``: own state (13,) at
-    ``effective_ns``: p, v (WRF), q_wxyz, omega (body). ``input_limits``: (6,) N and N m, body axes.
+    ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
+    ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
     """
 
     tick: int
@@ -88,7 +88,7 @@ class Observation:
     commands: tuple[OperatorCommand, ...]
     docking: Mapping[int, DockingStatus]
     impulses: Mapping[int, AppliedImpulse]
-    predicted: Mapping[int, Array]
+    ahead: Mapping[int, tuple[tuple[float, Array], ...]]
     input_limits: Mapping[int, Array]
     events: tuple[LogEntry, ...]
 
@@ -102,12 +102,19 @@ class Observation:
 class TargetEstimation:
     """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose is known.
 
+    ``own``: estimated states of the chasers with valid odometry; ``own_at_effect``: the same at ``Observation.effective_ns``,
+    (13,): p, v (WRF), q_wxyz, omega (body). ``disturbances``: estimated force and torque (6,) on a chaser, body axes.
+    ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
     target and these chasers as one rigid body.
     """
 
     target: TargetState
     at_effect: TargetState | None
+    own: Mapping[int, Odometry]
+    own_at_effect: Mapping[int, Array]
+    disturbances: Mapping[int, Array]
+    relative: tuple[RelativePose, ...]
     visible_to: frozenset[int]
     cameras: tuple[CameraCalibration, ...]
     latched: frozenset[int]

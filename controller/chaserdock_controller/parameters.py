@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from chaserdock_protocol import plugins
@@ -14,6 +15,7 @@ from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.types import Estimator
 
 from .estimation import make_estimator
+from .estimation.joint import JointEstimator, JointParameters
 from .nmpc import NmpcParameters
 
 
@@ -38,23 +40,37 @@ def nmpc_settings(controller: Controller, limits: Limits) -> dict[str, Any]:
     return {**settings, "max_reference_distance_m": limits.max_reference_distance_m}
 
 
-def estimator_of(scenario: FlightScenario) -> Estimator:
+def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
     """Return the estimator that the scenario names: a built-in one, or an installed ``chaserdock.estimators`` entry point,
-    called with the flight scenario. Raises PluginError if there is none of that name."""
-    if scenario.estimator.name == "paper":
-        return make_estimator("paper")
-    if scenario.estimator.name != "mekf":
-        return plugins.load("estimator", scenario.estimator.name, ESTIMATORS)(scenario)
+    called with the scenario. Raises PluginError if there is none of that name."""
+    name = scenario.estimator.name
+    if name not in ESTIMATORS:
+        return plugins.load("estimator", name, ESTIMATORS)(scenario)
+    if name == "paper":
+        return make_estimator(name)
     target, errors = scenario.target, scenario.navigation.errors()
-    size_m = scenario.target_model().size_m
-    ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, size_m)
-    return make_estimator(
-        "mekf",
-        MekfParameters(
-            motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
-            inertia_ratios=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
-            bias_position_m=errors.camera_shift_m,
-            bias_attitude_rad=errors.camera_turn_rad,
-            bias_focal_share=errors.camera_focal_share,
-        ),
+    ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
+    parameters = MekfParameters(
+        motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
+        inertia_ratios=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
+        bias_position_m=errors.camera_shift_m,
+        bias_attitude_rad=errors.camera_turn_rad,
+        bias_focal_share=errors.camera_focal_share,
     )
+    if name == "mekf":
+        return make_estimator(name, parameters)
+    body = scenario.chaser
+    joint = JointParameters(
+        target=parameters,
+        body=body,
+        camera=scenario.camera_model(),
+        navigation=errors,
+        force_max_N=body.force_max_N,
+        torque_max_N_m=body.torque_max_N_m,
+        unexpected_velocity_m_s=math.sqrt(3.0) * body.force_max_N / body.mass_kg / scenario.time.rate_hz,
+        unexpected_omega_rad_s=math.sqrt(3.0)
+        * body.torque_max_N_m
+        / min(body.inertia)
+        / scenario.time.rate_hz,
+    )
+    return JointEstimator(joint, len(scenario.chasers))

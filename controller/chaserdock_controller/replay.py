@@ -8,7 +8,9 @@ from itertools import groupby
 from typing import Any, cast
 
 import msgspec
+import numpy as np
 from chaserdock_protocol import topics
+from chaserdock_protocol.messages import WrenchCommand
 from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbeat, Stage
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
@@ -26,7 +28,14 @@ class _EstimationOnly:
 
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Return outputs with the target's estimate and nothing else."""
-        return TickOutputs(target=self._core.estimate(inputs))
+        target = self._core.estimate(inputs)
+        self._core.output.history.forget_before(inputs.time_ns)
+        return TickOutputs(target=target)
+
+    def add_command(self, command: WrenchCommand) -> None:
+        """Add a recorded command, which the estimator needs to know."""
+        wrench = np.array([*command.force_N, *command.torque_N_m])
+        self._core.output.history.add(command.chaser, command.effective_time_ns, wrench)
 
 
 def _core_of(scenario: FlightScenario) -> ControllerCore:
@@ -70,7 +79,10 @@ def _play(
                 controller.heartbeat = cast(Any, SilentHeartbeat())
             if is_target:
                 last_seq = received.message.seq
-            if received.topic is topics.OPERATED:
+            if received.topic is topics.WRENCH:
+                if isinstance(controller.core, _EstimationOnly):
+                    controller.core.add_command(received.message)
+            elif received.topic is topics.OPERATED:
                 controller.operate(received.message, lambda _: None)
             elif received.topic in _INPUTS:
                 node.put(received)
@@ -93,7 +105,7 @@ def play_fusion(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -
 
 
 _INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING, topics.THRUSTERS, topics.DOCKING)
-FUSION = Stage("controller", _INPUTS, (topics.TARGET,), play_fusion)
+FUSION = Stage("controller", (*_INPUTS, topics.WRENCH), (topics.TARGET,), play_fusion)
 CONTROLLER = Stage(
     "controller",
     (topics.OPERATED, *_INPUTS),

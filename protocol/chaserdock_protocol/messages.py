@@ -93,6 +93,21 @@ class CameraCalibration(Struct, frozen=True, kw_only=True):
     focal_sigma_share: float
 
 
+class RelativeEstimate(Struct, frozen=True, kw_only=True):
+    """Estimated pose of chaser ``chaser`` relative to the target, and the disturbance that acts on the chaser.
+
+    ``position_m`` is CRF's origin in TRF, ``q_wxyz`` takes CRF to TRF. ``covariance`` is row-major (6, 6) over (position in TRF
+    axes, dtheta in CRF axes) with q_true = q (x) exp(dtheta). ``force_N`` and ``torque_N_m``: body axes.
+    """
+
+    chaser: ChaserId
+    position_m: Vector3
+    q_wxyz: Quaternion
+    covariance: Square6
+    force_N: Vector3
+    torque_N_m: Vector3
+
+
 class ProbeTouch(Struct, frozen=True, kw_only=True):
     """First contact of a probe's tip with the target at ``sim_time_ns``: position and velocity relative to its port.
 
@@ -283,6 +298,7 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
 
     ``covariance`` is row-major (12, 12) over (position, velocity, dtheta in TRF, rate in TRF). With status ``none``,
     before the first sighting, the values are meaningless. ``cameras``: estimated calibration errors, if estimated.
+    ``relative``: poses of the chasers relative to the target, from an estimator that estimates the chasers, too.
     """
 
     status: Literal["none", "tracking", "predicting", "lost"]
@@ -294,6 +310,7 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
     accepted: ChaserIds
     rejected: ChaserIds
     cameras: Annotated[tuple[CameraCalibration, ...], Meta(max_length=256)] = ()
+    relative: Annotated[tuple[RelativeEstimate, ...], Meta(max_length=256)] = ()
 
 
 class Reference(Message, frozen=True, kw_only=True):

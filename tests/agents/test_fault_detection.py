@@ -142,8 +142,8 @@ def test_the_scenarios_odometry_is_the_pilots_noise() -> None:
             "attitude_noise_deg": 0.3,
         }
     )
-    assert noise_of(s.odometry) == ImpulseNoise(0.002, np.radians(0.1), np.radians(0.3))
-    assert noise_of(mission().odometry) == ImpulseNoise()
+    assert noise_of(s.navigation.errors()) == ImpulseNoise(0.002, np.radians(0.1), np.radians(0.3))
+    assert noise_of(mission().navigation.errors()) == ImpulseNoise()
 
 
 @pytest.mark.parametrize("thruster", [0, 4, 8])

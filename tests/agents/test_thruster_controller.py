@@ -17,7 +17,6 @@ from chaserdock_controller.guidance.thruster_commands import ThrusterCommandHand
 from chaserdock_controller.ingest.latency_compensation import (
     CommandHistory,
     predict_state,
-    predict_state_with_impulse,
 )
 from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models.wrench_set import wrench_matrix
@@ -162,11 +161,12 @@ def test_prediction_by_impulse_equals_prediction_by_wrench() -> None:
     o, history = odometry(velocity_m_s=(0.1, 0.0, 0.0)), CommandHistory()
     commanded = np.array([1.0, -0.5, 0.2, 0.01, 0.02, -0.03])
     history.add(0, 0, commanded)
-    expected = predict_state(o, history, 50_000_000, s.chaser)
-    np.testing.assert_allclose(
-        predict_state_with_impulse(o, commanded * 0.05, 50_000_000, s.chaser), expected, atol=1e-12
-    )
-    assert predict_state_with_impulse(o, commanded, 0, s.chaser)[3] == 0.1
+    still = np.zeros(6)
+    expected = predict_state(o, history.ahead(0, 0, 50_000_000), still, s.chaser)
+    by_impulse = predict_state(o, ((0.05, commanded * 0.05 / 0.05),), still, s.chaser)
+    np.testing.assert_allclose(by_impulse, expected, atol=1e-12)
+    np.testing.assert_allclose(predict_state(o, ((0.05, still),), commanded, s.chaser), expected, atol=1e-12)
+    assert predict_state(o, (), still, s.chaser)[3] == 0.1
 
 
 def test_commanded_force_respects_reported_limits() -> None:

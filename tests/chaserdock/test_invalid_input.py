@@ -119,7 +119,7 @@ INVALID = [
     ("log play {golden} --timeout 0.2 -l tcp/127.0.0.1:0", "no recorder joined within 0.2 s"),
     # comparison
     ("replay nowhere --through fusion", "nowhere"),
-    ("replay {golden} --through everything", "'everything' is not one of"),
+    ("replay {golden} --through everything", "--through everything: must be one of"),
     ("replay {golden} --through fusion --tolerance nan", "--tolerance"),
     ("compare nowhere nobody", "nowhere"),
     ("compare {golden} {golden} --tolerance -1", "--tolerance"),

@@ -283,7 +283,7 @@ def test_messages_of_older_versions_are_migrated(tmp_path: Path, monkeypatch: py
     writer = LogWriter(path)
     key = topics.ODOMETRY.key_of(255)
     writer.write(key, m.encoding_of(m.Odometry), msgspec.msgpack.encode(old), 1)
-    monkeypatch.setitem(m.VERSION, m.Odometry, 3)
+    monkeypatch.setitem(m.VERSION, m.Odometry, 4)
     writer.write(key, m.encoding_of(m.Odometry), codec.encode(now), 2)
     writer.close()
 
@@ -297,16 +297,16 @@ def test_messages_of_older_versions_are_migrated(tmp_path: Path, monkeypatch: py
     rejected: Counter[str] = Counter()
     assert [r.sent_ns for r in read_log(path, rejected=rejected)] == [2]
     assert rejected == {f"{key}: encoding": 1}
-    monkeypatch.setitem(upgrades.UPGRADES, ("Odometry", 1), scalar_first)
-    assert [r.sent_ns for r in read_log(path)] == [2]  # no way from 2 to 3 yet
-    monkeypatch.setitem(upgrades.UPGRADES, ("Odometry", 2), radians)
+    monkeypatch.setitem(upgrades.UPGRADES, ("Odometry", 2), scalar_first)
+    assert [r.sent_ns for r in read_log(path)] == [2]  # no way from 3 to 4 yet
+    monkeypatch.setitem(upgrades.UPGRADES, ("Odometry", 3), radians)
     first, second = (r.message for r in read_log(path))
     assert second == now
     assert first.q_wxyz == now.q_wxyz
     assert first.omega_rad_s == pytest.approx(now.omega_rad_s)
     assert msgspec.structs.replace(first, omega_rad_s=now.omega_rad_s) == now
     with pytest.raises(codec.Rejected):  # on the wire only the present version is taken
-        codec.decode(m.Odometry, msgspec.msgpack.encode(old), "application/msgpack;chaserdock.Odometry.v1")
+        codec.decode(m.Odometry, msgspec.msgpack.encode(old), "application/msgpack;chaserdock.Odometry.v2")
 
 
 def test_migrated_messages_are_validated(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,8 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from chaserdock_controller.estimation import mekf
+from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint.estimator import JointInputs
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
 from chaserdock_protocol.recording.log import LogWriter, Record, read_log, read_scenario
@@ -88,15 +89,15 @@ def test_replay_does_not_depend_on_the_order_in_the_file(tmp_path: Path) -> None
 
 def test_replay_finds_a_change_in_the_filter(monkeypatch: pytest.MonkeyPatch) -> None:
     """The filter's estimate moved by a tenth of a millimetre from half a second on: the diff says where and when."""
-    original = mekf.Mekf.update
+    original = JointEstimator.update
 
-    def changed(self: mekf.Mekf, measurements: Any, now_ns: int) -> Any:
-        estimate = original(self, measurements, now_ns)
-        if now_ns < 500_000_000:
+    def changed(self: JointEstimator, inputs: JointInputs) -> Any:
+        estimate = original(self, inputs)
+        if inputs.time_ns < 500_000_000:
             return estimate
         return dataclasses.replace(estimate, position_m=estimate.position_m + np.array([1e-4, 0.0, 0.0]))
 
-    monkeypatch.setattr(mekf.Mekf, "update", changed)
+    monkeypatch.setattr(JointEstimator, "update", changed)
     found = replay(GOLDEN, "fusion", tolerance=1e-6)
     (target,) = found.topics
     assert target.key == "controller/target"

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.estimation import stage as estimation
 from chaserdock_controller.guidance.phases import Phase
-from chaserdock_controller.ingest import stage as ingest
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.nmpc import stage as planning
 from chaserdock_models.arrays import Array
@@ -120,12 +120,12 @@ def test_latency_compensation_predicts_the_state_at_actuation(monkeypatch: pytes
     """With 0.2 s of latency tracking is as good as without; without the prediction it is not."""
     assert latency_error_m() < 5e-5
 
-    def at_exposure(odometry, history, until_ns, body):  # type: ignore[no-untyped-def]
+    def at_exposure(odometry, ahead, disturbance, body):  # type: ignore[no-untyped-def]
         return np.array(
             [*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s]
         )
 
-    monkeypatch.setattr(ingest, "predict_state", at_exposure)
+    monkeypatch.setattr(estimation, "predict_state", at_exposure)
     assert latency_error_m() > 5e-4
 
 

@@ -12,7 +12,7 @@ from chaserdock_controller.estimation import CameraPose, MekfParameters, PoseHyp
 from chaserdock_controller.estimation import motion_models as motion
 from chaserdock_controller.estimation.camera_calibration import predict_measurement
 from chaserdock_controller.estimation.hypothesis import StateHypothesis, correct, innovate
-from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE
+from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MODELS
 from chaserdock_models import rotations as rot
 from chaserdock_models import scalar_rotations as scalar
 from chaserdock_models.camera import Camera
@@ -65,7 +65,7 @@ def test_small_angles_lose_nothing() -> None:
 INERTIA = np.array([[2.0, 0.1, 0.0], [0.1, 3.0, -0.2], [0.0, -0.2, 4.0]])
 
 
-@pytest.mark.parametrize("model", motion.MODELS)
+@pytest.mark.parametrize("model", MODELS)
 def test_transition_by_differences(model: str) -> None:
     w, dt, h = np.array([0.4, -0.9, 0.3]), 0.7, 1e-6
 

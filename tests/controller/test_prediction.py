@@ -133,7 +133,7 @@ def test_prediction_flies_the_commands_that_are_under_way() -> None:
     history.add(0, 990_000_000, early)
     history.add(0, 1_040_000_000, late)
     history.add(0, 1_200_000_000, wrench(1.0))  # after the time asked for
-    predicted = predict_state(o, history, 1_100_000_000, LONG)
+    predicted = predict_state(o, history.ahead(0, o.sim_time_ns, 1_100_000_000), np.zeros(6), LONG)
     x = np.array([*o.position_m, *o.velocity_m_s, *o.q_wxyz, *o.omega_rad_s])
     x = fine(fine(x, early, LONG, 0.04, 200), late, LONG, 0.06, 200)
     np.testing.assert_allclose(predicted, x, rtol=0, atol=1e-9)
@@ -141,6 +141,6 @@ def test_prediction_flies_the_commands_that_are_under_way() -> None:
 
 def test_without_commands_a_chaser_coasts() -> None:
     o = odometry(time_ns=5, omega_rad_s=(0.0, 0.0, 0.1))
-    x = predict_state(o, CommandHistory(), 5 + 2_000_000_000, Body())
+    x = predict_state(o, CommandHistory().ahead(0, 5, 5 + 2_000_000_000), np.zeros(6), Body())
     np.testing.assert_allclose(x[:3], [1.06, 1.88, 3.0], rtol=0, atol=1e-12)
     np.testing.assert_allclose(x[6:10], rotations.integrate(o.q_wxyz, [0, 0, 0.1], 2.0), rtol=0, atol=1e-9)

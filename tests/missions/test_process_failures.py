@@ -48,7 +48,7 @@ LONG = (*SHORT, "duration_s=60.0")
         (["chasers.0.q_wxyz=[1,1,0,0]"], "unit length"),
         (
             ["chasers.1.position_m=[-1.0,0.0,0.0]", "chasers.1.start_offset_m=[-0.2,0.03,0.0]"],
-            "inside one another",
+            "nearer than limits.min_distance_chasers_m",
         ),
         (["name='a/b'"], "name"),
     ],

@@ -57,7 +57,14 @@ def test_there_is_a_sample_of_every_message() -> None:
     assert len(SAMPLES) == len(m.VERSION)
     # Every message type of the module stands in the table; parts of messages never stand alone.
     types = {t for t in vars(m).values() if isinstance(t, type) and issubclass(t, msgspec.Struct)}
-    parts = {m.CameraCalibration, m.PoseSolution, m.ProbeTouch, m.ThrusterPulse}
+    parts = {
+        m.CameraCalibration,
+        m.DrawnBody,
+        m.PoseSolution,
+        m.ProbeTouch,
+        m.RelativeEstimate,
+        m.ThrusterPulse,
+    }
     assert types - set(m.VERSION) - {msgspec.Struct, m.Message} - parts == set()
 
 

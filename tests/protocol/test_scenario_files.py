@@ -147,7 +147,7 @@ def test_one_element_of_a_default_can_be_set(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("path", "own"),
-    [("perception.name", "default"), ("estimator.name", "mekf"), ("controller.solver", "rti")],
+    [("perception.name", "default"), ("estimator.name", "joint"), ("controller.solver", "rti")],
 )
 def test_an_uninstalled_plugin_is_an_error_of_the_file_but_not_of_a_log(
     path: str, own: str, tmp_path: Path

@@ -65,17 +65,12 @@ def predict(hypothesis: StateHypothesis, time_ns: int, p: MekfParameters) -> Sta
     if time_ns < hypothesis.time_ns:
         raise ValueError(f"cannot predict backwards, from {hypothesis.time_ns} to {time_ns} ns")
     dt = (time_ns - hypothesis.time_ns) * 1e-9
-    if p.motion_model == "torque_free":
-        inertia = np.array(p.inertia_ratios, dtype=float)
-        q, w, t = motion.torque_free(
-            hypothesis.q_wxyz, hypothesis.omega_rad_s, dt, inertia, np.linalg.inv(inertia)
-        )
-    else:
-        q, w, t = motion.constant_rates(hypothesis.q_wxyz, hypothesis.omega_rad_s, dt)
+    (position, velocity, q, w), own = motion.propagate_target(
+        hypothesis.position_m, hypothesis.velocity_m_s, hypothesis.q_wxyz, hypothesis.omega_rad_s, dt, p
+    )
     n = hypothesis.covariance.shape[0]
     f = np.eye(n)
-    f[0, 3] = f[1, 4] = f[2, 5] = dt
-    f[6:12, 6:12] = t
+    f[:12, :12] = own
     bias = hypothesis.bias
     noise = np.zeros((n, n))
     noise[:12, :12] = motion.process_noise(
@@ -87,16 +82,6 @@ def predict(hypothesis: StateHypothesis, time_ns: int, p: MekfParameters) -> Sta
         f[i, i] = fade
         noise[i, i] = (1.0 - fade * fade) * np.tile(prior(p).diagonal(), len(hypothesis.cameras))
         bias = bias * fade
-    position, velocity = hypothesis.position_m + hypothesis.velocity_m_s * dt, hypothesis.velocity_m_s
-    if any(p.centre_of_mass_trf_m):
-        position, velocity, around = motion.about_centre(
-            (hypothesis.position_m, hypothesis.velocity_m_s, hypothesis.q_wxyz, hypothesis.omega_rad_s),
-            (q, w),
-            f[:12, :12],
-            np.array(p.centre_of_mass_trf_m),
-            dt,
-        )
-        f[:12, :12] = around
     return replace(
         hypothesis,
         time_ns=time_ns,

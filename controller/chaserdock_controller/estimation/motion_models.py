@@ -13,9 +13,9 @@ import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.rigid_body import rk4_step
 
+from .parameters import MekfParameters
 from .types import Array
 
-MODELS = ("constant_rates", "torque_free")
 _EYE3 = np.eye(3)
 
 
@@ -98,6 +98,25 @@ def about_centre(
         centre_velocity - so3.to_matrix(q_after) @ np.cross(omega_after, centre_trf_m),
         from_centre @ transition @ to_centre(q, omega, centre_trf_m),
     )
+
+
+def propagate_target(
+    position_m: Array, velocity_m_s: Array, q_wxyz: Array, omega_rad_s: Array, dt_s: float, p: MekfParameters
+) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    """Return position, velocity, attitude and rate after ``dt_s`` by the motion model of ``p``, and the transition (12, 12)."""
+    if p.motion_model == "torque_free":
+        inertia = np.array(p.inertia_ratios, dtype=float)
+        q, w, t = torque_free(q_wxyz, omega_rad_s, dt_s, inertia, np.linalg.inv(inertia))
+    else:
+        q, w, t = constant_rates(q_wxyz, omega_rad_s, dt_s)
+    f = np.eye(12)
+    f[0, 3] = f[1, 4] = f[2, 5] = dt_s
+    f[6:12, 6:12] = t
+    if not any(p.centre_of_mass_trf_m):
+        return (position_m + velocity_m_s * dt_s, velocity_m_s, q, w), f
+    before, centre = (position_m, velocity_m_s, q_wxyz, omega_rad_s), np.array(p.centre_of_mass_trf_m)
+    position, velocity, f = about_centre(before, (q, w), f, centre, dt_s)
+    return (position, velocity, q, w), f
 
 
 def process_noise(dt_s: float, acceleration_density: float, angular_density: float) -> Array:

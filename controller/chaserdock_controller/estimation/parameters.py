@@ -9,8 +9,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from chaserdock_models.arrays import Matrix3, Vector3
 
-from .motion_models import MODELS
-
+MODELS = ("constant_rates", "torque_free")
 GATE_CHI_SQUARE = 27.85634123601289
 """0.9999 quantile of the chi-square distribution with 6 degrees of freedom (tests compare with SciPy)."""
 

@@ -1,61 +1,139 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Second stage of a tick: estimate the target's state from the sightings of all chasers."""
+"""Second stage of a tick: estimate the states of the target and of the chasers."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import msgspec
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import CameraCalibration
+from chaserdock_protocol.messages import CameraCalibration, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
+from chaserdock_controller.ingest.latency_compensation import predict_state
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.interfaces import LogEntry, Observation, TargetEstimation
 
 from .composite_body import CompositeBody
+from .joint import JointEstimator
+from .joint.estimator import JointInputs
+from .joint.state import POSITION_DRIFT, JointState
 from .measurements import SightingConverter
 from .mekf import Mekf
-from .types import Estimator
+from .types import Estimator, TargetState
+
+_NO_DISTURBANCE = np.zeros(6)
 
 
 class EstimationStage:
     """The estimator, with the body that the target forms with latched chasers."""
 
-    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
         self.estimator = estimator
         self.composite = CompositeBody(scenario, estimator)
         self.consistency = SensorConsistency()
+        self._body, self._period_s = scenario.chaser, 1.0 / scenario.time.rate_hz
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
 
     def run(self, observation: Observation) -> TargetEstimation:
-        """Update the estimator with a tick's sightings, and with contacts and impulses from before them."""
-        o, now_ns = observation, observation.time_ns
-        self._converter.add_odometry(o.odometry, now_ns)
-        self.composite.disturb(o.docking, o.odometry, o.impulses, now_ns)
-        target = self.estimator.update(self._converter.measurements(o.sightings), now_ns)
+        """Update the estimator with a tick's inputs, and with contacts and impulses from before them."""
+        o, now_ns, estimator = observation, observation.time_ns, self.estimator
+        before = self.composite.latched
+        own = _without_drift(estimator, o.odometry)
+        self.composite.disturb(o.docking, own, o.impulses, now_ns)
+        if isinstance(estimator, JointEstimator):
+            target = estimator.update(self._joint_inputs(o, estimator.chasers, before))
+            own = _estimated(estimator.state, o.odometry)
+        else:
+            target = self._target_only(o, estimator)
         known = target.status in ("tracking", "predicting")
         if known:
-            self.composite.update_body(target, o.odometry)
+            self.composite.update_body(target, own)
+        disturbances = self._disturbances(own)
         visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
-        events: list[LogEntry] = [(e.level, e.text) for e in self.estimator.drain_events()]
+        events: list[LogEntry] = [(e.level, e.text) for e in estimator.drain_events()]
         accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
         events += self.consistency.update(o.time_s, accepted, rejected)
         return TargetEstimation(
             target=target,
-            at_effect=self.estimator.estimate_at(o.effective_ns) if known else None,
+            at_effect=estimator.estimate_at(o.effective_ns) if known else None,
+            own=own,
+            own_at_effect={i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own},
+            disturbances=disturbances,
+            relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
             visible_to=visible_to,
-            cameras=camera_calibrations(self.estimator, self._camera),
+            cameras=camera_calibrations(estimator, self._camera),
             latched=self.composite.latched,
             body=self.composite.body,
             events=tuple(events),
         )
 
+    def _target_only(self, o: Observation, estimator: Estimator) -> TargetState:
+        """Update an estimator that takes odometry as exact."""
+        self._converter.add_odometry(o.odometry, o.time_ns)
+        return estimator.update(self._converter.measurements(o.sightings), o.time_ns)
 
-def camera_calibrations(estimator: Estimator, camera: Camera) -> tuple[CameraCalibration, ...]:
+    def _joint_inputs(self, o: Observation, chasers: int, latched_before: frozenset[int]) -> JointInputs:
+        impulses = np.zeros((chasers, 6))
+        for i, applied in o.impulses.items():
+            impulses[i] = applied.impulse
+        touched = {i for i, s in o.docking.items() if s.contact and not s.latched}
+        latched = self.composite.latched
+        return JointInputs(
+            time_ns=o.time_ns,
+            odometry=o.odometry,
+            sightings=o.sightings,
+            impulses=impulses,
+            covered_s=self._period_s,
+            latched=latched,
+            contacts=frozenset(touched | (latched ^ latched_before)),
+        )
+
+    def _disturbances(self, own: Mapping[int, Odometry]) -> dict[int, Array]:
+        """Return the estimated disturbance on each chaser; none on a latched one, whose motion is the target's."""
+        state = self.estimator.state if isinstance(self.estimator, JointEstimator) else None
+        latched = self.composite.latched
+        return {i: _NO_DISTURBANCE if state is None or i in latched else state.disturbance(i) for i in own}
+
+
+def _without_drift(
+    estimator: Estimator | JointEstimator, odometry: Mapping[int, Odometry]
+) -> Mapping[int, Odometry]:
+    """Return odometry without the estimated drift of its position."""
+    state = estimator.state if isinstance(estimator, JointEstimator) else None
+    if state is None:
+        return odometry
+    return {
+        i: msgspec.structs.replace(o, position_m=vector(np.array(o.position_m) - state.of(i, POSITION_DRIFT)))
+        for i, o in odometry.items()
+    }
+
+
+def _estimated(state: JointState | None, odometry: Mapping[int, Odometry]) -> dict[int, Odometry]:
+    """Return the estimated states of the chasers that have odometry, in place of it."""
+    assert state is not None
+    return {
+        i: msgspec.structs.replace(
+            o,
+            position_m=vector(state.positions_m[i]),
+            velocity_m_s=vector(state.velocities_m_s[i]),
+            q_wxyz=vector(state.attitudes_wxyz[i]),
+            omega_rad_s=vector(state.omegas_rad_s[i]),
+        )
+        for i, o in odometry.items()
+    }
+
+
+def camera_calibrations(
+    estimator: Estimator | JointEstimator, camera: Camera
+) -> tuple[CameraCalibration, ...]:
     """Return the estimated errors of the cameras used so far, in CRF axes; ``camera``: the nominal calibration."""
-    if not isinstance(estimator, Mekf):
+    if not isinstance(estimator, Mekf | JointEstimator):
         return ()
     axes = rotations.to_matrix(camera.q_crf_irf_wxyz)
     calibrations = []

@@ -67,6 +67,20 @@ class CameraError:
 
 
 @dataclass(frozen=True, eq=False)
+class RelativePose:
+    """Estimated pose of a chaser relative to the target.
+
+    position_m: (3,) origin of CRF in TRF. q_wxyz: (4,) CRF to TRF. covariance: (6, 6), order (position in TRF axes, m;
+    dtheta in CRF axes, rad).
+    """
+
+    chaser: int
+    position_m: Array
+    q_wxyz: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, eq=False)
 class TargetState:
     """Estimated state of the target at ``time_ns``.
 

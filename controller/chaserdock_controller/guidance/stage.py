@@ -83,7 +83,7 @@ class GuidanceStage:
         self.machine.update_visibility(now_s, visible=target.status == "tracking")
         self.machine.target_acquired(now_s)
         if is_settled(target):
-            for i, odometry in observation.odometry.items():
+            for i, odometry in estimation.own.items():
                 self.machine.target_settled(i, now_s, pose_in_target(target, odometry)[0])
 
     def _apply_commands(self, observation: Observation) -> list[CommandReply]:
@@ -109,7 +109,7 @@ class GuidanceStage:
 
     def _update_chaser(self, i: int, observation: Observation, estimation: TargetEstimation) -> ReferencePose:
         """Advance a chaser's phase by its errors and its docking sensor; return its reference at the start of the tick."""
-        target, odometry, now_s = estimation.target, observation.odometry[i], observation.time_s
+        target, odometry, now_s = estimation.target, estimation.own[i], observation.time_s
         pose = self.references.pose(i, target, now_s)
         error_m = float(np.linalg.norm(pose[0] - odometry.position_m))
         error_rad = float(rotations.angle_between(pose[1], odometry.q_wxyz))
@@ -155,7 +155,7 @@ class GuidanceStage:
         if i not in observation.odometry:
             return None
         if c.phase is Phase.SEARCHING:
-            wrench = self.search.wrench(observation.odometry[i], c.since_s, estimation.target)
+            wrench = self.search.wrench(estimation.own[i], c.since_s, estimation.target)
             return DirectCommand("search", wrench)
         if attached:
             pull_N = self.machine.pull_N(i, observation.time_s)

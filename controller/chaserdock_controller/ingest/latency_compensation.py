@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -31,6 +32,12 @@ class CommandHistory:
             out.append((begin, end, acting[-1] if acting else np.zeros(6)))
         return out
 
+    def ahead(self, chaser: int, from_ns: int, to_ns: int) -> tuple[tuple[float, Array], ...]:
+        """Return what acts between two times as durations (s) and wrenches (6,)."""
+        return tuple(
+            ((end - begin) / 1e9, wrench) for begin, end, wrench in self.segments(chaser, from_ns, to_ns)
+        )
+
     def forget_before(self, time_ns: int) -> None:
         """Remove commands that do not act after ``time_ns``."""
         for chaser, sent in self._sent.items():
@@ -38,21 +45,14 @@ class CommandHistory:
             self._sent[chaser] = sent[last:]
 
 
-def _state_of(odometry: Odometry) -> Array:
-    return np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
+def predict_state(
+    odometry: Odometry, ahead: Iterable[tuple[float, Array]], disturbance: Array, body: RigidBody
+) -> Array:
+    """Return the state (13,) of a chaser after all of ``ahead``: durations (s) and wrenches (6,) that act on it.
 
-
-def predict_state(odometry: Odometry, history: CommandHistory, until_ns: int, body: RigidBody) -> Array:
-    """Return the state (13,) of a chaser at ``until_ns`` from its odometry and the commands already sent."""
-    x = _state_of(odometry)
-    for begin, end, wrench in history.segments(odometry.chaser, odometry.sim_time_ns, until_ns):
-        x = propagate(x, wrench, body, (end - begin) / 1e9)
+    ``disturbance`` (6,) acts as well. Wrenches are force and torque in body axes, N and N m.
+    """
+    x = np.array([*odometry.position_m, *odometry.velocity_m_s, *odometry.q_wxyz, *odometry.omega_rad_s])
+    for duration_s, wrench in ahead:
+        x = propagate(x, wrench + disturbance, body, duration_s)
     return x
-
-
-def predict_state_with_impulse(odometry: Odometry, impulse: Array, until_ns: int, body: RigidBody) -> Array:
-    """Return the state (13,) of a chaser at ``until_ns`` from its odometry and an impulse (6,), N s and N m s, body axes,
-    that is spread evenly over the time until then."""
-    duration_s = (until_ns - odometry.sim_time_ns) / 1e9
-    x = _state_of(odometry)
-    return propagate(x, impulse / duration_s, body, duration_s) if duration_s > 0.0 else x

@@ -1,16 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""First stage of a tick: check the inputs and predict the chasers' own states."""
+"""First stage of a tick: check the inputs, and collect what acts on the chasers."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import AppliedImpulse, Observation, TickInputs
 
-from .latency_compensation import CommandHistory, predict_state, predict_state_with_impulse
+from .latency_compensation import CommandHistory
 from .lost_chasers import LostChasers
 from .odometry_validation import why_invalid
 from .thruster_reports import ThrusterReports
@@ -42,25 +43,28 @@ class IngestStage:
             commands=inputs.commands,
             docking=inputs.docking,
             impulses=self._impulses(odometry, inputs, history),
-            predicted={i: self._predict(o, inputs.tick, effective_ns, history) for i, o in odometry.items()},
+            ahead={i: self._ahead(i, inputs, effective_ns, history) for i in odometry},
             input_limits={i: self.thrusters.limits(i) for i in inputs.odometry},
             events=tuple(events),
         )
 
-    def _predict(self, odometry: Odometry, tick: int, effective_ns: int, history: CommandHistory) -> Array:
-        body = self._scenario.chaser
-        impulse = self.thrusters.coming(odometry.chaser, tick)
+    def _ahead(
+        self, i: int, inputs: TickInputs, effective_ns: int, history: CommandHistory
+    ) -> tuple[tuple[float, Array], ...]:
+        """Return what acts on a chaser until ``effective_ns``; an impulse of thrusters is spread evenly."""
+        impulse = self.thrusters.coming(i, inputs.tick)
         if impulse is None:
-            return predict_state(odometry, history, effective_ns, body)
-        return predict_state_with_impulse(odometry, impulse, effective_ns, body)
+            return history.ahead(i, inputs.time_ns, effective_ns)
+        duration_s = (effective_ns - inputs.time_ns) / 1e9
+        return ((duration_s, impulse / duration_s),) if duration_s > 0.0 else ()
 
     def _impulses(
-        self, odometry: dict[int, Odometry], inputs: TickInputs, history: CommandHistory
+        self, chasers: Iterable[int], inputs: TickInputs, history: CommandHistory
     ) -> dict[int, AppliedImpulse]:
         measured = self.thrusters.given(inputs.tick)
         since_ns = inputs.time_ns - round(1e9 / self._scenario.time.rate_hz)
         impulses = {}
-        for i in odometry:
+        for i in chasers:
             if i in measured:
                 impulses[i] = AppliedImpulse(measured[i], measured=True)
                 continue

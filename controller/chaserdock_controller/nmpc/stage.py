@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -17,6 +18,7 @@ from chaserdock_controller.interfaces import (
     LogEntry,
     Observation,
     PlanResult,
+    TargetEstimation,
 )
 
 from . import make_solver
@@ -25,6 +27,8 @@ from .lost_chasers import with_lost_chasers
 from .types import NmpcInput, NmpcParameters, NmpcPlan
 
 _ATTACHED_FACTOR, _ATTACHED_MARGIN = 1.2, 1e-3
+_CANCELLED_SHARE = 0.5
+"""Largest share of an input limit that cancels a disturbance."""
 
 
 class PlanningStage:
@@ -49,12 +53,21 @@ class PlanningStage:
                     f"controller.solve_budget_s: solver {c.solver!r} has no max_iterations to set"
                 )
 
-    def run(self, observation: Observation, guidance: GuidanceResult) -> PlanResult:
-        """Plan for the chasers of the guidance horizon; lost chasers are obstacles."""
+    def run(
+        self, observation: Observation, estimation: TargetEstimation, guidance: GuidanceResult
+    ) -> PlanResult:
+        """Plan for the chasers of the guidance horizon; lost chasers are obstacles.
+
+        The problem is solved for the input plus the estimated disturbance, which is then subtracted: the input cost keeps
+        its reference, and the disturbance causes no offset.
+        """
         horizon = guidance.horizon
         if horizon is None:
             return PlanResult((), None, 0.0, ())
-        problem = self.problem(horizon, observation.predicted, observation.input_limits)
+        limits = {i: observation.input_limits[i] for i in horizon.chasers}
+        disturbances = {i: _bounded(estimation.disturbances[i], limits[i]) for i in horizon.chasers}
+        left = {i: limits[i] - np.abs(disturbances[i]) for i in horizon.chasers}
+        problem = self.problem(horizon, estimation.own_at_effect, left)
         problem = with_lost_chasers(
             problem, observation.lost, observation.effective_ns, self._parameters.dt_s
         )
@@ -72,6 +85,8 @@ class PlanningStage:
         wall_s = self._now_s() - start_s
         if self._budget is not None and plan is not None:
             self._budget.note(wall_s, int(plan.iterations.sum()))
+        if plan is not None:
+            plan = _without(plan, [disturbances[i] for i in horizon.chasers])
         return PlanResult(horizon.chasers, plan, wall_s, events)
 
     def problem(
@@ -93,3 +108,17 @@ class PlanningStage:
             input_max=limits,
             corridors=horizon.corridors,
         )
+
+
+def _bounded(disturbance: Array, limits: Array) -> Array:
+    """Return a disturbance (6,) of which an actuator with these limits can always cancel the whole and keep half its range."""
+    return np.clip(disturbance, -_CANCELLED_SHARE * limits, _CANCELLED_SHARE * limits)
+
+
+def _without(plan: NmpcPlan, disturbances: list[Array]) -> NmpcPlan:
+    """Return the plan with the inputs that the actuators are to give, in its first rows."""
+    if not np.any(disturbances):
+        return plan
+    inputs = plan.inputs.copy()
+    inputs[: len(disturbances)] -= np.array(disturbances)[:, None, :]
+    return replace(plan, inputs=inputs)

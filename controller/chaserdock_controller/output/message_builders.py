@@ -9,6 +9,7 @@ from chaserdock_protocol.messages import (
     Level,
     Plan,
     Reference,
+    RelativeEstimate,
     SolverStatus,
     TargetEstimate,
     Tick,
@@ -47,6 +48,18 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
         accepted=tuple(sorted(estimation.visible_to - set(target.rejected))),
         rejected=tuple(sorted(target.rejected)),
         cameras=estimation.cameras,
+        relative=tuple(
+            RelativeEstimate(
+                chaser=r.chaser,
+                position_m=vector(r.position_m),
+                q_wxyz=vector(r.q_wxyz),
+                covariance=vector(r.covariance),
+                force_N=vector(estimation.disturbances[r.chaser][:3]),
+                torque_N_m=vector(estimation.disturbances[r.chaser][3:]),
+            )
+            for r in estimation.relative
+            if r.chaser in estimation.disturbances
+        ),
     )
 
 

@@ -53,7 +53,7 @@ class OutputStage:
                 out.references[i] = reference_message(i, observation, directive)
             command = directive.direct
             if command is None:
-                command = self._plan_or_brake(i, observation, estimation.known, result, events, out)
+                command = self._plan_or_brake(i, observation, estimation, result, events, out)
             out.wrenches[i] = self._send(i, observation, guidance, command)
         for i, reason in observation.invalid.items():
             if i not in self._without_plan:
@@ -71,7 +71,7 @@ class OutputStage:
         self,
         i: int,
         observation: Observation,
-        target_known: bool,
+        estimation: TargetEstimation,
         result: PlanResult,
         events: list[LogEntry],
         out: TickOutputs,
@@ -80,7 +80,7 @@ class OutputStage:
         plan = result.plan
         row = result.chasers.index(i) if i in result.chasers else 0
         usable = plan is not None and plan.status[row] != "failed"
-        if usable != (i not in self._without_plan) and target_known:
+        if usable != (i not in self._without_plan) and estimation.known:
             if usable:
                 events.append(("info", f"chaser {i}: planned again"))
                 self._without_plan.discard(i)
@@ -88,7 +88,7 @@ class OutputStage:
                 events.append(("error", f"chaser {i}: no plan, braking"))
                 self._without_plan.add(i)
         if plan is None or not usable:
-            return DirectCommand("brake", brake_wrench(observation.odometry[i], self._scenario.chaser))
+            return DirectCommand("brake", brake_wrench(estimation.own[i], self._scenario.chaser))
         step_s = self._scenario.controller.dt_s
         out.plans[i] = plan_message(i, observation, step_s, plan, row)
         return DirectCommand("nmpc", plan.inputs[row, 0])

@@ -18,6 +18,8 @@ from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import Mekf
 from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
 from chaserdock_controller.estimation.filter_update import FilterState
+from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint.estimator import Hypotheses, TickRecord
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.target_body import TargetBody
@@ -111,6 +113,17 @@ class MekfState(Struct, forbid_unknown_fields=True, tag=True):
     _was_lost: bool
 
 
+class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
+    target: MekfParameters
+    late_dropped: int
+    duplicates: int
+    _records: list[TickRecord]
+    _base: Hypotheses | None
+    _pending: list[EstimatorEvent]
+    _drained: set[EstimatorEvent]
+    _was_lost: bool
+
+
 class PaperState(Struct, forbid_unknown_fields=True, tag=True):
     parameters: PaperParameters
     accepted: int
@@ -148,7 +161,7 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     lost_chasers: LostChaserState
     odometry: OdometryState
     consistency: ConsistencyState
-    estimator: MekfState | PaperState | None
+    estimator: JointEstimatorState | MekfState | PaperState | None
     plans: dict[int, Array]
 
 
@@ -233,19 +246,34 @@ def _write(owner: Any, state: Struct) -> None:
             setattr(owner, name, value)
 
 
-def _estimator_kind(estimator: Any) -> type[MekfState] | type[PaperState] | None:
-    return {Mekf: MekfState, PaperEstimator: PaperState}.get(type(estimator))
+EstimatorState = JointEstimatorState | MekfState | PaperState
 
 
-def _estimator_state(estimator: Any) -> MekfState | PaperState | None:
+def _estimator_kind(estimator: Any) -> type[EstimatorState] | None:
+    kinds = {JointEstimator: JointEstimatorState, Mekf: MekfState, PaperEstimator: PaperState}
+    return kinds.get(type(estimator))
+
+
+def _estimator_state(estimator: Any) -> EstimatorState | None:
     kind = _estimator_kind(estimator)
     if kind is None:
         return None
     state = _read(estimator, kind)
     if isinstance(state, PaperState):
         state._poses, state._rates = list(state._poses), list(state._rates)
-    elif len(state._buffer) > 1:
-        newest, before = state._buffer[-1], state._buffer[-2]
-        state._buffer, state._base = [newest], before.state
-        state._drained = {event for event in state._drained if event in newest.events}
+    elif isinstance(state, JointEstimatorState):
+        state._base, state._drained = _newest_only(state._records, state._base, state._drained)
+        state._records = state._records[-1:]
+    else:
+        state._base, state._drained = _newest_only(state._buffer, state._base, state._drained)
+        state._buffer = state._buffer[-1:]
     return state
+
+
+def _newest_only(
+    buffer: list[Any], base: Any, drained: set[EstimatorEvent]
+) -> tuple[Any, set[EstimatorEvent]]:
+    """Return the state before the newest entry of a buffer, and which of its events are drained."""
+    if len(buffer) < 2:
+        return base, drained
+    return buffer[-2].state, {event for event in drained if event in buffer[-1].events}

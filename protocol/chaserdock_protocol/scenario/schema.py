@@ -26,7 +26,7 @@ from .fields import (
 )
 
 PERCEPTIONS = ("default", "paper")
-ESTIMATORS = ("mekf", "paper")
+ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""
 
@@ -65,8 +65,9 @@ class EstimatorSection(Section):
     """Fusion of all chasers' sightings into the target's state."""
 
     name: Name = Field(
-        default="mekf",
-        description="`mekf`: multiplicative extended Kalman filter. `paper`: the paper's average. Or an installed plugin.",
+        default="joint",
+        description="`joint`: filter of target, chasers, sensors and disturbances. `mekf`: filter of the target, with odometry "
+        "taken as exact. `paper`: the paper's average. Or an installed plugin.",
     )
 
 

@@ -28,7 +28,7 @@ from .views import count_visible_markers, marker_errors, squared_errors
 Indices = NDArray[np.intp]
 
 # Lower bound of the corner noise, pixels; a single marker leaves only two degrees of freedom.
-SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.1, 0.2
+SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.03, 0.04
 # A single marker at a more grazing angle determines its tilt poorly, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
 # Largest corner error of an inlier of a coarse candidate, and of a refined pose.

@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parameters of the joint filter."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from chaserdock_models.arrays import Vector3
+from chaserdock_models.camera import Camera
+from chaserdock_models.rigid_body import RigidBody
+from chaserdock_protocol.scenario.navigation import NavigationErrors
+
+from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MekfParameters
+
+GATE_CHI_SQUARE_3 = 21.107513466160444
+"""0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with SciPy)."""
+
+
+@dataclass(frozen=True)
+class JointParameters:
+    """Parameters of ``JointEstimator``; docs/estimation.md gives the reasons for the values.
+
+    target: motion model, process noise, initial sigmas and thresholds of the target; the filter uses none of its camera
+        errors. body: assumed mass properties of the chasers. camera: as calibrated. navigation: errors of the chasers'
+        sensors.
+    control_force_share, control_torque_share: sigma of a commanded impulse's effect, as a share of it; control_arm_m:
+        offset of the force from the centre of mass. They cover errors of thrust, mass, inertia and alignment.
+    disturbance_*: force and torque on a chaser in its body axes: sigma at the start, and density of the random walk.
+    latched_*: white acceleration of a chaser whose latch holds the target.
+    contact_*: sigma of the change of a chaser's rates by a contact.
+    floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
+    sighting_scale: factor on the stated covariance of a sighting for its white part.
+    view_ratio: sigma of the error of a sighting that persists while the view stays the same, as a ratio of the stated sigma.
+    view_time_s: time constant of this error.
+    unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
+        as by a stuck thruster; assumed only where velocity or rate does not fit otherwise.
+    rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
+    collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
+    iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
+    overconfident_ticks, overconfident_ratio: odometry is reported as overconfident when its squared normalized
+        innovation, averaged over so many ticks, exceeds its expectation by this factor.
+    """
+
+    target: MekfParameters
+    body: RigidBody
+    camera: Camera
+    navigation: NavigationErrors
+    force_max_N: float = 1.0
+    torque_max_N_m: float = 0.1
+    control_force_share: float = 0.1
+    control_torque_share: float = 0.2
+    control_arm_m: float = 0.005
+    disturbance_force_N: float = 0.01
+    disturbance_torque_N_m: float = 0.001
+    disturbance_force_N_sqrt_s: float = 1e-3
+    disturbance_torque_N_m_sqrt_s: float = 1e-4
+    latched_acceleration_m_s2: float = 0.05
+    latched_acceleration_rad_s2: float = 0.1
+    contact_velocity_m_s: float = 0.01
+    contact_omega_rad_s: float = 0.02
+    floor_position_m: float = 2e-5
+    floor_velocity_m_s: float = 2e-5
+    floor_attitude_rad: float = 1e-5
+    floor_omega_rad_s: float = 1e-5
+    floor_sighting_m: float = 2e-5
+    floor_sighting_rad: float = math.radians(0.002)
+    sighting_scale: float = 0.85
+    view_ratio: float = 0.3
+    view_time_s: float = 30.0
+    gate_sighting: float = GATE_CHI_SQUARE
+    gate_odometry: float = GATE_CHI_SQUARE_3
+    unexpected_velocity_m_s: float = 0.01
+    unexpected_omega_rad_s: float = 0.05
+    rejections_to_drop: int = 5
+    collective_rejections: int = 3
+    iterated_updates: int = 5
+    iterations: int = 4
+    overconfident_ticks: float = 30.0
+    overconfident_ratio: float = 2.5
+    restart_after_s: float = 1.0
+    camera_turn_rad: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Derive the prior of the camera's turn: an error of the principal point acts as a turn, to first order."""
+        n = self.navigation
+        turn = math.hypot(n.camera_turn_rad, n.camera_centre_px / self.camera.fx_px)
+        object.__setattr__(self, "camera_turn_rad", turn)
+
+    @property
+    def inertia(self) -> Vector3:
+        """Return the chasers' principal moments of inertia, kg m²."""
+        return self.body.inertia

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion of the target and the chasers between ticks, and the growth of the covariance. Pure functions.
+
+A chaser is a rigid body under its commanded wrench and an unknown, slowly changing disturbance (F_d, T_d), both in body axes:
+v' = C (F + F_d) / m, I omega' = T + T_d - omega x I omega. Its sensor errors are Gauss-Markov processes or constants.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Set
+from dataclasses import replace
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import newton_euler, rk4_step
+
+from chaserdock_controller.estimation.motion_models import process_noise, propagate_target
+
+from .parameters import JointParameters
+from .state import (
+    ATTITUDE,
+    ATTITUDE_DRIFT,
+    CHASER,
+    EXTRA,
+    FORCE,
+    MOTION,
+    POSITION,
+    POSITION_DRIFT,
+    RATE,
+    TARGET,
+    TORQUE,
+    VELOCITY,
+    VIEW,
+    JointState,
+    block,
+)
+
+_EYE3 = np.eye(3)
+
+
+def predict(
+    state: JointState,
+    time_ns: int,
+    impulses: Array,
+    p: JointParameters,
+    latched: Set[int] = frozenset(),
+    nominal_s: float = math.inf,
+) -> JointState:
+    """Propagate the state to ``time_ns``.
+
+    ``impulses`` (N, 6): N s and N m s, body axes, that the actuators gave since then. ``nominal_s``: the time that they
+    cover; beyond it the command is unknown. Raises ValueError for an earlier time.
+    """
+    dt = (time_ns - state.time_ns) * 1e-9
+    if dt == 0.0:
+        return state
+    if dt < 0.0:
+        raise ValueError(f"cannot predict backwards, from {state.time_ns} to {time_ns} ns")
+    moved, target_transition = _predict_target(state, dt, p)
+    n = state.chasers
+    wrenches = impulses / dt + state.extra[:, :6]
+    for i in latched:
+        wrenches[i] = 0.0
+    rows = np.concatenate(
+        [state.positions_m, state.velocities_m_s, state.attitudes_wxyz, state.omegas_rad_s], axis=1
+    )
+    for i in range(n):
+        u = wrenches[i].tolist()
+        rows[i] = rk4_step(lambda y, u=u: newton_euler(y, u, p.body.mass_kg, p.inertia), rows[i], dt)
+    fade = _fading(dt, p)
+    motion = _motion_transitions(state, wrenches, dt, p)
+    covariance = _transform(target_transition, motion, fade, state.covariance)
+    _add_noise(covariance, state, impulses, dt, p, latched, fade, max(0.0, dt - nominal_s))
+    return replace(
+        moved,
+        time_ns=time_ns,
+        positions_m=rows[:, 0:3],
+        velocities_m_s=rows[:, 3:6],
+        attitudes_wxyz=rotations.normalize(rows[:, 6:10]),
+        omegas_rad_s=rows[:, 10:13],
+        extra=state.extra * fade[12:],
+        covariance=covariance,
+    )
+
+
+def predict_target(state: JointState, time_ns: int, p: JointParameters) -> tuple[JointState, Array]:
+    """Return the state with the target's mean at ``time_ns``, and the target's covariance (12, 12) then."""
+    dt = (time_ns - state.time_ns) * 1e-9
+    covariance = state.covariance[:TARGET, :TARGET]
+    if dt == 0.0:
+        return state, covariance.copy()
+    moved, f = _predict_target(state, dt, p)
+    return moved, f @ covariance @ f.T + _target_noise(dt, p)
+
+
+def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[JointState, Array]:
+    if not state.target_known:
+        return state, np.eye(TARGET)
+    motion = (state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s)
+    (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
+    return replace(state, position_m=position, velocity_m_s=velocity, q_wxyz=q, omega_rad_s=omega), f
+
+
+def _target_noise(dt: float, p: JointParameters) -> Array:
+    t = p.target
+    return process_noise(dt, t.acceleration_noise_m_s2_sqrt_hz**2, t.angular_noise_rad_s2_sqrt_hz**2)
+
+
+def _fading(dt: float, p: JointParameters) -> Array:
+    """Return the factor (CHASER,) by which each component of a chaser decays in ``dt``; 1 where it does not."""
+    fade, n = np.ones(CHASER), p.navigation
+    for part, sigma, time_s in (
+        (POSITION_DRIFT, n.position_drift_m, n.position_drift_time_s),
+        (ATTITUDE_DRIFT, n.attitude_drift_rad, n.attitude_drift_time_s),
+        (VIEW, p.view_ratio, p.view_time_s),
+    ):
+        fade[part] = math.exp(-dt / time_s) if sigma > 0.0 else 1.0
+    return fade
+
+
+def _motion_transitions(state: JointState, wrenches: Array, dt: float, p: JointParameters) -> Array:
+    """Return the transition matrices (N, MOTION, MOTION) of the errors of motion and disturbance, to second order in ``dt``."""
+    n, inertia = state.chasers, np.array(p.inertia)
+    a = np.zeros((n, MOTION, MOTION))
+    for i in range(n):
+        c, w = so3.to_matrix(state.attitudes_wxyz[i]), state.omegas_rad_s[i]
+        a[i, VELOCITY, ATTITUDE] = -c @ so3.skew(wrenches[i, :3]) / p.body.mass_kg
+        a[i, VELOCITY, FORCE] = c / p.body.mass_kg
+        a[i, ATTITUDE, ATTITUDE] = -so3.skew(w)
+        a[i, RATE, RATE] = (so3.skew(inertia * w) - so3.skew(w) * inertia) / inertia[:, None]
+    a[:, POSITION, VELOCITY] = a[:, ATTITUDE, RATE] = _EYE3
+    a[:, RATE, TORQUE] = np.diag(1.0 / inertia)
+    a *= dt
+    return np.eye(MOTION) + a + 0.5 * (a @ a)
+
+
+def _transform(target: Array, motion: Array, fade: Array, covariance: Array) -> Array:
+    """Return F P F' for the block-diagonal F of ``target`` (12, 12) and, for each chaser, ``motion`` (N, MOTION, MOTION) and
+    the decay ``fade`` (CHASER,) of its other components."""
+    n, size = len(motion), len(covariance)
+
+    def left(m: Array) -> Array:
+        out = np.empty((size, size))
+        np.matmul(target, m[:TARGET], out=out[:TARGET])
+        before, after = (x[TARGET:].reshape(n, CHASER, size) for x in (m, out))
+        np.matmul(motion, before[:, :MOTION], out=after[:, :MOTION])
+        np.multiply(before[:, MOTION:], fade[MOTION:, None], out=after[:, MOTION:])
+        return out
+
+    result = left(np.ascontiguousarray(left(covariance).T))
+    return 0.5 * (result + result.T)
+
+
+def _add_noise(
+    covariance: Array,
+    state: JointState,
+    impulses: Array,
+    dt: float,
+    p: JointParameters,
+    latched: Set[int],
+    fade: Array,
+    unknown_s: float,
+) -> None:
+    """Add the process noise of ``dt``, of which the command is unknown for ``unknown_s``, to the covariance in place."""
+    if state.target_known:
+        covariance[:TARGET, :TARGET] += _target_noise(dt, p)
+    inertia, m = np.array(p.inertia), p.body.mass_kg
+    drift = (1.0 - fade[12:] ** 2) * chaser_prior(p)
+    drift[0:3] = p.disturbance_force_N_sqrt_s**2 * dt
+    drift[3:6] = p.disturbance_torque_N_m_sqrt_s**2 * dt
+    for i in np.flatnonzero(state.alive).tolist():
+        force, torque = float(np.linalg.norm(impulses[i, :3])), np.abs(impulses[i, 3:])
+        if i in latched:
+            velocity = np.full(3, (p.latched_acceleration_m_s2 * dt) ** 2)
+            omega = np.full(3, (p.latched_acceleration_rad_s2 * dt) ** 2)
+        else:
+            velocity = np.full(
+                3, (p.control_force_share * force / m) ** 2 + (p.force_max_N * unknown_s / m) ** 2
+            )
+            omega = (p.control_torque_share * torque) ** 2 + (p.control_arm_m * force) ** 2
+            omega = (omega + (p.torque_max_N_m * unknown_s) ** 2) / inertia**2
+        noise = covariance[block(i), block(i)]
+        # The impulse acts, on average, in the middle of the interval.
+        for at, rate, variance in ((POSITION, VELOCITY, velocity), (ATTITUDE, RATE, omega)):
+            a, r = np.arange(at.start, at.stop), np.arange(rate.start, rate.stop)
+            noise[r, r] += variance
+            noise[a, a] += variance * dt**2 / 3.0
+            noise[a, r] += variance * dt / 2.0
+            noise[r, a] += variance * dt / 2.0
+        e = np.arange(12, CHASER)
+        noise[e, e] += drift if i not in latched else np.concatenate([np.zeros(6), drift[6:]])
+
+
+def chaser_prior(p: JointParameters) -> Array:
+    """Return the prior variances (EXTRA,) of a chaser's additive states."""
+    n, prior = p.navigation, np.zeros(EXTRA)
+    for part, sigma in (
+        (FORCE, p.disturbance_force_N),
+        (TORQUE, p.disturbance_torque_N_m),
+        (POSITION_DRIFT, math.hypot(n.position_drift_m, n.position_bias_m)),
+        (ATTITUDE_DRIFT, math.hypot(n.attitude_drift_rad, n.attitude_bias_rad)),
+        (slice(24, 27), n.gyro_bias_rad_s),
+        (slice(27, 30), p.camera_turn_rad),
+        (slice(30, 33), n.camera_shift_m),
+        (slice(33, 34), n.camera_focal_share),
+        (VIEW, p.view_ratio),
+    ):
+        prior[part.start - 12 : part.stop - 12] = sigma**2
+    return prior

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""State of the joint filter, and the layout of its error vector.
+
+The error vector has 12 components for the target, then ``CHASER`` for each chaser. Both begin with position and velocity
+(WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body axes). A chaser's additive states follow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.arrays import Array
+
+POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
+TARGET = 12
+"""Components of the target's error."""
+FORCE, TORQUE = slice(12, 15), slice(15, 18)
+"""Disturbance on the chaser, body axes, N and N m."""
+MOTION = 18
+"""Number of a chaser's components that its equations of motion couple."""
+POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(18, 21), slice(21, 24), slice(24, 27)
+"""Errors of its odometry that do not average out: m (WRF), rad (CRF), rad/s (CRF)."""
+TURN, SHIFT, FOCAL = slice(27, 30), slice(30, 33), slice(33, 34)
+"""Errors of its camera: rotation vector and shift (IRF), relative focal length (see ``camera_calibration``)."""
+VIEW = slice(34, 40)
+"""Error of its sightings that persists with the view, in units of the stated sigmas."""
+CHASER = 40
+"""Components of a chaser's error."""
+EXTRA = CHASER - 12
+"""Components that are added to the chaser's own state without a rotation."""
+SIGHTING_CHANNEL = 0
+CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
+"""Measurements that are gated separately."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointState:
+    """Estimate after the tick at ``time_ns``, of the target and of N chasers.
+
+    position_m, velocity_m_s, q_wxyz, omega_rad_s: of the target, (3,), (3,), (4,), (3,); meaningless until ``target_known``.
+    positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
+    additive states. covariance (12 + CHASER N, 12 + CHASER N). alive (N,): chasers whose state is known.
+    odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
+    nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
+    updates: ticks with sightings since the start of the target. log_likelihood: of all sightings since then.
+    """
+
+    time_ns: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    positions_m: Array
+    velocities_m_s: Array
+    attitudes_wxyz: Array
+    omegas_rad_s: Array
+    extra: Array
+    covariance: Array
+    alive: Array
+    odometry_ns: Array
+    rejections: Array
+    nis: Array
+    target_known: bool = False
+    updates: int = 0
+    log_likelihood: float = 0.0
+
+    @property
+    def chasers(self) -> int:
+        """Return the number of chasers."""
+        return len(self.positions_m)
+
+    def of(self, chaser: int, part: slice) -> Array:
+        """Return additive states of a chaser; ``part``: their components in its error."""
+        return self.extra[chaser, part.start - 12 : part.stop - 12]
+
+    def disturbance(self, chaser: int) -> Array:
+        """Return the estimated disturbance (6,) on a chaser: force and torque, body axes."""
+        return self.extra[chaser, :6]
+
+
+def empty_state(time_ns: int, chasers: int) -> JointState:
+    """Return a state in which nothing is known."""
+    n = chasers
+    return JointState(
+        time_ns=time_ns,
+        position_m=np.zeros(3),
+        velocity_m_s=np.zeros(3),
+        q_wxyz=np.array([1.0, 0.0, 0.0, 0.0]),
+        omega_rad_s=np.zeros(3),
+        positions_m=np.zeros((n, 3)),
+        velocities_m_s=np.zeros((n, 3)),
+        attitudes_wxyz=np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)),
+        omegas_rad_s=np.zeros((n, 3)),
+        extra=np.zeros((n, EXTRA)),
+        covariance=np.zeros((TARGET + CHASER * n, TARGET + CHASER * n)),
+        alive=np.zeros(n, dtype=bool),
+        odometry_ns=np.zeros(n, dtype=np.int64),
+        rejections=np.zeros((n, len(CHANNELS)), dtype=np.int64),
+        nis=np.full((n, len(CHANNELS) - 1), 3.0),
+    )
+
+
+def block(chaser: int) -> slice:
+    """Return the components of a chaser in the error vector."""
+    return slice(TARGET + CHASER * chaser, TARGET + CHASER * (chaser + 1))
+
+
+def inject(state: JointState, error: Array) -> JointState:
+    """Return the state corrected by an error vector; the covariance stays."""
+    each = error[TARGET:].reshape(-1, CHASER)
+    return replace(
+        state,
+        position_m=state.position_m + error[POSITION],
+        velocity_m_s=state.velocity_m_s + error[VELOCITY],
+        q_wxyz=so3.normalize(so3.multiply(state.q_wxyz, so3.exp(error[ATTITUDE]))),
+        omega_rad_s=state.omega_rad_s + error[RATE],
+        positions_m=state.positions_m + each[:, POSITION],
+        velocities_m_s=state.velocities_m_s + each[:, VELOCITY],
+        attitudes_wxyz=rotations.normalize(
+            rotations.multiply(state.attitudes_wxyz, rotations.exp(each[:, ATTITUDE]))
+        ),
+        omegas_rad_s=state.omegas_rad_s + each[:, RATE],
+        extra=state.extra + each[:, 12:],
+    )
+
+
+def difference(a: JointState, b: JointState) -> Array:
+    """Return the error vector that takes the state ``a`` to ``b``."""
+    n = a.chasers
+    error = np.empty(TARGET + CHASER * n)
+    error[POSITION], error[VELOCITY] = b.position_m - a.position_m, b.velocity_m_s - a.velocity_m_s
+    error[ATTITUDE] = so3.log(so3.inverse_multiply(a.q_wxyz, b.q_wxyz))
+    error[RATE] = b.omega_rad_s - a.omega_rad_s
+    each = error[TARGET:].reshape(n, CHASER)
+    each[:, POSITION] = b.positions_m - a.positions_m
+    each[:, VELOCITY] = b.velocities_m_s - a.velocities_m_s
+    turns = rotations.multiply(rotations.conjugate(a.attitudes_wxyz), b.attitudes_wxyz)
+    each[:, ATTITUDE] = rotations.log(turns)
+    each[:, RATE] = b.omegas_rad_s - a.omegas_rad_s
+    each[:, 12:] = b.extra - a.extra
+    return error

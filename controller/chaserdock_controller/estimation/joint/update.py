@@ -1,0 +1,421 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel. Pure functions.
+
+A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
+until it has fitted as often: a jump or a constant error then changes nothing. When most cameras are rejected together, the
+target has moved in an unexpected way: its rates are widened, and if that does not help its pose starts anew.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
+
+from .measurements import (
+    CameraMounting,
+    LinearizedMeasurement,
+    linearize_odometry,
+    linearize_sighting,
+    odometry_noise,
+    predict_sighting,
+    sighting_covariance,
+)
+from .parameters import JointParameters
+from .prediction import chaser_prior
+from .state import (
+    ATTITUDE,
+    ATTITUDE_DRIFT,
+    CHANNELS,
+    CHASER,
+    FOCAL,
+    FORCE,
+    GYRO_BIAS,
+    POSITION,
+    POSITION_DRIFT,
+    RATE,
+    SHIFT,
+    SIGHTING_CHANNEL,
+    TARGET,
+    TORQUE,
+    TURN,
+    VELOCITY,
+    JointState,
+    block,
+    difference,
+    inject,
+)
+
+POSE = np.array([0, 1, 2, 6, 7, 8])
+_VELOCITY_CHANNEL, _RATE_CHANNEL = CHANNELS.index("velocity"), CHANNELS.index("rate")
+_TICK_S = 0.1
+"""Time, at most about a tick, in which unexpected motion displaces a chaser."""
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """Chasers whose sightings were accepted and rejected, and by chaser the channels of odometry that were rejected."""
+
+    accepted: tuple[int, ...] = ()
+    rejected: tuple[int, ...] = ()
+    odometry: tuple[tuple[int, str], ...] = ()
+
+
+class _Channel(NamedTuple):
+    number: int
+    rows: slice
+    gate: float
+
+
+def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParameters) -> JointState:
+    """Return the state with chaser ``i`` known from its odometry alone."""
+    positions, velocities = state.positions_m.copy(), state.velocities_m_s.copy()
+    attitudes, omegas = state.attitudes_wxyz.copy(), state.omegas_rad_s.copy()
+    positions[i], velocities[i] = odometry.position_m, odometry.velocity_m_s
+    attitudes[i], omegas[i] = so3.normalize(np.array(odometry.q_wxyz)), odometry.omega_rad_s
+    extra, alive = state.extra.copy(), state.alive.copy()
+    extra[i], alive[i] = 0.0, True
+    rejections, nis = state.rejections.copy(), state.nis.copy()
+    rejections[i], nis[i] = 0, 3.0
+    covariance = state.covariance.copy()
+    covariance[block(i), :] = covariance[:, block(i)] = 0.0
+    own = np.zeros((CHASER, CHASER))
+    e = np.arange(12, CHASER)
+    own[e, e] = chaser_prior(p)
+    own[:12, :12] = odometry_noise(odometry, p)
+    # The measured state is the true one plus its error, hence the negative correlation.
+    for part, drift in ((POSITION, POSITION_DRIFT), (ATTITUDE, ATTITUDE_DRIFT), (RATE, GYRO_BIAS)):
+        prior = own[drift, drift].copy()
+        own[part, part] += prior
+        own[part, drift] = own[drift, part] = -prior
+    covariance[block(i), block(i)] = own
+    return replace(
+        state,
+        positions_m=positions,
+        velocities_m_s=velocities,
+        attitudes_wxyz=attitudes,
+        omegas_rad_s=omegas,
+        extra=extra,
+        alive=alive,
+        rejections=rejections,
+        nis=nis,
+        covariance=covariance,
+    )
+
+
+class SightedPose(NamedTuple):
+    """Pose of the target in WRF by one sighting: position (3,), attitude (4,), covariance (6, 6) (WRF; rotation in TRF) and
+    the covariance (6, D) with the error vector, all from the chaser's own estimated state."""
+
+    position_m: Array
+    q_wxyz: Array
+    covariance: Array
+    cross: Array
+
+
+def sighted_pose(
+    state: JointState, i: int, solution: PoseSolution, mounting: CameraMounting, p: JointParameters
+) -> SightedPose:
+    """Return the pose of the target by a sighting of chaser ``i``, with the camera's errors as estimated."""
+    c = so3.to_matrix(state.attitudes_wxyz[i])
+    delta = state.of(i, TURN)
+    q_camera = so3.multiply(state.attitudes_wxyz[i], mounting.q_wxyz)
+    scaled = np.array(solution.position_m) * [1.0, 1.0, 1.0 + float(state.of(i, FOCAL)[0])]
+    line = so3.to_matrix(so3.exp(delta)) @ scaled + state.of(i, SHIFT)
+    position = state.positions_m[i] + c @ (mounting.position_m + mounting.axes @ line)
+    q = so3.multiply(q_camera, so3.multiply(so3.exp(delta), np.array(solution.q_wxyz)))
+    moved = replace(state, position_m=position, q_wxyz=so3.normalize(q))
+    predicted = predict_sighting(moved, i, mounting)
+    to_pose = np.linalg.inv(predicted.by_target[:, POSE])
+    stated = sighting_covariance(solution, p)
+    noise = (p.sighting_scale**2 + p.view_ratio**2) * stated
+    by_chaser = to_pose @ predicted.by_chaser
+    cross = -by_chaser @ state.covariance[block(i), :]
+    own = state.covariance[block(i), block(i)]
+    covariance = by_chaser @ own @ by_chaser.T + to_pose @ noise @ to_pose.T
+    return SightedPose(position, moved.q_wxyz, 0.5 * (covariance + covariance.T), cross)
+
+
+def start_target(
+    state: JointState, pose: SightedPose, rates: tuple[Array, Array, Array], scale: float = 1.0
+) -> JointState:
+    """Return the state with the target at a sighted pose and ``rates``: velocity, omega and their covariance (6, 6).
+
+    ``scale``: factor on the covariance of the pose.
+    """
+    velocity, omega, rate_covariance = rates
+    covariance = state.covariance.copy()
+    covariance[:TARGET, :] = covariance[:, :TARGET] = 0.0
+    cross = pose.cross.copy()
+    cross[:, :TARGET] = 0.0
+    covariance[POSE, :], covariance[:, POSE] = cross, cross.T
+    covariance[np.ix_(POSE, POSE)] = pose.covariance * scale
+    r = np.array([3, 4, 5, 9, 10, 11])
+    covariance[np.ix_(r, r)] = rate_covariance
+    rejections = state.rejections.copy()
+    rejections[:, SIGHTING_CHANNEL] = 0
+    return replace(
+        state,
+        position_m=pose.position_m,
+        q_wxyz=pose.q_wxyz,
+        velocity_m_s=velocity,
+        omega_rad_s=omega,
+        covariance=covariance,
+        target_known=True,
+        updates=0,
+        rejections=rejections,
+    )
+
+
+def agree(a: SightedPose, b: SightedPose, gate: float) -> bool:
+    """Test whether the difference of two sighted poses is within the gate of their covariances."""
+    d = np.concatenate([a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))])
+    return float(d @ np.linalg.solve(a.covariance + b.covariance, d)) <= gate
+
+
+class ReducedCovariance:
+    """A covariance P - W'W during the updates of a tick, of which each adds rows to W.
+
+    P itself is subtracted from once, at the end, as it is large: the result is that of updates one after the other.
+    """
+
+    def __init__(self, covariance: Array, rows: int) -> None:
+        self._covariance, self._w = covariance.copy(), np.empty((rows, len(covariance)))
+        self._rows = 0
+
+    def innovation(self, i: int, z: LinearizedMeasurement) -> tuple[Array, Array]:
+        """Return P H' (D, k) and the innovation covariance (k, k) of a measurement of chaser ``i``."""
+        own, p, w = block(i), self._covariance, self._w[: self._rows]
+        cross = p[:, :TARGET] @ z.by_target.T + p[:, own] @ z.by_chaser.T
+        if self._rows:
+            cross -= w.T @ (w[:, :TARGET] @ z.by_target.T + w[:, own] @ z.by_chaser.T)
+        s = z.by_target @ cross[:TARGET] + z.by_chaser @ cross[own] + z.noise
+        return cross, 0.5 * (s + s.T)
+
+    def widen(self, variances: Array) -> None:
+        """Add variances (D,)."""
+        k = np.arange(len(variances))
+        self._covariance[k, k] += variances
+
+    def subtract(self, white: Array) -> None:
+        """Subtract white' white, with ``white`` (k, D)."""
+        self._w[self._rows : self._rows + len(white)] = white
+        self._rows += len(white)
+
+    def turn(self, part: slice, correction: Array) -> None:
+        """Make a rotation error relative to the corrected attitude (Sola eq. 287)."""
+        reset, p, w = so3.right_jacobian(correction), self._covariance, self._w[: self._rows]
+        p[part] = reset @ p[part]
+        p[:, part] = p[:, part] @ reset.T
+        w[:, part] = w[:, part] @ reset.T
+
+    def total(self) -> Array:
+        """Return the covariance (D, D)."""
+        w = self._w[: self._rows]
+        return self._covariance - w.T @ w
+
+
+def update(
+    state: JointState,
+    odometry: Mapping[int, Odometry],
+    sightings: Mapping[int, Sighting],
+    mounting: CameraMounting,
+    p: JointParameters,
+) -> tuple[JointState, UpdateReport]:
+    """Update the state at its time with the odometry and the sightings of the chasers."""
+    accepted: list[int] = []
+    rejected: list[int] = []
+    dropped: list[tuple[int, str]] = []
+    chasers = [i for i in sorted(odometry.keys() | sightings.keys()) if state.alive[i]]
+    covariance = ReducedCovariance(state.covariance, 18 * len(chasers))
+    for i in chasers:
+        sighting = sightings.get(i)
+        solutions = sighting.solutions if sighting is not None and state.target_known else ()
+        state, fits = _update_chaser(state, covariance, i, odometry.get(i), solutions, mounting, p)
+        if solutions:
+            (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
+        dropped += [(i, CHANNELS[k]) for k, fit in fits.items() if k != SIGHTING_CHANNEL and not fit]
+    updates = state.updates + bool(accepted)
+    state = replace(state, covariance=covariance.total(), updates=updates)
+    return state, UpdateReport(tuple(accepted), tuple(rejected), tuple(dropped))
+
+
+def _update_chaser(
+    prior: JointState,
+    covariance: ReducedCovariance,
+    i: int,
+    odometry: Odometry | None,
+    solutions: Sequence[PoseSolution],
+    mounting: CameraMounting,
+    p: JointParameters,
+) -> tuple[JointState, dict[int, bool]]:
+    """Update with the measurements of one chaser; return the state, and which channels were used."""
+    solution = _likeliest(prior, covariance, i, solutions, mounting, p)
+    z = _linearize(prior, i, odometry, solution, mounting, p)
+    channels = _channels(odometry is not None, solution is not None, p)
+    cross, s = covariance.innovation(i, z)
+    state, fits = _gate(prior, i, channels, z.residual, s, p)
+    if not (fits.get(_VELOCITY_CHANNEL, True) and fits.get(_RATE_CHANNEL, True)):
+        variances = _unexpected_motion(i, len(cross), p)
+        covariance.widen(variances)
+        wider_cross, wider_s = covariance.innovation(i, z)
+        wider_state, wider_fits = _gate(prior, i, channels, z.residual, wider_s, p)
+        if all(fit for k, fit in wider_fits.items() if k != SIGHTING_CHANNEL):
+            cross, s, fits = wider_cross, wider_s, wider_fits
+            state = replace(wider_state, nis=state.nis)
+        else:
+            covariance.widen(-variances)
+    used = [c.rows for c in channels if fits[c.number]]
+    if not used:
+        return state, fits
+    rows = np.concatenate([np.arange(r.start, r.stop) for r in used])
+    prior = state
+    nonlinear = fits.get(SIGHTING_CHANNEL, False) and prior.updates < p.iterated_updates
+    for k in range(p.iterations if nonlinear else 1):
+        if k:
+            z = _linearize(state, i, odometry, solution, mounting, p)
+            cross, s = covariance.innovation(i, z)
+        factor = np.linalg.cholesky(s[np.ix_(rows, rows)])
+        residual = z.residual[rows]
+        if k:
+            e = difference(prior, state)
+            residual = residual + z.by_target[rows] @ e[:TARGET] + z.by_chaser[rows] @ e[block(i)]
+        solved = np.linalg.solve(factor, np.column_stack([cross[:, rows].T, residual]))
+        white = solved[:, :-1]
+        correction = white.T @ solved[:, -1]
+        state = inject(prior, correction)
+    covariance.subtract(white)
+    for part in (ATTITUDE, _attitude_of(i)):
+        covariance.turn(part, correction[part])
+    return state, fits
+
+
+def _unexpected_motion(i: int, size: int, p: JointParameters) -> Array:
+    """Return the variances (``size``,) that a force and a torque without a command add to chaser ``i`` within a tick."""
+    variances, own = np.zeros(size), block(i).start
+    for part, sigma in (
+        (VELOCITY, p.unexpected_velocity_m_s),
+        (POSITION, p.unexpected_velocity_m_s * _TICK_S),
+        (RATE, p.unexpected_omega_rad_s),
+        (ATTITUDE, p.unexpected_omega_rad_s * _TICK_S),
+        (FORCE, p.force_max_N),
+        (TORQUE, p.torque_max_N_m),
+    ):
+        variances[own + part.start : own + part.stop] = sigma**2
+    return variances
+
+
+def _gate(
+    state: JointState, i: int, channels: Sequence[_Channel], residual: Array, s: Array, p: JointParameters
+) -> tuple[JointState, dict[int, bool]]:
+    """Count which channels fit; return the state with the counts, and by channel whether it is used."""
+    rejections, nis, likelihood = state.rejections.copy(), state.nis.copy(), state.log_likelihood
+    fits: dict[int, bool] = {}
+    for channel in channels:
+        r, part = residual[channel.rows], s[channel.rows, channel.rows]
+        value = float(r @ np.linalg.solve(part, r))
+        fits[channel.number] = _count(rejections, i, channel, value, p)
+        if channel.number == SIGHTING_CHANNEL:
+            # Bound the penalty: a gross outlier counts as much as one at the gate.
+            likelihood -= 0.5 * (min(value, channel.gate) + float(np.linalg.slogdet(part)[1]))
+        else:
+            k = channel.number - 1
+            nis[i, k] += (min(value, 10.0 * channel.gate) - nis[i, k]) / p.overconfident_ticks
+    return replace(state, rejections=rejections, nis=nis, log_likelihood=likelihood), fits
+
+
+def _likeliest(
+    state: JointState,
+    covariance: ReducedCovariance,
+    i: int,
+    solutions: Sequence[PoseSolution],
+    mounting: CameraMounting,
+    p: JointParameters,
+) -> PoseSolution | None:
+    """Return the likeliest solution of a sighting, the first one of equals; None without any."""
+    if len(solutions) < 2:
+        return solutions[0] if solutions else None
+
+    def log_density(solution: PoseSolution) -> float:
+        z = linearize_sighting(state, i, solution, mounting, p)
+        s = covariance.innovation(i, z)[1]
+        return -0.5 * (float(z.residual @ np.linalg.solve(s, z.residual)) + float(np.linalg.slogdet(s)[1]))
+
+    return max(solutions, key=log_density)
+
+
+def _attitude_of(i: int) -> slice:
+    first = TARGET + CHASER * i
+    return slice(first + ATTITUDE.start, first + ATTITUDE.stop)
+
+
+def _channels(has_odometry: bool, has_sighting: bool, p: JointParameters) -> list[_Channel]:
+    channels, row = [], 0
+    if has_sighting:
+        channels.append(_Channel(SIGHTING_CHANNEL, slice(0, 6), p.gate_sighting))
+        row = 6
+    if has_odometry:
+        for k in range(1, len(CHANNELS)):
+            channels.append(_Channel(k, slice(row, row + 3), p.gate_odometry))
+            row += 3
+    return channels
+
+
+def _count(rejections: Array, i: int, channel: _Channel, value: float, p: JointParameters) -> bool:
+    """Update the count of a channel's rejections; return whether the channel is used."""
+    count, limit = int(rejections[i, channel.number]), p.rejections_to_drop
+    if not value <= channel.gate:  # rejects NaN as well
+        rejections[i, channel.number] = min(count + 1, 2 * limit)
+        return False
+    rejections[i, channel.number] = count - 1 if count >= limit else 0
+    return count < limit
+
+
+def _linearize(
+    state: JointState,
+    i: int,
+    odometry: Odometry | None,
+    solution: PoseSolution | None,
+    mounting: CameraMounting,
+    p: JointParameters,
+) -> LinearizedMeasurement:
+    parts = []
+    if solution is not None:
+        parts.append(linearize_sighting(state, i, solution, mounting, p))
+    if odometry is not None:
+        parts.append(linearize_odometry(state, i, odometry, p))
+    if len(parts) == 1:
+        return parts[0]
+    a, b = parts
+    noise = np.zeros((18, 18))
+    noise[:6, :6], noise[6:, 6:] = a.noise, b.noise
+    return LinearizedMeasurement(
+        np.concatenate([a.residual, b.residual]),
+        np.concatenate([a.by_target, b.by_target]),
+        np.concatenate([a.by_chaser, b.by_chaser]),
+        noise,
+    )
+
+
+def widen_target(state: JointState, p: JointParameters) -> JointState:
+    """Return the state with less certain rates of the target."""
+    t, covariance = p.target, state.covariance.copy()
+    i = np.array([3, 4, 5, 9, 10, 11])
+    covariance[i, i] += np.repeat([t.reinitialised_velocity_m_s**2, t.reinitialised_omega_rad_s**2], 3)
+    return replace(state, covariance=covariance)
+
+
+def rate_covariance(velocity_m_s: float, omega_rad_s: float) -> Array:
+    """Return a covariance (6, 6) of velocity and rate with these sigmas."""
+    return np.diag(np.repeat([velocity_m_s**2, omega_rad_s**2], 3))
+
+
+def sigma_of(covariance: Array) -> float:
+    """Return the largest standard deviation of a covariance (3, 3)."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))

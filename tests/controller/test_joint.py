@@ -1,0 +1,244 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint filter: Jacobians, consistency, late and contradictory measurements."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint.estimator import JointInputs, relative_pose
+from chaserdock_controller.estimation.joint.measurements import (
+    linearize_odometry,
+    linearize_sighting,
+    mounting_of,
+    predict_sighting,
+)
+from chaserdock_controller.estimation.joint.parameters import GATE_CHI_SQUARE_3
+from chaserdock_controller.estimation.joint.prediction import predict
+from chaserdock_controller.estimation.joint.state import (
+    CHASER,
+    TARGET,
+    VIEW,
+    JointState,
+    block,
+    difference,
+    empty_state,
+    inject,
+)
+from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE
+from chaserdock_models import rotations
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.scenario.navigation import NavigationErrors
+from flight_cases import scenario
+from joint_cases import PERIOD_S, SyntheticFlight, navigation, parameters
+from scipy.stats import chi2
+
+SCENARIO = scenario()
+STEP = 1e-6
+
+
+def random_state(seed: int, chasers: int = 2) -> JointState:
+    """Return a state with a target at about 1 m, rates, and errors of every kind."""
+    rng = np.random.default_rng(seed)
+    spread = np.concatenate([np.full(TARGET, 0.2), *[_spread() for _ in range(chasers)]])
+    state = replace(empty_state(0, chasers), target_known=True, alive=np.ones(chasers, dtype=bool))
+    places = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])[:chasers]
+    return inject(replace(state, positions_m=places), spread * rng.normal(size=len(spread)))
+
+
+def _spread() -> np.ndarray:
+    return (
+        np.repeat([0.1, 0.05, 0.3, 0.1, 0.05, 0.005, 0.02, 0.01, 0.001, 0.02, 0.01], 3).tolist()
+        + [0.01]
+        + [0.3] * 6
+    )
+
+
+def fly(
+    estimator: JointEstimator, flight: SyntheticFlight, seconds: float, change=lambda i: i
+) -> list[float]:
+    """Fly for a time; return the NEES of all chasers every second of the second half. ``change`` replaces inputs."""
+    nees, ticks = [], round(seconds / PERIOD_S)
+    for k in range(ticks):
+        estimator.update(change(flight.inputs()))
+        if k >= ticks // 2 and k % 15 == 0:
+            nees += [flight.relative_error(estimator, i)[2] for i in range(flight.n)]
+        flight.step()
+    return nees
+
+
+def estimator_for(errors: NavigationErrors, chasers: int) -> JointEstimator:
+    return JointEstimator(parameters(SCENARIO, errors), chasers)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_jacobians_agree_with_finite_differences(seed: int) -> None:
+    state, p = random_state(seed), parameters(SCENARIO, navigation("orbit"), view_ratio=1.0)
+    mounting = mounting_of(p.camera)
+    flight = SyntheticFlight(SCENARIO, p.navigation, 2, seed)
+    odometry, sighting = flight.inputs().odometry[1], flight.inputs().sightings[1].solutions[0]
+    predicted = predict_sighting(state, 1, mounting)
+    sighting = msgspec.structs.replace(
+        sighting, position_m=vector(predicted.position_m), q_wxyz=vector(predicted.q_wxyz)
+    )
+    odometry = msgspec.structs.replace(odometry, q_wxyz=vector(state.attitudes_wxyz[1]))
+    extra = state.extra.copy()
+    extra[:, VIEW.start - 12 : VIEW.stop - 12] = 0.0
+    extra[:, 9:12] = 0.0  # attitude drift: the residual is linear at zero
+    state = replace(state, extra=extra)
+    for z, at in (
+        (
+            linearize_sighting(state, 1, sighting, mounting, p),
+            lambda s: linearize_sighting(s, 1, sighting, mounting, p),
+        ),
+        (linearize_odometry(state, 1, odometry, p), lambda s: linearize_odometry(s, 1, odometry, p)),
+    ):
+        numeric = np.empty((len(z.residual), TARGET + 2 * CHASER))
+        for k in range(numeric.shape[1]):
+            e = np.zeros(numeric.shape[1])
+            e[k] = STEP
+            numeric[:, k] = (at(inject(state, -e)).residual - at(inject(state, e)).residual) / (2 * STEP)
+        np.testing.assert_allclose(z.by_target, numeric[:, :TARGET], atol=2e-5)
+        np.testing.assert_allclose(z.by_chaser, numeric[:, block(1)], atol=2e-5)
+        assert not numeric[:, block(0)].any()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None:
+    p = parameters(SCENARIO, navigation("orbit"))
+    state = replace(random_state(seed), covariance=np.zeros((TARGET + 2 * CHASER,) * 2))
+    impulses = np.random.default_rng(seed).normal(size=(2, 6)) * np.repeat([0.02, 0.002], 3)
+    after = predict(state, round(PERIOD_S * 1e9), impulses, p)
+    noise = after.covariance
+    for k in range(TARGET + 2 * CHASER):
+        e = np.zeros(TARGET + 2 * CHASER)
+        e[k] = STEP
+        moved = predict(inject(state, e), round(PERIOD_S * 1e9), impulses, p)
+        column = difference(after, moved) / STEP
+        unit = np.zeros_like(noise)
+        unit[k, k] = 1.0
+        grown = (
+            predict(replace(state, covariance=unit), round(PERIOD_S * 1e9), impulses, p).covariance - noise
+        )
+        np.testing.assert_allclose(grown, np.outer(column, column), atol=1e-3)
+
+
+def test_gates_are_quantiles_of_chi_square() -> None:
+    assert pytest.approx(chi2.ppf(0.9999, 3), rel=1e-12) == GATE_CHI_SQUARE_3
+    assert pytest.approx(chi2.ppf(0.9999, 6), rel=1e-12) == GATE_CHI_SQUARE
+
+
+@pytest.mark.parametrize(("grade", "chasers"), [("lab", 1), ("lab", 4), ("orbit", 2)])
+def test_relative_poses_are_consistent(grade: str, chasers: int) -> None:
+    """The mean NEES over flights is 6; errors that are constant in a flight make single flights vary."""
+    nees = []
+    for seed in range(6):
+        flight = SyntheticFlight(SCENARIO, navigation(grade), chasers, seed, disturbance=0.005)
+        estimator = estimator_for(flight.errors, chasers)
+        nees.append(np.mean(fly(estimator, flight, 16.0)))
+        assert estimator.reinitialisations == 0
+        assert estimator.gated <= 0.002 * estimator.accepted + 6
+    # Six flights with at least six independent components each: three sigma of the mean.
+    assert 6.0 - 3 * np.sqrt(12 / 6) < np.mean(nees) < 6.0 + 3 * np.sqrt(12 / 6)
+
+
+def test_disturbances_are_estimated() -> None:
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 3, disturbance=0.005)
+    estimator = estimator_for(flight.errors, 2)
+    fly(estimator, flight, 30.0)
+    assert estimator.state is not None
+    for i, chaser in enumerate(flight.chasers):
+        error = estimator.state.disturbance(i) - chaser.disturbance
+        own = estimator.state.covariance[block(i), block(i)]
+        assert np.all(np.abs(error) < 4.0 * np.sqrt(np.diag(own)[12:18]))
+        assert np.linalg.norm(error[:3]) < 0.004
+
+
+def test_late_sightings_give_the_same_state() -> None:
+    """Sightings that arrive up to half a second late, in any order, change nothing in the end."""
+    rng = np.random.default_rng(5)
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 5)
+    prompt, late = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
+    held: list = []
+    for k in range(40):
+        inputs = flight.inputs()
+        prompt.update(inputs)
+        held += [(k + int(rng.integers(0, 8)), s) for s in inputs.sightings]
+        due = [s for at, s in held if at <= k or k == 39]
+        held = [(at, s) for at, s in held if at > k and k < 39]
+        rng.shuffle(due)
+        late.update(replace(inputs, sightings=tuple(due)))
+        flight.step()
+    assert late.late_dropped == 0
+    assert prompt.state is not None
+    assert late.state is not None
+    np.testing.assert_array_equal(prompt.state.covariance, late.state.covariance)
+    np.testing.assert_array_equal(prompt.state.position_m, late.state.position_m)
+    np.testing.assert_array_equal(prompt.state.extra, late.state.extra)
+
+
+def test_odometry_that_lies_is_dropped_and_reported() -> None:
+    """The position of chaser 1 jumps by 50 mm: it is reported within a second, and the relative pose stays good."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
+    estimator = estimator_for(flight.errors, 2)
+    fly(estimator, flight, 10.0)
+    usual_m = flight.relative_error(estimator, 1)[0]
+
+    def lie(inputs: JointInputs) -> JointInputs:
+        o = inputs.odometry[1]
+        moved = msgspec.structs.replace(o, position_m=vector(np.add(o.position_m, [0.05, 0.0, 0.0])))
+        return replace(inputs, odometry={**inputs.odometry, 1: moved})
+
+    estimator.drain_events()
+    fly(estimator, flight, 1.0, lie)
+    texts = [e.text for e in estimator.drain_events()]
+    assert "chaser 1: odometry position contradicts the estimate; not used" in texts
+    fly(estimator, flight, 5.0, lie)
+    assert flight.relative_error(estimator, 1)[0] < 2.0 * usual_m + 1e-3
+    fly(estimator, flight, 2.0)
+    assert "chaser 1: odometry position used again" in [e.text for e in estimator.drain_events()]
+
+
+def test_odometry_noisier_than_stated_is_reported() -> None:
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 1, 2)
+    estimator = estimator_for(flight.errors, 1)
+
+    def overconfident(inputs: JointInputs) -> JointInputs:
+        o = inputs.odometry[0]
+        stated = vector(np.reshape(o.velocity_covariance_m2_s2, (3, 3)) / 9.0)
+        return replace(inputs, odometry={0: msgspec.structs.replace(o, velocity_covariance_m2_s2=stated)})
+
+    fly(estimator, flight, 8.0, overconfident)
+    assert any("velocity is overconfident" in e.text for e in estimator.drain_events())
+    honest = estimator_for(flight.errors, 1)
+    fly(honest, SyntheticFlight(SCENARIO, navigation("lab"), 1, 2), 8.0)
+    assert not any("overconfident" in e.text for e in honest.drain_events())
+
+
+def test_target_without_sightings_stays_predicted() -> None:
+    """After 20 s without sight the relative position is still within a few millimetres, and its covariance says so."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 4, 11)
+    estimator = estimator_for(flight.errors, 4)
+    fly(estimator, flight, 20.0)
+    fly(estimator, flight, 20.0, lambda inputs: replace(inputs, sightings=()))
+    errors = [flight.relative_error(estimator, i) for i in range(4)]
+    assert max(e[0] for e in errors) < 7e-3
+    assert np.mean([e[2] for e in errors]) < chi2.ppf(0.999, 6)
+
+
+def test_relative_pose_has_the_covariance_of_its_errors() -> None:
+    state, rng = random_state(9), np.random.default_rng(9)
+    a = rng.normal(size=(TARGET + 2 * CHASER,) * 2) * 1e-4
+    state = replace(state, covariance=a @ a.T)
+    pose = relative_pose(state, 1)
+    draws = []
+    for _ in range(4000):
+        other = relative_pose(inject(state, a @ rng.normal(size=len(a))), 1)
+        turn = rotations.log(rotations.multiply(rotations.conjugate(pose.q_wxyz), other.q_wxyz))
+        draws.append(np.concatenate([other.position_m - pose.position_m, turn]))
+    sample = np.cov(np.array(draws).T)
+    scale = np.sqrt(np.outer(np.diag(pose.covariance), np.diag(pose.covariance)))
+    np.testing.assert_allclose(sample / scale, pose.covariance / scale, atol=0.12)

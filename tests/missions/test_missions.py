@@ -183,7 +183,7 @@ def test_four_chaser_docking_on_another_simd_level(main_job: Path, tmp_path: Pat
     status, output = run("four-chaser-docking", tmp_path / "run", *changes, timeout_s=1800, env=OTHER_SIMD)
     assert status == 0, output
     # Not zero, or the variables that disable instructions had no effect.
-    assert 0.0 < max(separations_m(main_job, tmp_path / "run").values()) < 1e-3
+    assert 0.0 < max(separations_m(main_job, tmp_path / "run").values()) < 3e-3
 
 
 @pytest.mark.slow

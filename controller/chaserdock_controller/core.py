@@ -8,6 +8,7 @@ from collections.abc import Callable
 from chaserdock_protocol.messages import TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 
+from .estimation.joint import JointEstimator
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
 from .guidance.stage import GuidanceStage
@@ -30,7 +31,7 @@ class ControllerCore:
         self,
         scenario: FlightScenario,
         now_s: Callable[[], float],
-        estimator: Estimator | None = None,
+        estimator: Estimator | JointEstimator | None = None,
         realtime: bool = False,
     ) -> None:
         self.scenario = scenario
@@ -54,6 +55,6 @@ class ControllerCore:
         return target_message(observation, self.estimation.run(observation))
 
     @property
-    def estimator(self) -> Estimator:
+    def estimator(self) -> Estimator | JointEstimator:
         """Return the target estimator."""
         return self.estimation.estimator

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.types import CameraPose, Measurement, PoseHypothesis
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_protocol.process import SINGLE_THREADED
@@ -83,6 +84,7 @@ def test_estimator_of_the_docs_ignores_few_markers(tmp_path: Path, monkeypatch: 
     monkeypatch.syspath_prepend(str(tmp_path))
     scenario = load_scenario(ROOT / "scenarios/single.toml", ("estimator.name=three",))
     estimator = estimator_of(scenario)
+    assert not isinstance(estimator, JointEstimator)
     pose = PoseHypothesis(np.array([1.0, 2.0, 3.0]), np.array([1.0, 0.0, 0.0, 0.0]), 1e-4 * np.eye(6))
     eye = CameraPose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
     assert estimator.update([Measurement(0, 0, (pose,), 2, eye)], 0).status == "none"

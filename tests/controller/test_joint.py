@@ -49,7 +49,7 @@ def random_state(seed: int, chasers: int = 2) -> JointState:
     return inject(replace(state, positions_m=places), spread * rng.normal(size=len(spread)))
 
 
-def _spread() -> np.ndarray:
+def _spread() -> list[float]:
     return (
         np.repeat([0.1, 0.05, 0.3, 0.1, 0.05, 0.005, 0.02, 0.01, 0.001, 0.02, 0.01], 3).tolist()
         + [0.01]

@@ -43,7 +43,8 @@ def test_drift_has_the_stated_sigma_and_correlation_over_the_seeds() -> None:
     for seed in range(400):
         s = sensor(seed, position_drift_m=0.02, position_drift_time_s=10.0)
         a, b = (offsets([s.measure(0, tick, STATE)])[0] for tick in ticks)
-        first.append(a), second.append(b)
+        first.append(a)
+        second.append(b)
     a, b = np.ravel(first), np.ravel(second)
     assert a.std() == pytest.approx(0.02, rel=0.06)  # 1200 samples: 2 % at one sigma
     assert b.std() == pytest.approx(0.02, rel=0.06)

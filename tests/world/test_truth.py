@@ -241,7 +241,7 @@ def wrench_of(actuators: IdealActuators, force: Any, step: int = 10) -> Array:
         effective_time_ns=0,
         source="command",
         force_N=force,
-        torque_N_m=(0.0,) * 3,
+        torque_N_m=(0.0, 0.0, 0.0),
     )
     actuators.command(command, step, 0)
     return actuators.act(step, 1, STEP_S)
@@ -279,7 +279,7 @@ def test_a_clock_that_is_ahead_does_not_act_before_the_command_arrives(offset_s:
     actuators = make_actuators(with_values(clock_offset_s=offset_s), 0)
     command = ActuatorCommand(
         tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command", force_N=(1.0, 0.0, 0.0),
-        torque_N_m=(0.0,) * 3,
+        torque_N_m=(0.0, 0.0, 0.0),
     )  # fmt: skip
     actuators.command(command, 10, 10)
     assert not actuators.act(acts_at - 1, 1, STEP_S).any()
@@ -293,7 +293,7 @@ def test_jitter_keeps_the_order_of_commands() -> None:
     for k in range(60):
         command = ActuatorCommand(
             seq=k, tick=k, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command",
-            force_N=(0.01 * k, 0.0, 0.0), torque_N_m=(0.0,) * 3,
+            force_N=(0.01 * k, 0.0, 0.0), torque_N_m=(0.0, 0.0, 0.0),
         )  # fmt: skip
         actuators.command(command, 10 * k, 0)
         steps.append(actuators._last_step)
@@ -306,8 +306,8 @@ def impulse_of(s: Any, width_ns: int = 50_000_000) -> Array:
     actuators = make_actuators(s, 0)
     pulse = ThrusterPulse(thruster=0, open_ns=100_000_000, close_ns=100_000_000 + width_ns)
     command = ActuatorCommand(
-        tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command", force_N=(0.0,) * 3,
-        torque_N_m=(0.0,) * 3, pulses=(pulse,),
+        tick=0, sim_time_ns=0, chaser=0, effective_time_ns=0, source="command", force_N=(0.0, 0.0, 0.0),
+        torque_N_m=(0.0, 0.0, 0.0), pulses=(pulse,),
     )  # fmt: skip
     actuators.command(command, 0, 0)
     step = 0

@@ -15,6 +15,7 @@ from chaserdock_protocol.scenario.bodies import cuboid_inertia
 
 from chaserdock_controller.interfaces import AppliedImpulse
 
+from .joint import JointEstimator
 from .target_body import TargetBody, attach_bodies
 from .types import Estimator, Shock, TargetState
 
@@ -42,7 +43,7 @@ def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Arra
 class CompositeBody:
     """Chasers whose latch holds the target (``latched``), and the body that they form with it."""
 
-    def __init__(self, scenario: FlightScenario, estimator: Estimator) -> None:
+    def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
         self._scenario = scenario
         self._estimator = estimator
         self._target_alone = target_body(scenario)

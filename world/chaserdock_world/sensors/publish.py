@@ -25,8 +25,9 @@ def odometry_of(
     sensor: OdometrySensor, chaser: int, true_state: BodyState, tick: int, time_ns: int
 ) -> Odometry:
     """Return a chaser's odometry message, as ``sensor`` measures its state."""
+    covariances: dict[str, Any] = sensor.covariances
     measured = _state_fields(sensor.measure(chaser, tick, true_state))
-    return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **measured, **sensor.covariances)
+    return Odometry(tick=tick, sim_time_ns=time_ns, chaser=chaser, **measured, **covariances)
 
 
 def publish_odometry(

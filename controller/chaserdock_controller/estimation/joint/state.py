@@ -13,6 +13,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 TARGET = 12
@@ -59,9 +60,9 @@ class JointState:
     omegas_rad_s: Array
     extra: Array
     covariance: Array
-    alive: Array
-    odometry_ns: Array
-    rejections: Array
+    alive: NDArray[np.bool_]
+    odometry_ns: NDArray[np.int64]
+    rejections: NDArray[np.int64]
     nis: Array
     target_known: bool = False
     updates: int = 0

@@ -17,6 +17,7 @@ import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
+from numpy.typing import NDArray
 
 from .measurements import (
     CameraMounting,
@@ -277,6 +278,7 @@ def _update_chaser(
     rows = np.concatenate([np.arange(r.start, r.stop) for r in used])
     prior = state
     nonlinear = fits.get(SIGHTING_CHANNEL, False) and prior.updates < p.iterated_updates
+    white, correction = np.zeros((0, len(cross))), np.zeros(len(cross))
     for k in range(p.iterations if nonlinear else 1):
         if k:
             z = _linearize(state, i, odometry, solution, mounting, p)
@@ -287,7 +289,7 @@ def _update_chaser(
             e = difference(prior, state)
             residual = residual + z.by_target[rows] @ e[:TARGET] + z.by_chaser[rows] @ e[block(i)]
         solved = np.linalg.solve(factor, np.column_stack([cross[:, rows].T, residual]))
-        white = solved[:, :-1]
+        white = np.asarray(solved[:, :-1], dtype=np.float64)
         correction = white.T @ solved[:, -1]
         state = inject(prior, correction)
     covariance.subtract(white)
@@ -367,7 +369,9 @@ def _channels(has_odometry: bool, has_sighting: bool, p: JointParameters) -> lis
     return channels
 
 
-def _count(rejections: Array, i: int, channel: _Channel, value: float, p: JointParameters) -> bool:
+def _count(
+    rejections: NDArray[np.int64], i: int, channel: _Channel, value: float, p: JointParameters
+) -> bool:
     """Update the count of a channel's rejections; return whether the channel is used."""
     count, limit = int(rejections[i, channel.number]), p.rejections_to_drop
     if not value <= channel.gate:  # rejects NaN as well

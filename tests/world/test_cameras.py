@@ -14,6 +14,7 @@ from chaserdock_world.sensors.errors import OdometrySensor, true_camera
 
 SINGLE = Path(__file__).resolve().parents[2] / "scenarios" / "single.toml"
 BARE = (
+    "navigation.grade='exact'",
     "target.model='servicer'",
     "camera.width_px=640",
     "camera.height_px=480",

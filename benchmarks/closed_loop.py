@@ -9,9 +9,8 @@ Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
 - ``swap-images``: the first ``--images`` of them with rendered images;
 - ``tracking``: the paper's tumble with perfect knowledge, with and without feed-forward, with 5 % actuator gain error;
 - ``tracking-images``: the same with rendered images: servicer, two chasers on the paper's target, stronger actuators;
-- ``table``: every row of the paper's single-chaser table with perfect knowledge.
 
-``--first`` and ``--flights`` choose seeds; ``--quick`` flies two variations, shorter runs, and the table from one start.
+``--first`` and ``--flights`` choose seeds; ``--quick`` flies two variations and shorter runs.
 Distances are true, between centres, at every tick.
 """
 
@@ -20,16 +19,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 
-import numpy as np
-from chaserdock_models.arrays import Array
 from chaserdock_protocol.scenario import Scenario
 from common import Figures, make_parser, run_parts
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
 from chaserdock.evaluation.perception import Perception, RenderedImages, measurement_model
 from chaserdock.evaluation.transfers import avoidance, fly_transfer, load_shipped, swap
-from chaserdock.reproduce.paper import ROWS
-from chaserdock.reproduce.plan import COLUMNS, SCENARIO, STARTS
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
 STEADY_FROM_S = 40.0
@@ -113,38 +108,7 @@ def tracking_with_images(duration_s: float) -> Figures:
     return out
 
 
-def nearest_m(flight: FlightRecord) -> float:
-    """Return chaser 0's minimum distance to the target."""
-    relative: Array = flight.states[:, 0, :3] - flight.target_states[:, :3]
-    return float(np.linalg.norm(relative, axis=1).min())
-
-
-def table(duration_s: float, quick: bool) -> Figures:
-    """Fly every row of the paper's table, from every start and in both columns of ``chaserdock reproduce``."""
-    failed = rows = 0
-    print("  position MSE, orientation MSE, failed solves, minimum distance to the target")
-    for start, rotated in STARTS.items():
-        for column, settings in COLUMNS.items():
-            if quick and (start, column) != ("receding", "paper"):
-                continue
-            for row in ROWS:
-                length = f"duration_s={duration_s}"
-                scenario = load_shipped(SCENARIO, *row.overrides, *settings, *rotated, length)
-                flight = record_flight(scenario)
-                errors = flight.position_error_m[:, 0], flight.orientation_error_rad[:, 0]
-                p, a = (float(np.mean(e**2)) for e in errors)
-                nearest = nearest_m(flight)
-                passed = flight.failed_solves == 0 and nearest >= scenario.limits.min_distance_target_m
-                rows, failed = rows + 1, failed + (not passed)
-                name = f"{start}, {column}, {row.label}"
-                print(
-                    f"  {name:35} {p:.4e} m^2  {a:.3e} rad^2  {flight.failed_solves:3d}  {nearest:.2f} m",
-                    flush=True,
-                )
-    return {"table_rows_flown": rows, "table_rows_failed": failed}
-
-
-PARTS = ("avoidance", "swap", "swap-images", "tracking", "tracking-images", "table")
+PARTS = ("avoidance", "swap", "swap-images", "tracking", "tracking-images")
 
 
 def main() -> None:
@@ -164,7 +128,6 @@ def main() -> None:
         "swap-images": lambda: variations("swap-images", seeds[: options.images], swap, RenderedImages),
         "tracking": lambda: tracking(duration_s),
         "tracking-images": lambda: tracking_with_images(min(duration_s, 80.0)),
-        "table": lambda: table(duration_s, options.quick),
     }
     run_parts(options, parts)
 

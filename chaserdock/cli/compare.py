@@ -69,7 +69,8 @@ def compare(
 
 def reproduce(
     quick: Annotated[
-        bool, typer.Option("--quick", help="shorter runs, one seed: minutes, not hours")
+        bool,
+        typer.Option("--quick", help="shorter runs, few of them with images: tens of minutes, not hours"),
     ] = False,
     out: Annotated[Path, typer.Option(help="folder for runs and page; a second call resumes there")] = Path(
         "runs/reproduce"
@@ -79,7 +80,11 @@ def reproduce(
         bool, typer.Option("--keep-logs", help="keep every mission.mcap (gigabytes)")
     ] = False,
 ) -> None:
-    """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and .html."""
+    """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and .html.
+
+    The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without them the page shows the
+    last recorded flights of that chain, and the status is 1.
+    """
     from chaserdock.reproduce.main import reproduce as fly_all
 
     raise typer.Exit(fly_all(quick, out, jobs, keep_logs))

@@ -40,6 +40,15 @@ _LIBRARY_SUFFIXES = (".so", ".dylib", ".dll")
 _SUFFIX = {"win32": ".pyd"}
 
 
+def missing_part() -> str | None:
+    """Return what this machine lacks to compile the solver, as an error message; None if it is complete."""
+    if importlib.util.find_spec("opengen") is None:
+        return "solver 'open' needs the package opengen: pip install 'chaserdock[open]'"
+    if shutil.which("cargo") is None:
+        return "solver 'open' needs cargo, Rust's build tool, on the PATH: see https://rustup.rs"
+    return None
+
+
 class OpenSolver(SingleShootingSolver):
     """Solve with OpEn for up to ``n_chasers`` chasers, warm-started from the last plans.
 
@@ -48,12 +57,9 @@ class OpenSolver(SingleShootingSolver):
     """
 
     def __init__(self, params: NmpcParameters, n_chasers: int, max_iterations: int | None = None) -> None:
-        if importlib.util.find_spec("opengen") is None:
-            raise ValueError("solver 'open' needs the package opengen: pip install 'chaserdock[open]'")
-        if shutil.which("cargo") is None:
-            raise ValueError(
-                "solver 'open' needs cargo, Rust's build tool, on the PATH: see https://rustup.rs"
-            )
+        missing = missing_part()
+        if missing is not None:
+            raise ValueError(missing)
         inner = MAX_INNER if max_iterations is None else max_iterations
 
         def program(n: int) -> tuple[Nlp, Any]:

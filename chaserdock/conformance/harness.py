@@ -22,6 +22,7 @@ from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node, RawSample
 from chaserdock_protocol.transport import session as presence
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
+from chaserdock_protocol.transport.network import unique_id
 
 from chaserdock.launch.launcher import open_hub
 
@@ -103,7 +104,7 @@ class TestStand:
         self._was_alive = False
         present = {"world", "controller", *(f"chaser/{i}" for i in range(len(ledger.scenario.chasers)))}
         self._partners = presence.required_peers(ledger.process, present) - {ledger.process}
-        self._instances = {name: presence.new_instance() for name in sorted(self._partners)}
+        self._instances = {name: unique_id() for name in sorted(self._partners)}
         self._presence_sent_s = 0.0
         self._period_s = presence.EARLY_PERIOD_S
         node.subscribe_raw("**", self._arrived)

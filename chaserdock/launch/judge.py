@@ -15,7 +15,7 @@ from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.run_name import run_name
 from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.transport import Link, Node
-from chaserdock_protocol.transport.session import join, new_instance, request_scenario
+from chaserdock_protocol.transport.session import join, request_scenario
 
 from chaserdock.exit_codes import STOPPED
 
@@ -40,7 +40,7 @@ def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_
     node = Node("operator", "operator", link)
     try:
         stop = StopSignal(watch_parent=False)
-        mission = join(node, new_instance(), stop, timeout_s)
+        mission = join(node, node.host.unique_id(), stop, timeout_s)
         if mission is None:
             return STOPPED
         folder = out / run_name(mission)

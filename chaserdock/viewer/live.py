@@ -23,7 +23,7 @@ from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, O
 from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.transport import Link, Node, ReceivedMessage
-from chaserdock_protocol.transport.session import new_instance
+from chaserdock_protocol.transport.network import unique_id
 
 from .address import DEFAULT_HOST, url_of
 from .history import History, reply_text
@@ -77,7 +77,7 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
 
 
 # One instance for all join requests: the world treats another instance as a replacement.
-_INSTANCE = new_instance()
+_INSTANCE = unique_id()
 
 
 def _join(node: Node) -> JoinReply | None:

@@ -25,7 +25,7 @@ from chaserdock_protocol.messages import (
     ThrusterReport,
     Tick,
 )
-from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup
+from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.transport import Node, ReceivedMessage
@@ -52,11 +52,12 @@ def main(options: ProcessOptions) -> int:
     def work(node: Node, mission: JoinReply, instance: str, stop: StopSignal) -> int:
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         faults, realtime = process_faults_from_json(mission.faults), mission.mode == "realtime"
-        core = ControllerCore(scenario, time.perf_counter, realtime=realtime)
-        controller = Controller(node, scenario, core, realtime)
-        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep=not realtime)
+        now_s = node.host.now_s
+        core = ControllerCore(scenario, now_s, realtime=realtime)
+        controller = Controller(node, scenario, core, realtime, now_s=now_s)
+        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, not realtime, node.host)
         controller.open(instance)
-        finish_startup()
+        node.host.finish_startup()
         while not (controller.ended or stop()):
             controller.listen()
         controller.farewell()
@@ -192,7 +193,7 @@ class Controller:
     # -- processing ------------------------------------------------------------------------------------------
 
     def _process(self, tick: Tick) -> None:
-        start_s = time.perf_counter()
+        start_s = self.now_s()
         leads = self.standby.leads_at(tick.tick)
         requests = self.requests.take()
         commands = tuple(c for c, _ in requests) if leads else self.standby.take_leader_commands(tick.tick)
@@ -206,7 +207,7 @@ class Controller:
         for i in tick.chasers:
             if i not in out.wrenches:
                 out.wrenches[i] = no_command(i, tick)
-        wall_s = time.perf_counter() - start_s
+        wall_s = self.now_s() - start_s
         self._last_result = (tick, out, wall_s)
         self.done_tick = tick.tick
         if leads:

@@ -13,11 +13,7 @@ which tells the reader not to wait. Real-time readers do not wait, and get none.
 from __future__ import annotations
 
 import math
-import os
 import random
-import signal
-import subprocess
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -33,6 +29,7 @@ from . import codec, topics
 from .codec import Rejected
 from .messages import Message, Odometry, PoseSolution, Sighting, WrenchCommand
 from .topics import Topic
+from .transport.network import Host
 
 _CORRUPTED_BYTES = 4
 
@@ -61,15 +58,14 @@ def sender_of(topic: Topic, place: str | None, receiver: str, message: Any = Non
 
 @dataclass
 class FaultLayer:
-    """Faults of process ``name``. ``kill`` and ``freeze`` (duration in s) carry out faults of these kinds."""
+    """Faults of process ``name``. ``host`` kills and freezes the process."""
 
     faults: tuple[Fault, ...]
     name: str
     timing: Timing
     seed: int
     lockstep: bool
-    kill: Callable[[], None] = field(default_factory=lambda: _kill)
-    freeze: Callable[[float], None] = field(default_factory=lambda: _freeze)
+    host: Host
     count: dict[str, int] = field(default_factory=dict)
     _held: dict[str, list[tuple[int, bool, Any]]] = field(default_factory=dict)
     _first_tick: int | None = None
@@ -120,9 +116,9 @@ class FaultLayer:
             if self._first_tick >= begin:
                 continue
             if fault.kind == "kill":
-                self.kill()
+                self.host.kill()
             else:
-                self.freeze(fault.duration_s or 0.0)
+                self.host.freeze(fault.duration_s or 0.0)
 
     # -- published messages ------------------------------------------------------------------------------
 
@@ -230,9 +226,11 @@ class FaultLayer:
         return damaged if same else None
 
 
-def create_fault_layer(faults: ProcessFaults, name: str, timing: Timing, lockstep: bool) -> FaultLayer | None:
-    """Return the fault layer of process ``name``, or None without faults."""
-    return FaultLayer(faults.faults, name, timing, faults.seed, lockstep) if faults.faults else None
+def create_fault_layer(
+    faults: ProcessFaults, name: str, timing: Timing, lockstep: bool, host: Host
+) -> FaultLayer | None:
+    """Return the fault layer of process ``name``, which runs on ``host``, or None without faults."""
+    return FaultLayer(faults.faults, name, timing, faults.seed, lockstep, host) if faults.faults else None
 
 
 def _rotation(fault: Fault) -> Array:
@@ -273,15 +271,3 @@ def _shift_stamps(message: Message, offset_s: float) -> Message:
         if name in message.__struct_fields__
     }
     return msgspec.structs.replace(message, **shifted)
-
-
-def _kill() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-
-
-def _freeze(seconds: float) -> None:
-    """Stop this process (SIGSTOP) for a wall-clock duration. A detached shell sends SIGCONT."""
-    command = ["/bin/sh", "-c", f'sleep {seconds:.3f}; kill -CONT "$0"', str(os.getpid())]
-    with open(os.devnull, "r+b") as null:
-        subprocess.Popen(command, stdin=null, stdout=null, stderr=null, start_new_session=True)
-    os.kill(os.getpid(), signal.SIGSTOP)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import gc
 import os
 import signal
 import sys
@@ -42,7 +41,7 @@ class ProcessOptions:
 
     ``rejoin_s``: wall-clock time (s) that a lock-step world waits after it lost all processes. ``by_run``: the recorder
     creates one folder per run in ``out``. ``until``: the router ends when this process has joined and left.
-    ``standby``: the controller starts as the standby.
+    ``standby``: the controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM.
     """
 
     link: Link = field(default_factory=Link)
@@ -61,14 +60,19 @@ class ProcessOptions:
     by_run: bool = False
     until: str | None = None
     standby: bool = False
+    signals: bool = True
+
+    def stop_signal(self) -> StopSignal:
+        """Return the signal that stops the process."""
+        return StopSignal(self.watch_parent, self.signals)
 
 
 class StopSignal:
     """Set by SIGINT, SIGTERM and, with ``watch_parent``, the end of standard input (the parent has ended)."""
 
-    def __init__(self, watch_parent: bool) -> None:
+    def __init__(self, watch_parent: bool, signals: bool = True) -> None:
         self._event = threading.Event()
-        if threading.current_thread() is threading.main_thread():
+        if signals and threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGTERM, self._on_signal)
             # The terminal sends Ctrl-C to all processes of `run`; the launcher handles it.
             signal.signal(signal.SIGINT, signal.SIG_IGN if watch_parent else self._on_signal)
@@ -88,12 +92,6 @@ class StopSignal:
 
     def __call__(self) -> bool:
         return self._event.is_set()
-
-
-def finish_startup() -> None:
-    """Exclude the objects created so far from garbage collection, which would otherwise pause the flight for some 10 ms."""
-    gc.collect()
-    gc.freeze()
 
 
 def print_status(process: str, text: str) -> None:

@@ -13,6 +13,7 @@ from .messages import Message
 from .scenario import FlightScenario
 from .topics import Topic
 from .transport import ReceivedMessage, TrafficCounters
+from .transport.network import Machine
 
 Published = tuple[Topic, int | str | None, Message]
 """A published message: topic, place, message (``seq`` not set)."""
@@ -24,6 +25,7 @@ class ReplayNode:
     def __init__(self, name: str) -> None:
         self.name = name
         self.counts = TrafficCounters()
+        self.host = Machine()
         self._pending: deque[ReceivedMessage] = deque()
         self._published: list[Published] = []
 

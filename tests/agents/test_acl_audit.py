@@ -25,7 +25,7 @@ from chaserdock_agents.router.acl_audit import (
 from chaserdock_protocol import codec
 from chaserdock_protocol.messages import Event
 from chaserdock_protocol.transport import Node, RawSample
-from chaserdock_protocol.transport.node import zenoh_config
+from chaserdock_protocol.transport.zenoh_network import zenoh_config
 from harness import chaserdock
 from mission_keys import EVERYONE, NAMESPACE, PATIENCE_S, client, keys_with_owners, make_keys
 

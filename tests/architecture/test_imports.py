@@ -64,7 +64,10 @@ def test_there_are_no_import_cycles() -> None:
 
 @pytest.mark.parametrize(
     ("library", "homes"),
-    [("zenoh", {"chaserdock_protocol.transport.node"}), ("pybullet", {"chaserdock_world.physics.bullet"})],
+    [
+        ("zenoh", {"chaserdock_protocol.transport.zenoh_network"}),
+        ("pybullet", {"chaserdock_world.physics.bullet"}),
+    ],
 )
 def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:
     users = {

@@ -18,7 +18,7 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import Odometry, Sighting, WrenchCommand, encoding_of
 from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.transport import Link
-from chaserdock_protocol.transport.node import zenoh_config
+from chaserdock_protocol.transport.zenoh_network import zenoh_config
 from harness import (
     SHORT,
     ByHand,

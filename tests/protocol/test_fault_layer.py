@@ -17,6 +17,7 @@ from chaserdock_protocol.fault_injection import FaultLayer, LostMessage, sender_
 from chaserdock_protocol.messages import Image, Odometry, Sighting, WrenchCommand
 from chaserdock_protocol.scenario.faults import Fault
 from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport.network import Host, Machine
 from message_samples import BY_TYPE
 
 TIMING = Timing(physics_hz=100, rate_hz=10, image_hz=10, latency_steps=2)
@@ -26,8 +27,23 @@ def fault(**values: Any) -> Fault:
     return Fault.model_validate({"at_s": 1.0, **values})
 
 
-def layer(name: str, *faults: Fault, lockstep: bool = True, seed: int = 0, **options: Any) -> FaultLayer:
-    return FaultLayer(faults, name, TIMING, seed, lockstep, **options)
+def layer(
+    name: str, *faults: Fault, lockstep: bool = True, seed: int = 0, host: Host | None = None
+) -> FaultLayer:
+    return FaultLayer(faults, name, TIMING, seed, lockstep, host or Machine())
+
+
+class RecordingHost(Machine):
+    """Notes what happens to its process."""
+
+    def __init__(self) -> None:
+        self.ends: list[str | float] = []
+
+    def kill(self) -> None:
+        self.ends.append("killed")
+
+    def freeze(self, duration_s: float) -> None:
+        self.ends.append(duration_s)
 
 
 def message(kind: type[msgspec.Struct], tick: int, chaser: int = 0) -> Any:
@@ -217,33 +233,33 @@ def test_flood() -> None:
 
 
 def test_a_process_dies_once_before_anything_of_its_tick() -> None:
-    ends: list[str] = []
-    on = layer("controller", fault(kind="kill", process="controller"), kill=lambda: ends.append("killed"))
+    host = RecordingHost()
+    on = layer("controller", fault(kind="kill", process="controller"), host=host)
     for tick in range(8, 14):
         sent = message(Odometry, tick)
         on.incoming(topics.ODOMETRY, "0", sent, codec.encode(sent))
-        assert ends == (["killed"] if tick >= 10 else [])
+        assert host.ends == (["killed"] if tick >= 10 else [])
 
 
 def test_restarted_process_ignores_a_past_kill() -> None:
-    ends: list[str] = []
-    on = layer("controller", fault(kind="kill", process="controller"), kill=lambda: ends.append("killed"))
+    host = RecordingHost()
+    on = layer("controller", fault(kind="kill", process="controller"), host=host)
     for tick in (10, 11, 12):
         on.apply_process_faults(tick)
-    assert ends == []
+    assert host.ends == []
 
 
 def test_freeze_stops_for_so_long() -> None:
-    stops: list[float] = []
+    host = RecordingHost()
     freezing = fault(kind="freeze", process="recorder", duration_s=1.5)
-    on = layer("recorder", freezing, freeze=stops.append)
+    on = layer("recorder", freezing, host=host)
     for tick in range(5, 30):
         on.apply_process_faults(tick)
-    assert stops == [1.5]
-    others = layer("controller", freezing, freeze=stops.append)
+    assert host.ends == [1.5]
+    others = layer("controller", freezing, host=host)
     for tick in range(5, 30):
         others.apply_process_faults(tick)
-    assert stops == [1.5]
+    assert host.ends == [1.5]
 
 
 def test_begin_and_end_are_reported() -> None:

@@ -13,7 +13,7 @@ import zenoh
 from chaserdock_protocol import topics
 from chaserdock_protocol.transport import access_control as rights
 from chaserdock_protocol.transport.access_control import Identity, access_control
-from chaserdock_protocol.transport.node import zenoh_config
+from chaserdock_protocol.transport.zenoh_network import zenoh_config
 from mission_keys import (
     CHASERS,
     EVERYONE,

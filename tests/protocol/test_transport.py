@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 from chaserdock_protocol import topics
 from chaserdock_protocol.transport import Link, Node, TransportError
-from chaserdock_protocol.transport.node import zenoh_config
+from chaserdock_protocol.transport.zenoh_network import zenoh_config
 
 
 def test_defaults_are_safe() -> None:
@@ -51,8 +52,9 @@ def test_bad_endpoint_raises_an_error() -> None:
 
 
 def congestion_of(node: Node, topic: topics.Topic, place: int | str | None = None) -> str:
-    key = node.advertise(topic, place)
-    return str(node._publishers[key].congestion_control).rpartition(".")[2]
+    node.advertise(topic, place)
+    connection: Any = node._connection
+    return str(connection._declared[-1].congestion_control).rpartition(".")[2]
 
 
 def test_slow_readers_block_only_in_lockstep() -> None:

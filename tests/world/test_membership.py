@@ -222,5 +222,5 @@ def test_heartbeat_ends_with_its_node() -> None:
     heartbeat = Heartbeat(node, "first")
     time.sleep(0.1)
     node.close()
-    assert not [t for t in threading.enumerate() if t.name == "presence"]
+    assert not [t for t in threading.enumerate() if t.name == "repeat"]
     heartbeat.stop()  # twice does no harm

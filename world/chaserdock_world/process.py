@@ -7,9 +7,6 @@ Real time: the wall clock ends a tick.
 
 from __future__ import annotations
 
-import time
-import uuid
-
 import cv2
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
@@ -22,11 +19,11 @@ from chaserdock_protocol.messages import (
     ScenarioRequest,
     ThrusterFaultCommand,
 )
-from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup, print_status
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario_json, load_scenario
 from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_protocol.transport import Node, TransportError
-from chaserdock_protocol.transport.session import Heartbeat, new_instance
+from chaserdock_protocol.transport.session import Heartbeat
 
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.operator_faults import ThrusterFaultHandler
@@ -34,7 +31,8 @@ from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.lockstep.membership import Membership
 from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
-from chaserdock_world.rendering.cameras import Cameras, States
+from chaserdock_world.rendering.cameras import States
+from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import drawn_truth, publish_docking, publish_odometry, publish_truth
 
@@ -50,7 +48,7 @@ def main(options: ProcessOptions) -> int:
         scenario = load_world_scenario(options)
         node = Node("world", "world", options.link)
         refuse_second_world(node)
-        return World(scenario, options, node).run(StopSignal(options.watch_parent))
+        return World(scenario, options, node).run(options.stop_signal())
     except ChaserdockError as error:
         print_status("world", str(error))
         return 2
@@ -69,9 +67,8 @@ def load_world_scenario(options: ProcessOptions) -> Scenario:
 
 def refuse_second_world(node: Node) -> None:
     """Raise TransportError if a world is already running in this namespace."""
-    reply = node.query(
-        topics.JOIN_KEY, JoinRequest(process="world", instance=new_instance()), JoinReply, timeout_s=0.5
-    )
+    request = JoinRequest(process="world", instance=node.host.unique_id())
+    reply = node.query(topics.JOIN_KEY, request, JoinReply, timeout_s=0.5)
     if reply is not None:
         raise TransportError(reply.reason)
 
@@ -82,14 +79,14 @@ class World:
     def __init__(self, scenario: Scenario, options: ProcessOptions, node: Node) -> None:
         self._scenario, self._options, self._node = scenario, options, node
         self._timing, self._realtime = scenario.timing, options.mode == "realtime"
-        self._cameras, self._physics = Cameras(scenario), Physics(scenario)
+        self._cameras, self._physics = make_cameras(scenario), Physics(scenario)
         self._odometry = OdometrySensor(scenario)
         self._actuators = {f"chaser/{i}": make_actuators(scenario, i) for i in range(len(scenario.chasers))}
         self._faults = ThrusterFaultHandler(scenario, self._actuators)
         self._contacts: set[tuple[str, str]] = set()
         self._started_s = 0.0
         own = faults_of(scenario, "world")
-        faults = create_fault_layer(own, "world", scenario.timing, lockstep=not self._realtime)
+        faults = create_fault_layer(own, "world", scenario.timing, not self._realtime, node.host)
         node.message_filter = faults
         self._barrier = self._open_mission()
         self._barrier.faults = faults
@@ -99,11 +96,12 @@ class World:
         node, scenario, options = self._node, self._scenario, self._options
         membership = Membership(
             chasers=len(scenario.chasers),
-            run_id=uuid.uuid4().hex[:12],
+            run_id=node.host.unique_id(),
             mode=options.mode,
             scenario_json=flight_scenario_json(scenario),
             faults_of=lambda process: faults_of(scenario, process).model_dump_json(),
-            instance=new_instance(),
+            instance=node.host.unique_id(),
+            now_s=node.host.now_s,
         )
         node.blocking = not self._realtime
         node.subscribe(topics.ACTUATORS)
@@ -141,9 +139,9 @@ class World:
         """Wait for the processes, simulate all ticks and end the mission; return the exit status."""
         if not self._wait_for_processes(stop):
             return self._end_mission(0, "stopped before the first tick", complete=False)
-        finish_startup()
+        self._node.host.finish_startup()
         self._node.publish(topics.TRUTH_DRAWN, drawn_truth(self._scenario, self._odometry))
-        self._started_s, tick = time.monotonic(), 0
+        self._started_s, tick = self._node.host.now_s(), 0
         while True:
             states = self._publish_state(tick)
             if tick == self._scenario.ticks:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -28,7 +27,7 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.process import ProcessOptions, StopSignal, finish_startup
+from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.topics import Topic
@@ -53,10 +52,10 @@ def main(options: ProcessOptions) -> int:
         scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
         faults = process_faults_from_json(mission.faults)
         lockstep = mission.mode == "lockstep"
-        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep)
+        node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep, node.host)
         chaser = Chaser(node, scenario, number, reports=FailureReports(faults.reported_failures))
         chaser.open(instance, realtime=not lockstep)
-        finish_startup()
+        node.host.finish_startup()
         while not (chaser.ended or stop()):
             chaser.listen()
         chaser.publish_farewell()
@@ -218,9 +217,9 @@ class Chaser:
             self.node.counts.stale += 1
             return
         self._processed_images.append(image.tick)
-        started_s = time.perf_counter()
+        started_s = self.node.host.now_s()
         sighting = look(self._perception, image, prediction_from(self.sighting))
-        elapsed_s = time.perf_counter() - started_s
+        elapsed_s = self.node.host.now_s() - started_s
         if sighting.status == "bad_image" and (self.sighting is None or self.sighting.status != "bad_image"):
             self._publish_warning("bad image", sighting.detail, image.tick, image.sim_time_ns)
         self.sighting = sighting

@@ -8,9 +8,7 @@ end it waits until it has received as many messages as the other processes repor
 from __future__ import annotations
 
 import ctypes
-import os
 import queue
-import time
 from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -41,7 +39,6 @@ from .rotation import Recording
 
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
-_WRITING_NICE = 19
 # glibc's malloc.h
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
 _MAPPED_FROM_BYTES = 1 << 18
@@ -72,17 +69,19 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
         return 1
     scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
     out = options.out / run_name(mission) if options.by_run else options.out
-    recording = Recording(out, mission, full, options.rotation, scenario if options.viewer_layer else None)
+    recording = Recording(
+        out, mission, full, options.rotation, scenario if options.viewer_layer else None, node.host.now_s
+    )
     try:
         injected = process_faults_from_json(mission.faults)
         lockstep = mission.mode == "lockstep"
-        faults = create_fault_layer(injected, node.name, scenario.timing, lockstep)
+        faults = create_fault_layer(injected, node.name, scenario.timing, lockstep, node.host)
         node.message_filter = faults
         recorder = Recorder(node, recording, faults)
         recorder.open(instance)
         if mission.mode == "realtime":
             # Flight processes have priority; received messages wait in the queue.
-            os.nice(_WRITING_NICE)
+            node.host.lower_priority()
         while not recorder.finished() and not (stop() and recorder.idle()):
             recorder.write_next(0.1)
     finally:
@@ -108,13 +107,15 @@ class Recorder:
     recording: Recording
     faults: FaultLayer | None
     ended_s: float | None = None
-    _queue: BoundedQueue[RawSample] = field(default_factory=BoundedQueue)
     _received: dict[str, int] = field(default_factory=dict)
     _published: dict[str, dict[str, int]] = field(default_factory=dict)
     _controllers: set[str] = field(default_factory=lambda: {"controller"})
     _expected: set[str] = field(default_factory=set)
     _latest: dict[str, int] = field(default_factory=dict)
     _acked: int = -1
+
+    def __post_init__(self) -> None:
+        self._queue: BoundedQueue[RawSample] = self.node.host.new_queue()
 
     def open(self, instance: str) -> None:
         """Subscribe to all topics, then start the heartbeat."""
@@ -162,7 +163,7 @@ class Recorder:
             case Farewell(process=process, published=published):
                 self._published[process] = published
             case MissionEnd():
-                self.ended_s = time.monotonic()
+                self.ended_s = self.node.host.now_s()
 
     def _acknowledge(self) -> None:
         keys = self._expected | {topics.TICK.key_of()}
@@ -200,7 +201,7 @@ class Recorder:
             *(k.rpartition("/")[0] for k in self._expected if k.startswith("chaser")),
         }
         complete = publishers <= self._published.keys() and not self.missing() and self.idle()
-        return complete or time.monotonic() - self.ended_s > _DRAIN_S
+        return complete or self.node.host.now_s() - self.ended_s > _DRAIN_S
 
 
 _DECODED = SHOWN | {

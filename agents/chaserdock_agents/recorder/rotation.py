@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +31,11 @@ class Recording:
         full_scenario_json: str,
         rotation: Rotation,
         scenario: FlightScenario | None,
+        now_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder, self._mission, self._rotation, self._scenario = folder, mission, rotation, scenario
         self._full_scenario_json = full_scenario_json
-        self._part = 0
+        self._now_s, self._part = now_s, 0
         self._from_ns: int | None = None
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -52,7 +55,7 @@ class Recording:
         name = LOG_NAME
         if self._rotation.wanted:
             name, run["part"] = part_name(self._part), str(self._part)
-        self._writer = LogWriter(self._folder / name)
+        self._writer = LogWriter(self._folder / name, self._now_s)
         self._writer.describe(self._full_scenario_json, run)
         self._viewer = ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
         self._from_ns = None

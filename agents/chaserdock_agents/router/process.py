@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Event
-from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
+from chaserdock_protocol.process import ProcessOptions, print_status
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.access_control import access_control
 
@@ -38,7 +38,7 @@ def main(options: ProcessOptions) -> int:
     except ChaserdockError as error:
         print_status(NAME, str(error))
         return 2
-    stop, watched = StopSignal(options.watch_parent), _WatchedProcess(options.until or "")
+    stop, watched = options.stop_signal(), _WatchedProcess(options.until or "")
     auditor = _AuditLogger(node, log) if log is not None else None
     try:
         if options.until is not None:

@@ -14,6 +14,7 @@ from .faults import Fault
 from .fields import Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
 from .schema import FlightChaser
+from .simulation import SimulationSection
 from .thrusters import ThrusterFailure
 from .truth import TruthSection
 
@@ -91,6 +92,7 @@ class Scenario(FlightScenario):
     fault: tuple[Fault, ...] = Field(default=(), max_length=100)
     success: Success = Success()
     truth: TruthSection = TruthSection()
+    simulation: SimulationSection = SimulationSection()
 
     @model_validator(mode="after")
     def _check_consistent(self) -> Scenario:

@@ -25,7 +25,7 @@ from .fields import (
     Vector,
 )
 
-PERCEPTIONS = ("default", "paper")
+PERCEPTIONS = ("default", "paper", "statistical")
 ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""
@@ -75,7 +75,9 @@ class PerceptionSection(Section):
     """Pose estimation from one image."""
 
     name: Name = Field(
-        default="default", description="`default`, `paper` (the paper's method), or an installed plugin."
+        default="default",
+        description="`default`, `paper` (the paper's method), `statistical` (no images: measurements are drawn around the true "
+        "pose, [simulation.md](simulation.md)), or an installed plugin.",
     )
 
 

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transport over Eclipse Zenoh: nodes, their configuration and access control."""
 
-from .config import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, RawSample, ReceivedMessage, Tls
-from .node import MessageFilter, Node, TrafficCounters, TransportError
+from .config import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, ReceivedMessage, Tls, TransportError
+from .network import RawSample
+from .node import MessageFilter, Node, TrafficCounters
 
 __all__ = [
     "DEFAULT_ENDPOINT",

@@ -10,7 +10,10 @@ from typing import Any, Literal
 
 from msgspec import Struct
 
+from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.topics import Topic
+
+from .network import Network
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 DEFAULT_NAMESPACE = "chaserdock"
@@ -31,6 +34,10 @@ _RUST_SOURCE = re.compile(r" at \S+\.rs:\d+\.?")
 """Source locations that Zenoh appends to its error messages."""
 
 
+class TransportError(ChaserdockError):
+    """The network cannot be used as configured. The text is one line."""
+
+
 @dataclass(frozen=True)
 class Tls:
     """PEM files for mutual TLS: certificate authority of the mission, certificate and private key of this process."""
@@ -49,7 +56,8 @@ class Tls:
 class Link:
     """Endpoints and options of a Zenoh session. ``lease_ms``: time after which a silent peer counts as lost.
 
-    ``access_control``: rules that a router enforces (see ``access_control.py``).
+    ``access_control``: rules that a router enforces (see ``access_control.py``). ``network``: carries the messages in place
+    of Zenoh; the other fields have no effect then.
     """
 
     namespace: str = DEFAULT_NAMESPACE
@@ -60,6 +68,7 @@ class Link:
     lease_ms: int = 60_000
     tls: Tls | None = None
     access_control: dict[str, Any] | None = None
+    network: Network | None = None
 
 
 class ReceivedMessage(Struct, frozen=True):
@@ -68,15 +77,6 @@ class ReceivedMessage(Struct, frozen=True):
     topic: Topic
     place: str | None
     message: Any
-    sent_ns: int
-
-
-class RawSample(Struct, frozen=True):
-    """A sample from the wire, not decoded."""
-
-    key: str
-    encoding: str
-    payload: bytes
     sent_ns: int
 
 

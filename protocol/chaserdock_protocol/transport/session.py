@@ -11,8 +11,6 @@ all pairs that exchange messages have received each other's presence.
 from __future__ import annotations
 
 import threading
-import time
-import uuid
 from collections.abc import Callable
 
 from chaserdock_protocol import topics
@@ -40,11 +38,6 @@ class JoinRefused(ChaserdockError):
     """The world rejects this process. The text gives the reason."""
 
 
-def new_instance() -> str:
-    """Return a unique id for one start of one process."""
-    return uuid.uuid4().hex[:12]
-
-
 def join(
     node: Node, instance: str, stopped: Callable[[], bool], patience_s: float | None = None
 ) -> JoinReply | None:
@@ -52,18 +45,18 @@ def join(
 
     Raises JoinRefused if the world rejects the process, or after ``patience_s`` of wall time without a reply.
     """
-    begun = time.monotonic()
+    begun = node.host.now_s()
     while not stopped():
         reply = node.query(topics.JOIN_KEY, JoinRequest(process=node.name, instance=instance), JoinReply, 0.5)
         if reply is not None:
             if not reply.accepted:
                 raise JoinRefused(reply.reason)
             return reply
-        if patience_s is not None and time.monotonic() - begun > patience_s:
+        if patience_s is not None and node.host.now_s() - begun > patience_s:
             raise JoinRefused(
                 f"no world answered within {patience_s:.0f} s; is it running, and on the same namespace?"
             )
-        time.sleep(0.02)
+        node.host.sleep(0.02)
     return None
 
 
@@ -74,16 +67,16 @@ def request_scenario(
 
     Raises JoinRefused when the world gives none within ``patience_s`` of wall time.
     """
-    begun = time.monotonic()
+    begun = node.host.now_s()
     while not stopped():
         reply = node.query(topics.SCENARIO_KEY, ScenarioRequest(process=node.name), ScenarioReply, 0.5)
         if reply is not None and reply.run_id == mission.run_id:
             return reply.scenario_json
-        if time.monotonic() - begun > patience_s:
+        if node.host.now_s() - begun > patience_s:
             raise JoinRefused(
                 f"the world gave no scenario on {topics.SCENARIO_KEY} within {patience_s:.0f} s; may {node.name} read it?"
             )
-        time.sleep(0.02)
+        node.host.sleep(0.02)
     return None
 
 
@@ -98,7 +91,7 @@ def run_member(
     node: Node | None = None
     try:
         node = Node(name, role, options.link)
-        stop, instance = StopSignal(options.watch_parent), new_instance()
+        stop, instance = options.stop_signal(), node.host.unique_id()
         mission = join(node, instance, stop, options.patience_s)
         if mission is None:
             return 1
@@ -121,7 +114,7 @@ def required_peers(process: str, present: set[str]) -> set[str]:
 
 
 class Heartbeat:
-    """Publishes this process' presence at intervals from a daemon thread, and collects that of the others.
+    """Publishes this process' presence at intervals in the background, and collects that of the others.
 
     Construct it after all other subscriptions of the node.
     """
@@ -131,13 +124,12 @@ class Heartbeat:
         self._instance = instance
         self._heard: dict[str, str] = {}
         self._lock = threading.Lock()
-        self._stop = threading.Event()
         self.in_flight = threading.Event()
         """Set at the first tick: presence is then published once a second only."""
         node.advertise(topics.PRESENCE, node.name)
         node.subscribe(topics.PRESENCE)
-        self._thread = threading.Thread(target=self._run, name="presence", daemon=True)
-        self._thread.start()
+        self.stop = node.host.repeat(self._publish)
+        """Stops publishing, and waits for a publication that has begun."""
         # A thread inside Zenoh while the interpreter shuts down crashes the process.
         node.on_close(self.stop)
 
@@ -156,16 +148,11 @@ class Heartbeat:
         with self._lock:
             self._heard.pop(process, None)
 
-    def _run(self) -> None:
-        while not self._stop.is_set():
-            message = Presence(process=self._node.name, instance=self._instance, heard=self.heard())
-            self._node.publish(topics.PRESENCE, message, self._node.name)
-            self._stop.wait(STEADY_PERIOD_S if self.in_flight.is_set() else EARLY_PERIOD_S)
-
-    def stop(self) -> None:
-        """Stop publishing and join the thread, which may take as long as a blocked publication."""
-        self._stop.set()
-        self._thread.join()
+    def _publish(self) -> float:
+        """Publish the presence; return after how many seconds to publish the next."""
+        message = Presence(process=self._node.name, instance=self._instance, heard=self.heard())
+        self._node.publish(topics.PRESENCE, message, self._node.name)
+        return STEADY_PERIOD_S if self.in_flight.is_set() else EARLY_PERIOD_S
 
     def farewell(self, tick: int, time_ns: int) -> None:
         """Stop the heartbeat and publish this process' last messages: health, and the message count of each key."""

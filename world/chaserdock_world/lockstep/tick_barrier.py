@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 
 from chaserdock_models.clock import Timing
@@ -123,7 +122,7 @@ class TickBarrier:
         All processes are lost at once when the router restarts or the world is cut off. In lock-step this waits, with
         simulated time at rest, until all are back or the time is over; in real time it does not wait.
         """
-        now_s = time.monotonic()
+        now_s = self._node.host.now_s()
         if self.chasers or rejoin_s <= 0.0:
             self._no_chaser_since_s = None
             return not self.chasers
@@ -134,7 +133,7 @@ class TickBarrier:
             return now_s - self._no_chaser_since_s > rejoin_s
         self._recorder_expected = self._recorder_configured
         self.wait_until(
-            lambda: not self.missing_processes() or time.monotonic() - now_s > rejoin_s,
+            lambda: not self.missing_processes() or self._node.host.now_s() - now_s > rejoin_s,
             stopped,
             lambda: ", ".join(self.missing_processes()),
         )
@@ -163,19 +162,19 @@ class TickBarrier:
         self, done: Callable[[], bool], stopped: Callable[[], bool], waiting_for: Callable[[], str]
     ) -> bool:
         """Process messages until ``done``; return False if ``stopped`` first. Prints at intervals what it waits for."""
-        printed_s = time.monotonic()
+        printed_s = self._node.host.now_s()
         while not done():
             if stopped():
                 return False
             self.process_message(_POLL_S)
-            if time.monotonic() - printed_s > _STATUS_INTERVAL_S:
-                printed_s = time.monotonic()
+            if self._node.host.now_s() - printed_s > _STATUS_INTERVAL_S:
+                printed_s = self._node.host.now_s()
                 print_status("world", f"waiting for {waiting_for()}")
         return True
 
     def process_until(self, wall_s: float) -> None:
         """Process messages until a time of the monotonic wall clock."""
-        while (left := wall_s - time.monotonic()) > 0:
+        while (left := wall_s - self._node.host.now_s()) > 0:
             self.process_message(min(left, _POLL_S))
 
     def process_message(self, timeout_s: float) -> None:
@@ -240,7 +239,7 @@ class TickBarrier:
     def _now_s(self) -> float:
         """Return the time that leases are measured in."""
         if self._membership.realtime:
-            return time.monotonic()
+            return self._node.host.now_s()
         return self._timing.tick_time_ns(max(self._tick, 0)) / 1e9
 
     def _update_leader(self) -> bool:

@@ -11,6 +11,7 @@ from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
 from numpy.typing import ArrayLike, NDArray
 
 from .pipeline import Method, Perception, PerceptionResult, TargetPose
+from .statistical import StatisticalPerception
 
 
 class PerceptionMethod(Protocol):
@@ -28,6 +29,8 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
     match scenario.perception.name:
         case "default" | "paper" as method:
             return Perception(camera, target, method)
+        case "statistical":
+            return StatisticalPerception(camera, target)
         case name:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 

@@ -1,0 +1,2 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Deterministic simulation of whole missions: all processes in one, on a simulated network, in virtual time."""

@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fly one scenario in this process: all processes of the mission, unchanged, on a simulated network."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import io
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from chaserdock_agents.chaser import process as chaser
+from chaserdock_agents.recorder import process as recorder
+from chaserdock_controller import process as controller
+from chaserdock_protocol.process import ProcessOptions
+from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.transport import Link, RawSample
+from chaserdock_world import process as world
+
+from .network import SimulatedNetwork, Traffic
+from .scheduler import Scheduler, Task
+
+Tap = Callable[[str, RawSample], None]
+
+_START_S, _END_S = 30.0, 60.0
+"""Longest virtual time from the start of the processes to the first tick, and from the mission's end to theirs (s)."""
+
+
+@dataclass(frozen=True)
+class Flight:
+    """A simulated flight. ``statuses``: exit status by process; None of one that was killed.
+
+    ``crashes``: traceback by process. ``stalled``: processes that had not ended when the time was over. ``output``: what the
+    processes printed. ``time_s``: virtual time at the end.
+    """
+
+    folder: Path
+    statuses: dict[str, int | None]
+    crashes: dict[str, str]
+    stalled: tuple[str, ...]
+    output: str
+    time_s: float
+    traffic: Traffic = field(repr=False)
+
+
+def simulate(path: Path, folder: Path, overrides: tuple[str, ...] = (), tap: Tap | None = None) -> Flight:
+    """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes to ``folder``.
+
+    ``tap`` sees every message when it is published: the sender's name, the sample. Raises ScenarioError.
+    """
+    scenario = load_scenario(path, overrides)
+    scheduler = Scheduler(scenario.seed)
+    conditions = scenario.simulation
+    lockstep = conditions.mode == "lockstep"
+    network = SimulatedNetwork(
+        scheduler, conditions, scenario.seed, lockstep, tap or (lambda sender, raw: None)
+    )
+    options = ProcessOptions(
+        link=Link(network=network),
+        scenario=path,
+        overrides=overrides,
+        mode=conditions.mode,
+        out=folder,
+        viewer_layer=False,
+        signals=False,
+    )
+    printed = io.StringIO()
+    collecting = gc.isenabled()
+    gc.disable()
+    try:
+        with contextlib.redirect_stderr(printed):
+            tasks = _spawn(scheduler, scenario, options)
+            limit_s = _START_S + 3.0 * scenario.duration_s + _END_S
+            scheduler.run(lambda: all(t.done for t in tasks), limit_s)
+            stalled = tuple(t.name for t in tasks if not t.done)
+            scheduler.end()
+    finally:
+        if collecting:
+            gc.enable()
+    return Flight(
+        folder=folder,
+        statuses={t.name: None if t.killed else t.result for t in tasks if t.name not in stalled},
+        crashes={t.name: t.error for t in tasks if t.error},
+        stalled=stalled,
+        output=printed.getvalue(),
+        time_s=scheduler.now_s,
+        traffic=network.traffic,
+    )
+
+
+def _spawn(scheduler: Scheduler, scenario: Scenario, options: ProcessOptions) -> list[Task]:
+    """Start world, controllers, chasers and recorder."""
+
+    def start(name: str, main: Callable[[ProcessOptions], int], **changes: object) -> Task:
+        return scheduler.spawn(name, lambda: main(replace(options, **changes)))
+
+    tasks = [start("world", world.main), start("controller", controller.main)]
+    if scenario.controller.standby:
+        tasks.append(start("standby", controller.main, standby=True))
+    tasks += [start(f"chaser/{i}", chaser.main, chaser=i) for i in range(len(scenario.chasers))]
+    return [*tasks, start("recorder", recorder.main)]

@@ -1,0 +1,483 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simulated network: carries the messages of all nodes in virtual time, with the faults of ``Conditions``.
+
+It behaves as Zenoh over TCP links: messages of one priority arrive in order, declarations and messages travel the same
+links, a link that is cut or congested holds back what must not be lost and drops the rest. Deliveries run within the
+scheduler, so that publishing never waits.
+"""
+
+from __future__ import annotations
+
+import random
+import re
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.scenario.simulation import Partition, SimulationSection
+from chaserdock_protocol.transport import RawSample
+from chaserdock_protocol.transport.bounded_queue import BoundedQueue
+from chaserdock_protocol.transport.network import Connection, Host, Query, Reply, Undo
+
+from .scheduler import NEVER, Due, Killed, Scheduler, VirtualQueue
+
+LINK_BYTES = 1 << 20
+"""A link drops droppable messages while so many bytes are on it, as Zenoh with the options of ``transport.config`` does."""
+LEASE_S = 2.0
+"""Time after which a silent process counts as lost in real time, as under ``chaserdock run``."""
+_RETRY_S = 0.2
+"""Time after which a lost message that must not be lost is sent again."""
+_EPOCH_NS = 1_800_000_000 * 10**9
+"""Wall-clock time at the begin of a simulation."""
+
+
+@lru_cache(maxsize=4096)
+def matches(expression: str, key: str) -> bool:
+    """Return whether a key expression includes a key: ``*`` stands for one chunk, ``**`` for any number."""
+    pattern = re.escape(expression).replace(r"\*\*/", "(.*/)?").replace(r"\*\*", ".*")
+    return re.fullmatch(pattern.replace(r"\*", "[^/]*"), key) is not None
+
+
+@dataclass
+class Traffic:
+    """What the network has carried and lost."""
+
+    sent: int = 0
+    lost: int = 0
+    most_bytes: int = 0
+    queues: dict[str, VirtualQueue] = field(default_factory=dict)
+
+
+@dataclass
+class _LinkState:
+    """One direction between two processes: bytes on the way, and the last arrival by priority."""
+
+    bytes: int = 0
+    last: dict[str, Due] = field(default_factory=dict)
+
+
+@dataclass
+class _Subscription:
+    owner: SimulatedConnection
+    expression: str
+    arrived: Callable[[RawSample], None]
+    known_to: set[str] = field(default_factory=set)
+
+
+class SimulatedNetwork:
+    """The ``Network`` of one simulated mission. ``tap`` sees every message when it is published: sender, sample.
+
+    ``lockstep``: nothing is lost, duplicated or reordered on one link, as TCP guarantees; conditions only delay.
+    """
+
+    def __init__(
+        self,
+        scheduler: Scheduler,
+        conditions: SimulationSection,
+        seed: int,
+        lockstep: bool,
+        tap: Callable[[str, RawSample], None] = lambda sender, raw: None,
+    ) -> None:
+        self.scheduler, self.conditions, self.lockstep, self.tap = scheduler, conditions, lockstep, tap
+        self.traffic = Traffic()
+        self.first_tick_s: float | None = None
+        self._seed = seed
+        self._random = random.Random(f"network {seed}")
+        self._connections: dict[str, SimulatedConnection] = {}
+        self._subscriptions: list[_Subscription] = []
+        self._routes: dict[str, list[_Subscription]] = {}
+        self._links: dict[tuple[str, str], _LinkState] = {}
+
+    def open(self, name: str) -> tuple[Connection, Host]:
+        """Connect a process. A process that is started again replaces itself."""
+        host = SimulatedHost(name, self)
+        self._connections[name] = SimulatedConnection(self, name, host)
+        for subscription in self._subscriptions:
+            self._declare(subscription, name)
+        return self._connections[name], host
+
+    @property
+    def mission_s(self) -> float:
+        """Time since the first tick (s), which ``Conditions`` refer to; negative before."""
+        return -1.0 if self.first_tick_s is None else self.scheduler.now_s - self.first_tick_s
+
+    def seeded(self, *parts: object) -> random.Random:
+        """Return a random stream of this network's seed."""
+        return random.Random(f"{self._seed} {parts}")
+
+    # -- messages ------------------------------------------------------------------------------------------------
+
+    def publish(self, sender: SimulatedConnection, raw: RawSample, qos: str, blocking: bool) -> None:
+        """Send a sample to all who have subscribed to its key, as far as the sender knows."""
+        if sender.closed:
+            return
+        if self.first_tick_s is None and raw.key == topics.TICK.key:
+            self.first_tick_s = self.scheduler.now_s
+            self._schedule_partitions()
+        self.traffic.sent += 1
+        self.tap(sender.name, raw)
+        for subscription in self._route(raw.key):
+            if subscription.owner is sender:
+                subscription.arrived(raw)
+            elif sender.name in subscription.known_to:
+                self._send(sender, subscription, raw, qos, blocking)
+
+    def _route(self, key: str) -> list[_Subscription]:
+        if key not in self._routes:
+            self._routes[key] = [s for s in self._subscriptions if matches(s.expression, key)]
+        return self._routes[key]
+
+    def _send(
+        self, sender: SimulatedConnection, to: _Subscription, raw: RawSample, qos: str, blocking: bool
+    ) -> None:
+        link, size = self._link(sender.name, to.owner.name), len(raw.payload)
+        droppable = not blocking and not self.lockstep
+        copies, late_s = self._draw_faults(link, sender.name, to.owner.name, size, droppable)
+        for _ in range(copies):
+            link.bytes += size
+            self.traffic.most_bytes = max(self.traffic.most_bytes, link.bytes)
+
+            def deliver() -> None:
+                link.bytes -= size
+                if not to.owner.closed:
+                    to.arrived(raw)
+
+            self.deliver(sender.name, to.owner.name, deliver, qos, late_s)
+
+    def _draw_faults(
+        self, link: _LinkState, sender: str, receiver: str, size: int, droppable: bool
+    ) -> tuple[int, float]:
+        """Return how many copies of a message arrive, and the additional delay (s)."""
+        c, late_s = self.conditions, 0.0
+        if droppable and (link.bytes + size > LINK_BYTES or self._cut_until_s(sender, receiver) > 0.0):
+            self.traffic.lost += 1
+            return 0, 0.0
+        if self.lockstep or self.mission_s < 0.0:
+            return 1, 0.0
+        if c.loss and self._random.random() < c.loss:
+            self.traffic.lost += droppable
+            return (0, 0.0) if droppable else (1, _RETRY_S)
+        if c.reorder and droppable and self._random.random() < c.reorder:
+            late_s = -1.0
+        copies = 2 if c.duplicate and droppable and self._random.random() < c.duplicate else 1
+        return copies, late_s
+
+    def deliver(
+        self, sender: str, receiver: str, call: Callable[[], None], qos: str = "control", late_s: float = 0.0
+    ) -> float:
+        """Call ``call`` when a message arrives that is sent now, and return that time (s).
+
+        It arrives after all earlier ones of its priority, unless ``late_s`` < 0, and after all declarations.
+        """
+        c, link = self.conditions, self._link(sender, receiver)
+        delay_s = c.latency_s + max(0.0, late_s)
+        if c.jitter_s:
+            delay_s += self._random.expovariate(1.0 / c.jitter_s)
+        if late_s < 0.0:
+            delay_s += 4.0 * (c.latency_s + c.jitter_s)
+        due_s = max(self.scheduler.now_s + delay_s, self._cut_until_s(sender, receiver))
+        if late_s < 0.0:
+            return self.scheduler.call_at(due_s, call)[0]
+        after = max(link.last.get(qos, NEVER), link.last.get("control", NEVER))
+        link.last[qos] = self.scheduler.call_at(due_s, call, after)
+        return link.last[qos][0]
+
+    def _link(self, sender: str, receiver: str) -> _LinkState:
+        return self._links.setdefault((sender, receiver), _LinkState())
+
+    # -- partitions and liveliness -------------------------------------------------------------------------------
+
+    def _cut_until_s(self, sender: str, receiver: str) -> float:
+        """Return the end of the partition between two processes (virtual time, s), 0 without one."""
+        now_s, end_s = self.mission_s, 0.0
+        if now_s < 0.0 or not self.conditions.partition:
+            return 0.0
+        for p in self.conditions.partition:
+            if p.at_s <= now_s < p.at_s + p.duration_s and p.separates(sender, receiver):
+                end_s = max(end_s, p.at_s + p.duration_s)
+        return end_s and end_s + (self.first_tick_s or 0.0)
+
+    def _schedule_partitions(self) -> None:
+        """Let processes lose sight of each other when a partition outlasts the lease."""
+        if self.lockstep:
+            return
+        begin_s = self.first_tick_s or 0.0
+        for partition in self.conditions.partition:
+            if partition.duration_s > LEASE_S:
+                for at_s in (partition.at_s + LEASE_S, partition.at_s + partition.duration_s + 1e-3):
+                    self.scheduler.call_at(begin_s + at_s, lambda p=partition: self._review_liveliness(p))
+
+    def _review_liveliness(self, partition: Partition) -> None:
+        for name in list(self._connections):
+            for other in self._connections.values():
+                if partition.separates(name, other.name):
+                    other.review(name)
+
+    def is_alive(self, name: str, seen_from: str) -> bool:
+        """Return whether a process counts as alive for another one."""
+        connection, host = self._connections.get(name), self.host_of(name)
+        if connection is None or connection.closed or not connection.token:
+            return False
+        if self.lockstep:
+            return True
+        silent_s = host.frozen_for_s if host is not None else 0.0
+        if silent_s > LEASE_S:
+            return False
+        return not any(
+            p.at_s + LEASE_S <= self.mission_s < p.at_s + p.duration_s
+            for p in self.conditions.partition
+            if p.separates(name, seen_from)
+        )
+
+    def host_of(self, name: str) -> SimulatedHost | None:
+        """Return the host of a process."""
+        connection = self._connections.get(name)
+        return None if connection is None else connection.host
+
+    def disconnect(self, name: str) -> None:
+        """Close the connection of a process that has died."""
+        self._connections[name].close()
+
+    def announce(self, name: str) -> None:
+        """Let all others review whether a process is alive, after the time that the news takes to them."""
+        for other in list(self._connections.values()):
+            if other.name != name:
+                self.deliver(name, other.name, lambda other=other: other.review(name))
+
+    # -- declarations --------------------------------------------------------------------------------------------
+
+    def subscribe(
+        self, owner: SimulatedConnection, expression: str, arrived: Callable[[RawSample], None]
+    ) -> None:
+        """Add a subscription, which each publisher learns of when the declaration arrives there."""
+        added = _Subscription(owner, expression, arrived)
+        for name in self._connections:
+            if name != owner.name:
+                self._declare(added, name)
+        self._subscriptions.append(added)
+        self._routes.clear()
+
+    def _declare(self, subscription: _Subscription, publisher: str) -> None:
+        """Let a publisher know a subscription when the declaration arrives there."""
+        self.deliver(subscription.owner.name, publisher, lambda: subscription.known_to.add(publisher))
+
+    def ask(
+        self,
+        asker: SimulatedConnection,
+        key: str,
+        payload: bytes,
+        encoding: str,
+        replied: Callable[[Reply], None],
+    ) -> None:
+        """Carry a query to the process that serves its key, if any, and the reply back."""
+        for server in list(self._connections.values()):
+            handle = server.queryables.get(key)
+            if handle is None or server.closed:
+                continue
+
+            def answer(reply: Reply, server: SimulatedConnection = server) -> None:
+                self.deliver(server.name, asker.name, lambda: replied(reply), "event")
+
+            query = _SimulatedQuery(payload, encoding, answer)
+            self.deliver(asker.name, server.name, lambda s=server, q=query: s.serve(key, q), "event")
+            return
+
+    def forget(self, connection: SimulatedConnection) -> None:
+        """Remove the subscriptions of a connection that closes."""
+        self._subscriptions = [s for s in self._subscriptions if s.owner is not connection]
+        self._routes.clear()
+
+
+@dataclass(frozen=True)
+class _SimulatedQuery:
+    payload: bytes
+    encoding: str
+    answer: Callable[[Reply], None]
+
+    def reply(self, payload: bytes, encoding: str) -> None:
+        self.answer(Reply(payload, encoding))
+
+    def refuse(self, text: str) -> None:
+        self.answer(Reply(b"", "", text))
+
+
+class SimulatedConnection:
+    """A ``Connection`` to a simulated network."""
+
+    def __init__(self, network: SimulatedNetwork, name: str, host: SimulatedHost) -> None:
+        self.network, self.name, self.host = network, name, host
+        self.closed = False
+        self.token = ""
+        self.queryables: dict[str, Callable[[Query], None]] = {}
+        self._watchers: list[tuple[str, Callable[[str, bool], None]]] = []
+        self._known: dict[str, bool] = {}
+
+    def declare_publisher(
+        self, key: str, encoding: str, qos: str, *, express: bool, blocking: bool
+    ) -> Callable[[bytes], None]:
+        def send(payload: bytes) -> None:
+            raw = RawSample(key, encoding, payload, self.host.wall_ns())
+            self.network.publish(self, raw, qos, blocking)
+
+        return send
+
+    def put(self, raw: RawSample) -> None:
+        sent = RawSample(raw.key, raw.encoding, raw.payload, self.host.wall_ns())
+        self.network.publish(self, sent, "state", blocking=True)
+
+    def subscribe(self, expression: str, arrived: Callable[[RawSample], None]) -> None:
+        self.network.subscribe(self, expression, arrived)
+
+    def subscribe_ring(self, expression: str, depth: int) -> Callable[[], RawSample | None]:
+        ring: deque[RawSample] = deque(maxlen=depth)
+        self.network.subscribe(self, expression, ring.append)
+        return lambda: ring.popleft() if ring else None
+
+    def declare_queryable(self, key: str, arrived: Callable[[Query], None]) -> Undo:
+        self.queryables[key] = arrived
+
+        def undeclare() -> None:
+            self.queryables.pop(key, None)
+
+        return undeclare
+
+    def serve(self, key: str, query: Query) -> None:
+        """Hand a query that has arrived to the process, if it still serves the key."""
+        if not self.closed and key in self.queryables:
+            self.queryables[key](query)
+
+    def query(self, key: str, payload: bytes, encoding: str, timeout_s: float) -> Iterator[Reply]:
+        scheduler, replies = self.network.scheduler, deque[Reply](maxlen=1)
+        asking = scheduler.running
+
+        def replied(reply: Reply) -> None:
+            replies.append(reply)
+            if asking is not None:
+                scheduler.wake(asking)
+
+        self.network.ask(self, key, payload, encoding, replied)
+        self.host.pause(timeout_s, lambda: bool(replies))
+        yield from replies
+
+    def declare_liveliness(self, key: str) -> None:
+        self.token = key
+        self.network.announce(self.name)
+
+    def watch_liveliness(self, expression: str, changed: Callable[[str, bool], None]) -> None:
+        self._watchers.append((expression, changed))
+
+    def review(self, name: str) -> None:
+        """Tell the watchers if another process has appeared or disappeared."""
+        if self.closed:
+            return
+        alive, key = self.network.is_alive(name, self.name), topics.LIVE_KEY.format(process=name)
+        if self._known.get(name, False) == alive:
+            return
+        self._known[name] = alive
+        for expression, changed in self._watchers:
+            if matches(expression, key):
+                changed(key, alive)
+
+    def close(self) -> None:
+        if not self.closed:
+            self.network.announce(self.name)
+            self.network.forget(self)
+        self.closed = True
+
+
+class SimulatedHost:
+    """The ``Host`` of a process in virtual time. Its clock differs from the scheduler's by an offset and a drift."""
+
+    def __init__(self, name: str, network: SimulatedNetwork) -> None:
+        self.name = name
+        self.frozen_until_s = 0.0
+        self._network, self._scheduler = network, network.scheduler
+        self._ids = network.seeded("ids", name, len(network.scheduler.tasks), network.scheduler.now_s)
+        clock = next((c for c in network.conditions.clock if c.process == name), None)
+        self._offset_s, self._rate = (0.0, 1.0) if clock is None else (clock.offset_s, 1.0 + clock.drift)
+        self._slow = [s for s in network.conditions.slow if s.process == name]
+        self._dead = False
+
+    # -- time ----------------------------------------------------------------------------------------------------
+
+    def now_s(self) -> float:
+        return self._offset_s + self._rate * self._scheduler.now_s
+
+    def wall_ns(self) -> int:
+        """Return the wall clock (ns), which message time stamps use."""
+        return _EPOCH_NS + round(self.now_s() * 1e9)
+
+    def pause(self, timeout_s: float | None, over: Callable[[], bool] = lambda: False) -> None:
+        """Wait until ``over``, after which the task is woken, or for a time of this host's clock."""
+        end_s = None if timeout_s is None else self._scheduler.now_s + timeout_s / self._rate
+        while not over() and (end_s is None or self._scheduler.now_s < end_s):
+            self._scheduler.pause(None if end_s is None else end_s - self._scheduler.now_s)
+
+    def sleep(self, duration_s: float) -> None:
+        self.pause(duration_s)
+
+    def new_queue(self) -> BoundedQueue:
+        items = VirtualQueue(self._scheduler, self._read_slowly, self._rate)
+        self._network.traffic.queues[f"{self.name} {len(self._network.traffic.queues)}"] = items
+        return BoundedQueue(items=items)
+
+    def _read_slowly(self) -> None:
+        """Take as long as a slow reader does before it reads a message."""
+        now_s = self._network.mission_s
+        for slow in self._slow:
+            if slow.at_s <= now_s < slow.at_s + slow.duration_s:
+                self.sleep(slow.each_s)
+
+    def unique_id(self) -> str:
+        return f"{self._ids.getrandbits(48):012x}"
+
+    def repeat(self, call: Callable[[], float]) -> Undo:
+        """Call ``call`` within the scheduler; a frozen or dead host does not."""
+        ended = False
+
+        def run() -> None:
+            if ended or self._dead:
+                return
+            if self._scheduler.now_s < self.frozen_until_s:
+                self._scheduler.call_at(self.frozen_until_s, run)
+                return
+            self._scheduler.call_at(self._scheduler.now_s + call() / self._rate, run)
+
+        def end() -> None:
+            nonlocal ended
+            ended = True
+
+        run()
+        return end
+
+    # -- the process ---------------------------------------------------------------------------------------------
+
+    def finish_startup(self) -> None:
+        """Do nothing: many missions share the interpreter."""
+
+    def lower_priority(self) -> None:
+        """Do nothing: tasks have no priority."""
+
+    def kill(self) -> None:
+        """End the process' task. Nothing that it does on the way out reaches the network."""
+        self._dead = True
+        self._network.disconnect(self.name)
+        raise Killed
+
+    @property
+    def frozen_for_s(self) -> float:
+        """How long the process has been frozen (s)."""
+        now_s = self._scheduler.now_s
+        return now_s - self._frozen_since_s if now_s < self.frozen_until_s else 0.0
+
+    _frozen_since_s = 0.0
+
+    def freeze(self, duration_s: float) -> None:
+        self._frozen_since_s = self._scheduler.now_s
+        self.frozen_until_s = self._frozen_since_s + duration_s
+        for at_s in (self._frozen_since_s + LEASE_S + 1e-3, self.frozen_until_s + 1e-3):
+            if duration_s > LEASE_S:
+                self._scheduler.call_at(at_s, lambda: self._network.announce(self.name))
+        self.sleep(duration_s * self._rate)

@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images without a picture, for the perception ``statistical``: one row of pixels that are the bytes of nine numbers.
+
+They are the pose of the target in the camera and what the perception draws its errors from. World and chaser exchange
+them as ``mono8`` images, so that everything but rendering and detection stays as it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
+
+NAME = "statistical"
+"""Value of ``perception.name``."""
+_NUMBERS = 9
+WIDTH_PX = 8 * _NUMBERS
+
+
+def encode_pose(position_irf_m: Array, q_irf_trf_wxyz: Array, seed: tuple[int, int]) -> bytes:
+    """Return the pixels of an image (1, ``WIDTH_PX``): position in IRF, rotation TRF to IRF, two numbers below 2^32."""
+    return np.concatenate([position_irf_m, q_irf_trf_wxyz, seed]).astype("<f8").tobytes()
+
+
+def decode_pose(image: NDArray[np.uint8]) -> tuple[Array, Array, tuple[int, int]]:
+    """Return position, rotation and seed. Raises ValueError for any other image."""
+    if image.shape != (1, WIDTH_PX):
+        raise ValueError(f"an image of {image.shape} is none of perception {NAME!r}")
+    numbers = np.frombuffer(image.tobytes(), dtype="<f8")
+    if not np.isfinite(numbers).all() or not 0.0 <= numbers[7:].min() <= numbers[7:].max() < 2.0**32:
+        raise ValueError("damaged image")
+    return numbers[:3], numbers[3:7], (int(numbers[7]), int(numbers[8]))

@@ -1,0 +1,186 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network that is Eclipse Zenoh, with safe defaults. No other module imports zenoh.
+
+Defaults: no multicast, loopback only, one namespace per run, no shared memory.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import zenoh
+
+from .config import QUEUE_OPTIONS, Link, Tls, TransportError, open_error
+from .network import Connection, Host, Machine, Query, RawSample, Reply, Undo
+
+_PRIORITY = {
+    "bulk": zenoh.Priority.DATA,
+    "state": zenoh.Priority.DATA_HIGH,
+    "command": zenoh.Priority.REAL_TIME,
+    "event": zenoh.Priority.DATA_LOW,
+}
+
+
+def zenoh_config(link: Link) -> zenoh.Config:
+    """Return the Zenoh configuration of a link. Raises TransportError for a bad file, namespace or endpoint."""
+    if not link.namespace or any(c in link.namespace for c in "/*$?#@ "):
+        raise TransportError(f"namespace {link.namespace!r}: must be one word without / * $ ? # @ or blanks")
+    try:
+        config = zenoh.Config.from_file(str(link.config)) if link.config else zenoh.Config()
+    except zenoh.ZError as error:
+        raise TransportError(f"Zenoh configuration {link.config}: {error}") from None
+    values: dict[str, Any] = {
+        "scouting/multicast/enabled": False,
+        "transport/shared_memory/enabled": False,
+        "timestamping/enabled": True,
+    }
+    # Processes start in any order: retry the connection, unless the file configures it.
+    retry = {
+        "connect/timeout_ms": -1,
+        "connect/exit_on_failure": False,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 1.5},
+    }
+    values |= {name: value for name, value in retry.items() if config.get_json(name) in ("null", None)}
+    if link.config is None:
+        values |= {
+            "mode": link.mode,
+            "listen/endpoints": list(link.listen) if link.mode != "client" else [],
+            "connect/endpoints": list(link.connect),
+            "transport/link/tx/lease": link.lease_ms,
+            **QUEUE_OPTIONS,
+        }
+    if link.tls is not None:
+        values |= _tls_values(link.tls)
+    if link.access_control is not None:
+        values["access_control"] = link.access_control
+    try:
+        config.insert_json5("namespace", json.dumps(link.namespace))
+        for name, value in values.items():
+            config.insert_json5(name, json.dumps(value))
+    except zenoh.ZError as error:
+        raise TransportError(f"Zenoh option: {error}") from None
+    return config
+
+
+def _tls_values(tls: Tls) -> dict[str, Any]:
+    """Return the options that allow TLS only, with mission certificates on both sides."""
+    return {
+        "transport/link/protocols": ["tls"],
+        "transport/link/tls": {
+            "root_ca_certificate": str(tls.ca),
+            "enable_mtls": True,
+            "listen_private_key": str(tls.key),
+            "listen_certificate": str(tls.certificate),
+            "connect_private_key": str(tls.key),
+            "connect_certificate": str(tls.certificate),
+        },
+    }
+
+
+def _raw_sample(sample: zenoh.Sample, key: str) -> RawSample:
+    stamp = sample.timestamp
+    sent_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
+    return RawSample(key, str(sample.encoding), sample.payload.to_bytes(), sent_ns)
+
+
+class ZenohNetwork:
+    """Opens Zenoh sessions with the configuration of a link."""
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+
+    def open(self, name: str) -> tuple[Connection, Host]:
+        """Open a session. Raises TransportError."""
+        zenoh.init_log_from_env_or("error")
+        try:
+            return _ZenohConnection(zenoh.open(zenoh_config(self._link))), Machine()
+        except zenoh.ZError as error:
+            raise TransportError(open_error(error, self._link)) from None
+
+
+class _ZenohConnection:
+    """A ``Connection`` over one Zenoh session, which all declarations live as long as."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._declared: list[Any] = []
+
+    def declare_publisher(
+        self, key: str, encoding: str, qos: str, *, express: bool, blocking: bool
+    ) -> Callable[[bytes], None]:
+        control = zenoh.CongestionControl
+        publisher = self._session.declare_publisher(
+            key,
+            encoding=encoding,
+            priority=_PRIORITY[qos],
+            express=express,
+            reliability=zenoh.Reliability.RELIABLE,
+            congestion_control=control.BLOCK if blocking else control.DROP,
+        )
+        self._declared.append(publisher)
+        return lambda payload: publisher.put(payload, timestamp=self._session.new_timestamp())
+
+    def put(self, raw: RawSample) -> None:
+        self._session.put(
+            raw.key,
+            raw.payload,
+            encoding=raw.encoding,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            timestamp=self._session.new_timestamp(),
+        )
+
+    def subscribe(self, expression: str, arrived: Callable[[RawSample], None]) -> None:
+        def callback(sample: zenoh.Sample) -> None:
+            arrived(_raw_sample(sample, str(sample.key_expr)))
+
+        self._declared.append(self._session.declare_subscriber(expression, callback))
+
+    def subscribe_ring(self, expression: str, depth: int) -> Callable[[], RawSample | None]:
+        ring = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(depth))
+        self._declared.append(ring)
+
+        def take() -> RawSample | None:
+            sample = ring.try_recv()
+            return None if sample is None else _raw_sample(sample, str(sample.key_expr))
+
+        return take
+
+    def declare_queryable(self, key: str, arrived: Callable[[Query], None]) -> Undo:
+        return self._session.declare_queryable(key, lambda query: arrived(_ZenohQuery(key, query))).undeclare
+
+    def query(self, key: str, payload: bytes, encoding: str, timeout_s: float) -> Iterator[Reply]:
+        for reply in self._session.get(key, payload=payload, encoding=encoding, timeout=timeout_s):
+            if reply.ok is not None:
+                yield Reply(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
+            elif reply.err is not None and reply.err.payload.to_bytes() not in (b"Timeout", b""):
+                yield Reply(b"", "", reply.err.payload.to_string())
+
+    def declare_liveliness(self, key: str) -> None:
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def watch_liveliness(self, expression: str, changed: Callable[[str, bool], None]) -> None:
+        def callback(sample: zenoh.Sample) -> None:
+            changed(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        subscriber = self._session.liveliness().declare_subscriber(expression, callback, history=True)
+        self._declared.append(subscriber)
+
+    def close(self) -> None:
+        self._session.close()
+
+
+class _ZenohQuery:
+    def __init__(self, key: str, query: zenoh.Query) -> None:
+        self._key, self._query = key, query
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.encoding = str(query.encoding)
+
+    def reply(self, payload: bytes, encoding: str) -> None:
+        self._query.reply(self._key, payload, encoding=encoding)
+        self._query.drop()
+
+    def refuse(self, text: str) -> None:
+        self._query.reply_err(text)
+        self._query.drop()

@@ -117,7 +117,7 @@ def test_process_noise_composes_and_is_positive() -> None:
 
 def _branch(bias: np.ndarray, covariance: np.ndarray) -> StateHypothesis:
     return StateHypothesis(
-        0, np.array([1.0, 2.0, 3.0]), V, Q0, W, (7,), bias.reshape(1, 7), covariance, 0.0, {}
+        0, np.array([1.0, 2.0, 3.0]), V, Q0, W, covariance, cameras=(7,), bias=bias.reshape(1, 7)
     )
 
 

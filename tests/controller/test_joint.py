@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import msgspec
@@ -29,6 +30,7 @@ from chaserdock_controller.estimation.joint.state import (
     inject,
 )
 from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE
+from chaserdock_controller.estimation.types import Shock
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.scenario.navigation import NavigationErrors
@@ -227,6 +229,57 @@ def test_target_without_sightings_stays_predicted() -> None:
     errors = [flight.relative_error(estimator, i) for i in range(4)]
     assert max(e[0] for e in errors) < 7e-3
     assert np.mean([e[2] for e in errors]) < chi2.ppf(0.999, 6)
+
+
+@pytest.mark.parametrize("wrong_first", [False, True])
+def test_ambiguous_start_is_resolved_by_a_clear_view(wrong_first: bool) -> None:
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 1, 12)
+    estimator = estimator_for(flight.errors, 1)
+    flip = rotations.exp([0.0, math.radians(40.0), 0.0])
+
+    def ambiguous(inputs: JointInputs) -> JointInputs:
+        right = inputs.sightings[0].solutions[0]
+        other = msgspec.structs.replace(right, q_wxyz=vector(rotations.multiply(right.q_wxyz, flip)))
+        pair = (other, right) if wrong_first else (right, other)
+        sighting = msgspec.structs.replace(inputs.sightings[0], solutions=pair, marker_ids=(0,))
+        return replace(inputs, sightings=(sighting,))
+
+    fly(estimator, flight, 0.4, ambiguous)
+    sigma = math.sqrt(estimator.estimate_at(flight.time_ns).covariance[7, 7])
+    assert sigma > math.radians(10.0)  # both attitudes are still open
+    fly(estimator, flight, 2.0)
+    events = [e.text for e in estimator.drain_events()]
+    assert "initialised by chaser 0, ambiguous: two hypotheses" in events
+    assert events[-1] == "ambiguity resolved"
+    estimate = estimator.estimate_at(flight.time_ns)
+    assert rotations.angle_between(estimate.q_wxyz, flight.target[6:10]) < math.radians(1.5)
+    assert math.sqrt(estimate.covariance[7, 7]) < math.radians(1.0)
+
+
+def test_target_that_jumps_is_initialized_again() -> None:
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 13)
+    estimator = estimator_for(flight.errors, 2)
+    fly(estimator, flight, 4.0)
+    flight.target[:3] += [0.0, 0.0, 0.3]
+    fly(estimator, flight, 2.0)
+    assert estimator.reinitialisations == 1
+    assert any(e.text.startswith("re-initialised by chaser") for e in estimator.drain_events())
+    assert np.linalg.norm(estimator.estimate_at(flight.time_ns).position_m - flight.target[:3]) < 0.01
+
+
+def test_pushed_target_without_sightings_is_lost_and_reacquired() -> None:
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 14)
+    estimator = estimator_for(flight.errors, 2)
+    fly(estimator, flight, 4.0)
+    estimator.disturb(Shock(0.5, 0.5))
+    fly(estimator, flight, 1.0, lambda inputs: replace(inputs, sightings=()))
+    assert estimator.estimate_at(flight.time_ns).status == "lost"
+    flight.target[:3] += [0.0, 0.0, 4.0]
+    fly(estimator, flight, 1.0)
+    assert estimator.estimate_at(flight.time_ns).status == "tracking"
+    assert estimator.reinitialisations == 1
+    texts = [e.text for e in estimator.drain_events()]
+    assert texts.index("lost") < next(i for i, t in enumerate(texts) if t.startswith("reacquired by chaser"))
 
 
 def test_relative_pose_has_the_covariance_of_its_errors() -> None:

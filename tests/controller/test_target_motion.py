@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from chaserdock_controller.estimation import motion_models as motion
@@ -47,18 +49,7 @@ def parameters(body: TargetBody) -> MekfParameters:
 
 
 def branch(s: BodyState) -> StateHypothesis:
-    return StateHypothesis(
-        0,
-        s.position_m,
-        s.velocity_m_s,
-        s.q_wxyz,
-        s.omega_rad_s,
-        (),
-        np.zeros((0, 6)),
-        np.eye(12) * 1e-6,
-        0.0,
-        {},
-    )
+    return StateHypothesis(0, s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s, np.eye(12) * 1e-6)
 
 
 def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
@@ -125,17 +116,12 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
 
     def moved(d: np.ndarray) -> StateHypothesis:
         return predict(
-            StateHypothesis(
-                0,
-                start.position_m + d[:3],
-                start.velocity_m_s + d[3:6],
-                so3.multiply(start.q_wxyz, so3.exp(d[6:9])),
-                start.omega_rad_s + d[9:12],
-                (),
-                start.bias,
-                start.covariance,
-                0.0,
-                {},
+            replace(
+                start,
+                position_m=start.position_m + d[:3],
+                velocity_m_s=start.velocity_m_s + d[3:6],
+                q_wxyz=so3.multiply(start.q_wxyz, so3.exp(d[6:9])),
+                omega_rad_s=start.omega_rad_s + d[9:12],
             ),
             dt_ns,
             p,

@@ -9,7 +9,7 @@ Source of the error-state equations: J. Sola, "Quaternion kinematics for the err
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
@@ -18,31 +18,24 @@ from chaserdock_models import scalar_rotations as so3
 from . import motion_models as motion
 from .camera_calibration import ERRORS, NO_ERROR, pose_prior_covariance, predict_measurement, prior
 from .parameters import MekfParameters
+from .target_hypotheses import POSE, RATES, TargetHypothesis, TargetRates, poses_agree
 from .types import Array, CameraPose, Measurement, PoseHypothesis
 
-POSE = np.array([0, 1, 2, 6, 7, 8])
 _POSE_GRID = np.ix_(POSE, POSE)
 _EYE3 = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
-class StateHypothesis:
-    """State and covariance at ``time_ns``.
+class StateHypothesis(TargetHypothesis):
+    """State of the target and of the cameras' errors at ``time_ns``; covariance (12 + 7 n, 12 + 7 n).
 
-    cameras: chaser of each bias slot. bias: (n, 7) for n slots. covariance: (12 + 7 n, 12 + 7 n). log_likelihood: of
-    all measurements since initialization. rejections: number of consecutive rejected measurements of each chaser.
+    cameras: chaser of each of n bias slots. bias: (n, 7). rejections: number of consecutive rejected measurements of each
+    chaser.
     """
 
-    time_ns: int
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-    cameras: tuple[int, ...]
-    bias: Array
-    covariance: Array
-    log_likelihood: float
-    rejections: dict[int, int]
+    cameras: tuple[int, ...] = ()
+    bias: Array = field(default_factory=lambda: np.zeros((0, ERRORS)))
+    rejections: dict[int, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,19 +208,18 @@ def count_agreements(poses: list[tuple[PoseHypothesis, CameraPose]], p: MekfPara
     counts = [0] * len(poses)
     for i in range(len(poses)):
         for j in range(i):
-            if poses_agree(*poses[i], *poses[j], p):
+            if measurements_agree(*poses[i], *poses[j], p):
                 counts[i] += 1
                 counts[j] += 1
     return counts
 
 
-def poses_agree(
+def measurements_agree(
     a: PoseHypothesis, camera_a: CameraPose, b: PoseHypothesis, camera_b: CameraPose, p: MekfParameters
 ) -> bool:
-    """Test whether the difference of two simultaneous poses is within the chi-square gate of their errors."""
-    d = np.concatenate([a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))])
+    """Test whether the difference of two simultaneous measured poses is within the chi-square gate of their errors."""
     s = _pose_covariance(a, camera_a, p) + _pose_covariance(b, camera_b, p)
-    return float(d @ np.linalg.solve(s, d)) <= p.gate_chi_square
+    return poses_agree(a, b, s, p.gate_chi_square)
 
 
 def _pose_covariance(h: PoseHypothesis, camera: CameraPose, p: MekfParameters) -> Array:
@@ -237,22 +229,18 @@ def _pose_covariance(h: PoseHypothesis, camera: CameraPose, p: MekfParameters) -
 
 
 def start(
-    time_ns: int, m: Measurement, h: PoseHypothesis, rates: tuple[Array, Array, Array], p: MekfParameters
+    time_ns: int, m: Measurement, h: PoseHypothesis, rates: TargetRates, p: MekfParameters
 ) -> StateHypothesis:
-    """Create a hypothesis from one measured pose and from rates: velocity, omega and their (6, 6) covariance.
+    """Create a hypothesis from one measured pose and from rates.
 
     The covariance contains the correlation of the pose error with the camera's bias.
     """
     scale = p.single_marker_scale**2 if m.markers <= 1 else 1.0
-    velocity, omega, rate_covariance = rates
     covariance = np.zeros((12, 12))
-    r = np.array([3, 4, 5, 9, 10, 11])
-    covariance[np.ix_(r, r)] = rate_covariance
+    covariance[np.ix_(RATES, RATES)] = rates.covariance
     covariance[_POSE_GRID] = measurement_noise(h, p) * scale
-    hypothesis = StateHypothesis(
-        time_ns, h.position_m, velocity, so3.normalize(h.q_wxyz), omega, (), np.zeros((0, ERRORS)), covariance,
-        0.0, {},
-    )  # fmt: skip
+    q = so3.normalize(h.q_wxyz)
+    hypothesis = StateHypothesis(time_ns, h.position_m, rates.velocity_m_s, q, rates.omega_rad_s, covariance)
     if not p.has_bias:
         return hypothesis
     hypothesis = with_cameras(hypothesis, [m.chaser], p)
@@ -269,13 +257,6 @@ def start(
 def measurement_noise(h: PoseHypothesis, p: MekfParameters) -> Array:
     """Return the measured covariance (6, 6) plus the white floor."""
     return h.covariance + _diagonal(p.floor_position_m, p.floor_attitude_rad)
-
-
-def pose_sigmas(covariance: Array) -> tuple[float, float]:
-    """Return the largest standard deviations of position (m) and attitude (rad) of a (12+, 12+) covariance."""
-    position = np.linalg.eigvalsh(covariance[0:3, 0:3])[-1]
-    attitude = np.linalg.eigvalsh(covariance[6:9, 6:9])[-1]
-    return math.sqrt(max(float(position), 0.0)), math.sqrt(max(float(attitude), 0.0))
 
 
 @lru_cache(maxsize=64)

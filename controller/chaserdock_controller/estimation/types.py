@@ -41,7 +41,7 @@ class Measurement:
 
     time_ns: simulated time of the exposure. markers: number of markers used.
     hypotheses: one pose, two for the planar ambiguity of a single marker (the likelier first), none
-        if the target is not visible. eye: nominal pose of the camera.
+        if the target is not visible. camera: its nominal pose.
     """
 
     chaser: int

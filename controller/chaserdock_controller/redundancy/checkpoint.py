@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections import deque
 from typing import Any, TypeVar
 
+import msgspec
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, OperatorCommand, ThrusterReport
 from msgspec import Struct
@@ -19,9 +20,10 @@ from chaserdock_controller.estimation import Mekf
 from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
 from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import Hypotheses, TickRecord
+from chaserdock_controller.estimation.joint.estimator import JointFilterState, TickRecord
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
+from chaserdock_controller.estimation.replay import ReplayBuffer
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
@@ -101,15 +103,12 @@ class ConsistencyState(Struct, forbid_unknown_fields=True):
 
 
 class MekfState(Struct, forbid_unknown_fields=True, tag=True):
-    parameters: MekfParameters
+    target: MekfParameters
     late_dropped: int
     early_dropped: int
     invalid: int
     duplicates: int
-    _buffer: list[Exposure]
-    _base: FilterState | None
-    _pending: list[EstimatorEvent]
-    _drained: set[EstimatorEvent]
+    _buffer: ReplayBuffer[Exposure, FilterState]
     _was_lost: bool
 
 
@@ -117,10 +116,7 @@ class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
     target: MekfParameters
     late_dropped: int
     duplicates: int
-    _records: list[TickRecord]
-    _base: Hypotheses | None
-    _pending: list[EstimatorEvent]
-    _drained: set[EstimatorEvent]
+    _buffer: ReplayBuffer[TickRecord, JointFilterState]
     _was_lost: bool
 
 
@@ -261,19 +257,5 @@ def _estimator_state(estimator: Any) -> EstimatorState | None:
     state = _read(estimator, kind)
     if isinstance(state, PaperState):
         state._poses, state._rates = list(state._poses), list(state._rates)
-    elif isinstance(state, JointEstimatorState):
-        state._base, state._drained = _newest_only(state._records, state._base, state._drained)
-        state._records = state._records[-1:]
-    else:
-        state._base, state._drained = _newest_only(state._buffer, state._base, state._drained)
-        state._buffer = state._buffer[-1:]
-    return state
-
-
-def _newest_only(
-    buffer: list[Any], base: Any, drained: set[EstimatorEvent]
-) -> tuple[Any, set[EstimatorEvent]]:
-    """Return the state before the newest entry of a buffer, and which of its events are drained."""
-    if len(buffer) < 2:
-        return base, drained
-    return buffer[-2].state, {event for event in drained if event in buffer[-1].events}
+        return state
+    return msgspec.structs.replace(state, _buffer=state._buffer.with_newest_only())

@@ -15,6 +15,9 @@ from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
+from chaserdock_controller.estimation import target_hypotheses
+from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
+
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 TARGET = 12
 """Components of the target's error."""
@@ -38,35 +41,27 @@ CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
 
 
 @dataclass(frozen=True, eq=False)
-class JointState:
-    """Estimate after the tick at ``time_ns``, of the target and of N chasers.
+class JointState(TargetHypothesis):
+    """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``) and of N chasers.
 
-    position_m, velocity_m_s, q_wxyz, omega_rad_s: of the target, (3,), (3,), (4,), (3,); meaningless until ``target_known``.
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
     additive states. covariance (12 + CHASER N, 12 + CHASER N). alive (N,): chasers whose state is known.
     odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
-    updates: ticks with sightings since the start of the target. log_likelihood: of all sightings since then.
+    updates: ticks with sightings since the start of the target.
     """
 
-    time_ns: int
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
     positions_m: Array
     velocities_m_s: Array
     attitudes_wxyz: Array
     omegas_rad_s: Array
     extra: Array
-    covariance: Array
     alive: NDArray[np.bool_]
     odometry_ns: NDArray[np.int64]
     rejections: NDArray[np.int64]
     nis: Array
     target_known: bool = False
     updates: int = 0
-    log_likelihood: float = 0.0
 
     @property
     def chasers(self) -> int:
@@ -132,9 +127,7 @@ def difference(a: JointState, b: JointState) -> Array:
     """Return the error vector that takes the state ``a`` to ``b``."""
     n = a.chasers
     error = np.empty(TARGET + CHASER * n)
-    error[POSITION], error[VELOCITY] = b.position_m - a.position_m, b.velocity_m_s - a.velocity_m_s
-    error[ATTITUDE] = so3.log(so3.inverse_multiply(a.q_wxyz, b.q_wxyz))
-    error[RATE] = b.omega_rad_s - a.omega_rad_s
+    error[:TARGET] = target_hypotheses.difference(a, b)
     each = error[TARGET:].reshape(n, CHASER)
     each[:, POSITION] = b.positions_m - a.positions_m
     each[:, VELOCITY] = b.velocities_m_s - a.velocities_m_s

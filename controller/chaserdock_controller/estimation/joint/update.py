@@ -8,7 +8,6 @@ target has moved in an unexpected way: its rates are widened, and if that does n
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -18,6 +17,9 @@ from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
 from numpy.typing import NDArray
+
+from chaserdock_controller.estimation.target_hypotheses import POSE, RATES, TargetRates
+from chaserdock_controller.estimation.types import PoseHypothesis
 
 from .measurements import (
     CameraMounting,
@@ -53,7 +55,6 @@ from .state import (
     inject,
 )
 
-POSE = np.array([0, 1, 2, 6, 7, 8])
 _VELOCITY_CHANNEL, _RATE_CHANNEL = CHANNELS.index("velocity"), CHANNELS.index("rate")
 _TICK_S = 0.1
 """Time, at most about a tick, in which unexpected motion displaces a chaser."""
@@ -61,11 +62,10 @@ _TICK_S = 0.1
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """Chasers whose sightings were accepted and rejected, and by chaser the channels of odometry that were rejected."""
+    """Chasers whose sightings were accepted and rejected."""
 
     accepted: tuple[int, ...] = ()
     rejected: tuple[int, ...] = ()
-    odometry: tuple[tuple[int, str], ...] = ()
 
 
 class _Channel(NamedTuple):
@@ -110,13 +110,10 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
     )
 
 
-class SightedPose(NamedTuple):
-    """Pose of the target in WRF by one sighting: position (3,), attitude (4,), covariance (6, 6) (WRF; rotation in TRF) and
-    the covariance (6, D) with the error vector, all from the chaser's own estimated state."""
+@dataclass(frozen=True, eq=False)
+class SightedPose(PoseHypothesis):
+    """Pose of the target by one sighting and the chaser's estimated state; ``cross`` (6, D): covariance with the error vector."""
 
-    position_m: Array
-    q_wxyz: Array
-    covariance: Array
     cross: Array
 
 
@@ -143,41 +140,32 @@ def sighted_pose(
     return SightedPose(position, moved.q_wxyz, 0.5 * (covariance + covariance.T), cross)
 
 
-def start_target(
-    state: JointState, pose: SightedPose, rates: tuple[Array, Array, Array], scale: float = 1.0
-) -> JointState:
-    """Return the state with the target at a sighted pose and ``rates``: velocity, omega and their covariance (6, 6).
+def start_target(state: JointState, pose: SightedPose, rates: TargetRates, scale: float = 1.0) -> JointState:
+    """Return the state with the target at a sighted pose with ``rates``.
 
     ``scale``: factor on the covariance of the pose.
     """
-    velocity, omega, rate_covariance = rates
     covariance = state.covariance.copy()
     covariance[:TARGET, :] = covariance[:, :TARGET] = 0.0
     cross = pose.cross.copy()
     cross[:, :TARGET] = 0.0
     covariance[POSE, :], covariance[:, POSE] = cross, cross.T
     covariance[np.ix_(POSE, POSE)] = pose.covariance * scale
-    r = np.array([3, 4, 5, 9, 10, 11])
-    covariance[np.ix_(r, r)] = rate_covariance
+    covariance[np.ix_(RATES, RATES)] = rates.covariance
     rejections = state.rejections.copy()
     rejections[:, SIGHTING_CHANNEL] = 0
     return replace(
         state,
         position_m=pose.position_m,
         q_wxyz=pose.q_wxyz,
-        velocity_m_s=velocity,
-        omega_rad_s=omega,
+        velocity_m_s=rates.velocity_m_s,
+        omega_rad_s=rates.omega_rad_s,
         covariance=covariance,
+        log_likelihood=0.0,
         target_known=True,
         updates=0,
         rejections=rejections,
     )
-
-
-def agree(a: SightedPose, b: SightedPose, gate: float) -> bool:
-    """Test whether the difference of two sighted poses is within the gate of their covariances."""
-    d = np.concatenate([a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))])
-    return float(d @ np.linalg.solve(a.covariance + b.covariance, d)) <= gate
 
 
 class ReducedCovariance:
@@ -232,7 +220,6 @@ def update(
     """Update the state at its time with the odometry and the sightings of the chasers."""
     accepted: list[int] = []
     rejected: list[int] = []
-    dropped: list[tuple[int, str]] = []
     chasers = [i for i in sorted(odometry.keys() | sightings.keys()) if state.alive[i]]
     covariance = ReducedCovariance(state.covariance, 18 * len(chasers))
     for i in chasers:
@@ -241,10 +228,9 @@ def update(
         state, fits = _update_chaser(state, covariance, i, odometry.get(i), solutions, mounting, p)
         if solutions:
             (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
-        dropped += [(i, CHANNELS[k]) for k, fit in fits.items() if k != SIGHTING_CHANNEL and not fit]
     updates = state.updates + bool(accepted)
     state = replace(state, covariance=covariance.total(), updates=updates)
-    return state, UpdateReport(tuple(accepted), tuple(rejected), tuple(dropped))
+    return state, UpdateReport(tuple(accepted), tuple(rejected))
 
 
 def _update_chaser(
@@ -405,21 +391,3 @@ def _linearize(
         np.concatenate([a.by_chaser, b.by_chaser]),
         noise,
     )
-
-
-def widen_target(state: JointState, p: JointParameters) -> JointState:
-    """Return the state with less certain rates of the target."""
-    t, covariance = p.target, state.covariance.copy()
-    i = np.array([3, 4, 5, 9, 10, 11])
-    covariance[i, i] += np.repeat([t.reinitialised_velocity_m_s**2, t.reinitialised_omega_rad_s**2], 3)
-    return replace(state, covariance=covariance)
-
-
-def rate_covariance(velocity_m_s: float, omega_rad_s: float) -> Array:
-    """Return a covariance (6, 6) of velocity and rate with these sigmas."""
-    return np.diag(np.repeat([velocity_m_s**2, omega_rad_s**2], 3))
-
-
-def sigma_of(covariance: Array) -> float:
-    """Return the largest standard deviation of a covariance (3, 3)."""
-    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Hypotheses of the target's state, as both Kalman filters treat them: rates, loss, shocks, choice, mixture. Pure functions.
+
+The error vector of every hypothesis begins with the target's 12 components: position, velocity (WRF), rotation, rate (TRF).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+from chaserdock_models import scalar_rotations as so3
+from chaserdock_models.arrays import Array
+
+from .parameters import MekfParameters
+from .types import EstimatorEvent, PoseHypothesis, Shock, TargetState
+
+POSE, RATES = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
+"""Components of a body's error that belong to its pose and to its rates."""
+
+
+@dataclass(frozen=True, eq=False)
+class TargetHypothesis:
+    """State of the target at ``time_ns``: position, velocity, attitude and rate, as in ``TargetState``.
+
+    covariance: of the filter's complete error vector. log_likelihood: of all measurements since the start of the target.
+    """
+
+    time_ns: int
+    position_m: Array
+    velocity_m_s: Array
+    q_wxyz: Array
+    omega_rad_s: Array
+    covariance: Array
+    log_likelihood: float = field(default=0.0, kw_only=True)
+
+
+Hypothesis = TypeVar("Hypothesis", bound=TargetHypothesis)
+
+
+@dataclass(frozen=True, eq=False)
+class HypothesisSet(Generic[Hypothesis]):
+    """State of a filter at ``time_ns``.
+
+    hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is unresolved.
+    seen, rejected: chasers accepted and gated out at this time. accepted, gated, reinitialisations: counts since the start.
+    """
+
+    time_ns: int
+    hypotheses: tuple[Hypothesis, ...] = ()
+    ambiguous_since_ns: int = 0
+    last_accepted_ns: int = 0
+    seen: tuple[int, ...] = ()
+    rejected: tuple[int, ...] = ()
+    accepted: int = 0
+    gated: int = 0
+    reinitialisations: int = 0
+
+
+State = TypeVar("State", bound=HypothesisSet[Any])
+
+
+class TargetRates(NamedTuple):
+    """Velocity (3,) in WRF and rate (3,) in TRF, with their covariance (6, 6)."""
+
+    velocity_m_s: Array
+    omega_rad_s: Array
+    covariance: Array
+
+
+def rate_variances(velocity_m_s: float, omega_rad_s: float) -> Array:
+    """Return the variances (6,) of velocity and rate for these sigmas."""
+    return np.repeat([velocity_m_s**2, omega_rad_s**2], 3)
+
+
+def unknown_rates(p: MekfParameters) -> TargetRates:
+    """Return the rates that are assumed before the first measurement."""
+    variances = rate_variances(p.initial_velocity_m_s, p.initial_omega_rad_s)
+    return TargetRates(np.zeros(3), np.zeros(3), np.diag(variances))
+
+
+def rates_of(h: TargetHypothesis) -> TargetRates:
+    """Return the rates of a hypothesis."""
+    return TargetRates(h.velocity_m_s, h.omega_rad_s, h.covariance[np.ix_(RATES, RATES)])
+
+
+def widened(covariance: Array, variances: Array, first: int = 0) -> Array:
+    """Return the covariance with ``variances`` (6,) added to the rates of the body whose error begins at ``first``."""
+    wider, k = covariance.copy(), first + RATES
+    wider[k, k] += variances
+    return wider
+
+
+def with_uncertain_rates(h: Hypothesis, p: MekfParameters) -> Hypothesis:
+    """Return the hypothesis with the additional variances of a re-initialization."""
+    added = rate_variances(p.reinitialised_velocity_m_s, p.reinitialised_omega_rad_s)
+    return replace(h, covariance=widened(h.covariance, added))
+
+
+def apply_shocks(state: State, shocks: Sequence[Shock]) -> State:
+    """Add the known part of ``shocks`` to the rates of every hypothesis, and the unknown part to the covariance."""
+    for shock in shocks:
+        added = rate_variances(shock.sigma_velocity_m_s, shock.sigma_omega_rad_s)
+        hypotheses = tuple(
+            replace(
+                h,
+                velocity_m_s=h.velocity_m_s + shock.velocity_m_s,
+                omega_rad_s=h.omega_rad_s + shock.omega_rad_s,
+                covariance=widened(h.covariance, added),
+            )
+            for h in state.hypotheses
+        )
+        state = replace(state, hypotheses=hypotheses)
+    return state
+
+
+def is_lost(covariance: Array, p: MekfParameters) -> bool:
+    """Test whether a pose with this covariance (12+, 12+) is too uncertain to use."""
+    variances = covariance.diagonal()
+    if variances[0:3].sum() <= p.lost_position_m**2 and variances[6:9].sum() <= p.lost_attitude_rad**2:
+        return False  # no eigenvalue exceeds the trace
+    position_m, attitude_rad = (_largest_sigma(covariance[k : k + 3, k : k + 3]) for k in (0, 6))
+    return position_m > p.lost_position_m or attitude_rad > p.lost_attitude_rad
+
+
+def all_lost(state: HypothesisSet[Any], p: MekfParameters) -> bool:
+    """Test whether every hypothesis is too uncertain to use."""
+    return all(is_lost(h.covariance, p) for h in state.hypotheses)
+
+
+def poses_agree(a: PoseHypothesis, b: PoseHypothesis, covariance: Array, gate: float) -> bool:
+    """Test whether the difference of two simultaneous poses is within the gate of its ``covariance`` (6, 6)."""
+    d = np.concatenate([a.position_m - b.position_m, so3.log(so3.inverse_multiply(b.q_wxyz, a.q_wxyz))])
+    return float(d @ np.linalg.solve(covariance, d)) <= gate
+
+
+def weights(hypotheses: Sequence[TargetHypothesis]) -> list[float]:
+    """Return the probabilities of the hypotheses from their likelihoods and equal priors."""
+    top = max(h.log_likelihood for h in hypotheses)
+    w = [math.exp(h.log_likelihood - top) for h in hypotheses]
+    return [x / sum(w) for x in w]
+
+
+def mixture_covariance(hypotheses: Sequence[TargetHypothesis], covariances: Sequence[Array]) -> Array:
+    """Return the target's covariance (12, 12) about the first hypothesis, including the spread between hypotheses.
+
+    ``covariances`` (12, 12): of the target's state, one for each hypothesis.
+    """
+    if len(hypotheses) == 1:
+        return covariances[0].copy()
+    total = np.zeros((12, 12))
+    for weight, h, covariance in zip(weights(hypotheses), hypotheses, covariances, strict=True):
+        d = difference(hypotheses[0], h)
+        total += weight * (covariance + np.outer(d, d))
+    return total
+
+
+def difference(a: TargetHypothesis, b: TargetHypothesis) -> Array:
+    """Return the target's error (12,) that takes ``a`` to ``b``."""
+    turn = so3.log(so3.inverse_multiply(a.q_wxyz, b.q_wxyz))
+    moved = (
+        b.position_m - a.position_m,
+        b.velocity_m_s - a.velocity_m_s,
+        turn,
+        b.omega_rad_s - a.omega_rad_s,
+    )
+    return np.concatenate(moved)
+
+
+def count_measurements(state: State, accepted: Sequence[int], rejected: Sequence[int]) -> State:
+    """Return the state with the chasers whose measurements were accepted and rejected at its time."""
+    return replace(
+        state,
+        last_accepted_ns=state.time_ns if accepted else state.last_accepted_ns,
+        seen=tuple(sorted({*state.seen, *accepted})),
+        rejected=tuple(rejected),
+        accepted=state.accepted + len(accepted),
+        gated=state.gated + len(rejected),
+    )
+
+
+def before_restart(state: State) -> State:
+    """Return the state in which the measurements of its time are not counted yet, and a re-initialization is."""
+    return replace(
+        state,
+        seen=(),
+        rejected=(),
+        accepted=state.accepted - len(state.seen),
+        gated=state.gated - len(state.rejected),
+        reinitialisations=state.reinitialisations + 1,
+    )
+
+
+def choose(state: State, p: MekfParameters, events: list[EstimatorEvent]) -> State:
+    """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout; append an event for that."""
+    if len(state.hypotheses) < 2:
+        return state
+    ranked = sorted(state.hypotheses, key=lambda h: -h.log_likelihood)
+    top = ranked[0]
+    kept = [h for h in ranked if top.log_likelihood - h.log_likelihood < p.ambiguity_log_odds]
+    if len(kept) == 1:
+        events.append(EstimatorEvent(state.time_ns, "info", "ambiguity resolved"))
+    elif state.time_ns - state.ambiguous_since_ns > p.ambiguity_timeout_s * 1e9:
+        kept = [top]
+        events.append(
+            EstimatorEvent(state.time_ns, "info", "ambiguity timed out: kept the likelier attitude")
+        )
+    return replace(state, hypotheses=tuple(kept))
+
+
+def target_state(
+    state: HypothesisSet[Any],
+    time_ns: int,
+    best: TargetHypothesis,
+    covariance: Array,
+    lost: bool,
+    p: MekfParameters,
+) -> TargetState:
+    """Return the estimate for ``time_ns``: ``best`` and ``covariance`` (12, 12) predicted from the filter's ``state``."""
+    status = "predicting"
+    if lost:
+        status = "lost"
+    elif time_ns - state.last_accepted_ns <= p.tracking_s * 1e9:
+        status = "tracking"
+    return TargetState(
+        time_ns,
+        best.position_m.copy(),
+        best.velocity_m_s.copy(),
+        best.q_wxyz.copy(),
+        best.omega_rad_s.copy(),
+        covariance,
+        status,
+        len(state.seen),
+        state.rejected,
+    )
+
+
+def _largest_sigma(covariance: Array) -> float:
+    """Return the largest standard deviation of a covariance (3, 3)."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 0.0))

@@ -9,7 +9,6 @@ drawn from the number of the run. Outcomes: ``docked``; ``safe`` (not docked, an
 
 from __future__ import annotations
 
-import json
 import random
 import subprocess
 import sys
@@ -18,9 +17,8 @@ import time
 from collections import Counter
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
-from chaserdock_protocol.scenario.faults import FaultKind
 from common import (
     ROOT,
     Figures,
@@ -34,16 +32,9 @@ from common import (
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
+from chaserdock.simulation.swarm import KINDS, draw_fault, toml
 
 SCENARIO = "fault-drill"
-KINDS: tuple[str, ...] = get_args(FaultKind)
-CHASERS = [f"chaser/{i}" for i in range(4)]
-RECEIVED = {
-    "world": ["actuators"],
-    "controller": ["odometry", "sighting"],
-    "chaser": ["image", "odometry", "wrench"],
-}
-PUBLISHED = {"world": ["image", "odometry"], "controller": ["wrench"], "chaser": ["sighting", "actuators"]}
 TIMEOUT_S = 300.0
 GOOD = ("docked", "safe")
 
@@ -65,53 +56,14 @@ class Result:
     wall_s: float
 
 
-def draw_fault(number: int) -> dict[str, Any]:
+def fault_of(number: int) -> dict[str, Any]:
     """Return the fault of a run: kinds in turn, everything else drawn from the number."""
-    kind, draw = KINDS[number % len(KINDS)], random.Random(f"fault {number}")
-    fault: dict[str, Any] = {"kind": kind, "at_s": round(draw.uniform(0.5, 20.0), 2)}
-    duration_s = round(draw.choice([0.3, 1.0, 3.0, 8.0]) * draw.uniform(0.5, 1.5), 2)
-    if kind != "kill":
-        fault["duration_s"] = min(duration_s, 3.0) if kind == "freeze" else duration_s
-    processes = ["world", "controller", *CHASERS]
-    if kind == "kill":
-        fault["process"] = draw.choice(["controller", "recorder", *CHASERS])
-    elif kind == "freeze":
-        fault["process"] = draw.choice([*processes, "recorder"])
-    elif kind == "cut":
-        fault["process"] = draw.choice(CHASERS)
-        if draw.random() < 0.5:
-            fault["peer"] = "controller"
-    elif kind in ("camera_off", "lying_sensor", "odometry_lie"):
-        fault["process"] = draw.choice(CHASERS)
-    elif kind == "clock_jump":
-        fault["process"] = draw.choice(["controller", *CHASERS])
-        fault["offset_s"] = round(draw.choice([-1, 1]) * 10 ** draw.uniform(-2, 2), 3)
-    else:
-        fault["process"] = draw.choice(processes)
-        topics = PUBLISHED if kind == "flood" else RECEIVED
-        fault["topic"] = draw.choice(topics[fault["process"].partition("/")[0]])
-    if kind in ("drop", "duplicate", "reorder", "corrupt"):
-        fault["share"] = draw.choice([0.1, 0.5, 1.0])
-    if kind == "delay":
-        fault["delay_s"] = round(draw.uniform(0.1, 1.0), 2)
-    if kind == "flood":
-        fault["copies"] = draw.choice([5, 50, 200])
-    if kind in ("lying_sensor", "odometry_lie"):
-        fault["offset_m"] = [round(draw.gauss(0.0, 0.1), 3) for _ in range(3)]
-        fault["rotation_deg"] = [round(draw.gauss(0.0, 5.0), 2) for _ in range(3)]
-    return fault
-
-
-def toml(value: Any) -> str:
-    """Return a value as inline TOML."""
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
-    return json.dumps(value)
+    return draw_fault(KINDS[number % len(KINDS)], random.Random(f"fault {number}"), chasers=4)
 
 
 def fly(number: int, mode: str) -> Result:
     """Fly one run. Raise SystemExit if the scenario is refused."""
-    fault = draw_fault(number)
+    fault = fault_of(number)
     with tempfile.TemporaryDirectory() as folder:
         out, begin_s = Path(folder) / "run", time.monotonic()
         changes = ("--mode", mode, "--set", f"fault=[{toml(fault)}]")
@@ -173,7 +125,7 @@ def evaluate(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bo
 def read_results(path: Path, mode: str) -> dict[int, Result]:
     """Return earlier results by number; a result whose fault is no longer that of its number is ignored."""
     results = [Result(**row) for row in read_lines(path)]
-    return {r.number: r for r in results if r.mode == mode and r.fault == draw_fault(r.number)}
+    return {r.number: r for r in results if r.mode == mode and r.fault == fault_of(r.number)}
 
 
 def table(results: list[Result]) -> str:

@@ -23,9 +23,10 @@ from .options import fail
 from .processes import chaser, controller, record, router, world
 from .run import campaign, judge, run
 from .setup import calibrate, keys, markers
+from .simulate import simulate
 
 GROUPS: dict[str, tuple[Any, ...]] = {
-    "Fly": (run, campaign),
+    "Fly": (run, campaign, simulate),
     "Scenarios": (scenario.app,),
     "Processes": (world, chaser, controller, record, router),
     "Operate": (command, thruster_fault, status, view, judge),

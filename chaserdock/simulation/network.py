@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import random
 import re
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -42,11 +42,12 @@ def matches(expression: str, key: str) -> bool:
 
 @dataclass
 class Traffic:
-    """What the network has carried and lost."""
+    """What the network has carried and lost. ``recorded``: messages that arrived at the recorder, by key."""
 
     sent: int = 0
     lost: int = 0
     most_bytes: int = 0
+    recorded: Counter[str] = field(default_factory=Counter)
     queues: dict[str, VirtualQueue] = field(default_factory=dict)
 
 
@@ -120,6 +121,8 @@ class SimulatedNetwork:
         self.tap(sender.name, raw)
         for subscription in self._route(raw.key):
             if subscription.owner is sender:
+                if sender.name == "recorder" and subscription.expression == "**":
+                    self.traffic.recorded[raw.key] += 1
                 subscription.arrived(raw)
             elif sender.name in subscription.known_to:
                 self._send(sender, subscription, raw, qos, blocking)
@@ -141,8 +144,11 @@ class SimulatedNetwork:
 
             def deliver() -> None:
                 link.bytes -= size
-                if not to.owner.closed:
-                    to.arrived(raw)
+                if to.owner.closed:
+                    return
+                if to.owner.name == "recorder" and to.expression == "**":
+                    self.traffic.recorded[raw.key] += 1
+                to.arrived(raw)
 
             self.deliver(sender.name, to.owner.name, deliver, qos, late_s)
 

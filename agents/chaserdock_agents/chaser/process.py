@@ -97,7 +97,7 @@ class Chaser:
         self._fallback: FallbackState | None = None
         self._clearance_m = clearance_m(self.scenario, self.number)
         self._thrusters_tick = self._uncommanded_tick = -1
-        self._odometry_ns = 0
+        self._odometry_ns, self._odometry_arrived_s = 0, 0.0
         self._processed_images: deque[int] = deque(maxlen=64)
         self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._thrusters = (
@@ -138,8 +138,8 @@ class Chaser:
         match received.message if received is not None else None:
             case Image() as image:
                 self._process_image(image)
-            case Odometry() as odometry:
-                self._odometry_ns = odometry.sim_time_ns
+            case Odometry() as odometry if received is not None:
+                self._odometry_ns, self._odometry_arrived_s = odometry.sim_time_ns, received.arrived_s
                 self._update_odometry(odometry)
             case DockingStatus() as docking:
                 self.docking = docking
@@ -254,7 +254,7 @@ class Chaser:
             if not self.realtime:  # in real time the last command remains valid for its lifetime
                 self._mark_uncommanded(command.tick)
             return
-        now_ns = self.odometry.sim_time_ns if self.odometry is not None else 0
+        now_ns = self._now_ns()
         if stale := stale_term(command, self.tick, self._term):
             self.node.counts.rejected["wrench:stale term"] += 1
             if not self._reported_stale:  # the first of a series
@@ -273,6 +273,13 @@ class Chaser:
         self._reported_refusal = True
         # The world waits for a reply to the tick: without this command, a safe one.
         self._mark_uncommanded(command.tick)
+
+    def _now_ns(self) -> int:
+        """Return the simulated time: in real time it goes on while this process does not run or hears nothing."""
+        if self.odometry is None:
+            return 0
+        silent_s = self.node.host.now_s() - self._odometry_arrived_s if self.realtime else 0.0
+        return self.odometry.sim_time_ns + round(max(0.0, silent_s) * 1e9)
 
     def _execute(self, command: WrenchCommand) -> None:
         self.executed_ns, self._term = command.sim_time_ns, command.term

@@ -72,12 +72,13 @@ class Link:
 
 
 class ReceivedMessage(Struct, frozen=True):
-    """A valid message. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped."""
+    """A valid message. ``sent_ns`` is the sender's wall clock (HLC), 0 if unstamped; ``arrived_s`` the clock of this host."""
 
     topic: Topic
     place: str | None
     message: Any
     sent_ns: int
+    arrived_s: float = 0.0
 
 
 def open_error(error: Exception, link: Link) -> str:

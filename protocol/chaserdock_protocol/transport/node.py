@@ -36,6 +36,10 @@ class TrafficCounters:
     stale: int = 0
 
 
+_Arrival = tuple[Topic, str | None, RawSample, float]
+"""Topic, place and sample of a message, and the time (s) when it arrived."""
+
+
 class MessageFilter(Protocol):
     """Replaces the messages that a node sends and receives. Fault injection implements it."""
 
@@ -63,7 +67,7 @@ class Node:
         self.blocking = True
         """True (lock-step): a slow reader blocks the publisher. False: it misses messages. Set before publishing."""
         self._ready: deque[ReceivedMessage] = deque()
-        self._latest: dict[str, tuple[Topic, str | None, RawSample]] = {}
+        self._latest: dict[str, _Arrival] = {}
         self._latest_lock = threading.Lock()
         self._publishers: dict[str, Callable[[bytes], None]] = {}
         self._next_seq: Counter[str] = Counter()
@@ -73,7 +77,7 @@ class Node:
         self._close_callbacks: list[Callable[[], None]] = []
         network: Network = ZenohNetwork(link) if link.network is None else link.network
         self._connection, self.host = network.open(name)
-        self._inbox: BoundedQueue[tuple[Topic, str | None, RawSample] | None] = self.host.new_queue()
+        self._inbox: BoundedQueue[_Arrival | None] = self.host.new_queue()
 
     # -- publishing ---------------------------------------------------------------------------------------
 
@@ -140,10 +144,10 @@ class Node:
             if latest:
                 with self._latest_lock:
                     waiting = key in self._latest
-                    self._latest[key] = (topic, found[1], raw)
+                    self._latest[key] = (topic, found[1], raw, self.host.now_s())
                 if not waiting:
                     self._inbox.put(None, 0)
-            elif not self._inbox.put((topic, found[1], raw), len(raw.payload)):
+            elif not self._inbox.put((topic, found[1], raw, self.host.now_s()), len(raw.payload)):
                 self.counts.rejected["queue full"] += 1
 
         self._connection.subscribe(expression, arrived)
@@ -201,8 +205,10 @@ class Node:
                 item = self._latest.pop(key)
         return self._filter(*item)
 
-    def _filter(self, topic: Topic, place: str | None, raw: RawSample) -> ReceivedMessage | None:
-        received = self._decode(topic, place, raw)
+    def _filter(
+        self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float
+    ) -> ReceivedMessage | None:
+        received = self._decode(topic, place, raw, arrived_s)
         if received is None:
             return None
         seq, last = received.message.seq, self._last_seq.get(raw.key)
@@ -212,10 +218,12 @@ class Node:
         if self.message_filter is None:
             return received
         delivered = self.message_filter.incoming(topic, place, received.message, raw.payload)
-        self._ready.extend(ReceivedMessage(topic, place, m, raw.sent_ns) for m in delivered)
+        self._ready.extend(ReceivedMessage(topic, place, m, raw.sent_ns, arrived_s) for m in delivered)
         return self._ready.popleft() if self._ready else None
 
-    def _decode(self, topic: Topic, place: str | None, raw: RawSample) -> ReceivedMessage | None:
+    def _decode(
+        self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float = 0.0
+    ) -> ReceivedMessage | None:
         try:
             message: Any = codec.decode(topic.kind, raw.payload, raw.encoding)
             if place is not None and str(getattr(message, "chaser", place)) != place:
@@ -223,7 +231,7 @@ class Node:
         except Rejected as refusal:
             self.counts.rejected[f"{topic.key}:{refusal.reason}"] += 1
             return None
-        return ReceivedMessage(topic, place, message, raw.sent_ns)
+        return ReceivedMessage(topic, place, message, raw.sent_ns, arrived_s)
 
     # -- queries and liveliness ----------------------------------------------------------------------------
 

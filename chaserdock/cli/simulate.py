@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``chaserdock simulate``: missions in one process, in virtual time, with random faults."""
+
+from __future__ import annotations
+
+import re
+import sys
+import time
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from chaserdock.exit_codes import DONE, FAILED
+
+from .options import Mode, ScenarioArg, fail
+
+if TYPE_CHECKING:
+    from chaserdock.simulation.swarm import Result
+
+
+def _seed_range(text: str) -> range:
+    found = re.fullmatch(r"(\d+)(?::(\d+))?", text)
+    first, last = (int(found[1]), int(found[2] or found[1])) if found else (1, 0)
+    if last < first or last >= 2**32:
+        raise typer.BadParameter("must be FIRST:LAST or one number, below 2^32")
+    return range(first, last + 1)
+
+
+def simulate(
+    scenario: ScenarioArg,
+    seeds: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FIRST:LAST",
+            help="fly random faults drawn from these seeds; without: as the scenario states",
+        ),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly on")] = 1,
+    mode: Annotated[Mode | None, typer.Option(help="fly all seeds in this mode; drawn by default")] = None,
+    images: Annotated[
+        bool, typer.Option("--images", help="render images instead of drawing measurements (slower)")
+    ] = False,
+    shrinking: Annotated[
+        bool,
+        typer.Option(
+            "--shrink/--no-shrink", help="reduce seeds that fail to the simplest scenario that fails"
+        ),
+    ] = True,
+    out: Annotated[
+        Path, typer.Option(help="folder for scenarios that fail, and for the log of a flight without --seeds")
+    ] = Path("simulations"),
+) -> None:
+    """Simulate missions in this process, in virtual time, and check invariants. Status 0 only if all of them hold."""
+    from chaserdock.simulation.campaign import (
+        Swarm,
+        consistency,
+        fly_seeds,
+        inconsistency,
+        shrink_result,
+        write_case,
+    )
+    from chaserdock.simulation.swarm import fly_case
+
+    if seeds is None:
+        raise typer.Exit(_fly_one(scenario, out, mode))
+    begin_s = time.monotonic()
+    results: list[Result] = []
+    outcomes: Counter[str] = Counter()
+    swarm = Swarm(scenario, images, None if mode is None else mode.value)
+    for result in fly_seeds(swarm, _seed_range(seeds), jobs):
+        results.append(result)
+        outcomes[result.outcome] += 1
+        if not result.violations:
+            continue
+        for violation in result.violations:
+            print(f"seed {result.seed}: {violation}", flush=True)
+        if shrinking:
+            case = shrink_result(result)
+            path = write_case(case, fly_case(case, result.seed), out)
+            print(f"seed {result.seed}: shrunk to {path}:\n\n{path.read_text()}", flush=True)
+    elapsed_s = time.monotonic() - begin_s
+    failed = sum(bool(r.violations) for r in results)
+    counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common())
+    mean, flights = consistency(results)
+    print(
+        f"{len(results)} seeds in {elapsed_s:.0f} s: {counts}; mean NEES {mean:.2f} of 6 over {flights} flights"
+    )
+    if reason := inconsistency(results):
+        print(f"chaserdock: {reason}", file=sys.stderr)
+        failed += 1
+    raise typer.Exit(FAILED if failed else DONE)
+
+
+def _fly_one(scenario: str, out: Path, mode: Any) -> int:
+    """Fly a scenario with its own faults and conditions; print what it violates."""
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    from chaserdock.simulation.swarm import fly_case
+
+    path = find_scenario(scenario)
+    case: dict[str, Any] = {"extends": str(path.resolve())}
+    if mode is not None:
+        case["simulation"] = {"mode": mode.value}
+    folder = out / path.stem
+    if (folder / "run").exists():
+        raise fail(f"{folder / 'run'} exists already; a log is never overwritten, choose another --out")
+    result = fly_case(case, 0, folder)
+    for violation in result.violations:
+        print(violation)
+    print(f"{path.stem}: {result.outcome}, fingerprint {result.fingerprint}; log: {folder / 'run'}")
+    return FAILED if result.violations else DONE

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fly many seeds, on several processes if asked to; shrink what fails, and check consistency over all of them."""
+
+from __future__ import annotations
+
+import itertools
+import multiprocessing
+import os
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from chaserdock_protocol.process import SINGLE_THREADED
+from chaserdock_protocol.scenario import ScenarioError, load_scenario
+from chaserdock_protocol.shipped_scenarios import find_scenario
+
+from .shrinking import shrink
+from .swarm import Case, Result, case_text, draw_case, fly_case
+
+NEES_LIMITS = (1.5, 12.0)
+"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights whose sensors are honest."""
+LEAST_NEES_FLIGHTS = 20
+
+
+@dataclass(frozen=True)
+class Swarm:
+    """What to fly: a scenario by name or path; with rendered images; in one mode only."""
+
+    scenario: str
+    images: bool = False
+    mode: str | None = None
+
+
+def fly_seed(swarm: Swarm, seed: int) -> Result:
+    """Draw and fly the case of a seed. Raises ScenarioError."""
+    path = find_scenario(swarm.scenario)
+    name = str(path.resolve()) if path == Path(swarm.scenario) else path.stem
+    case = draw_case(name, seed, load_scenario(path), images=swarm.images, mode=swarm.mode)
+    return fly_case(case, seed)
+
+
+def _fly(job: tuple[Swarm, int]) -> Result:
+    return fly_seed(*job)
+
+
+def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Result]:
+    """Yield the results of the seeds, in their order."""
+    if jobs == 1:
+        yield from map(_fly, ((swarm, seed) for seed in seeds))
+        return
+    os.environ.update(SINGLE_THREADED)  # read by the numerical libraries of the new processes when they start
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(jobs, mp_context=context) as pool:
+        remaining, running = iter(seeds), []
+        for seed in itertools.islice(remaining, 2 * jobs):
+            running.append(pool.submit(_fly, (swarm, seed)))
+        while running:
+            yield running.pop(0).result()
+            running += [pool.submit(_fly, (swarm, seed)) for seed in itertools.islice(remaining, 1)]
+
+
+def shrink_result(result: Result, attempts: int = 200) -> Case:
+    """Return the simplest case found that violates the first violated invariant of a result."""
+    first = result.violations[0]
+
+    def fails(case: Case) -> bool:
+        try:
+            return any(v.invariant == first.invariant for v in fly_case(case, result.seed).violations)
+        except ScenarioError:  # a simplification that leaves the scenario inconsistent
+            return False
+
+    return shrink(result.case, fails, first.time_s, attempts)
+
+
+def write_case(case: Case, result: Result, folder: Path) -> Path:
+    """Write a case that fails as a scenario file, with what it violates in its first lines; return its path."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"seed-{result.seed}.toml"
+    lines = [f"# {violation}" for violation in result.violations]
+    path.write_text("\n".join([*lines, case_text(case)]), encoding="utf-8")
+    return path
+
+
+def consistency(results: Iterable[Result]) -> tuple[float, int]:
+    """Return the mean NEES over the flights whose sensors are honest, each weighted equally, and their number."""
+    means = [float(np.mean(r.nees)) for r in results if r.honest and r.nees]
+    return (float(np.mean(means)) if means else float("nan")), len(means)
+
+
+def inconsistency(results: Iterable[Result]) -> str | None:
+    """Return why the estimate's covariance is inconsistent over an ensemble, None if it is not or the ensemble is small."""
+    mean, number = consistency(results)
+    low, high = NEES_LIMITS
+    if number < LEAST_NEES_FLIGHTS or low <= mean <= high:
+        return None
+    return f"covariance consistency: mean NEES {mean:.2f} over {number} flights, allowed {low:g} to {high:g}"

@@ -1,0 +1,297 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What must hold in every simulated flight, whatever fails: checked on all published messages, at every tick.
+
+The checks see messages only, and trust none of the processes: who commands follows from what the chasers flew.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    BodyTruth,
+    DrawnTruth,
+    Event,
+    MissionEnd,
+    Reference,
+    TargetEstimate,
+    Tick,
+    WorldTruth,
+)
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.transport import RawSample
+
+from chaserdock.analysis.criteria import nearest_allowed_m
+
+SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate"})
+"""Phases in which a chaser keeps its distance, if their reason is in the log."""
+KEEP_OUT_SLACK_M = 0.02
+_NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
+_DOCKED = frozenset({"docked", "latched", "verified"})
+_POSE = (0, 1, 2, 6, 7, 8)
+_IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
+_CONSERVED_SHARE = 2e-3
+
+
+@dataclass(frozen=True)
+class Violation:
+    """An invariant that did not hold: its name, the mission time (s), and what was found."""
+
+    invariant: str
+    time_s: float
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.invariant} at {self.time_s:.2f} s: {self.text}"
+
+
+@dataclass
+class Invariants:
+    """Checks the messages of one flight as they are published; each violation is noted once per subject.
+
+    ``nees``: normalized squared errors of the estimated pose of the target, one a second (6 on average if consistent).
+    """
+
+    scenario: Scenario
+    violations: list[Violation] = field(default_factory=list)
+    nees: list[float] = field(default_factory=list)
+    reasons: list[str] = field(default_factory=list)
+    end: MissionEnd | None = None
+    phases: dict[int, str] = field(default_factory=dict)
+    dead: set[str] = field(default_factory=set)
+    _seen: set[tuple[str, str]] = field(default_factory=set)
+    _tick: int = -1
+    _state_tick: int = -1
+    _bodies: list[BodyTruth] = field(default_factory=list)
+    _states: dict[str, BodyTruth] = field(default_factory=dict)
+    _drawn: dict[str, Any] = field(default_factory=dict)
+    _flown: dict[int, ActuatorCommand] = field(default_factory=dict)
+    _first_flown: dict[int, int] = field(default_factory=dict)
+    _touching: set[str] = field(default_factory=set)
+    _begin: dict[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._lifetime_ticks = math.ceil(
+            self.scenario.controller.command_lifetime_s * self.scenario.time.rate_hz
+        )
+        self._nearest_m = {
+            f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
+        }
+        self._handlers: dict[type, Callable[[Any], None]] = {
+            Tick: self._on_tick,
+            WorldTruth: self._on_world,
+            DrawnTruth: self._on_drawn,
+            BodyTruth: self._on_body,
+            ActuatorCommand: self._on_command,
+            TargetEstimate: self._on_estimate,
+            Reference: self._on_reference,
+            Event: self._on_event,
+            MissionEnd: self._on_end,
+        }
+
+    @property
+    def time_s(self) -> float:
+        """Mission time of the newest tick (s)."""
+        return max(0, self._tick, self._state_tick) / self.scenario.time.rate_hz
+
+    def violate(self, invariant: str, subject: str, text: str) -> None:
+        """Note a violation, unless one of the same invariant and subject is noted already."""
+        if (invariant, subject) not in self._seen:
+            self._seen.add((invariant, subject))
+            self.violations.append(Violation(invariant, self.time_s, f"{subject}: {text}"))
+
+    def observe(self, sender: str, raw: RawSample) -> None:
+        """Check a message when it is published."""
+        found = topics.topic_of_key(raw.key)
+        try:
+            if found is None:
+                raise Rejected("key", f"unknown key {raw.key}")
+            message = codec.decode(found[0].kind, raw.payload, raw.encoding)
+        except Rejected as refusal:
+            self.violate("valid messages", sender, f"{raw.key}: {refusal}")
+            return
+        handle = self._handlers.get(type(message))
+        if handle is not None:
+            handle(message)
+
+    # -- bodies --------------------------------------------------------------------------------------------------
+
+    def _on_tick(self, tick: Tick) -> None:
+        if tick.tick > self._tick:
+            self._tick = tick.tick
+            self._check_distances()
+
+    def _on_world(self, world: WorldTruth) -> None:
+        self._state_tick = world.tick
+        for a, b in world.contacts:
+            # A chaser that no command reaches drifts: what it hits is nobody's doing.
+            if not {a, b} & self.dead:
+                self.violate("no contact", f"{a} and {b}", "bodies touch")
+        self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in world.latched}
+        self._touching |= {f"chaser/{t.chaser}" for t in world.touches}
+        for body in self._bodies:
+            self._check_body(body)
+        self._bodies.clear()
+
+    def _on_drawn(self, drawn: DrawnTruth) -> None:
+        self._drawn = {body.body: body for body in drawn.bodies}
+
+    def _on_body(self, body: BodyTruth) -> None:
+        self._bodies.append(body)
+
+    def _check_body(self, body: BodyTruth) -> None:
+        before = self._states.get(body.body)
+        self._states[body.body] = body
+        if self._touching & {body.body, *(["target"] if self._touching else [])}:
+            self._begin.clear()
+            return
+        if before is None or body.tick != before.tick + 1:
+            return
+        if body.body == "target":
+            self._check_target(body)
+        else:
+            self._check_momentum(before, body)
+
+    def _check_momentum(self, before: BodyTruth, after: BodyTruth) -> None:
+        """Compare the change of a chaser's momentum with the impulse of its actuators and disturbances."""
+        drawn = self._drawn.get(after.body)
+        if drawn is None or np.any(
+            drawn.centre_of_mass_m
+        ):  # the body's origin is not its centre of mass then
+            return
+        truth, dt_s = self.scenario.truth.mismatch("chaser"), 1.0 / self.scenario.time.rate_hz
+        impulse = np.array(after.impulse_N_s) + np.array(drawn.force_N) * dt_s
+        halfway = rotations.integrate(np.array(before.q_wxyz), np.array(before.omega_rad_s), 0.5 * dt_s)
+        gained = drawn.mass_kg * (np.array(after.velocity_m_s) - np.array(before.velocity_m_s))
+        error = float(np.linalg.norm(gained - rotations.rotate(halfway, impulse)))
+        turned = float(np.linalg.norm(after.omega_rad_s)) * dt_s
+        allowed = _IMPULSE_FLOOR_N_S + (_IMPULSE_SHARE + turned) * (
+            after.absolute_impulse_N_s + float(np.linalg.norm(drawn.force_N)) * dt_s
+        )
+        if error > allowed + 5.0 * truth.force_noise_N * dt_s:
+            self.violate("momentum", after.body, f"{error:.2e} N s without a cause, {allowed:.2e} allowed")
+
+    def _check_target(self, body: BodyTruth) -> None:
+        """Compare the untouched target's motion with what its kind of motion conserves."""
+        drawn = self._drawn.get("target")
+        if drawn is None:
+            return
+        omega, velocity = np.array(body.omega_rad_s), np.array(body.velocity_m_s)
+        inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
+        conserved = {"rotational energy": 0.5 * float(omega @ inertia @ omega)}
+        if not np.any(drawn.centre_of_mass_m):
+            conserved["speed"] = float(np.linalg.norm(velocity))
+        if self.scenario.target.motion == "torque_free":
+            momentum = rotations.rotate(np.array(body.q_wxyz), inertia @ omega)
+            conserved |= {
+                f"angular momentum {axis}": float(x) for axis, x in zip("xyz", momentum, strict=True)
+            }
+        scale = float(np.linalg.norm(inertia @ omega))
+        for name, value in conserved.items():
+            begin = self._begin.setdefault(name, value)
+            size = max(abs(begin), scale if name.startswith("angular") else abs(begin), 1e-9)
+            if abs(value - begin) > _CONSERVED_SHARE * size:
+                self.violate("energy and momentum", "target", f"{name} from {begin:.6g} to {value:.6g}")
+
+    def _check_distances(self) -> None:
+        states, target = self._states, self._states.get("target")
+        chasers = {
+            n: np.array(s.position_m) for n, s in states.items() if n != "target" and n not in self.dead
+        }
+        limit_m = self.scenario.limits.min_distance_chasers_m - KEEP_OUT_SLACK_M
+        for (a, at), (b, bt) in itertools.combinations(chasers.items(), 2):
+            if (distance_m := _distance(at, bt)) < limit_m:
+                self.violate("keep-out zone", f"{a} and {b}", f"{distance_m:.3f} m apart")
+        for name, at in chasers.items():
+            if target is None or name in self._touching:
+                continue
+            distance_m = _distance(at, np.array(target.position_m))
+            if distance_m < self._nearest_m[name] - KEEP_OUT_SLACK_M:
+                self.violate("keep-out zone", name, f"{distance_m:.3f} m from the target")
+
+    # -- commands ------------------------------------------------------------------------------------------------
+
+    def _on_command(self, command: ActuatorCommand) -> None:
+        if command.source != "command":
+            return
+        name, before = f"chaser/{command.chaser}", self._flown.get(command.chaser)
+        self._flown[command.chaser] = command
+        age = self._tick - command.tick
+        if age > self._lifetime_ticks:
+            self.violate("no stale command", name, f"flies a command of {age} ticks ago")
+        if before is not None and command.tick < before.tick:
+            self.violate("no stale command", name, f"flies tick {command.tick} after {before.tick}")
+        if before is not None and command.term < before.term:
+            self.violate("no superseded command", name, f"flies term {command.term} after {before.term}")
+        first = self._first_flown.setdefault(command.term, command.tick)
+        for term, since in self._first_flown.items():
+            if term > command.term and command.tick > since + 1:
+                self.violate(
+                    "one commander",
+                    name,
+                    f"flies term {command.term} at tick {command.tick}; term {term} is flown since {since}",
+                )
+        self._first_flown[command.term] = min(first, command.tick)
+
+    # -- the rest ------------------------------------------------------------------------------------------------
+
+    def _on_estimate(self, estimate: TargetEstimate) -> None:
+        truth = self._states.get("target")
+        if estimate.tick % self.scenario.time.rate_hz or estimate.status not in ("tracking", "predicting"):
+            return
+        if truth is None or truth.sim_time_ns != estimate.sim_time_ns:
+            return
+        covariance = np.array(estimate.covariance).reshape(12, 12)[np.ix_(_POSE, _POSE)]
+        turn = rotations.log(
+            rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), np.array(truth.q_wxyz))
+        )
+        error = np.concatenate([np.array(truth.position_m) - np.array(estimate.position_m), turn])
+        self.nees.append(float(error @ np.linalg.solve(covariance, error)))
+
+    def _on_reference(self, reference: Reference) -> None:
+        self.phases[reference.chaser] = reference.phase
+
+    def _on_event(self, event: Event) -> None:
+        if event.level != "info" and not event.what.startswith("fault "):
+            self.reasons.append(f"{event.process}: {event.what} {event.detail}".strip())
+        if event.process == "world" and event.what == "process lost":
+            self.dead.add(event.detail)
+        if event.process == "world" and event.what == "actuators stopped":
+            self.dead.add(event.detail.partition(":")[0])
+
+    def _on_end(self, end: MissionEnd) -> None:
+        self.end = end
+
+    def check_end(self, crashes: dict[str, str], stalled: tuple[str, ...]) -> None:
+        """Check what must hold when a flight is over: it ended, all processes did, and each mission is docked or safe."""
+        for name, trace in crashes.items():
+            self.violate("no crash", name, trace.strip().splitlines()[-1])
+        for name in stalled:
+            self.violate("liveness", name, "has not ended")
+        if self.end is None:
+            self.violate("liveness", "world", "the mission has not ended")
+            return
+        if not self.end.complete and not self.dead.issuperset(self._nearest_m):
+            self.violate("liveness", "world", f"the mission ended early: {self.end.reason}")
+        success, commanded = self.scenario.success, {e.command for e in self.scenario.timeline}
+        for chaser in (*success.docked, *success.latched):
+            phase = self.phases.get(chaser, "")
+            if phase in _DOCKED or self.reasons or (phase in SAFE_PHASES and commanded & set(_NAMED_IN)):
+                continue
+            self.violate(
+                "liveness", f"chaser/{chaser}", f"ends in phase {phase or 'none'} without a named reason"
+            )
+
+
+def _distance(a: Array, b: Array) -> float:
+    return math.dist(a.tolist(), b.tolist())

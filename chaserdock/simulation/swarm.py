@@ -1,0 +1,325 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random flights: each seed draws a subset of the kinds of faults, and from these its faults, network and operator commands.
+
+Leaving out most kinds in each flight finds more than mixing all of them always (A. Groce et al., "Swarm testing", 2012). A
+flight is a ``Case``: the keys of a scenario file that extends a shipped scenario.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import random
+import tempfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+from chaserdock_protocol.recording.log import LogError, count_messages
+from chaserdock_protocol.recording.scan import LOG_NAME
+from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario.faults import FaultKind
+from chaserdock_protocol.transport import RawSample
+
+from .invariants import Invariants, Violation
+from .mission import Flight, simulate
+
+KINDS: tuple[str, ...] = get_args(FaultKind)
+RECEIVED = {
+    "world": ["actuators"],
+    "controller": ["odometry", "sighting"],
+    "chaser": ["image", "odometry", "wrench"],
+}
+PUBLISHED = {"world": ["image", "odometry"], "controller": ["wrench"], "chaser": ["sighting", "actuators"]}
+
+Case = dict[str, Any]
+"""Keys and values of a scenario file."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal flights.
+
+    ``nees``: of the estimate, one value a second; ``honest``: no sensor lied, so that it should be consistent.
+    """
+
+    seed: int
+    case: Case
+    violations: tuple[Violation, ...]
+    outcome: str
+    fingerprint: str
+    nees: tuple[float, ...]
+    honest: bool
+    sim_time_s: float
+
+
+def draw_fault(kind: str, draw: random.Random, chasers: int, latest_s: float = 20.0) -> dict[str, Any]:
+    """Return a random fault of a kind, as in a scenario file, that begins before ``latest_s``."""
+    names = [f"chaser/{i}" for i in range(chasers)]
+    fault: dict[str, Any] = {"kind": kind, "at_s": round(draw.uniform(0.5, latest_s), 2)}
+    duration_s = round(draw.choice([0.3, 1.0, 3.0, 8.0]) * draw.uniform(0.5, 1.5), 2)
+    if kind != "kill":
+        fault["duration_s"] = min(duration_s, 3.0) if kind == "freeze" else duration_s
+    processes = ["world", "controller", *names]
+    if kind == "kill":
+        fault["process"] = draw.choice(["controller", "recorder", *names])
+    elif kind == "freeze":
+        fault["process"] = draw.choice([*processes, "recorder"])
+    elif kind == "cut":
+        fault["process"] = draw.choice(names)
+        if draw.random() < 0.5:
+            fault["peer"] = "controller"
+    elif kind in ("camera_off", "lying_sensor", "odometry_lie"):
+        fault["process"] = draw.choice(names)
+    elif kind == "clock_jump":
+        fault["process"] = draw.choice(["controller", *names])
+        fault["offset_s"] = round(draw.choice([-1, 1]) * 10 ** draw.uniform(-2, 2), 3)
+    else:
+        fault["process"] = draw.choice(processes)
+        topics = PUBLISHED if kind == "flood" else RECEIVED
+        fault["topic"] = draw.choice(topics[fault["process"].partition("/")[0]])
+    fault |= _draw_severity(kind, draw)
+    return fault
+
+
+def _draw_severity(kind: str, draw: random.Random) -> dict[str, Any]:
+    if kind in ("drop", "duplicate", "reorder", "corrupt"):
+        return {"share": draw.choice([0.1, 0.5, 1.0])}
+    if kind == "delay":
+        return {"delay_s": round(draw.uniform(0.1, 1.0), 2)}
+    if kind == "flood":
+        return {"copies": draw.choice([5, 50, 200])}
+    if kind in ("lying_sensor", "odometry_lie"):
+        return {
+            "offset_m": [round(draw.gauss(0.0, 0.1), 3) for _ in range(3)],
+            "rotation_deg": [round(draw.gauss(0.0, 5.0), 2) for _ in range(3)],
+        }
+    return {}
+
+
+def draw_case(
+    name: str, seed: int, scenario: Scenario, *, images: bool = False, mode: str | None = None
+) -> Case:
+    """Return the flight of a seed: a variant of scenario ``name``, which is ``scenario`` when loaded."""
+    draw, chasers, end_s = random.Random(f"swarm {seed}"), len(scenario.chasers), scenario.duration_s
+    case: Case = {"extends": name, "name": f"seed-{seed}", "seed": seed % 2**32}
+    if not images:
+        case["perception"] = {"name": "statistical"}
+    standby = scenario.controller.standby or draw.random() < 0.5
+    case["controller"] = {"standby": standby}
+    kinds = [kind for kind in KINDS if draw.random() < 0.25]
+    faults = [
+        draw_fault(draw.choice(kinds), draw, chasers, 0.8 * end_s)
+        for _ in range(draw.choice([0, 1, 1, 2, 3, 4]) if kinds else 0)
+    ]
+    for fault in faults:
+        if standby and fault["process"] == "controller" and draw.random() < 0.3:
+            fault["process"] = "standby"
+    case["fault"] = faults
+    case["simulation"] = _draw_network(draw, chasers, end_s, standby)
+    if mode is not None:
+        case["simulation"]["mode"] = mode
+    if truth := _draw_truth(draw):
+        case["truth"] = truth
+    if commands := _draw_commands(draw, scenario):
+        case["timeline"] = commands
+    return case
+
+
+def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool) -> dict[str, Any]:
+    """Return a section ``[simulation]``."""
+    names = [
+        "world",
+        "controller",
+        *(["standby"] if standby else []),
+        *(f"chaser/{i}" for i in range(chasers)),
+    ]
+
+    def window() -> dict[str, float]:
+        duration_s = draw.choice([0.2, 1.0, 4.0]) * draw.uniform(0.5, 1.5)
+        return {"at_s": round(draw.uniform(0.5, 0.8 * end_s), 2), "duration_s": round(duration_s, 2)}
+
+    section: dict[str, Any] = {"mode": draw.choice(["lockstep", "realtime", "realtime"])}
+    section["latency_s"] = draw.choice([0.0, 0.0005, 0.002, 0.01])
+    for key, values in (
+        ("jitter_s", [0.0005, 0.002, 0.01]),
+        ("loss", [0.001, 0.01, 0.05]),
+        ("duplicate", [0.001, 0.02, 0.1]),
+        ("reorder", [0.001, 0.02, 0.1]),
+    ):
+        if draw.random() < 0.3:
+            section[key] = draw.choice(values)
+    if draw.random() < 0.3:
+        section["partition"] = [
+            {**window(), "processes": sorted(draw.sample(names, draw.choice([1, 1, 2])))}
+            for _ in range(draw.choice([1, 1, 2]))
+        ]
+    if draw.random() < 0.25:
+        reader = draw.choice([*names, "recorder"])
+        section["slow"] = [{**window(), "process": reader, "each_s": draw.choice([0.001, 0.005, 0.02])}]
+    if draw.random() < 0.3:
+        wrong = draw.sample(names, draw.choice([1, 2]))
+        section["clock"] = [
+            {
+                "process": p,
+                "offset_s": round(draw.uniform(-1e3, 1e3), 1),
+                "drift": round(draw.gauss(0, 0.005), 4),
+            }
+            for p in sorted(wrong)
+        ]
+        for clock in section["clock"]:
+            clock["drift"] = max(-0.05, min(0.05, clock["drift"]))
+    return section
+
+
+def _draw_truth(draw: random.Random) -> dict[str, Any]:
+    """Return a section ``[truth]``: mostly none."""
+    if draw.random() > 0.3:
+        return {}
+    chaser = {
+        "mass_share": draw.choice([0.05, 0.1]),
+        "thrust_share": 0.05,
+        "force_N": 0.005,
+        "torque_N_m": 0.0005,
+        "delay_s": 0.01,
+        "clock_offset_s": 0.005,
+    }
+    return {"chaser": {key: value for key, value in chaser.items() if draw.random() < 0.5}}
+
+
+def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
+    """Return a timeline: that of the scenario and random operator commands; empty without any."""
+    if draw.random() > 0.3:
+        return []
+    timeline = [e.model_dump(exclude_none=True) for e in scenario.timeline]
+    for _ in range(draw.choice([1, 2, 3])):
+        chaser = draw.randrange(len(scenario.chasers))
+        command = draw.choice(["hold", "retreat", "abort", "approach", "goto"])
+        entry = {"at_s": round(draw.uniform(1.0, 0.9 * scenario.duration_s), 2), "command": command}
+        entry["chasers"] = [chaser]
+        if command == "goto":
+            entry["offset_m"] = [round(1.3 * x, 3) for x in scenario.chasers[chaser].position_m]
+        timeline.append(entry)
+    return sorted(timeline, key=lambda e: e["at_s"])
+
+
+def fly_case(case: Case, seed: int, folder: Path | None = None) -> Result:
+    """Simulate a case and check the invariants; the log stays in ``folder`` if one is given. Raises ScenarioError."""
+    with contextlib.ExitStack() as stack:
+        scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_memory_folder())))
+        path = (folder or scratch) / "scenario.toml"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(case_text(case), encoding="utf-8")
+        checks, fingerprint = Invariants(load_scenario(path)), 0
+
+        def tap(sender: str, raw: RawSample) -> None:
+            nonlocal fingerprint
+            fingerprint = zlib.crc32(
+                raw.payload, zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), fingerprint)
+            )
+            checks.observe(sender, raw)
+
+        flight = simulate(path, path.parent / "run", tap=tap)
+        checks.check_end(flight.crashes, flight.stalled)
+        _check_recording(checks, flight)
+        _check_queues(checks, flight)
+    lies = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
+    return Result(
+        seed=seed,
+        case=case,
+        violations=tuple(checks.violations),
+        outcome=_outcome(checks),
+        fingerprint=f"{fingerprint:08x}",
+        nees=tuple(checks.nees),
+        honest=not lies & {f["kind"] for f in case.get("fault", [])} and "truth" not in case,
+        sim_time_s=checks.time_s,
+    )
+
+
+def _memory_folder() -> str | None:
+    """Return a folder in memory for logs that are not kept, if this system has one."""
+    return "/dev/shm" if Path("/dev/shm").is_dir() else None
+
+
+def _outcome(checks: Invariants) -> str:
+    if checks.violations:
+        return checks.violations[0].invariant
+    success = checks.scenario.success
+    wanted = {*success.docked, *success.latched}
+    return (
+        "docked" if all(checks.phases.get(i) in ("docked", "latched", "verified") for i in wanted) else "safe"
+    )
+
+
+def _check_recording(checks: Invariants, flight: Flight) -> None:
+    """Compare the log with what reached the recorder."""
+    if "recorder" in flight.stalled or flight.statuses.get("recorder") is None:
+        return
+    try:
+        recorded = count_messages(flight.folder / LOG_NAME)
+    except LogError as error:
+        checks.violate("no recorded data lost", "recorder", str(error))
+        return
+    for key, number in flight.traffic.recorded.items():
+        if recorded.get(key, 0) != number:
+            checks.violate(
+                "no recorded data lost", key, f"{recorded.get(key, 0)} of {number} messages are in the log"
+            )
+
+
+def _check_queues(checks: Invariants, flight: Flight) -> None:
+    """Queues stay short unless a flood or a slow or frozen reader fills them; they are bounded anyway."""
+    s = checks.scenario
+    if s.simulation.slow or s.simulation.partition or any(f.kind in ("flood", "freeze") for f in s.fault):
+        return
+    for name, items in flight.traffic.queues.items():
+        if items.most > QUEUE_LIMIT:
+            checks.violate("bounded queues", name.split()[0], f"{items.most} messages waited")
+
+
+QUEUE_LIMIT = 2000
+"""Most messages that may wait for a reader which is neither slow nor flooded."""
+
+
+# -- scenario files ---------------------------------------------------------------------------------------------
+
+
+def case_text(case: Mapping[str, Any]) -> str:
+    """Return a case as the text of a scenario file."""
+    plain = {k: v for k, v in case.items() if not isinstance(v, Mapping | list) or _is_plain(v)}
+    lines = [f"{key} = {toml(value)}" for key, value in plain.items() if not isinstance(value, Mapping)]
+    for key, value in case.items():
+        lines += _table_lines(key, value)
+    return "\n".join(lines) + "\n"
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, list) and not any(isinstance(v, Mapping) for v in value)
+
+
+def _table_lines(key: str, value: Any) -> list[str]:
+    if isinstance(value, Mapping) and value:
+        nested = {k: v for k, v in value.items() if isinstance(v, Mapping) or (v and _is_table_array(v))}
+        lines = [f"{k} = {toml(v)}" for k, v in value.items() if k not in nested and v != []]
+        out = ["", f"[{key}]", *lines] if lines else []
+        return out + [line for k, v in nested.items() for line in _table_lines(f"{key}.{k}", v)]
+    if _is_table_array(value):
+        return [
+            line
+            for row in value
+            for line in ("", f"[[{key}]]", *(f"{k} = {toml(v)}" for k, v in row.items()))
+        ]
+    return []
+
+
+def _is_table_array(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
+
+
+def toml(value: Any) -> str:
+    """Return a value as inline TOML."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
+    return json.dumps(list(value) if isinstance(value, tuple) else value)

@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Random cases, the invariants of simulated flights, and the reduction of failing cases."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    BodyTruth,
+    DrawnBody,
+    DrawnTruth,
+    Event,
+    MissionEnd,
+    Reference,
+    Tick,
+    WorldTruth,
+    encoding_of,
+)
+from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.topics import Topic
+from chaserdock_protocol.transport import RawSample
+from harness import ROOT
+from message_samples import BY_TYPE
+
+from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
+from chaserdock.simulation.invariants import Invariants, Violation
+from chaserdock.simulation.shrinking import shrink
+from chaserdock.simulation.swarm import KINDS, Case, Result, case_text, draw_case
+
+DRILL = ROOT / "scenarios" / "fault-drill.toml"
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return load_scenario(DRILL)
+
+
+# -- cases ------------------------------------------------------------------------------------------------------
+
+
+def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario, tmp_path: Path) -> None:
+    kinds, modes, sections = set(), set(), set()
+    for seed in range(150):
+        case = draw_case("fault-drill", seed, scenario)
+        assert case == draw_case("fault-drill", seed, scenario)
+        path = tmp_path / "case.toml"
+        path.write_text(case_text(case))
+        loaded = load_scenario(path)
+        assert [f.kind for f in loaded.fault] == [f["kind"] for f in case["fault"]]
+        assert loaded.simulation.model_dump(exclude_unset=True).keys() == case["simulation"].keys()
+        assert loaded.perception.name == "statistical"
+        kinds |= {f.kind for f in loaded.fault}
+        modes.add(loaded.simulation.mode)
+        sections |= case.keys() | case["simulation"].keys()
+    assert kinds == set(KINDS)
+    assert modes == {"lockstep", "realtime"}
+    assert sections >= {"truth", "timeline", "partition", "slow", "clock", "loss", "duplicate", "reorder"}
+
+
+def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> None:
+    path = tmp_path / "case.toml"
+    path.write_text(case_text({"extends": "fault-drill", "timeline": [], "success": {"docked": []}}))
+    assert load_scenario(path).timeline == ()
+
+
+# -- invariants -------------------------------------------------------------------------------------------------
+
+
+class Log:
+    """Publishes messages to the invariants of a scenario."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.checks = Invariants(scenario)
+
+    def publish(
+        self, topic: Topic, message: Any, place: int | str | None = None, sender: str = "world"
+    ) -> None:
+        raw = RawSample(topic.key_of(place), encoding_of(topic.kind), codec.encode(message), 0)
+        self.checks.observe(sender, raw)
+
+    def tick(self, tick: int) -> None:
+        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=tick * 100_000_000)
+        self.publish(topics.TICK, sample)
+
+    def bodies(self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()) -> None:
+        for body in bodies:
+            stamped = msgspec.structs.replace(body, tick=tick, sim_time_ns=tick * 100_000_000)
+            self.publish(topics.TRUTH_BODY, stamped, body.body)
+        self.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=contacts, saturated=()))
+        self.tick(tick)
+
+    def flies(self, chaser: int, tick: int, term: int = 1, source: str = "command") -> None:
+        sample: Any = BY_TYPE[ActuatorCommand]
+        command = msgspec.structs.replace(sample, chaser=chaser, tick=tick, term=term, source=source)
+        self.publish(topics.ACTUATORS, command, chaser, f"chaser/{chaser}")
+
+    def event(self, what: str, detail: str, process: str = "world", level: Any = "warning") -> None:
+        self.publish(topics.EVENT, Event(process=process, level=level, what=what, detail=detail), process)
+
+    @property
+    def found(self) -> list[str]:
+        return [v.invariant for v in self.checks.violations]
+
+
+@pytest.fixture
+def log(scenario: Scenario) -> Log:
+    return Log(scenario)
+
+
+def body(name: str, x_m: float, speed_m_s: float = 0.0, **values: Any) -> BodyTruth:
+    state = {
+        "velocity_m_s": (speed_m_s, 0.0, 0.0),
+        "q_wxyz": (1.0, 0.0, 0.0, 0.0),
+        "omega_rad_s": (0.0, 0.0, 0.1),
+    }
+    return BodyTruth(body=name, position_m=(x_m, 0.0, 0.0), **{**state, **values})
+
+
+def test_contact_is_a_violation_unless_a_chaser_is_lost(log: Log) -> None:
+    log.event("process lost", "chaser/1")
+    log.bodies(1, contacts=(("chaser/1", "target"),))
+    assert log.found == []
+    log.bodies(2, contacts=(("chaser/0", "chaser/2"),))
+    log.bodies(3, contacts=(("chaser/0", "chaser/2"),))
+    assert log.found == ["no contact"]
+    assert "0.20 s: chaser/0 and chaser/2" in str(log.checks.violations[0])
+
+
+def test_keep_out_zones_surround_target_and_chasers(log: Log) -> None:
+    log.bodies(1, body("target", 0.0), body("chaser/0", 0.34), body("chaser/1", 0.70))
+    assert log.found == []
+    log.bodies(2, body("target", 0.0), body("chaser/0", 0.32), body("chaser/1", 0.64))
+    assert log.found == ["keep-out zone", "keep-out zone"]
+
+
+def test_momentum_changes_by_impulses_only(log: Log) -> None:
+    drawn = DrawnBody(body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0,) * 9)
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
+    pushed = {"impulse_N_s": (0.1, 0.0, 0.0), "absolute_impulse_N_s": 0.1}
+    log.bodies(0, body("chaser/0", 2.0))
+    log.bodies(1, body("chaser/0", 2.0, 0.01, **pushed))
+    assert log.found == []
+    log.bodies(2, body("chaser/0", 2.0, 0.02))
+    assert log.found == ["momentum"]
+
+
+def test_an_untouched_target_conserves_its_energy(log: Log) -> None:
+    drawn = DrawnBody(body="target", mass_kg=1.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
+    for tick, rate in enumerate((0.1, 0.1, 0.1, 0.11)):
+        log.bodies(tick, body("target", 0.0, 0.1, omega_rad_s=(0.0, 0.0, rate)))
+    assert log.found == ["energy and momentum"]
+
+
+def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
+    log.tick(20)
+    log.flies(0, 20)
+    log.flies(0, 19, source="brake")
+    log.flies(1, 16)
+    assert log.found == []
+    log.flies(1, 10)
+    assert log.found == ["no stale command"]
+    log.flies(0, 21, term=2)
+    log.flies(0, 22, term=1)
+    assert log.found[1:] == ["no superseded command"]
+
+
+def test_two_chasers_do_not_fly_different_commanders_beyond_a_hand_over(log: Log) -> None:
+    log.tick(20)
+    log.flies(0, 20, term=2)
+    log.flies(1, 20, term=1)
+    log.flies(1, 21, term=1)
+    assert log.found == []
+    log.tick(22)
+    log.flies(1, 22, term=1)
+    assert log.found == ["one commander"]
+
+
+def test_invalid_messages_are_noticed(log: Log) -> None:
+    log.checks.observe("chaser/0", RawSample("world/tick", encoding_of(Tick), b"\xc1", 0))
+    log.checks.observe("chaser/0", RawSample("nowhere", "", b"", 0))
+    assert log.found == ["valid messages"]
+
+
+def ended(log: Log, complete: bool = True) -> Log:
+    log.publish(
+        topics.END, MissionEnd(tick=250, reason="completed" if complete else "no chaser", complete=complete)
+    )
+    return log
+
+
+def at_end(log: Log, phase: str) -> None:
+    for chaser in (0, 3):
+        reference: Any = msgspec.structs.replace(BY_TYPE[Reference], chaser=chaser, phase=phase)
+        log.publish(topics.REFERENCE, reference, chaser)
+
+
+def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, scenario: Scenario) -> None:
+    at_end(log, "docked")
+    ended(log).checks.check_end({}, ())
+    assert log.found == []
+    without = Log(scenario)
+    at_end(without, "hold")
+    ended(without).checks.check_end({}, ())
+    assert without.found == ["liveness", "liveness"]
+    with_reason = Log(scenario)
+    at_end(with_reason, "hold")
+    with_reason.event("no command", "for 2 s", "chaser/0")
+    ended(with_reason).checks.check_end({}, ())
+    assert with_reason.found == []
+
+
+def test_crashes_stalls_and_early_ends_are_violations(scenario: Scenario) -> None:
+    log = Log(scenario)
+    log.checks.check_end({"controller": "Traceback\nValueError: x"}, ("chaser/0",))
+    assert log.found == ["no crash", "liveness", "liveness"]
+    assert "ValueError: x" in log.checks.violations[0].text
+    early = ended(Log(scenario), complete=False)
+    at_end(early, "docked")
+    early.checks.check_end({}, ())
+    assert early.found == ["liveness"]
+
+
+def result(nees: float, honest: bool = True) -> Result:
+    return Result(1, {}, (), "docked", "", (nees,) * 5, honest, 25.0)
+
+
+def test_covariance_is_judged_over_honest_flights_only() -> None:
+    high = NEES_LIMITS[1] + 1.0
+    assert inconsistency([result(6.0)] * 30 + [result(1e3, honest=False)] * 30) is None
+    assert inconsistency([result(high)] * 3) is None
+    assert "mean NEES 13.00 over 30 flights" in str(inconsistency([result(high)] * 30))
+
+
+# -- shrinking --------------------------------------------------------------------------------------------------
+
+
+def test_shrinking_leaves_what_the_failure_needs(scenario: Scenario) -> None:
+    case: Case = draw_case("fault-drill", 2, scenario)
+    culprit = {
+        "kind": "drop",
+        "at_s": 7.34,
+        "duration_s": 3.71,
+        "process": "chaser/2",
+        "topic": "wrench",
+        "share": 0.5,
+    }
+    case["fault"] = [
+        *case["fault"],
+        {"kind": "freeze", "at_s": 3.0, "duration_s": 1.0, "process": "world"},
+        culprit,
+    ]
+    case["simulation"] |= {
+        "partition": [{"at_s": 1.0, "duration_s": 1.0, "processes": ["world"]}],
+        "loss": 0.01,
+    }
+    original = copy.deepcopy(case)
+    calls = 0
+
+    def fails(c: Case) -> bool:
+        nonlocal calls
+        calls += 1
+        drops = [f for f in c["fault"] if f["kind"] == "drop" and f["process"] == "chaser/2"]
+        long = any(f["duration_s"] >= 0.9 and f["at_s"] < c.get("duration_s", 25.0) for f in drops)
+        return long and c.get("simulation", {}).get("loss", 0.0) > 0.0
+
+    small = shrink(case, fails, violated_s=9.2)
+    assert case == original
+    assert fails(small)
+    assert small["duration_s"] == 10.0
+    assert small["simulation"] == {"loss": 0.01}
+    assert small["fault"] == [{**culprit, "at_s": 7.0, "duration_s": 0.9, "share": 1.0}] or (
+        small["fault"][0]["duration_s"] < 2.0 and small["fault"][0]["share"] == 1.0
+    )
+    assert "truth" not in small
+    assert small["seed"] == 0
+    assert calls < 120
+
+
+def test_shrinking_stops_after_its_attempts(scenario: Scenario) -> None:
+    calls = 0
+
+    def fails(_: Case) -> bool:
+        nonlocal calls
+        calls += 1
+        return False
+
+    case = draw_case("fault-drill", 5, scenario)
+    assert shrink(case, fails, 3.0, attempts=7) == case
+    assert calls <= 7
+
+
+def test_violations_print_as_one_line() -> None:
+    assert str(Violation("no contact", 1.25, "a and b: touch")) == "no contact at 1.25 s: a and b: touch"

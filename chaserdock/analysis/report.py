@@ -223,7 +223,7 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
 
 
 def _drawn(flight: RecordedFlight) -> str:
-    """Return a table of the true bodies and sensors beside what the flight software was told."""
+    """Return a table of the true bodies and sensors beside the nominal values of the flight software."""
     stated = {"target": flight.scenario.target.mass_kg} | {
         f"chaser/{i}": flight.scenario.chaser.mass_kg for i in range(len(flight.scenario.chasers))
     }

@@ -7,7 +7,7 @@ log holds the faulty message. Random draws depend only on the seed of the
 process' faults, the key and the tick.
 
 In lock-step a tick waits for its messages. A lost, late or damaged message is therefore replaced by a ``LostMessage``,
-which tells the reader not to wait. Real-time readers do not wait, and get none.
+on which the reader stops waiting. Real-time readers do not wait, and get none.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def test_numbers_that_are_none_are_refused() -> None:
 
 
 def test_a_lost_thruster_costs_its_share_of_the_box_only() -> None:
-    """Every corner of the limits that the pilot would tell the controller is still given exactly."""
+    """Every corner of the limits that the chaser would report to the controller is still given exactly."""
     allocator, full, limits = CASES["slider"]
     corners: Array = np.array(np.meshgrid(*[[-1.0, 1.0]] * 6)).reshape(6, -1).T * limits
     for lost in (0, 2):

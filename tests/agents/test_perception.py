@@ -192,7 +192,7 @@ def test_markers_of_another_target_are_foreign():
 
 
 def test_two_equal_targets_in_one_image_are_not_mixed_up():
-    """Every id twice: there is no telling which of the two is meant."""
+    """Every id is there twice, so its marker is ambiguous."""
     scene = Scene("paper", 1280, 720)
     image = scene.image(np.array([-0.15, 0.0, 0.9]), FACING)
     image[:, 640:] = scene.image(np.array([0.15, 0.0, 0.9]), FACING, 1)[:, 640:]

@@ -23,7 +23,7 @@ PERIOD_S, S = 0.1, 1_000_000_000
 
 
 class Bench:
-    """The proofs of a body's thrusters; what a burn fires counts as ``information`` each."""
+    """The self-test of a body's thrusters without a chaser; the caller adds the information of each burn."""
 
     def __init__(self, body: str = "tetra12", every_s: float = 10.0) -> None:
         chaser = mission(body).chaser
@@ -40,7 +40,7 @@ class Bench:
 
 @pytest.mark.parametrize("body", ["tetra12", "slider"])
 @pytest.mark.parametrize("lost", [None, 3])
-def test_burns_cancel_and_reach_every_thruster_and_then_there_is_peace(body: str, lost: int | None) -> None:
+def test_burns_cancel_reach_every_thruster_and_then_stop(body: str, lost: int | None) -> None:
     bench, tested = Bench(body), np.zeros(0)
     can = bench.full.copy()
     if lost is not None:
@@ -57,12 +57,12 @@ def test_burns_cancel_and_reach_every_thruster_and_then_there_is_peace(body: str
         now_ns, burns = now_ns + S // 2, burns + 1
         assert burns <= 2 * len(can)
     assert len(tested) == len(can) - (lost is not None)
-    # Anew when the proofs have grown old, and not before.
+    # They are repeated when the results have become too old, and not before.
     assert bench.burn(9 * S, can) is None
     assert bench.burn(now_ns + 11 * S, can) is not None
 
 
-def test_one_look_is_no_proof_and_neither_are_poor_ones() -> None:
+def test_one_test_is_not_sufficient_and_neither_are_noisy_ones() -> None:
     bench = Bench()
     assert bench.self_test.untested(0).all()
     bench.self_test.add_information(np.full(12, 1e6), 0)
@@ -76,7 +76,7 @@ def test_one_look_is_no_proof_and_neither_are_poor_ones() -> None:
 
 
 @pytest.mark.parametrize("every_s", [0.0, 10.0])
-def test_what_is_old_is_forgotten_though_nobody_asks(every_s: float) -> None:
+def test_old_results_expire_between_tests(every_s: float) -> None:
     bench = Bench(every_s=every_s)
     for k in range(1000):
         bench.self_test.add_information(np.full(12, 1.0), k * S)
@@ -93,7 +93,7 @@ def test_burns_are_apart_and_only_where_there_is_room() -> None:
 
 
 def fired(navigation: dict[str, float] | None = None, chaser: Any = None, **command_as: Any) -> set[int]:
-    """Thrusters that open within three seconds in which a pilot is asked for nothing."""
+    """Return the thrusters that open within three seconds of zero commands."""
     s = mission(chaser=chaser or {}, navigation={"grade": "exact", **(navigation or {})})
     pilot, out = ThrusterController(s, 0), set()
     for tick in range(45):
@@ -104,16 +104,16 @@ def fired(navigation: dict[str, float] | None = None, chaser: Any = None, **comm
     return out
 
 
-def test_a_pilot_tests_when_it_may_and_can() -> None:
+def test_thrusters_are_tested_when_enabled_and_observable() -> None:
     assert len(fired()) >= 3
     assert fired(chaser={"thruster_test_s": 0}) == set()
     assert fired(chaser={"modulation": {"modulator": "schmitt"}}) == set()
     assert len(fired({"velocity_noise_m_s": 0.001, "omega_noise_deg_s": 0.05})) >= 3
-    # Where a least pulse drowns in the noise of the odometry, tests would go on for ever.
+    # Where odometry noise hides a minimum pulse, tests would never end.
     assert fired({"velocity_noise_m_s": 0.01, "omega_noise_deg_s": 1.0}) == set()
 
 
-def test_who_is_about_to_touch_or_is_held_tests_nothing() -> None:
+def test_no_tests_near_contact_or_while_held() -> None:
     """The latch is armed from the final approach on (test_capture_guidance)."""
     assert len(fired(latch="release")) >= 3
     assert fired(latch="arm") == set()
@@ -122,7 +122,7 @@ def test_who_is_about_to_touch_or_is_held_tests_nothing() -> None:
 
 @pytest.mark.parametrize(("test_s", "finds"), [(10.0, True), (0.0, False)])
 def test_an_idle_thruster_that_sticks_off_is_found(test_s: float, finds: bool) -> None:
-    """Thruster 11 of tetra12 is not used at the paper's rates: without tests nobody learns that it is gone."""
+    """Thruster 11 of tetra12 is not used at the paper's rates: without tests its failure stays undetected."""
     failure = {"chaser": 0, "thruster": 11, "at_s": 8.0, "kind": "stuck_off"}
     scenario = mission(duration_s=26.0, chaser={"thruster_test_s": test_s}, thruster_failure=[failure])
     record = record_flight(scenario, measurement_model(scenario, 0))

@@ -31,7 +31,7 @@ def joined(members: Membership, *names: str) -> Membership:
     return members
 
 
-def tell(members: Membership, name: str, *heard: str, instance: str | None = None) -> bool:
+def announce(members: Membership, name: str, *heard: str, instance: str | None = None) -> bool:
     message = Presence(process=name, instance=instance or f"{name}-1", heard=first(*heard))
     return members.update_presence(message)
 
@@ -64,7 +64,7 @@ def test_refused_process_receives_the_reason(name: str, reason: str) -> None:
     assert not reply.accepted
     assert reason in reply.reason
     assert reply.scenario_json == ""
-    assert not tell(members, name, instance="i")
+    assert not announce(members, name, instance="i")
 
 
 def test_running_process_blocks_a_second_instance_until_it_departs() -> None:
@@ -76,8 +76,8 @@ def test_running_process_blocks_a_second_instance_until_it_departs() -> None:
     assert members.take_departed() == ["chaser/0"]
     assert members.take_departed() == []
     assert members.admit(twin).accepted
-    assert not tell(members, "chaser/0", "world")  # the old one has nothing to say any more
-    assert tell(members, "chaser/0", "world", instance="another")
+    assert not announce(members, "chaser/0", "world")  # the old instance is ignored
+    assert announce(members, "chaser/0", "world", instance="another")
 
 
 def test_departure_of_unknown_process_is_ignored() -> None:
@@ -91,30 +91,30 @@ def test_connection_requires_mutual_discovery() -> None:
     members = joined(membership(1), "chaser/0", "controller")
     assert members.connected({}) == set()
     everyone = first("chaser/0", "controller")
-    tell(members, "chaser/0", "world", "controller")
-    tell(members, "controller", "world", "chaser/0")
+    announce(members, "chaser/0", "world", "controller")
+    announce(members, "controller", "world", "chaser/0")
     assert members.connected(everyone) == {"chaser/0", "controller"}
     assert members.connected(first("controller")) == {"controller"}  # the world has not heard the chaser
-    tell(members, "controller", "world")  # not any more
+    announce(members, "controller", "world")  # no longer
     assert members.connected(everyone) == set()
-    tell(members, "controller", "chaser/0")  # has not heard the world
+    announce(members, "controller", "chaser/0")  # has not heard the world
     assert members.connected(everyone) == {"chaser/0"}
 
 
 def test_chasers_need_not_discover_each_other_but_recorder_needs_all() -> None:
     members = joined(membership(2), "chaser/0", "chaser/1", "controller", "recorder")
-    tell(members, "chaser/0", "world", "controller")
-    tell(members, "chaser/1", "world", "controller")
-    tell(members, "controller", "world", "chaser/0", "chaser/1")
-    tell(members, "recorder", "world", "chaser/0", "controller")
+    announce(members, "chaser/0", "world", "controller")
+    announce(members, "chaser/1", "world", "controller")
+    announce(members, "controller", "world", "chaser/0", "chaser/1")
+    announce(members, "recorder", "world", "chaser/0", "controller")
     everyone = first("chaser/0", "chaser/1", "controller", "recorder")
     assert members.connected(everyone) == {"chaser/0", "chaser/1", "controller"}
 
 
 def test_departed_process_is_disconnected() -> None:
     members = joined(membership(1), "chaser/0", "controller")
-    tell(members, "chaser/0", "world", "controller")
-    tell(members, "controller", "world", "chaser/0")
+    announce(members, "chaser/0", "world", "controller")
+    announce(members, "controller", "world", "chaser/0")
     everyone = first("chaser/0", "controller")
     members.set_alive("controller", False)
     assert members.connected(everyone) == {"chaser/0"}
@@ -125,12 +125,12 @@ def test_departed_process_is_disconnected() -> None:
 
 def test_discovery_of_an_earlier_instance_does_not_count() -> None:
     members = joined(membership(1), "chaser/0", "controller")
-    tell(members, "chaser/0", "world", "controller")
-    tell(members, "controller", "world", "chaser/0")
+    announce(members, "chaser/0", "world", "controller")
+    announce(members, "controller", "world", "chaser/0")
     members.set_alive("chaser/0", False)
     assert members.admit(JoinRequest(process="chaser/0", instance="chaser/0-2")).accepted
     members.set_alive("chaser/0", True)
-    tell(members, "chaser/0", "world", "controller", instance="chaser/0-2")
+    announce(members, "chaser/0", "world", "controller", instance="chaser/0-2")
     again = {**first("controller"), "chaser/0": "chaser/0-2"}
     assert members.connected(again) == set()  # the controller still talks of the first one
     heard = {"world": "world-1", "chaser/0": "chaser/0-2"}
@@ -143,8 +143,8 @@ def flying(chasers: int = 2) -> tuple[Membership, dict[str, str]]:
     ids = [f"chaser/{i}" for i in range(chasers)]
     members = joined(membership(chasers), *ids, "controller")
     for name in ids:
-        tell(members, name, "world", "controller")
-    tell(members, "controller", "world", *ids)
+        announce(members, name, "world", "controller")
+    announce(members, "controller", "world", *ids)
     heard = first(*ids, "controller")
     members.flying = True
     assert members.connected(heard) == set(heard)
@@ -152,11 +152,11 @@ def flying(chasers: int = 2) -> tuple[Membership, dict[str, str]]:
 
 
 def again(members: Membership, name: str, *heard: str) -> None:
-    """A process that crashed has started again, and tells whom it has heard."""
+    """A process that crashed has started again, and announces whom it has received."""
     members.set_alive(name, False)
     assert members.admit(JoinRequest(process=name, instance=f"{name}-2")).accepted
     members.set_alive(name, True)
-    assert tell(members, name, *heard, instance=f"{name}-2")
+    assert announce(members, name, *heard, instance=f"{name}-2")
 
 
 def test_joining_chaser_disconnects_nobody_in_flight() -> None:
@@ -180,7 +180,7 @@ def test_joining_controller_disconnects_nobody_and_waits_for_all() -> None:
         presence = Presence(process=f"chaser/{i}", instance=f"chaser/{i}-1", heard=with_it)
         assert members.update_presence(presence)
         assert members.connected(heard) == {"chaser/0", "chaser/1"}
-    tell(members, "controller", "world", "chaser/0", "chaser/1", instance="controller-2")
+    announce(members, "controller", "world", "chaser/0", "chaser/1", instance="controller-2")
     assert members.connected(heard) == {"chaser/0", "chaser/1", "controller"}
 
 
@@ -188,7 +188,7 @@ def test_flying_processes_must_stay_mutually_discovered() -> None:
     members, heard = flying(1)
     assert members.connected(first("controller")) == {"controller"}  # the world lost sight of the chaser
     members, heard = flying(1)
-    tell(members, "controller", "world")
+    announce(members, "controller", "world")
     assert members.connected(heard) == set()
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``[truth]``: true bodies, actuators and sensors that differ from what the flight software is told."""
+"""``[truth]``: true bodies, actuators and sensors that differ from the nominal values of the flight software."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def momenta(physics: Physics, name: str = "chaser/0") -> tuple[Array, Array, flo
 # -- bodies -------------------------------------------------------------------------------------------------
 
 
-def test_without_truth_plants_are_the_stated_bodies() -> None:
+def test_without_truth_plants_are_the_nominal_bodies() -> None:
     s = docking_scenario()
     for plant, body in ((chaser_plant(s, 0), s.chaser), (target_plant(s), s.target)):
         assert plant.frame is None

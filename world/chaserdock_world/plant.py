@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""True bodies and actuators: what ``[truth]`` makes of the bodies that the flight software is told of.
+"""True bodies and actuators: the nominal ones of the flight software with the errors of ``[truth]``.
 
-Everything is drawn from the scenario's seed and the chaser's number. Without ``[truth]`` a plant is the stated body.
+Everything is drawn from the scenario's seed and the chaser's number. Without ``[truth]`` a plant is the nominal body.
 """
 
 from __future__ import annotations

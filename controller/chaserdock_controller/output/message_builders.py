@@ -117,7 +117,7 @@ def event_message(observation: Observation, level: Level, text: str) -> Event:
 
 
 def no_command(chaser: int, tick: Tick) -> WrenchCommand:
-    """Return a message that tells a waiting chaser that there is no command for a tick."""
+    """Return the message for a chaser that waits for the command of a tick for which there is none."""
     zero = (0.0, 0.0, 0.0)
     return WrenchCommand(
         tick=tick.tick,

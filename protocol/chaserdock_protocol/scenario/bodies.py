@@ -15,7 +15,7 @@ from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
 
 class FlightTarget(Section):
-    """The target as flight software knows it: shape, motion model, and assumed mass properties."""
+    """Nominal target of the flight software: shape, motion model, and assumed mass properties."""
 
     model: Name = Field(
         default="paper",

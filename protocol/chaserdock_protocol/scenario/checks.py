@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def check_flight(scenario: FlightScenario) -> None:
-    """Run the checks of what flight software knows."""
+    """Check the part of a scenario that flight software receives."""
     _check_references(scenario)
     _check_named_chasers(scenario)
     if scenario.chaser.actuation == "thrusters":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The part of a scenario that flight software receives: chasers, controller and standby (docs/flight_scenario.md).
 
-Ground truth, what is random and what is planned to fail are not in it. A section that flight software may know is a field
+Ground truth, what is random and what is planned to fail are not in it. A section that flight software receives is a field
 of ``FlightScenario``; any other one is a field of ``Scenario`` (mission.py).
 """
 
@@ -36,7 +36,7 @@ from .schema import (
 
 
 class FlightScenario(Section):
-    """A mission as its flight software knows it."""
+    """The part of a scenario that the flight software receives: nominal bodies and sensors, its own settings, the mission."""
 
     format: Literal[3] = Field(
         default=FORMAT,
@@ -94,7 +94,7 @@ _FLIGHT: TypeAdapter[FlightScenario] = TypeAdapter(FlightScenario)
 
 
 def flight_scenario(scenario: FlightScenario) -> FlightScenario:
-    """Return what flight software may know of a scenario: an object that holds nothing else."""
+    """Return the part of a scenario that flight software receives; the object holds nothing else."""
     return FlightScenario.model_validate_json(flight_scenario_json(scenario))
 
 

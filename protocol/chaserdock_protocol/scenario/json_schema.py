@@ -155,7 +155,7 @@ def editor_schema_text(model: type[BaseModel]) -> str:
 
 
 def _simplified(node: Any) -> Any:
-    """Remove titles and nulls, and express what draft 7 does not know by what it knows."""
+    """Remove titles and nulls, and replace keywords that draft 7 lacks by equivalent ones."""
     if isinstance(node, list):
         return [_simplified(item) for item in node]
     if not isinstance(node, dict):

@@ -28,7 +28,7 @@ _CAMERA_PRIORS = {
     "camera_bias_position_m": "camera_shift_m",
     "camera_bias_focal_share": "camera_focal_share",
 }
-"""Key of ``[estimator]`` in format 2 -> key of ``[navigation]``: what the estimator knew of the cameras' errors."""
+"""Key of ``[estimator]`` in format 2 -> key of ``[navigation]``: sigmas of the cameras' errors that the estimator assumed."""
 _CAMERA_ERRORS = {
     "mounting_deg": ("camera_turn_deg", "turn_deg"),
     "mounting_m": ("camera_shift_m", "shift_m"),
@@ -116,7 +116,7 @@ def _rename_keys(values: dict[str, Any]) -> None:
 def _state_navigation(values: dict[str, Any]) -> None:
     """Migrate from format 2 to 3, in place: exact navigation with the errors that the scenario states.
 
-    The camera's figures are those that the estimator knew, so that it replays as it flew; errors beyond are ``[truth]``.
+    The camera's figures are those that the estimator assumed, so that it replays as it flew; errors beyond are ``[truth]``.
     """
     navigation: dict[str, Any] = {"grade": "exact"}
     navigation |= {key: value for key, value in _table(values, "odometry").items() if value}

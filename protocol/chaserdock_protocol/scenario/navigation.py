@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[navigation]``: errors of the chasers' odometry and of their cameras, as the flight software knows them."""
+"""Scenario section ``[navigation]``: errors of the chasers' odometry and cameras that the flight software assumes."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class NavigationErrors:
 
 
 class NavigationSection(Section):
-    """Errors of the chasers' odometry and cameras, which the flight software knows: standard deviations per axis. A figure
+    """Errors of the chasers' odometry and cameras, known to the flight software: standard deviations per axis. A figure
     that is not given is that of the grade ([world.md](world.md))."""
 
     grade: Literal["exact", "lab", "orbit", "poor"] = Field(

@@ -188,7 +188,7 @@ class Approach(Section):
 
 
 class FlightChaser(Oriented):
-    """One chaser as flight software knows it: its reference pose."""
+    """One chaser of the flight software: its reference pose."""
 
     position_m: Vector = Field(description="Reference position (TRF), m. Not the origin.")
     q_wxyz: UnitQuaternion = Field(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Scenario section ``[truth]``: how the world differs from what the flight software is told. Read by the world alone."""
+"""Scenario section ``[truth]``: errors of the nominal values that the flight software assumes. Only the world reads it."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ class TargetTruth(Section):
 
 
 class CameraTruth(Section):
-    """Camera errors in addition to `navigation.camera_*`, which the flight software does not know of."""
+    """Camera errors in addition to `navigation.camera_*`, unknown to the flight software."""
 
     turn_deg: Degrees = Field(default=0.0, description="Rotation of the mounting, degrees.")
     shift_m: Metres = Field(default=0.0, description="Shift of the lens, m.")
@@ -212,8 +212,8 @@ class Mismatch:
 
 
 class TruthSection(Section):
-    """How the world differs from what the flight software is told ([world.md](world.md)). Only the world, the recorder and
-    analysis know it. By default there is no difference."""
+    """Differences between the simulated world and the nominal values that the flight software assumes ([world.md](world.md)).
+    Only the world, the recorder and analysis read them. By default there are none."""
 
     preset: Literal["nominal", "mismatch"] = Field(
         default="nominal",

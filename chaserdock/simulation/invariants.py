@@ -36,6 +36,8 @@ from chaserdock.analysis.criteria import nearest_allowed_m
 SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate"})
 """Phases in which a chaser keeps its distance, if their reason is in the log."""
 KEEP_OUT_SLACK_M = 0.02
+SETTLING_S = 15.0
+"""Longest time (s) after the last warning until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
 _DOCKED = frozenset({"docked", "latched", "verified"})
 _POSE = (0, 1, 2, 6, 7, 8)
@@ -59,13 +61,15 @@ class Violation:
 class Invariants:
     """Checks the messages of one flight as they are published; each violation is noted once per subject.
 
-    ``nees``: normalized squared errors of the estimated pose of the target, one a second (6 on average if consistent).
+    ``reasons``: warnings and errors in the log, the last at ``reason_s``. ``nees``: normalized squared errors of the estimated
+    pose of the target, one a second (6 on average if consistent).
     """
 
     scenario: Scenario
     violations: list[Violation] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
+    reason_s: float = 0.0
     end: MissionEnd | None = None
     phases: dict[int, str] = field(default_factory=dict)
     dead: set[str] = field(default_factory=set)
@@ -264,6 +268,7 @@ class Invariants:
     def _on_event(self, event: Event) -> None:
         if event.level != "info" and not event.what.startswith("fault "):
             self.reasons.append(f"{event.process}: {event.what} {event.detail}".strip())
+            self.reason_s = self.time_s
         if event.process == "world" and event.what == "process lost":
             self.dead.add(event.detail)
         if event.process == "world" and event.what == "actuators stopped":
@@ -285,12 +290,12 @@ class Invariants:
             self.violate("liveness", "world", f"the mission ended early: {self.end.reason}")
         success, commanded = self.scenario.success, {e.command for e in self.scenario.timeline}
         for chaser in (*success.docked, *success.latched):
-            phase = self.phases.get(chaser, "")
-            if phase in _DOCKED or self.reasons or (phase in SAFE_PHASES and commanded & set(_NAMED_IN)):
+            phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
+            named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
+            disturbed = self.time_s - self.reason_s < SETTLING_S
+            if phase in _DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
-            self.violate(
-                "liveness", f"chaser/{chaser}", f"ends in phase {phase or 'none'} without a named reason"
-            )
+            self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
 
 
 def _distance(a: Array, b: Array) -> float:

@@ -60,7 +60,7 @@ class Scheduler:
         self.tasks: list[Task] = []
         self._random = random.Random(f"scheduler {seed}")
         self._events: list[tuple[float, float, int, Callable[[], None]]] = []
-        self._count = 0
+        self._count = self._alive = 0
         self._hub: greenlet = getcurrent()
         self._running: Task | None = None
 
@@ -78,13 +78,14 @@ class Scheduler:
         """Start a task at the present time."""
         task = Task(name, work)
         self.tasks.append(task)
+        self._alive += 1
         self.call_at(self.now_s, lambda: self._continue(task, 0))
         return task
 
-    def run(self, until: Callable[[], bool], limit_s: float) -> bool:
-        """Run until ``until`` holds, which is checked after each event; return False if it does not by ``limit_s``."""
+    def run(self, limit_s: float) -> bool:
+        """Run until all tasks have ended; return False if they have not by ``limit_s``."""
         self._hub = getcurrent()
-        while not until():
+        while self._alive:
             if not self._events or self._events[0][0] > limit_s:
                 return False
             self.now_s, _, _, call = heapq.heappop(self._events)
@@ -134,6 +135,7 @@ class Scheduler:
             task.fiber.switch()
         finally:
             self._running = None
+            self._alive -= task.done
 
 
 class VirtualQueue:

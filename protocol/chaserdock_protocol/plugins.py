@@ -32,8 +32,9 @@ def installed(kind: Kind) -> dict[str, EntryPoint]:
 
 def require(kind: Kind, name: str, own: tuple[str, ...]) -> None:
     """Raise PluginError unless ``name`` is built in (``own``) or installed."""
-    known = installed(kind)
-    if name not in own and name not in known:
+    if name in own:
+        return
+    if name not in (known := installed(kind)):
         raise PluginError(
             f"{kind} {name!r} is unknown; built in: {', '.join(own)}; installed (entry points of "
             f"{_GROUPS[kind]!r}): {', '.join(known) or 'none'}"

@@ -23,7 +23,7 @@ def flown(*works: Callable[[Scheduler], Any], seed: int = 0, limit_s: float = 10
     """Runs tasks to their end."""
     scheduler = Scheduler(seed)
     tasks = [scheduler.spawn(str(k), lambda w=work: w(scheduler)) for k, work in enumerate(works)]
-    scheduler.run(lambda: all(t.done for t in tasks), limit_s)
+    scheduler.run(limit_s)
     scheduler.end()
     for task in tasks:
         assert not task.error, task.error
@@ -81,7 +81,7 @@ def test_killed_and_failing_tasks_end_without_the_others() -> None:
     scheduler = Scheduler(0)
     failing, dying = scheduler.spawn("failing", fail), scheduler.spawn("dying", killed)
     healthy = scheduler.spawn("healthy", lambda: scheduler.pause(1.0) or 7)
-    assert scheduler.run(lambda: healthy.done, 10.0)
+    assert scheduler.run(10.0)
     assert "ValueError: broken" in failing.error
     assert dying.killed
     assert not dying.error
@@ -96,7 +96,7 @@ def test_a_run_that_never_ends_is_stopped() -> None:
             scheduler.pause(1.0)
 
     task = scheduler.spawn("forever", forever)
-    assert not scheduler.run(lambda: task.done, 10.0)
+    assert not scheduler.run(10.0)
     scheduler.end()
     assert task.done
     assert not task.error

@@ -5,13 +5,15 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.ingest.sighting_validation import valid_sightings
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.parameters import nmpc_parameters
 from chaserdock_protocol import codec
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.messages import Odometry, OperatorCommand, encoding_of
+from chaserdock_protocol.messages import Odometry, OperatorCommand, PoseSolution, Sighting, encoding_of
 from chaserdock_protocol.scenario import Scenario, ScenarioError, parse_scenario
 from flight_cases import odometry, scenario
 
@@ -146,3 +148,40 @@ def test_unreachable_goto_is_rejected_with_reason() -> None:
         assert message in reply.reason
         assert out.wrenches[0].mode == "nmpc"
         assert out.references[0].phase == "hold"
+
+
+def solution(**changes: Any) -> PoseSolution:
+    covariance = tuple((1e-6 * np.eye(6)).ravel().tolist())
+    values = {"position_m": (0.0, 0.0, 1.0), "q_wxyz": (1.0, 0.0, 0.0, 0.0), "covariance": covariance}
+    return PoseSolution(**{**values, "reprojection_rms_px": 0.1, **changes})  # type: ignore[arg-type]
+
+
+def covariance(row: int, column: int, value: float) -> tuple[float, ...]:
+    matrix = 1e-6 * np.eye(6)
+    matrix[row, column] = value
+    return tuple(matrix.ravel().tolist())
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({}, ""),
+        ({"covariance": covariance(2, 2, -1e-6)}, "covariance is not positive definite"),
+        ({"covariance": covariance(0, 1, 1e-7)}, "covariance is not symmetric"),
+        ({"q_wxyz": (0.0, 0.0, 0.0, 0.0)}, "q_wxyz has length 0, not 1"),
+    ],
+)
+def test_invalid_solutions_of_a_sighting_are_dropped_with_an_event(
+    changes: dict[str, Any], reason: str
+) -> None:
+    sample = Sighting(
+        chaser=2,
+        status="seen",
+        solutions=(solution(**changes), solution()),
+        marker_ids=(1,),
+        corners_px=(),
+        rejected_ids=(),
+    )
+    (checked,), events = valid_sightings([sample])
+    assert checked.solutions == (sample.solutions if not reason else sample.solutions[1:])
+    assert events == ([("warning", f"chaser 2: invalid sighting, ignored: {reason}")] if reason else [])

@@ -14,6 +14,7 @@ from chaserdock_controller.interfaces import AppliedImpulse, Observation, TickIn
 from .latency_compensation import CommandHistory
 from .lost_chasers import LostChasers
 from .odometry_validation import why_invalid
+from .sighting_validation import valid_sightings
 from .thruster_reports import ThrusterReports
 
 
@@ -31,7 +32,8 @@ class IngestStage:
         odometry = {i: o for i, o in inputs.odometry.items() if i not in invalid}
         self.thrusters.update(inputs.thrusters)
         effective_ns = self._scenario.timing.effective_ns(inputs.tick)
-        events = self.lost_chasers.update(odometry, inputs.time_ns)
+        sightings, events = valid_sightings(inputs.sightings)
+        events += self.lost_chasers.update(odometry, inputs.time_ns)
         return Observation(
             tick=inputs.tick,
             time_ns=inputs.time_ns,
@@ -39,7 +41,7 @@ class IngestStage:
             odometry=odometry,
             invalid=invalid,
             lost=self.lost_chasers.obstacles(inputs.time_ns),
-            sightings=inputs.sightings,
+            sightings=sightings,
             commands=inputs.commands,
             docking=inputs.docking,
             impulses=self._impulses(odometry, inputs, history),

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks that sightings are poses with covariances: a damaged one must not reach an estimator."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+import msgspec
+import numpy as np
+from chaserdock_protocol.messages import Level, PoseSolution, Sighting
+
+_UNIT_WITHIN = 0.1
+_ROUNDING = 1e-6
+
+
+def why_invalid(solution: PoseSolution) -> str:
+    """Return why a solution is not a pose with a positive definite covariance, or an empty string."""
+    length = math.hypot(*solution.q_wxyz)
+    if not abs(length - 1.0) <= _UNIT_WITHIN:
+        return f"q_wxyz has length {length:.3g}, not 1"
+    covariance = np.array(solution.covariance).reshape(6, 6)
+    if np.abs(covariance - covariance.T).max() > _ROUNDING * np.abs(covariance).max():
+        return "covariance is not symmetric"
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return "covariance is not positive definite"
+    return ""
+
+
+def valid_sightings(
+    sightings: Iterable[Sighting],
+) -> tuple[tuple[Sighting, ...], list[tuple[Level, str]]]:
+    """Return the sightings with their valid solutions only, and an event for each sighting that loses one."""
+    valid: list[Sighting] = []
+    events: list[tuple[Level, str]] = []
+    for sighting in sightings:
+        reasons = {id(s): reason for s in sighting.solutions if (reason := why_invalid(s))}
+        if reasons:
+            events.append(
+                (
+                    "warning",
+                    f"chaser {sighting.chaser}: invalid sighting, ignored: {next(iter(reasons.values()))}",
+                )
+            )
+            kept = tuple(s for s in sighting.solutions if id(s) not in reasons)
+            sighting = msgspec.structs.replace(sighting, solutions=kept)
+        valid.append(sighting)
+    return tuple(valid), events

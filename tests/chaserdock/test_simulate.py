@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``chaserdock simulate``: verdicts, scenario files of failures, and invalid input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from chaserdock_protocol.scenario import load_scenario
+from harness import ROOT, finished
+
+from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
+from chaserdock.simulation.swarm import fly_case
+
+SHORT = """
+extends = "single"
+name = "short"
+duration_s = 1.0
+timeline = []
+success = {docked = [DOCKED]}
+"""
+
+
+@pytest.fixture
+def good(tmp_path: Path) -> Path:
+    path = tmp_path / "good.toml"
+    path.write_text(SHORT.replace("DOCKED", ""))
+    return path
+
+
+@pytest.fixture
+def bad(tmp_path: Path) -> Path:
+    """A mission that is to dock without any command, which violates liveness."""
+    path = tmp_path / "bad.toml"
+    path.write_text(SHORT.replace("DOCKED", "0"))
+    return path
+
+
+def test_seeds_of_a_good_mission_pass_on_two_processes(good: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    status, text = finished("simulate", str(good), "--seeds", "1:2", "--jobs", "2", "--out", str(out))
+    assert status == 0, text
+    assert "2 seeds in" in text
+    assert not out.exists()
+
+
+def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -> None:
+    arguments = ("simulate", str(good), "--out", str(tmp_path / "out"))
+    status, text = finished(*arguments)
+    assert status == 0, text
+    assert (tmp_path / "out" / "good" / "run" / "mission.mcap").is_file()
+    status, text = finished(*arguments)
+    assert status == 2
+    assert "exists already" in text
+
+
+def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_path: Path) -> None:
+    seed = next(s for s in range(1, 50) if fly_seed(Swarm(str(bad)), s).violations)
+    result = fly_seed(Swarm(str(bad)), seed)
+    assert fly_seed(Swarm(str(bad)), seed).fingerprint == result.fingerprint
+    case = shrink_result(result, attempts=60)
+    path = write_case(case, fly_case(case, seed), tmp_path / "out")
+    assert not case["fault"]
+    assert case.keys() <= {"extends", "name", "seed", "perception", "fault", "duration_s"}
+    assert path.read_text().startswith(
+        "# liveness at 1.00 s: chaser/0: ends in phase hold without a named reason"
+    )
+    assert load_scenario(path).duration_s == 1.0
+    assert [v.invariant for v in fly_case({"extends": str(path)}, seed).violations] == ["liveness"]
+
+
+@pytest.mark.parametrize("seeds", ["5:3", "x", "-1", "1:5000000000"])
+def test_invalid_ranges_of_seeds_are_refused(seeds: str) -> None:
+    status, text = finished("simulate", "single", f"--seeds={seeds}")
+    assert status == 2
+    assert "must be FIRST:LAST or one number, below 2^32" in text
+
+
+def test_regressions_are_scenarios_that_run_accepts() -> None:
+    for path in (ROOT / "tests" / "regressions").glob("*.toml"):
+        status, text = finished("scenario", "validate", str(path))
+        assert status == 0, text

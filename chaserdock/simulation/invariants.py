@@ -37,7 +37,7 @@ SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acqui
 """Phases in which a chaser keeps its distance, if their reason is in the log."""
 KEEP_OUT_SLACK_M = 0.02
 SETTLING_S = 15.0
-"""Longest time (s) after the last warning until a chaser has docked or is safe."""
+"""Longest time (s) after the last warning or command until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
 _DOCKED = frozenset({"docked", "latched", "verified"})
 _POSE = (0, 1, 2, 6, 7, 8)
@@ -292,7 +292,8 @@ class Invariants:
         for chaser in (*success.docked, *success.latched):
             phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
             named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
-            disturbed = self.time_s - self.reason_s < SETTLING_S
+            commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
+            disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < SETTLING_S
             if phase in _DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
             self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")

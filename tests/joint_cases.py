@@ -193,7 +193,7 @@ class SyntheticFlight:
 
 def parameters(scenario: Scenario, errors: NavigationErrors, **more: float) -> JointParameters:
     """Return the parameters of a filter that knows the errors' sigmas; sightings without a persistent error."""
-    options = {"view_ratio": 0.0, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
+    options = {"view_ratio_single": 0.0, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
     return JointParameters(MekfParameters(), scenario.chaser, scenario.camera_model(), errors, **options)  # type: ignore[arg-type]
 
 

@@ -8,7 +8,9 @@ import pytest
 from chaserdock_agents.chaser.thrusters.fault_detection import Flags, ThrusterFault, ThrusterFaultDetector
 from chaserdock_agents.chaser.thrusters.impulse_residual import (
     ImpulseNoise,
+    PlantMismatch,
     covariance,
+    mismatch_signatures,
     noise_of,
     observed_impulse,
 )
@@ -25,16 +27,37 @@ TICK_S = 1.0 / 15
 
 
 class Case:
-    """A body whose odometry comes from integrating what its thrusters really give."""
+    """A body whose odometry comes from integrating what its thrusters really give.
+
+    With ``mismatched`` the true mass, inertia, centre of mass and thrusts are drawn with the assumed sigmas.
+    """
 
     def __init__(
-        self, body: str, seed: int, noise: ImpulseNoise | None = None, odometry_noise: bool = False
+        self,
+        body: str,
+        seed: int,
+        noise: ImpulseNoise | None = None,
+        odometry_noise: bool = False,
+        mismatched: bool = False,
     ) -> None:
         self.body: Body = mission(body).chaser
+        draw, sigma = np.random.default_rng((seed, 1)), PlantMismatch()
+        shares = draw.normal(size=4 + len(self.body.thrusters)) * mismatched
+        self.true_body = self.body.model_copy(
+            update={
+                "mass_kg": self.body.mass_kg * (1 + sigma.mass * shares[0]),
+                "inertia_kg_m2": tuple(
+                    (np.array(self.body.inertia) * (1 + sigma.inertia * shares[1:4])).tolist()
+                ),
+            }
+        )
+        self.thrust = 1 + sigma.thrust * shares[4:]
+        self.centre_m = sigma.centre_of_mass_m * draw.normal(size=3) * mismatched
+        self.force_N = sigma.force_N * draw.normal(size=3) * mismatched
         self.noise = noise or ImpulseNoise()
         self.matrix, self.full = wrench_matrix(self.body.thrusters), thrusts_max(self.body.thrusters)
         least = self.full * [t.min_on_s for t in self.body.thrusters]
-        self.watch = ThrusterFaultDetector(self.matrix, self.full, least)
+        self.watch = ThrusterFaultDetector(self.matrix, self.full, least, 13 + len(self.full))
         self.rng = np.random.default_rng(seed)
         self.state = start(seed)
         self.state[3:6] *= 0.05
@@ -60,15 +83,19 @@ class Case:
         )
 
     def step(self, asked_N_s: Array, given_N_s: Array, suspects: Flags | None = None) -> ThrusterFault | None:
-        self.state = propagate(self.state, self.matrix @ given_N_s / TICK_S, self.body, TICK_S)
+        wrench = self.matrix @ (given_N_s * self.thrust) / TICK_S
+        wrench[:3] += self.force_N
+        wrench[3:] -= np.cross(self.centre_m, wrench[:3])
+        self.state = propagate(self.state, wrench, self.true_body, TICK_S)
         self.tick += 1
         now = self._odometry()
         residual = observed_impulse(self.last, now, self.body) - self.matrix @ asked_N_s
         spread = covariance(self.noise, self.body, self.matrix, asked_N_s, self.last, now)
+        mismatch = mismatch_signatures(PlantMismatch(), self.body, self.matrix, asked_N_s, self.last, now)
         self.last = now
         everyone: Flags = np.ones(len(self.full), dtype=np.bool_)
         return self.watch.update(
-            residual, spread, asked_N_s, TICK_S, everyone if suspects is None else suspects
+            residual, spread, asked_N_s, TICK_S, everyone if suspects is None else suspects, mismatch
         )
 
     def random(self, share: float = 0.25) -> Array:
@@ -131,6 +158,30 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
         asked = case.random()
         given = asked * (1.0 + 0.05 * case.rng.normal(size=len(asked)))
         assert case.step(asked, given) is None
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_false_alarm_with_another_plant_than_assumed(seed: int) -> None:
+    noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=4e-4)
+    case = Case("tetra12", seed, noise, odometry_noise=True, mismatched=True)
+    for _ in range(600):
+        asked = case.random()
+        assert case.step(asked, asked) is None
+
+
+@pytest.mark.parametrize("thruster", range(12))
+@pytest.mark.parametrize("left", [0.0, 2.0])
+def test_a_failure_is_found_with_another_plant_than_assumed(thruster: int, left: float) -> None:
+    noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=4e-4)
+    case = Case("tetra12", thruster, noise, odometry_noise=True, mismatched=True)
+    for _ in range(200):
+        asked = case.random()
+        given = asked.copy()
+        given[thruster] = case.full[thruster] * TICK_S if left > 1.0 else 0.0
+        if (verdict := case.step(asked, given)) is not None:
+            break
+    assert verdict is not None
+    assert (verdict.thruster, verdict.kind) == (thruster, "stuck_on" if left > 1.0 else "stuck_off")
 
 
 def test_the_scenarios_odometry_is_the_pilots_noise() -> None:

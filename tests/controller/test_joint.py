@@ -78,7 +78,7 @@ def estimator_for(errors: NavigationErrors, chasers: int) -> JointEstimator:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_jacobians_agree_with_finite_differences(seed: int) -> None:
-    state, p = random_state(seed), parameters(SCENARIO, navigation("orbit"), view_ratio=1.0)
+    state, p = random_state(seed), parameters(SCENARIO, navigation("orbit"), view_ratio_single=1.0)
     mounting = mounting_of(p.camera)
     flight = SyntheticFlight(SCENARIO, p.navigation, 2, seed)
     odometry, sighting = flight.inputs().odometry[1], flight.inputs().sightings[1].solutions[0]
@@ -93,8 +93,8 @@ def test_jacobians_agree_with_finite_differences(seed: int) -> None:
     state = replace(state, extra=extra)
     for z, at in (
         (
-            linearize_sighting(state, 1, sighting, mounting, p),
-            lambda s: linearize_sighting(s, 1, sighting, mounting, p),
+            linearize_sighting(state, 1, sighting, 1, mounting, p),
+            lambda s: linearize_sighting(s, 1, sighting, 1, mounting, p),
         ),
         (linearize_odometry(state, 1, odometry, p), lambda s: linearize_odometry(s, 1, odometry, p)),
     ):

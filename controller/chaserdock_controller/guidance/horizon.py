@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -10,7 +12,7 @@ from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, predict_path
-from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.estimation.types import RelativePose, TargetState
 from chaserdock_controller.interfaces import HorizonReference, ReferencePose
 
 from . import reference
@@ -62,8 +64,12 @@ class ReferenceBuilder:
         start: TargetState,
         body: TargetBody,
         attached: frozenset[int],
+        relative: Sequence[RelativePose] = (),
     ) -> HorizonReference:
-        """Return the references of ``chasers`` from the time of ``start`` on."""
+        """Return the references of ``chasers`` from the time of ``start`` on.
+
+        ``relative``: poses relative to the target, whose covariance widens the distance to keep from it.
+        """
         s, step_s = self._scenario, self._step_s
         torque_free = s.target.motion == "torque_free"
         nodes, middles = target_path(body, torque_free, start, step_s, self._stages)
@@ -81,13 +87,17 @@ class ReferenceBuilder:
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
-        distances = np.array([self._machine.min_distance_target_m(i) for i in chasers])
+        known = {r.chaser: r.covariance for r in relative}
+        distances = [
+            self._machine.min_distance_target_m(i) + self._margin_m(known.get(i, start.covariance))
+            for i in chasers
+        ]
         return HorizonReference(
             chasers=chasers,
             references=reference.references_on(nodes.positions_m, nodes.q_wxyz, offsets, q_off),
             u_ref=u_ref,
             target_positions=nodes.positions_m,
-            min_distance_target_m=distances + self._margin_m(start),
+            min_distance_target_m=np.array(distances),
             corridors=corridor_rows([self._machine.corridor(i) for i in chasers], nodes.q_wxyz),
             attached=attached,
         )
@@ -110,7 +120,7 @@ class ReferenceBuilder:
         turns = self._machine.body_rotations(i, times_s)
         return q if turns is None else rotations.multiply(q, turns)
 
-    def _margin_m(self, target: TargetState) -> float:
-        """Return the addition to the distance from the target for the uncertainty of its position."""
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(target.covariance[:3, :3])[-1]))
+    def _margin_m(self, covariance: Array) -> float:
+        """Return the addition to the distance from the target for an uncertain position, the first block of ``covariance``."""
+        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
         return min(self._scenario.limits.estimate_margin_sigmas * sigma_m, _GREATEST_MARGIN_M)

@@ -58,7 +58,9 @@ class GuidanceStage:
         horizon = None
         # Latched chasers are planned for only where others have to fly around them.
         if estimation.at_effect is not None and planned and attached != set(ids):
-            horizon = self.references.horizon(planned, estimation.at_effect, estimation.body, attached)
+            horizon = self.references.horizon(
+                planned, estimation.at_effect, estimation.body, attached, estimation.relative
+            )
         directives = {}
         for i, c in enumerate(self.chasers):
             directives[i] = Directive(

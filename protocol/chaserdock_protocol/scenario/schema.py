@@ -151,8 +151,8 @@ class Limits(Section):
         default=0.35, description="Smallest distance from the target, m."
     )
     estimate_margin_sigmas: NotNegative = Field(
-        default=0.0,
-        description="Standard deviations of the target's estimated position that are added to "
+        default=3.0,
+        description="Standard deviations of a chaser's estimated position relative to the target that are added to "
         "`min_distance_target_m`, at most 0.1 m in all.",
     )
     min_distance_chasers_m: NotNegative = Field(

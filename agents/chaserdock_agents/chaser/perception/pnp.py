@@ -29,6 +29,9 @@ Indices = NDArray[np.intp]
 
 # Lower bound of the corner noise, pixels; a single marker leaves only two degrees of freedom.
 SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.03, 0.04
+# Residuals above this noise come from light, compression or the pixel grid, which move the four corners of a marker together:
+# with several markers, their variance averages out over markers, not over corners.
+COMMON_PER_MARKER = 4.0
 # A single marker at a more grazing angle determines its tilt poorly, with an optimistic covariance.
 MIN_SINGLE_COSINE = 0.25
 # Largest corner error of an inlier of a coarse candidate, and of a refined pose.
@@ -186,12 +189,13 @@ def pose_covariance(
     rotation: Array,
     floor_px: float,
     sigma: Array,
+    common: float = 1.0,
 ) -> tuple[Array, float] | None:
     """Return the covariance (6, 6), as in `TargetPose`, and the weighted sum of squared residuals of a pose.
 
     The pose fits n points (n, 3) to n ideal pixels (n, 2) with relative uncertainties ``sigma`` (n,). It is
-    s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``. None if the pose is not
-    observable or has points behind the camera.
+    s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of which the part above the floor counts ``common``
+    times. None if the pose is not observable or has points behind the camera.
     """
     pose = CameraPose(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
@@ -204,7 +208,7 @@ def pose_covariance(
     information = jacobian.T @ jacobian
     if not (math.isfinite(rss) and math.isfinite(float(information.sum()))):
         return None
-    variance = max(floor_px**2, rss / (len(residual) - 6))
+    variance = floor_px**2 + common * max(0.0, rss / (len(residual) - 6) - floor_px**2)
     # Metres and radians are scaled to comparable size before the condition number is checked.
     each = [1.0 / math.sqrt(max(d, 1e-300)) for d in information.diagonal().tolist()]
     scale = np.array([[a * b for b in each] for a in each])
@@ -339,7 +343,8 @@ def _solutions(seen: _DetectedMarkers, poses: list[CameraPose], floor_px: float)
         if refined is None or any(_angle(refined.rotation, other) < 1e-3 for other in kept):
             continue
         position, rotation = refined.position, refined.rotation
-        result = pose_covariance(seen.camera, points, pixels, position, rotation, floor_px, sigma)
+        common = COMMON_PER_MARKER if len(seen.which) > 1 else 1.0
+        result = pose_covariance(seen.camera, points, pixels, position, rotation, floor_px, sigma, common)
         if result is None:
             continue
         kept.append(rotation)

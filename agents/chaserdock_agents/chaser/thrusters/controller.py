@@ -22,7 +22,15 @@ from chaserdock_protocol.scenario.thrusters import FailureKind, thrusts_max
 
 from .allocation import allocator_of
 from .fault_detection import SUFFICIENT_INFORMATION, Flags, ThrusterFault, ThrusterFaultDetector
-from .impulse_residual import ImpulseNoise, covariance, noise_of, observed_impulse, quiescent_variance
+from .impulse_residual import (
+    ImpulseNoise,
+    PlantMismatch,
+    covariance,
+    mismatch_signatures,
+    noise_of,
+    observed_impulse,
+    quiescent_variance,
+)
 from .modulation import Modulator
 from .self_test import ThrusterSelfTest
 
@@ -52,7 +60,10 @@ class ThrusterController:
         self._modulator = Modulator(body.thrusters, body.modulation, scenario.timing)
         self._valves = Valves(body.thrusters)  # the chaser's model of the real valves
         min_pulse_N_s = self._full_N * [t.min_on_s for t in body.thrusters]
-        self._detector = ThrusterFaultDetector(self._matrix, self._full_N, min_pulse_N_s)
+        self._detector = ThrusterFaultDetector(
+            self._matrix, self._full_N, min_pulse_N_s, 13 + len(self._full_N)
+        )
+        self._mismatch = PlantMismatch()
         self._noise = noise or noise_of(scenario.navigation.errors())
         variance = quiescent_variance(self._noise, body)
         information = (min_pulse_N_s**2 * (self._matrix**2 / variance[:, None]).sum(axis=0)).min()
@@ -115,7 +126,9 @@ class ThrusterController:
         noise = covariance(self._noise, self._body, self._matrix, thrusters, before, after)
         time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
         suspects = self._suspects(before.sim_time_ns)
-        if (fault := self._detector.update(residual, noise, thrusters, time_s, suspects)) is not None:
+        mismatch = mismatch_signatures(self._mismatch, self._body, self._matrix, thrusters, before, after)
+        fault = self._detector.update(residual, noise, thrusters, time_s, suspects, mismatch)
+        if fault is not None:
             self._add_fault(fault, after.sim_time_ns, "detected")
         else:
             self._self_test.add_information(self._detector.information, after.sim_time_ns)

@@ -5,12 +5,16 @@ Two hypotheses are tested for every thruster, each with its signature: stuck on 
 part that was not commanded) and weak or stuck off (the residual is the negative of a share of what was commanded). A
 hypothesis is accepted if the residuals are much more likely under it than without a fault (likelihood ratio), are consistent
 with it (chi-square), and no other thruster explains them nearly as well. Single faults only. No I/O.
+
+Mass properties and thrusts that differ from the model cause residuals too, the same ones at every tick. All likelihoods are
+those after integration over these constant differences with their prior, so that only what they cannot explain counts.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,8 +38,9 @@ _OWN_SCATTER = 0.1
 """Relative uncertainty of the failed thruster's thrust."""
 _LOSS_SIGMA = 0.07
 """Maximum standard deviation of the loss for a decision."""
-SUFFICIENT_INFORMATION = 1.0 / _LOSS_SIGMA**2
-"""Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known that well."""
+SUFFICIENT_INFORMATION = 2.0 / _LOSS_SIGMA**2
+"""Information about a thruster (``ThrusterFaultDetector.information``) at which its loss is known that well: half of it is
+lost to the uncertainty of the nominal thrust (5 %)."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +52,51 @@ class ThrusterFault:
     factor: float
 
 
-class ThrusterFaultDetector:
-    """Accumulates the residuals of the last ticks; ``matrix`` (6, n): see ``wrench_matrix``.
+class _Evidence:
+    """Sums over ticks, as one vector each, of whitened quantities: residual r, signatures f (6, n) of the hypotheses of all
+    thrusters, and signatures m (6, q) of the mismatch per standard deviation."""
 
-    ``information`` (n,): inverse variance of every thruster's loss from the last update.
+    def __init__(self, thrusters: int, differences: int) -> None:
+        n, q = thrusters, differences
+        self._n, self._shape = n, (q, 1 + n + q)
+
+    def of_tick(self, residual: Array, signatures: Array, mismatch: Array) -> Array:
+        """Return the vector of one tick: r'r, f'r (n,), f'f (n,) and m' [r f m] (q, 1 + n + q)."""
+        columns = np.column_stack([residual, signatures, mismatch])
+        return np.concatenate(
+            [
+                [residual @ residual],
+                signatures.T @ residual,
+                (signatures**2).sum(axis=0),
+                (mismatch.T @ columns).ravel(),
+            ]
+        )
+
+    def marginal(self, total: Array) -> tuple[float, Array, Array]:
+        """Return energy r'r, f'r (n,) and f'f (n,) with the inverse covariance I - m (I + m'm)^-1 m' that the mismatch
+        gives to the residuals."""
+        n = self._n
+        parts = total[1 + 2 * n :].reshape(self._shape)
+        information = parts[:, 1 + n :] + np.eye(len(parts))
+        white = np.linalg.solve(np.linalg.cholesky(information), parts[:, : 1 + n])
+        energy = float(total[0] - white[:, 0] @ white[:, 0])
+        along = total[1 : 1 + n] - white[:, 1:].T @ white[:, 0]
+        squared = total[1 + n : 1 + 2 * n] - (white[:, 1:] ** 2).sum(axis=0)
+        return energy, along, np.maximum(squared, 0.0)
+
+
+class ThrusterFaultDetector:
+    """Accumulates the residuals of the last ticks; ``matrix`` (6, n): see ``wrench_matrix``; ``differences``: number of
+    constant differences between plant and model.
+
+    ``information`` (n,): inverse variance of every thruster's loss from the last update, for a plant as modelled.
     """
 
-    def __init__(self, matrix: Array, full_N: Array, min_pulse_N_s: Array) -> None:
+    def __init__(self, matrix: Array, full_N: Array, min_pulse_N_s: Array, differences: int) -> None:
         self._matrix, self._full_N, self._min_pulse_N_s = matrix, full_N, min_pulse_N_s
-        self._on: deque[tuple[Array, Array, float]] = deque(maxlen=max(_ON_WINDOWS))
-        self._off: list[deque[tuple[Array, Array, float]]] = []
+        self._evidence = _Evidence(len(full_N), differences)
+        self._on: deque[Array] = deque(maxlen=max(_ON_WINDOWS))
+        self._off: list[deque[Array]] = []
         self.information = np.zeros(len(full_N))
         self.reset()
 
@@ -66,32 +106,35 @@ class ThrusterFaultDetector:
         self._off = [deque(maxlen=max(_OFF_WINDOWS)) for _ in self._full_N]
 
     def update(
-        self, residual: Array, noise: Array, commanded_N_s: Array, time_s: float, suspects: Flags
+        self,
+        residual: Array,
+        noise: Array,
+        commanded_N_s: Array,
+        time_s: float,
+        suspects: Flags,
+        mismatch: Array,
     ) -> ThrusterFault | None:
         """Add the residual of one tick; return a fault if one is detected.
 
         ``residual`` (6,): observed minus expected impulse; ``noise`` (6, 6): its covariance; ``commanded_N_s`` (n,):
-        expected impulse of every thruster in ``time_s``; ``suspects`` (n,): thrusters that may have failed.
+        expected impulse of every thruster in ``time_s``; ``suspects`` (n,): thrusters that may have failed; ``mismatch``
+        (6, differences): see ``mismatch_signatures``.
         """
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
-        white = whiten @ residual
-        columns = whiten @ self._matrix
+        white, columns = whiten @ residual, whiten @ self._matrix
+        constant = whiten @ mismatch
         extra = self._full_N * time_s - commanded_N_s
-        # Per thruster: signature times residual, and squared signature; and the squared residual.
-        along, squared = columns.T @ white, (columns**2).sum(axis=0)
-        energy = float(white @ white)
-        self._on.append((extra * along, extra**2 * squared, energy))
+        self._on.append(self._evidence.of_tick(white, columns * extra, constant))
         fired = suspects & (commanded_N_s > 0.5 * self._min_pulse_N_s)
-        self.information = np.where(fired, commanded_N_s**2 * squared, 0.0)
+        self.information = np.where(fired, commanded_N_s**2 * (columns**2).sum(axis=0), 0.0)
+        lost = self._evidence.of_tick(white, -columns * commanded_N_s, constant)
         for thruster in np.flatnonzero(fired):
-            self._off[thruster].append((-commanded_N_s * along, commanded_N_s**2 * squared, energy))
+            self._off[thruster].append(lost)
         return self._detect_stuck_on(suspects) or self._detect_loss(np.flatnonzero(fired).tolist(), suspects)
 
     def _detect_stuck_on(self, suspects: Flags) -> ThrusterFault | None:
-        for length in _ON_WINDOWS:
-            if len(self._on) < length:
-                break
-            along, squared, energy = (np.sum(x, axis=0) for x in zip(*list(self._on)[-length:], strict=True))
+        for length, total in _totals(self._on, _ON_WINDOWS):
+            energy, along, squared = self._evidence.marginal(total)
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
             if _is_distinct(gain, best) and _is_consistent(
@@ -102,17 +145,13 @@ class ThrusterFaultDetector:
 
     def _detect_loss(self, fired: list[int], suspects: Flags) -> ThrusterFault | None:
         for thruster in fired:
-            evidence = self._off[thruster]
-            for length in _OFF_WINDOWS:
-                if len(evidence) < length:
-                    break
-                rows = list(evidence)[-length:]
-                along, squared, energy = (np.sum(x, axis=0) for x in zip(*rows, strict=True))
+            for length, total in _totals(self._off[thruster], _OFF_WINDOWS):
+                energy, along, squared = self._evidence.marginal(total)
                 loss = np.where(
                     squared > 0.0, np.clip(along / np.where(squared > 0.0, squared, 1.0), 0.0, 1.0), 0.0
                 )
                 gain = np.where(suspects, loss * along - loss**2 * squared / 2.0, -math.inf)
-                known = squared[thruster] >= SUFFICIENT_INFORMATION
+                known = squared[thruster] * _LOSS_SIGMA**2 >= 1.0
                 if not known or loss[thruster] < _WEAK_LOSS or int(np.argmax(gain)) != thruster:
                     continue
                 if _is_distinct(gain, thruster) and _is_consistent(
@@ -125,6 +164,17 @@ class ThrusterFaultDetector:
                         0.0 if stuck_off else float(1.0 - loss[thruster]),
                     )
         return None
+
+
+def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
+    """Yield the sums over the last ticks, for each of the ``windows`` that is full."""
+    total, first = np.zeros_like(ticks[-1]), len(ticks)
+    for length in windows:
+        if len(ticks) < length:
+            return
+        total = total + np.sum([ticks[k] for k in range(len(ticks) - length, first)], axis=0)
+        first = len(ticks) - length
+        yield length, total
 
 
 def _is_distinct(gain: Array, best: int) -> bool:

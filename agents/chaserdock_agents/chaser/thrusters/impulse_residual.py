@@ -30,6 +30,23 @@ class ImpulseNoise:
     floor_N_m_s: float = 2e-4
 
 
+@dataclass(frozen=True)
+class PlantMismatch:
+    """Standard deviations of the constant differences between a chaser and its model, from which residuals of a healthy chaser
+    follow.
+
+    ``mass``, ``inertia`` (per principal moment) and ``thrust`` (per thruster): relative. ``centre_of_mass_m`` per axis; it also
+    covers thrusters that are turned by a degree. ``force_N``, ``torque_N_m``: external, per body axis.
+    """
+
+    mass: float = 0.1
+    inertia: float = 0.15
+    thrust: float = 0.05
+    centre_of_mass_m: float = 0.006
+    force_N: float = 0.005
+    torque_N_m: float = 0.0005
+
+
 def noise_of(errors: NavigationErrors) -> ImpulseNoise:
     """Return the noise for the errors of the odometry."""
     return ImpulseNoise(
@@ -71,6 +88,38 @@ def covariance(
     turned = float(np.linalg.norm(after.omega_rad_s)) * (after.sim_time_ns - before.sim_time_ns) * 1e-9
     relative = noise.scatter**2 + (turned / 4.0) ** 2 + noise.attitude_rad**2
     return np.diag(quiescent_variance(noise, body)) + (matrix * (relative * thrusters_N_s**2)) @ matrix.T
+
+
+def mismatch_signatures(
+    mismatch: PlantMismatch,
+    body: Body,
+    matrix: Array,
+    thrusters_N_s: Array,
+    before: Odometry,
+    after: Odometry,
+) -> Array:
+    """Return the residuals (6, 13 + n) for one standard deviation of each part of ``mismatch``: mass, three moments of
+    inertia, centre of mass, force, torque, and the thrust of every thruster.
+
+    To first order, with motion and forces at the origin of CRF and the centre of mass c: m (a + omega' x c
+    + omega x (omega x c)) = F and I omega' + omega x I omega = tau - c x F.
+    """
+    time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
+    inertia, force = np.asarray(body.inertia), observed_impulse(before, after, body)[:3]
+    first, last = np.asarray(before.omega_rad_s), np.asarray(after.omega_rad_s)
+    omega, turned = (first + last) / 2.0, rotations.skew(last - first)
+    turning = rotations.skew(omega)
+    signatures = np.zeros((6, 13 + len(thrusters_N_s)))
+    signatures[:3, 0] = -mismatch.mass * force
+    signatures[3:, 1:4] = -mismatch.inertia * (
+        np.diag(inertia * (last - first)) + turning @ np.diag(inertia * omega) * time_s
+    )
+    signatures[:3, 4:7] = -mismatch.centre_of_mass_m * body.mass_kg * (turned + turning @ turning * time_s)
+    signatures[3:, 4:7] = mismatch.centre_of_mass_m * rotations.skew(force)
+    signatures[:3, 7:10] = mismatch.force_N * time_s * np.eye(3)
+    signatures[3:, 10:13] = mismatch.torque_N_m * time_s * np.eye(3)
+    signatures[:, 13:] = mismatch.thrust * matrix * thrusters_N_s
+    return signatures
 
 
 def quiescent_variance(noise: ImpulseNoise, body: Body) -> Array:

@@ -265,7 +265,8 @@ def _start(
     """Start the target at the sighting with which most others agree, and apply the others as updates."""
     s = now.hypotheses[0]
     poses = {
-        i: [sighted_pose(s, i, x, mounting, p) for x in sighting.solutions] for i, sighting in seen.items()
+        i: [sighted_pose(s, i, x, len(sighting.marker_ids), mounting, p) for x in sighting.solutions]
+        for i, sighting in seen.items()
     }
 
     def support(i: int, pose: SightedPose) -> int:

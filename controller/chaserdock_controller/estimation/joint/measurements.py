@@ -133,12 +133,17 @@ def predict_sighting(state: JointState, i: int, mounting: CameraMounting) -> Pre
 
 
 def linearize_sighting(
-    state: JointState, i: int, solution: PoseSolution, mounting: CameraMounting, p: JointParameters
+    state: JointState,
+    i: int,
+    solution: PoseSolution,
+    markers: int,
+    mounting: CameraMounting,
+    p: JointParameters,
 ) -> LinearizedMeasurement:
-    """Return the residual (6,) of a sighting: position in IRF, m, and rotation in TRF, rad."""
+    """Return the residual (6,) of a solution from so many ``markers``: position in IRF, m, and rotation in TRF, rad."""
     predicted = predict_sighting(state, i, mounting)
     stated = sighting_covariance(solution, p)
-    factor = np.linalg.cholesky(stated)
+    factor = p.view_ratio(markers) * np.linalg.cholesky(stated)
     view = factor @ state.of(i, VIEW)
     r = np.empty(6)
     r[0:3] = solution.position_m - predicted.position_m - view[0:3]

@@ -31,7 +31,8 @@ class JointParameters:
     contact_*: sigma of the change of a chaser's rates by a contact.
     floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
     sighting_scale: factor on the stated covariance of a sighting for its white part.
-    view_ratio: sigma of the error of a sighting that persists while the view stays the same, as a ratio of the stated sigma.
+    view_ratio_single, view_ratio_several: sigma of the error of a sighting that persists while the view stays the same, as a ratio
+        of the stated sigma, with one marker and with several smaller ones, whose corners depend more on the pixel grid.
     view_time_s: time constant of this error.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
         as by a stuck thruster; assumed only where velocity or rate does not fit otherwise.
@@ -66,8 +67,9 @@ class JointParameters:
     floor_sighting_m: float = 2e-5
     floor_sighting_rad: float = math.radians(0.002)
     sighting_scale: float = 0.85
-    view_ratio: float = 0.3
-    view_time_s: float = 30.0
+    view_ratio_single: float = 0.1
+    view_ratio_several: float = 1.3
+    view_time_s: float = 3.0
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.01
@@ -86,6 +88,10 @@ class JointParameters:
         n = self.navigation
         turn = math.hypot(n.camera_turn_rad, n.camera_centre_px / self.camera.fx_px)
         object.__setattr__(self, "camera_turn_rad", turn)
+
+    def view_ratio(self, markers: int) -> float:
+        """Return the ratio of the persistent error of a sighting of this many markers to its stated sigma."""
+        return self.view_ratio_single if markers <= 1 else self.view_ratio_several
 
     @property
     def inertia(self) -> Vector3:

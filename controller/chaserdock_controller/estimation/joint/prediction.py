@@ -119,7 +119,7 @@ def _fading(dt: float, p: JointParameters) -> Array:
     for part, sigma, time_s in (
         (POSITION_DRIFT, n.position_drift_m, n.position_drift_time_s),
         (ATTITUDE_DRIFT, n.attitude_drift_rad, n.attitude_drift_time_s),
-        (VIEW, p.view_ratio, p.view_time_s),
+        (VIEW, 1.0, p.view_time_s),
     ):
         fade[part] = math.exp(-dt / time_s) if sigma > 0.0 else 1.0
     return fade
@@ -210,7 +210,7 @@ def chaser_prior(p: JointParameters) -> Array:
         (TURN, p.camera_turn_rad),
         (SHIFT, n.camera_shift_m),
         (FOCAL, n.camera_focal_share),
-        (VIEW, p.view_ratio),
+        (VIEW, 1.0),
     ):
         prior[part.start - 12 : part.stop - 12] = sigma**2
     return prior

@@ -118,9 +118,14 @@ class SightedPose(PoseHypothesis):
 
 
 def sighted_pose(
-    state: JointState, i: int, solution: PoseSolution, mounting: CameraMounting, p: JointParameters
+    state: JointState,
+    i: int,
+    solution: PoseSolution,
+    markers: int,
+    mounting: CameraMounting,
+    p: JointParameters,
 ) -> SightedPose:
-    """Return the pose of the target by a sighting of chaser ``i``, with the camera's errors as estimated."""
+    """Return the pose of the target by a solution of chaser ``i``, with the camera's errors as estimated."""
     c = so3.to_matrix(state.attitudes_wxyz[i])
     delta = state.of(i, TURN)
     q_camera = so3.multiply(state.attitudes_wxyz[i], mounting.q_wxyz)
@@ -132,7 +137,7 @@ def sighted_pose(
     predicted = predict_sighting(moved, i, mounting)
     to_pose = np.linalg.inv(predicted.by_target[:, POSE])
     stated = sighting_covariance(solution, p)
-    noise = (p.sighting_scale**2 + p.view_ratio**2) * stated
+    noise = (p.sighting_scale**2 + p.view_ratio(markers) ** 2) * stated
     by_chaser = to_pose @ predicted.by_chaser
     cross = -by_chaser @ state.covariance[block(i), :]
     own = state.covariance[block(i), block(i)]
@@ -223,10 +228,9 @@ def update(
     chasers = [i for i in sorted(odometry.keys() | sightings.keys()) if state.alive[i]]
     covariance = ReducedCovariance(state.covariance, 18 * len(chasers))
     for i in chasers:
-        sighting = sightings.get(i)
-        solutions = sighting.solutions if sighting is not None and state.target_known else ()
-        state, fits = _update_chaser(state, covariance, i, odometry.get(i), solutions, mounting, p)
-        if solutions:
+        sighting = sightings.get(i) if state.target_known else None
+        state, fits = _update_chaser(state, covariance, i, odometry.get(i), sighting, mounting, p)
+        if sighting is not None and sighting.solutions:
             (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
     updates = state.updates + bool(accepted)
     state = replace(state, covariance=covariance.total(), updates=updates)
@@ -238,13 +242,14 @@ def _update_chaser(
     covariance: ReducedCovariance,
     i: int,
     odometry: Odometry | None,
-    solutions: Sequence[PoseSolution],
+    sighting: Sighting | None,
     mounting: CameraMounting,
     p: JointParameters,
 ) -> tuple[JointState, dict[int, bool]]:
     """Update with the measurements of one chaser; return the state, and which channels were used."""
-    solution = _likeliest(prior, covariance, i, solutions, mounting, p)
-    z = _linearize(prior, i, odometry, solution, mounting, p)
+    markers = len(sighting.marker_ids) if sighting is not None else 0
+    solution = _likeliest(prior, covariance, i, sighting, mounting, p)
+    z = _linearize(prior, i, odometry, solution, markers, mounting, p)
     channels = _channels(odometry is not None, solution is not None, p)
     cross, s = covariance.innovation(i, z)
     state, fits = _gate(prior, i, channels, z.residual, s, p)
@@ -267,7 +272,7 @@ def _update_chaser(
     white, correction = np.zeros((0, len(cross))), np.zeros(len(cross))
     for k in range(p.iterations if nonlinear else 1):
         if k:
-            z = _linearize(state, i, odometry, solution, mounting, p)
+            z = _linearize(state, i, odometry, solution, markers, mounting, p)
             cross, s = covariance.innovation(i, z)
         factor = np.linalg.cholesky(s[np.ix_(rows, rows)])
         residual = z.residual[rows]
@@ -322,16 +327,17 @@ def _likeliest(
     state: JointState,
     covariance: ReducedCovariance,
     i: int,
-    solutions: Sequence[PoseSolution],
+    sighting: Sighting | None,
     mounting: CameraMounting,
     p: JointParameters,
 ) -> PoseSolution | None:
     """Return the likeliest solution of a sighting, the first one of equals; None without any."""
-    if len(solutions) < 2:
+    solutions = sighting.solutions if sighting is not None else ()
+    if sighting is None or len(solutions) < 2:
         return solutions[0] if solutions else None
 
     def log_density(solution: PoseSolution) -> float:
-        z = linearize_sighting(state, i, solution, mounting, p)
+        z = linearize_sighting(state, i, solution, len(sighting.marker_ids), mounting, p)
         s = covariance.innovation(i, z)[1]
         return -0.5 * (float(z.residual @ np.linalg.solve(s, z.residual)) + float(np.linalg.slogdet(s)[1]))
 
@@ -372,12 +378,13 @@ def _linearize(
     i: int,
     odometry: Odometry | None,
     solution: PoseSolution | None,
+    markers: int,
     mounting: CameraMounting,
     p: JointParameters,
 ) -> LinearizedMeasurement:
     parts = []
     if solution is not None:
-        parts.append(linearize_sighting(state, i, solution, mounting, p))
+        parts.append(linearize_sighting(state, i, solution, markers, mounting, p))
     if odometry is not None:
         parts.append(linearize_odometry(state, i, odometry, p))
     if len(parts) == 1:

@@ -21,6 +21,7 @@ from chaserdock_controller.interfaces import LogEntry, Observation, TargetEstima
 from .composite_body import CompositeBody
 from .joint import JointEstimator
 from .joint.estimator import JointInputs
+from .joint.prediction import disturbance
 from .joint.state import POSITION_DRIFT, JointState
 from .measurements import SightingConverter
 from .mekf import Mekf
@@ -54,7 +55,7 @@ class EstimationStage:
         known = target.status in ("tracking", "predicting")
         if known:
             self.composite.update_body(target, own)
-        disturbances = self._disturbances(own)
+        disturbances = self._disturbances(o, own)
         visible_to = frozenset(s.chaser for s in o.sightings if s.solutions)
         events: list[LogEntry] = [(e.level, e.text) for e in estimator.drain_events()]
         accepted, rejected = sorted(visible_to - set(target.rejected)), sorted(target.rejected)
@@ -94,11 +95,15 @@ class EstimationStage:
             contacts=frozenset(touched | (latched ^ latched_before)),
         )
 
-    def _disturbances(self, own: Mapping[int, Odometry]) -> dict[int, Array]:
+    def _disturbances(self, o: Observation, own: Mapping[int, Odometry]) -> dict[int, Array]:
         """Return the estimated disturbance on each chaser; none on a latched one, whose motion is the target's."""
-        state = self.estimator.state if isinstance(self.estimator, JointEstimator) else None
-        latched = self.composite.latched
-        return {i: _NO_DISTURBANCE if state is None or i in latched else state.disturbance(i) for i in own}
+        estimator, found = self.estimator, dict.fromkeys(own, _NO_DISTURBANCE)
+        if not isinstance(estimator, JointEstimator) or estimator.state is None:
+            return found
+        for i in own.keys() - self.composite.latched:
+            impulse = o.impulses[i].impulse if i in o.impulses else np.zeros(6)
+            found[i] = disturbance(estimator.state, i, impulse / self._period_s, estimator.parameters)
+        return found
 
 
 def _without_drift(

@@ -43,8 +43,11 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     """Check that a chaser can fly the calibration manoeuvre."""
     if phase is not Phase.HOLD or not at_rest:
         return f"in phase {phase}; hold first"
-    if scenario.estimator.name != "mekf" or not scenario.navigation.errors().uncertain_mounting:
-        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = mekf)"
+    if (
+        scenario.estimator.name not in ("joint", "mekf")
+        or not scenario.navigation.errors().uncertain_mounting
+    ):
+        return "the cameras are taken as exact: set navigation.camera_turn_deg (and estimator.name = joint or mekf)"
     return ""
 
 

@@ -25,15 +25,17 @@ class JointParameters:
         errors. body: assumed mass properties of the chasers. camera: as calibrated. navigation: errors of the chasers'
         sensors.
     control_force_share, control_torque_share: sigma of a commanded impulse's effect, as a share of it; control_arm_m:
-        offset of the force from the centre of mass. They cover errors of thrust, mass, inertia and alignment.
+        offset of the force from the centre of mass. They cover errors of thrust, mass, inertia and alignment, which are the
+        same at every tick: as white noise they are larger.
     disturbance_*: force and torque on a chaser in its body axes: sigma at the start, and density of the random walk.
+    centre_of_mass_m: sigma of a chaser's centre of mass from the origin of CRF, per axis.
     latched_*: white acceleration of a chaser whose latch holds the target.
     contact_*: sigma of the change of a chaser's rates by a contact.
     floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
     sighting_scale: factor on the stated covariance of a sighting for its white part.
     view_ratio_single, view_ratio_several: sigma of the error of a sighting that persists while the view stays the same, as a ratio
         of the stated sigma, with one marker and with several smaller ones, whose corners depend more on the pixel grid.
-    view_time_s: time constant of this error.
+    view_time_single_s, view_time_several_s: time constants of this error.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
         as by a stuck thruster; assumed only where velocity or rate does not fit otherwise.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
@@ -49,13 +51,14 @@ class JointParameters:
     navigation: NavigationErrors
     force_max_N: float = 1.0
     torque_max_N_m: float = 0.1
-    control_force_share: float = 0.1
-    control_torque_share: float = 0.2
+    control_force_share: float = 0.3
+    control_torque_share: float = 0.5
     control_arm_m: float = 0.005
     disturbance_force_N: float = 0.01
     disturbance_torque_N_m: float = 0.001
     disturbance_force_N_sqrt_s: float = 1e-3
     disturbance_torque_N_m_sqrt_s: float = 1e-4
+    centre_of_mass_m: float = 0.005
     latched_acceleration_m_s2: float = 0.05
     latched_acceleration_rad_s2: float = 0.1
     contact_velocity_m_s: float = 0.01
@@ -69,7 +72,8 @@ class JointParameters:
     sighting_scale: float = 0.85
     view_ratio_single: float = 0.1
     view_ratio_several: float = 1.3
-    view_time_s: float = 3.0
+    view_time_single_s: float = 30.0
+    view_time_several_s: float = 3.0
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.01
@@ -92,6 +96,10 @@ class JointParameters:
     def view_ratio(self, markers: int) -> float:
         """Return the ratio of the persistent error of a sighting of this many markers to its stated sigma."""
         return self.view_ratio_single if markers <= 1 else self.view_ratio_several
+
+    def view_time_s(self, markers: int) -> float:
+        """Return the time constant of this error, s."""
+        return self.view_time_single_s if markers <= 1 else self.view_time_several_s
 
     @property
     def inertia(self) -> Vector3:

@@ -2,7 +2,8 @@
 """Motion of the target and the chasers between ticks, and the growth of the covariance. Pure functions.
 
 A chaser is a rigid body under its commanded wrench and an unknown, slowly changing disturbance (F_d, T_d), both in body axes:
-v' = C (F + F_d) / m, I omega' = T + T_d - omega x I omega. Its sensor errors are Gauss-Markov processes or constants.
+I omega' = T + T_d - c x (F + F_d) - omega x I omega, v' = C ((F + F_d) / m - omega' x c - omega x (omega x c)), where the
+origin of CRF is at -c from the centre of mass. Its sensor errors are Gauss-Markov processes or constants.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from .parameters import JointParameters
 from .state import (
     ATTITUDE,
     ATTITUDE_DRIFT,
+    CENTRE,
     CHASER,
     EXTRA,
     FOCAL,
@@ -66,16 +68,17 @@ def predict(
     moved, target_transition = _predict_target(state, dt, p)
     n = state.chasers
     wrenches = impulses / dt + state.extra[:, :6]
+    centres = state.extra[:, CENTRE.start - 12 : CENTRE.stop - 12].copy()
     for i in latched:
-        wrenches[i] = 0.0
+        wrenches[i] = centres[i] = 0.0
     rows = np.concatenate(
         [state.positions_m, state.velocities_m_s, state.attitudes_wxyz, state.omegas_rad_s], axis=1
     )
     for i in range(n):
-        u = wrenches[i].tolist()
+        u = at_origin(wrenches[i], centres[i], state.omegas_rad_s[i], p).tolist()
         rows[i] = rk4_step(lambda y, u=u: newton_euler(y, u, p.body.mass_kg, p.inertia), rows[i], dt)
-    fade = _fading(dt, p)
-    motion = _motion_transitions(state, wrenches, dt, p)
+    fade = _fading(state, dt, p)
+    motion = _motion_transitions(state, wrenches, centres, dt, p)
     covariance = _transform(target_transition, motion, fade, state.covariance)
     _add_noise(covariance, state, impulses, dt, p, latched, fade, max(0.0, dt - nominal_s))
     return replace(
@@ -85,7 +88,7 @@ def predict(
         velocities_m_s=rows[:, 3:6],
         attitudes_wxyz=rotations.normalize(rows[:, 6:10]),
         omegas_rad_s=rows[:, 10:13],
-        extra=state.extra * fade[12:],
+        extra=state.extra * fade[:, 12:],
         covariance=covariance,
     )
 
@@ -113,37 +116,67 @@ def _target_noise(dt: float, p: JointParameters) -> Array:
     return process_noise(dt, t.acceleration_noise_m_s2_sqrt_hz**2, t.angular_noise_rad_s2_sqrt_hz**2)
 
 
-def _fading(dt: float, p: JointParameters) -> Array:
-    """Return the factor (CHASER,) by which each component of a chaser decays in ``dt``; 1 where it does not."""
-    fade, n = np.ones(CHASER), p.navigation
+def _fading(state: JointState, dt: float, p: JointParameters) -> Array:
+    """Return the factors (N, CHASER) by which the components of the chasers decay in ``dt``; 1 where they do not."""
+    fade, n = np.ones((state.chasers, CHASER)), p.navigation
     for part, sigma, time_s in (
         (POSITION_DRIFT, n.position_drift_m, n.position_drift_time_s),
         (ATTITUDE_DRIFT, n.attitude_drift_rad, n.attitude_drift_time_s),
-        (VIEW, 1.0, p.view_time_s),
     ):
-        fade[part] = math.exp(-dt / time_s) if sigma > 0.0 else 1.0
+        fade[:, part] = math.exp(-dt / time_s) if sigma > 0.0 else 1.0
+    for i, markers in enumerate(state.markers.tolist()):
+        fade[i, VIEW] = math.exp(-dt / p.view_time_s(markers))
     return fade
 
 
-def _motion_transitions(state: JointState, wrenches: Array, dt: float, p: JointParameters) -> Array:
+def at_origin(wrench: Array, centre_m: Array, omega: Array, p: JointParameters) -> Array:
+    """Return the wrench (6,) that moves a body with its centre of mass at the origin of CRF as ``wrench`` moves the chaser's
+    origin; ``centre_m`` (3,): its centre of mass, CRF; ``omega`` (3,) rad/s."""
+    if not centre_m.any():
+        return wrench
+    inertia = np.array(p.inertia)
+    torque = wrench[3:] - np.cross(centre_m, wrench[:3])
+    alpha = (torque - np.cross(omega, inertia * omega)) / inertia
+    turning = np.cross(alpha, centre_m) + np.cross(omega, np.cross(omega, centre_m))
+    return np.concatenate([wrench[:3] - p.body.mass_kg * turning, torque])
+
+
+def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) -> Array:
+    """Return the wrench (6,) that acts on chaser ``i``, as a body with its centre of mass at the origin of CRF, in addition to
+    the commanded ``wrench``."""
+    total = wrench + state.extra[i, :6]
+    return at_origin(total, state.of(i, CENTRE), state.omegas_rad_s[i], p) - wrench
+
+
+def _motion_transitions(
+    state: JointState, wrenches: Array, centres_m: Array, dt: float, p: JointParameters
+) -> Array:
     """Return the transition matrices (N, MOTION, MOTION) of the errors of motion and disturbance, to second order in ``dt``."""
     n, inertia = state.chasers, np.array(p.inertia)
     a = np.zeros((n, MOTION, MOTION))
     for i in range(n):
         c, w = so3.to_matrix(state.attitudes_wxyz[i]), state.omegas_rad_s[i]
-        a[i, VELOCITY, ATTITUDE] = -c @ so3.skew(wrenches[i, :3]) / p.body.mass_kg
-        a[i, VELOCITY, FORCE] = c / p.body.mass_kg
-        a[i, ATTITUDE, ATTITUDE] = -so3.skew(w)
-        a[i, RATE, RATE] = (so3.skew(inertia * w) - so3.skew(w) * inertia) / inertia[:, None]
+        centre, turning = so3.skew(centres_m[i]), so3.skew(w)
+        total = at_origin(wrenches[i], centres_m[i], w, p)
+        alpha = (total[3:] - np.cross(w, inertia * w)) / inertia
+        a[i, ATTITUDE, ATTITUDE] = -turning
+        a[i, RATE, RATE] = (so3.skew(inertia * w) - turning * inertia) / inertia[:, None]
+        a[i, RATE, FORCE] = -centre / inertia[:, None]
+        a[i, RATE, TORQUE] = np.diag(1.0 / inertia)
+        a[i, RATE, CENTRE] = so3.skew(wrenches[i, :3]) / inertia[:, None]
+        a[i, VELOCITY] = c @ centre @ a[i, RATE]
+        a[i, VELOCITY, ATTITUDE] = -c @ so3.skew(total[:3]) / p.body.mass_kg
+        a[i, VELOCITY, RATE] += c @ (so3.skew(np.cross(w, centres_m[i])) + turning @ centre)
+        a[i, VELOCITY, FORCE] += c / p.body.mass_kg
+        a[i, VELOCITY, CENTRE] -= c @ (so3.skew(alpha) + turning @ turning)
     a[:, POSITION, VELOCITY] = a[:, ATTITUDE, RATE] = _EYE3
-    a[:, RATE, TORQUE] = np.diag(1.0 / inertia)
     a *= dt
     return np.eye(MOTION) + a + 0.5 * (a @ a)
 
 
 def _transform(target: Array, motion: Array, fade: Array, covariance: Array) -> Array:
     """Return F P F' for the block-diagonal F of ``target`` (12, 12) and, for each chaser, ``motion`` (N, MOTION, MOTION) and
-    the decay ``fade`` (CHASER,) of its other components."""
+    the decay ``fade`` (N, CHASER) of its other components."""
     n, size = len(motion), len(covariance)
 
     def left(m: Array) -> Array:
@@ -151,7 +184,7 @@ def _transform(target: Array, motion: Array, fade: Array, covariance: Array) -> 
         np.matmul(target, m[:TARGET], out=out[:TARGET])
         before, after = (x[TARGET:].reshape(n, CHASER, size) for x in (m, out))
         np.matmul(motion, before[:, :MOTION], out=after[:, :MOTION])
-        np.multiply(before[:, MOTION:], fade[MOTION:, None], out=after[:, MOTION:])
+        np.multiply(before[:, MOTION:], fade[:, MOTION:, None], out=after[:, MOTION:])
         return out
 
     result = left(np.ascontiguousarray(left(covariance).T))
@@ -172,9 +205,9 @@ def _add_noise(
     if state.target_known:
         covariance[:TARGET, :TARGET] += _target_noise(dt, p)
     inertia, m = np.array(p.inertia), p.body.mass_kg
-    drift = (1.0 - fade[12:] ** 2) * chaser_prior(p)
-    drift[0:3] = p.disturbance_force_N_sqrt_s**2 * dt
-    drift[3:6] = p.disturbance_torque_N_m_sqrt_s**2 * dt
+    drifts = (1.0 - fade[:, 12:] ** 2) * chaser_prior(p)
+    drifts[:, 0:3] = p.disturbance_force_N_sqrt_s**2 * dt
+    drifts[:, 3:6] = p.disturbance_torque_N_m_sqrt_s**2 * dt
     for i in np.flatnonzero(state.alive).tolist():
         force, torque = float(np.linalg.norm(impulses[i, :3])), np.abs(impulses[i, 3:])
         if i in latched:
@@ -195,7 +228,7 @@ def _add_noise(
             noise[a, r] += variance * dt / 2.0
             noise[r, a] += variance * dt / 2.0
         e = np.arange(12, CHASER)
-        noise[e, e] += drift if i not in latched else np.concatenate([np.zeros(6), drift[6:]])
+        noise[e, e] += drifts[i] if i not in latched else np.concatenate([np.zeros(6), drifts[i, 6:]])
 
 
 def chaser_prior(p: JointParameters) -> Array:
@@ -204,6 +237,7 @@ def chaser_prior(p: JointParameters) -> Array:
     for part, sigma in (
         (FORCE, p.disturbance_force_N),
         (TORQUE, p.disturbance_torque_N_m),
+        (CENTRE, p.centre_of_mass_m),
         (POSITION_DRIFT, math.hypot(n.position_drift_m, n.position_bias_m)),
         (ATTITUDE_DRIFT, math.hypot(n.attitude_drift_rad, n.attitude_bias_rad)),
         (GYRO_BIAS, n.gyro_bias_rad_s),

@@ -23,15 +23,17 @@ TARGET = 12
 """Components of the target's error."""
 FORCE, TORQUE = slice(12, 15), slice(15, 18)
 """Disturbance on the chaser, body axes, N and N m."""
-MOTION = 18
+CENTRE = slice(18, 21)
+"""Offset of the chaser's centre of mass from the origin of CRF, m (CRF)."""
+MOTION = 21
 """Number of a chaser's components that its equations of motion couple."""
-POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(18, 21), slice(21, 24), slice(24, 27)
+POSITION_DRIFT, ATTITUDE_DRIFT, GYRO_BIAS = slice(21, 24), slice(24, 27), slice(27, 30)
 """Errors of its odometry that do not average out: m (WRF), rad (CRF), rad/s (CRF)."""
-TURN, SHIFT, FOCAL = slice(27, 30), slice(30, 33), slice(33, 34)
+TURN, SHIFT, FOCAL = slice(30, 33), slice(33, 36), slice(36, 37)
 """Errors of its camera: rotation vector and shift (IRF), relative focal length (see ``camera_calibration``)."""
-VIEW = slice(34, 40)
+VIEW = slice(37, 43)
 """Error of its sightings that persists with the view, in units of the stated sigmas."""
-CHASER = 40
+CHASER = 43
 """Components of a chaser's error."""
 EXTRA = CHASER - 12
 """Components that are added to the chaser's own state without a rotation."""
@@ -47,6 +49,7 @@ class JointState(TargetHypothesis):
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
     additive states. covariance (12 + CHASER N, 12 + CHASER N). alive (N,): chasers whose state is known.
     odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
+    markers (N,): number of markers in the newest sighting of each chaser.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
     updates: ticks with sightings since the start of the target.
     """
@@ -60,6 +63,7 @@ class JointState(TargetHypothesis):
     odometry_ns: NDArray[np.int64]
     rejections: NDArray[np.int64]
     nis: Array
+    markers: NDArray[np.int64]
     target_known: bool = False
     updates: int = 0
 
@@ -71,10 +75,6 @@ class JointState(TargetHypothesis):
     def of(self, chaser: int, part: slice) -> Array:
         """Return additive states of a chaser; ``part``: their components in its error."""
         return self.extra[chaser, part.start - 12 : part.stop - 12]
-
-    def disturbance(self, chaser: int) -> Array:
-        """Return the estimated disturbance (6,) on a chaser: force and torque, body axes."""
-        return self.extra[chaser, :6]
 
 
 def empty_state(time_ns: int, chasers: int) -> JointState:
@@ -96,6 +96,7 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         odometry_ns=np.zeros(n, dtype=np.int64),
         rejections=np.zeros((n, len(CHANNELS)), dtype=np.int64),
         nis=np.full((n, len(CHANNELS) - 1), 3.0),
+        markers=np.zeros(n, dtype=np.int64),
     )
 
 

@@ -232,8 +232,11 @@ def update(
         state, fits = _update_chaser(state, covariance, i, odometry.get(i), sighting, mounting, p)
         if sighting is not None and sighting.solutions:
             (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
+    markers = state.markers.copy()
+    for i in accepted:
+        markers[i] = len(sightings[i].marker_ids)
     updates = state.updates + bool(accepted)
-    state = replace(state, covariance=covariance.total(), updates=updates)
+    state = replace(state, covariance=covariance.total(), updates=updates, markers=markers)
     return state, UpdateReport(tuple(accepted), tuple(rejected))
 
 

@@ -156,7 +156,7 @@ class Invariants:
     def _check_body(self, body: BodyTruth) -> None:
         before = self._states.get(body.body)
         self._states[body.body] = body
-        if self._touching & {body.body, *(["target"] if self._touching else [])}:
+        if body.body in self._touching or (body.body == "target" and self._touching):
             self._begin.clear()
             return
         if before is None or body.tick != before.tick + 1:

@@ -158,6 +158,17 @@ def test_an_untouched_target_conserves_its_energy(log: Log) -> None:
     assert log.found == ["energy and momentum"]
 
 
+def test_a_touched_target_may_change_its_energy(log: Log) -> None:
+    drawn = DrawnBody(body="target", mass_kg=1.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
+    for tick, rate in enumerate((0.1, 0.2, 0.2)):
+        turning = body("target", 0.0, 0.1, omega_rad_s=(0.0, 0.0, rate), tick=tick)
+        log.publish(topics.TRUTH_BODY, turning, "target")
+        latched = (0,) if tick == 1 else ()
+        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched))
+    assert log.found == []
+
+
 def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     log.tick(20)
     log.flies(0, 20)

@@ -134,11 +134,16 @@ def at_origin(wrench: Array, centre_m: Array, omega: Array, p: JointParameters) 
     origin; ``centre_m`` (3,): its centre of mass, CRF; ``omega`` (3,) rad/s."""
     if not centre_m.any():
         return wrench
+    torque = wrench[3:] - so3.skew(centre_m) @ wrench[:3]
+    alpha = _angular_acceleration(torque, omega, p)
+    turning = so3.skew(omega)
+    acceleration = so3.skew(alpha) @ centre_m + turning @ (turning @ centre_m)
+    return np.concatenate([wrench[:3] - p.body.mass_kg * acceleration, torque])
+
+
+def _angular_acceleration(torque: Array, omega: Array, p: JointParameters) -> Array:
     inertia = np.array(p.inertia)
-    torque = wrench[3:] - np.cross(centre_m, wrench[:3])
-    alpha = (torque - np.cross(omega, inertia * omega)) / inertia
-    turning = np.cross(alpha, centre_m) + np.cross(omega, np.cross(omega, centre_m))
-    return np.concatenate([wrench[:3] - p.body.mass_kg * turning, torque])
+    return (torque - so3.skew(omega) @ (inertia * omega)) / inertia
 
 
 def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) -> Array:
@@ -158,7 +163,7 @@ def _motion_transitions(
         c, w = so3.to_matrix(state.attitudes_wxyz[i]), state.omegas_rad_s[i]
         centre, turning = so3.skew(centres_m[i]), so3.skew(w)
         total = at_origin(wrenches[i], centres_m[i], w, p)
-        alpha = (total[3:] - np.cross(w, inertia * w)) / inertia
+        alpha = _angular_acceleration(total[3:], w, p)
         a[i, ATTITUDE, ATTITUDE] = -turning
         a[i, RATE, RATE] = (so3.skew(inertia * w) - turning * inertia) / inertia[:, None]
         a[i, RATE, FORCE] = -centre / inertia[:, None]
@@ -166,7 +171,7 @@ def _motion_transitions(
         a[i, RATE, CENTRE] = so3.skew(wrenches[i, :3]) / inertia[:, None]
         a[i, VELOCITY] = c @ centre @ a[i, RATE]
         a[i, VELOCITY, ATTITUDE] = -c @ so3.skew(total[:3]) / p.body.mass_kg
-        a[i, VELOCITY, RATE] += c @ (so3.skew(np.cross(w, centres_m[i])) + turning @ centre)
+        a[i, VELOCITY, RATE] += c @ (so3.skew(turning @ centres_m[i]) + turning @ centre)
         a[i, VELOCITY, FORCE] += c / p.body.mass_kg
         a[i, VELOCITY, CENTRE] -= c @ (so3.skew(alpha) + turning @ turning)
     a[:, POSITION, VELOCITY] = a[:, ATTITUDE, RATE] = _EYE3

@@ -315,7 +315,8 @@ def _gate(
     fits: dict[int, bool] = {}
     for channel in channels:
         r, part = residual[channel.rows], s[channel.rows, channel.rows]
-        value = float(r @ np.linalg.solve(part, r))
+        white = np.linalg.solve(part, r) if len(r) > 3 else _solve3(part, r)
+        value = float(r @ white)
         fits[channel.number] = _count(rejections, i, channel, value, p)
         if channel.number == SIGHTING_CHANNEL:
             # Bound the penalty: a gross outlier counts as much as one at the gate.
@@ -324,6 +325,12 @@ def _gate(
             k = channel.number - 1
             nis[i, k] += (min(value, 10.0 * channel.gate) - nis[i, k]) / p.overconfident_ticks
     return replace(state, rejections=rejections, nis=nis, log_likelihood=likelihood), fits
+
+
+def _solve3(a: Array, b: Array) -> Array:
+    """Return the solution (3,) of a symmetric system (3, 3) by its adjugate, faster than LAPACK for one so small."""
+    columns = [so3.skew(a[1]) @ a[2], so3.skew(a[2]) @ a[0], so3.skew(a[0]) @ a[1]]
+    return np.array([float(c @ b) for c in columns]) / float(a[0] @ columns[0])
 
 
 def _likeliest(

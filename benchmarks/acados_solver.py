@@ -21,7 +21,7 @@ import numpy as np
 from chaserdock_controller.nmpc.problem import dynamics, multiply
 from chaserdock_controller.nmpc.slack import SLACK_L2, slack_l1_weight
 from chaserdock_controller.nmpc.types import NmpcInput, NmpcParameters, NmpcPlan
-from chaserdock_controller.nmpc.warm_start import Frame, Task, status_of
+from chaserdock_controller.nmpc.warm_start import Frame, PreparedProblem, status_of
 from chaserdock_models.arrays import Array
 
 KINDS = ("coupled", "decoupled")
@@ -188,7 +188,7 @@ class AcadosSolver:
         self.solve_time = SolveTime(wall_s, cpu_s)
         return frame.finish(task, u, statuses, iterations)
 
-    def _set_problem(self, row: int, task: Task, guess: Array) -> None:
+    def _set_problem(self, row: int, task: PreparedProblem, guess: Array) -> None:
         """Pass the tick's problem and the initial guess (N, D+1, 13) to the solver of group ``row``."""
         solver, group, params = self._solvers[row], self._groups[row], self._frame.params
         p, d, own = task.problem, params.stages, len(group)
@@ -227,7 +227,7 @@ class AcadosSolver:
             solver.set(k, "yref", np.concatenate(y))
 
 
-def sidestep(task: Task) -> Array:
+def sidestep(task: PreparedProblem) -> Array:
     """Return the offsets (N, D+1, 3), m, of an initial guess at rest: a path to the reference, bent to its right."""
     p = task.problem
     path = p.references[:, -1, :3] - p.states[:, :3]

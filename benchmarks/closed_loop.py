@@ -23,7 +23,7 @@ from chaserdock_protocol.scenario import Scenario
 from common import Figures, make_parser, run_parts
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
-from chaserdock.evaluation.perception import Perception, RenderedImages, measurement_model
+from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
 from chaserdock.evaluation.transfers import avoidance, fly_transfer, load_shipped, swap
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
@@ -31,7 +31,7 @@ STEADY_FROM_S = 40.0
 """From here on the transient of a start 0.85 m away has decayed."""
 
 
-def noisy(scenario: Scenario) -> Perception:
+def noisy(scenario: Scenario) -> PerceptionModel:
     """Return a measurement model with 2 mm and 0.1 degrees of white noise."""
     return measurement_model(scenario, scenario.seed, NOISE_M, NOISE_RAD)
 
@@ -40,7 +40,7 @@ def variations(
     name: str,
     seeds: Iterable[int],
     scenario_of: Callable[[int], Scenario],
-    perception_of: Callable[[Scenario], Perception],
+    perception_of: Callable[[Scenario], PerceptionModel],
 ) -> Figures:
     """Fly every seed, and return the worst of each figure."""
     outcomes = []

@@ -39,25 +39,25 @@ from common import (
 
 from chaserdock.evaluation.docking_flights import (
     APPROACH_AT_S,
+    DockingOutcome,
     Failure,
-    Outcome,
     abort,
     dock,
     docking_scenario,
 )
-from chaserdock.evaluation.perception import Perception, RenderedImages, measurement_model
+from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
 
-PerceptionOf = Callable[[Scenario], Perception]
+PerceptionOf = Callable[[Scenario], PerceptionModel]
 KINDS = ("stuck_on", "stuck_off")
 
 
-class Row(msgspec.Struct, frozen=True):
+class DockingRow(msgspec.Struct, frozen=True):
     """One flight in the results file: part, settings, commit and outcome."""
 
     part: str
     settings: str
     commit: str
-    outcome: Outcome
+    outcome: DockingOutcome
 
 
 @dataclass
@@ -68,13 +68,13 @@ class Batch:
     settings: str
 
     def __post_init__(self) -> None:
-        rows = [msgspec.convert(line, Row) for line in read_lines(self.path)]
+        rows = [msgspec.convert(line, DockingRow) for line in read_lines(self.path)]
         matching = [row for row in rows if row.settings == self.settings]
         self._known = {(row.part, row.outcome.seed): row.outcome for row in matching}
         self.commits = {row.commit for row in matching}
         self._commit = commit()
 
-    def fly(self, part: str, seed: int, flight: Callable[[int], Outcome]) -> Outcome:
+    def fly(self, part: str, seed: int, flight: Callable[[int], DockingOutcome]) -> DockingOutcome:
         """Return the outcome of a flight from the results file, or fly it."""
         known = self._known.get((part, seed))
         if known is not None:
@@ -82,11 +82,11 @@ class Batch:
         outcome = flight(seed)
         self.commits.add(self._commit)
         print(f"{part} {outcome.line()}", file=sys.stderr, flush=True)
-        append_line(self.path, msgspec.to_builtins(Row(part, self.settings, self._commit, outcome)))
+        append_line(self.path, msgspec.to_builtins(DockingRow(part, self.settings, self._commit, outcome)))
         return outcome
 
 
-def docking_figures(name: str, outcomes: list[Outcome]) -> Figures:
+def docking_figures(name: str, outcomes: list[DockingOutcome]) -> Figures:
     """Return the figures of docking flights by name."""
     touches = [o.touch for o in outcomes if o.touch is not None]
     out: Figures = {
@@ -118,7 +118,7 @@ def docking_figures(name: str, outcomes: list[Outcome]) -> Figures:
     return out
 
 
-def print_causes(name: str, outcomes: list[Outcome]) -> None:
+def print_causes(name: str, outcomes: list[DockingOutcome]) -> None:
     """Print the number of flights and their first seeds by cause."""
     print(f"{name}: {len(outcomes)} flights")
     for cause, number in Counter(o.cause for o in outcomes).most_common():
@@ -127,7 +127,7 @@ def print_causes(name: str, outcomes: list[Outcome]) -> None:
         print(f"  {number:4d}  {cause}  (seeds {shown})")
 
 
-def abort_figures(name: str, outcomes: list[Outcome]) -> Figures:
+def abort_figures(name: str, outcomes: list[DockingOutcome]) -> Figures:
     """Return the figures of aborted flights by name."""
     opened = [o.opened_s for o in outcomes if o.opened_s is not None]
     return {
@@ -140,7 +140,7 @@ def abort_figures(name: str, outcomes: list[Outcome]) -> Figures:
     }
 
 
-def noisy(scenario: Scenario) -> Perception:
+def noisy(scenario: Scenario) -> PerceptionModel:
     """Return a measurement model with 2 mm and 0.1 degrees of noise, and no detection in every tenth image."""
     return measurement_model(scenario, scenario.seed, 0.002, math.radians(0.1), dropout=0.1)
 
@@ -180,14 +180,14 @@ def main() -> None:
         at_s = o.failed_at or float(np.random.default_rng([seed, 0xFA1]).uniform(2.0, 24.0))
         return kind, seed % 12, at_s
 
-    def dock_with(perception_of: PerceptionOf, kind: str | None = None) -> Callable[[int], Outcome]:
-        def flight(seed: int) -> Outcome:
+    def dock_with(perception_of: PerceptionOf, kind: str | None = None) -> Callable[[int], DockingOutcome]:
+        def flight(seed: int) -> DockingOutcome:
             failure = None if kind is None else failure_of(kind, seed)
             return dock(seed, scenario_of(seed, failure), perception_of, failure, o.approach_at)
 
         return flight
 
-    def abort_with(perception_of: PerceptionOf) -> Callable[[int], Outcome]:
+    def abort_with(perception_of: PerceptionOf) -> Callable[[int], DockingOutcome]:
         return lambda seed: abort(seed, scenario_of(seed), perception_of, again=seed % 5 == 0)
 
     for part, number, flight, evaluate in (

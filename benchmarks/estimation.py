@@ -134,7 +134,7 @@ class EstimatorErrors:
 
 
 @dataclass
-class Flight:
+class EstimationFlight:
     """A flight: errors of its estimator and of the parallel estimators, tracking errors as (time s, m, rad) of all chasers, events as
     (time s, level, text), whether each image had a detection by chaser, the last outputs, and reinitializations."""
 
@@ -177,7 +177,7 @@ def fly(
     on_image: Callable[[Image], Image] = lambda image: image,
     on_sighting: Callable[[Sighting], Sighting] = lambda sighting: sighting,
     until: Callable[[EstimatorErrors], bool] = lambda errors: False,
-) -> Flight:
+) -> EstimationFlight:
     """Fly a scenario with rendered images to its end, or ``until`` the errors so far satisfy a condition.
 
     ``on_image`` changes an image before perception, ``on_sighting`` what a chaser reports of it.
@@ -213,7 +213,7 @@ def fly(
             if until(errors):
                 break
         assert outputs is not None
-        return Flight(
+        return EstimationFlight(
             errors,
             {name: estimator.errors for name, estimator in estimators.items()},
             tracking,
@@ -254,7 +254,7 @@ def with_errors(scenario: Scenario) -> Scenario:
     return changed(scenario, camera={"effects": HEAVY}, navigation=ERRORS)
 
 
-def figures(flown: Flight, from_s: float) -> Row:
+def figures(flown: EstimationFlight, from_s: float) -> Row:
     """Return the figures of a flight: RMS from ``from_s`` on, maxima from 1 s on."""
     e = flown.estimates
     m, rad = flown.tracking_rms(from_s)

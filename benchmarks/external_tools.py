@@ -49,7 +49,7 @@ with open(sys.argv[1], "rb") as file:
 print(len(summary.channels), len(without), read, summary.statistics.message_count)
 """
 
-Checked = tuple[Figures, bool]
+CheckedFigures = tuple[Figures, bool]
 """Figures, and whether they are as they should be."""
 
 
@@ -79,7 +79,7 @@ def install_tools(folder: Path) -> Path:
     return programs
 
 
-def evo(programs: Path, log: Path, work: Path) -> Checked:
+def evo(programs: Path, log: Path, work: Path) -> CheckedFigures:
     """Compare the errors of the target estimate by evo with ours."""
     write_tracks(log, work)
     errors = estimate_errors(load_flight(log))
@@ -95,7 +95,7 @@ def evo(programs: Path, log: Path, work: Path) -> Checked:
     return figures, all(abs(ratio - 1.0) <= TOLERANCE for ratio in ratios)
 
 
-def doctor(programs: Path, log: Path) -> Checked:
+def doctor(programs: Path, log: Path) -> CheckedFigures:
     """Check the log with pymcap-cli. Raise RuntimeError for an output without verdict."""
     output = call(programs / "pymcap-cli", "doctor", log, COLUMNS="400")
     found = re.search(r"(\d+) errors, (\d+) warnings", output)
@@ -104,7 +104,7 @@ def doctor(programs: Path, log: Path) -> Checked:
     return {"pymcap_errors": int(found[1]), "pymcap_warnings": int(found[2])}, found[1] == "0"
 
 
-def mcap_reader(programs: Path, log: Path) -> Checked:
+def mcap_reader(programs: Path, log: Path) -> CheckedFigures:
     """Read all messages with the reader of the mcap package."""
     channels, without_schema, read, total = map(int, call(programs / "python", "-c", READ, log).split())
     figures: Figures = {
@@ -116,7 +116,7 @@ def mcap_reader(programs: Path, log: Path) -> Checked:
     return figures, without_schema == 0 and read == total > 0
 
 
-def rerun(programs: Path, log: Path, image: Path) -> Checked:
+def rerun(programs: Path, log: Path, image: Path) -> CheckedFigures:
     """Draw the log with rerun."""
     image.unlink(missing_ok=True)
     call(

@@ -40,7 +40,7 @@ GOOD = ("docked", "safe")
 
 
 @dataclass(frozen=True)
-class Result:
+class FaultResult:
     """Outcome of one run. ``reason``: the first warning or error in the log after the fault began."""
 
     number: int
@@ -61,7 +61,7 @@ def fault_of(number: int) -> dict[str, Any]:
     return draw_fault(KINDS[number % len(KINDS)], random.Random(f"fault {number}"), chasers=4)
 
 
-def fly(number: int, mode: str) -> Result:
+def fly(number: int, mode: str) -> FaultResult:
     """Fly one run. Raise SystemExit if the scenario is refused."""
     fault = fault_of(number)
     with tempfile.TemporaryDirectory() as folder:
@@ -86,7 +86,9 @@ def fly(number: int, mode: str) -> Result:
         return evaluate(number, mode, fault, out, ended, time.monotonic() - begin_s)
 
 
-def evaluate(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool, wall_s: float) -> Result:
+def evaluate(
+    number: int, mode: str, fault: dict[str, Any], out: Path, ended: bool, wall_s: float
+) -> FaultResult:
     """Evaluate the log of a run."""
     flight = load_flight(out / "mission.mcap")
     summary = summary_of(flight)
@@ -107,7 +109,7 @@ def evaluate(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bo
         outcome = "safe" if reason else "no reason named"
     lost = sum(m["lost"] for m in summary["messages"].values())
     end_s = fault["at_s"] - 1.0 if recorder_killed else flight.scenario.duration_s - 0.2
-    return Result(
+    return FaultResult(
         number=number,
         kind=fault["kind"],
         fault=fault,
@@ -122,13 +124,13 @@ def evaluate(number: int, mode: str, fault: dict[str, Any], out: Path, ended: bo
     )
 
 
-def read_results(path: Path, mode: str) -> dict[int, Result]:
+def read_results(path: Path, mode: str) -> dict[int, FaultResult]:
     """Return earlier results by number; a result whose fault is no longer that of its number is ignored."""
-    results = [Result(**row) for row in read_lines(path)]
+    results = [FaultResult(**row) for row in read_lines(path)]
     return {r.number: r for r in results if r.mode == mode and r.fault == fault_of(r.number)}
 
 
-def table(results: list[Result]) -> str:
+def table(results: list[FaultResult]) -> str:
     """Return the outcomes by kind of fault as a table."""
     outcomes = sorted({r.outcome for r in results}, key=lambda o: (o not in GOOD, o))
     columns = ["runs", *outcomes, "log complete", "nearest chasers", "nearest target"]

@@ -70,7 +70,7 @@ _head = msgspec.msgpack.Decoder(Head)
 
 
 @dataclass
-class Observer:
+class LatencyObserver:
     """Sending times (wall clock, ns) of ticks by tick, of images and commands by chaser and tick."""
 
     ticks: dict[int, int] = field(default_factory=dict)
@@ -137,7 +137,12 @@ async def read_viewer(port: int) -> None:
 
 
 def measure_window(
-    observer: Observer, fleet: Fleet, hub: Node, process: psutil.Process, condition: str, seconds: float
+    observer: LatencyObserver,
+    fleet: Fleet,
+    hub: Node,
+    process: psutil.Process,
+    condition: str,
+    seconds: float,
 ) -> Window:
     """Measure one window with the process under a condition."""
     stop = threading.Event()
@@ -164,7 +169,7 @@ def fly(part: str, seconds: float, rounds: int, keep: Path | None) -> Figures:
     windows: list[Window] = []
     with tempfile.TemporaryDirectory() if keep is None else nullcontext(str(keep)) as folder:
         hub, endpoint = open_hub(namespace, LEASE_MS, name="observer", role="analysis")
-        fleet, observer = Fleet(), Observer()
+        fleet, observer = Fleet(), LatencyObserver()
         try:
             hub.subscribe(topics.END)
             for topic in (topics.TICK, topics.IMAGE, topics.ACTUATORS):
@@ -196,7 +201,7 @@ def fly(part: str, seconds: float, rounds: int, keep: Path | None) -> Figures:
     return out
 
 
-def figures(name: str, windows: list[Window], observer: Observer) -> Figures:
+def figures(name: str, windows: list[Window], observer: LatencyObserver) -> Figures:
     """Return the figures of all windows of one condition."""
     keys = [(i, tick) for w in windows for tick in range(w.first, w.last + 1) for i in range(CHASERS)]
     sent = {key: observer.commands[key] for key in keys if key in observer.commands}
@@ -215,7 +220,7 @@ def figures(name: str, windows: list[Window], observer: Observer) -> Figures:
     return out
 
 
-def wait_for_images(observer: Observer, tick: int, fleet: Fleet, hub: Node) -> None:
+def wait_for_images(observer: LatencyObserver, tick: int, fleet: Fleet, hub: Node) -> None:
     """Wait until the images of a tick have been sent. Raise SystemExit if the mission ends before."""
     while observer.last_tick < tick:
         received = hub.receive(0.05)

@@ -83,7 +83,7 @@ class Proxy:
 
 
 @dataclass
-class Observer:
+class TakeoverObserver:
     """Sending time of the first command of each term (wall clock, ns), and progress of the flight."""
 
     first_command_ns: dict[int, int] = field(default_factory=dict)
@@ -117,7 +117,7 @@ class Takeover:
     stale_refused: int
 
 
-Fault = Callable[[psutil.Process, Proxy], None]
+InjectedFault = Callable[[psutil.Process, Proxy], None]
 
 
 def kill(controller: psutil.Process, proxy: Proxy) -> None:
@@ -137,10 +137,10 @@ def partition(controller: psutil.Process, proxy: Proxy) -> None:
     threading.Timer(OUTAGE_S, proxy.forwarding.set).start()
 
 
-FAULTS: dict[str, Fault] = {"kill": kill, "freeze": freeze, "partition": partition}
+FAULTS: dict[str, InjectedFault] = {"kill": kill, "freeze": freeze, "partition": partition}
 
 
-def fly(fault: Fault, at_s: float) -> Takeover:
+def fly(fault: InjectedFault, at_s: float) -> Takeover:
     """Fly in real time with a fault at ``at_s`` (simulated time)."""
     namespace, port = f"standby-{uuid.uuid4().hex[:8]}", free_port()
 
@@ -149,7 +149,7 @@ def fly(fault: Fault, at_s: float) -> Takeover:
         return ["--namespace", namespace, *endpoint]
 
     with tempfile.TemporaryDirectory() as name:
-        folder, observer, fleet = Path(name), Observer(), Fleet()
+        folder, observer, fleet = Path(name), TakeoverObserver(), Fleet()
         proxies = {process: Proxy(port) for process in topics.CONTROLLERS}
         router = Link(namespace, (), (f"tcp/127.0.0.1:{port}",), "router", lease_ms=LEASE_MS)
         node = Node("observer", "analysis", router)

@@ -122,7 +122,7 @@ def errors_of(sighting: PerceptionResult, view: View) -> tuple[float, float]:
     return min(errors, key=lambda e: e[1])
 
 
-class Results:
+class ViewResults:
     """Perception results of many views."""
 
     def __init__(self) -> None:
@@ -158,7 +158,7 @@ def accuracy(count: int) -> Figures:
     for target in ("servicer", "paper"):
         views = Views(target)
         ours, paper = views.perception(), views.perception("paper")
-        results, baseline = Results(), Results()
+        results, baseline = ViewResults(), ViewResults()
         for k, view in enumerate(views.random_views(count, 0.5, 2.0, 4)):
             results.add(ours.estimate(view.image), view)
             if k % 10 == 0 or count < 1000:
@@ -174,7 +174,7 @@ def at_one_metre(count: int) -> Figures:
         views = Views(target)
         ours, paper = views.perception(), views.perception("paper")
         for lit in (True, False):
-            results, baseline = Results(), Results()
+            results, baseline = ViewResults(), ViewResults()
             for view in views.face_views(count, 1.0, np.deg2rad(40.0), lit, 5, 0.1):
                 results.add(ours.estimate(view.image), view)
                 baseline.add(paper.estimate(view.image), view)
@@ -192,7 +192,7 @@ def reach(count: int) -> Figures:
     half_m = 0.2
 
     def detected(distance_m: float, tilt_deg: float, lateral_m: float, faces: tuple[int, ...]) -> float:
-        results = Results()
+        results = ViewResults()
         shown = views.face_views(6 * count, distance_m, np.deg2rad(tilt_deg), True, 6, lateral_m)
         for k, view in enumerate(shown):
             if k % 6 in faces:
@@ -212,7 +212,7 @@ def reach(count: int) -> Figures:
 
 def near_views(count: int) -> Figures:
     """Evaluate random attitudes with the centre at 0.28 to 0.45 m, where the body fills the image."""
-    views, results = Views("servicer"), Results()
+    views, results = Views("servicer"), ViewResults()
     perception = views.perception()
     for view in views.random_views(count, 0.28, 0.45, 8):
         results.add(perception.estimate(view.image), view)

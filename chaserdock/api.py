@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from chaserdock_protocol.scenario import Scenario
 
     from .launch.json_events import JsonLine
-    from .launch.launcher import Outcome
+    from .launch.launcher import MissionOutcome
     from .launch.progress import Show
     from .logs.reader import Log
     from .summary import Summary
@@ -102,7 +102,7 @@ def fly(
     viewer_port: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
     emit: Callable[[JsonLine], None] | None = None,
-) -> Outcome:
+) -> MissionOutcome:
     """Fly a scenario with ``KEY=VALUE`` overrides; the common part of ``run`` here and on the command line."""
     from chaserdock_protocol.shipped_scenarios import find_scenario
 

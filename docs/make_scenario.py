@@ -12,7 +12,7 @@ from pathlib import Path
 
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.json_schema import (
-    Node,
+    SchemaNode,
     description_of,
     editor_schema_text,
     item_of,
@@ -75,7 +75,7 @@ def unit_of(key: str) -> str:
     return next((unit for end, unit in _UNITS.items() if key.endswith(f"_{end}")), "")
 
 
-def type_of(node: Node, root: Node) -> str:
+def type_of(node: SchemaNode, root: SchemaNode) -> str:
     """Return a value's type in words."""
     if "enum" in node:
         return " or ".join(f"`{value}`" for value in node["enum"])
@@ -97,7 +97,7 @@ def type_of(node: Node, root: Node) -> str:
     return names[str(kind)]
 
 
-def range_of(node: Node, root: Node) -> str:
+def range_of(node: SchemaNode, root: SchemaNode) -> str:
     """Return the range of a number, of an array's numbers, or of an array's length."""
     if node.get("type") != "array":
         return range_text(node)
@@ -117,7 +117,7 @@ def range_of(node: Node, root: Node) -> str:
     return "; ".join(text for text in (f"{length} elements" if length else "", own) if text)
 
 
-def default_of(node: Node, required: bool, inner: Node) -> str:
+def default_of(node: SchemaNode, required: bool, inner: SchemaNode) -> str:
     """Return a key's default in TOML's notation."""
     if required:
         return "*required*"
@@ -133,7 +133,7 @@ def cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-def sections(path: str, node: Node, root: Node) -> list[str]:
+def sections(path: str, node: SchemaNode, root: SchemaNode) -> list[str]:
     """Return the chapter of a table, and those of the tables in it."""
     below: list[str] = []
     required = node.get("required", [])

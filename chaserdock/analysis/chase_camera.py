@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from .plots import colour
 from .scene import Face, Scene
 
-Pixels = NDArray[np.uint8]
-Pose = tuple[Array, Array]
+BgrImage = NDArray[np.uint8]
+BodyPose = tuple[Array, Array]
 """Position (3,) WRF and attitude (4,) body to WRF."""
 
 _NEAR_M = 0.02
@@ -66,12 +66,12 @@ def _fixed(px: Array) -> NDArray[np.int32]:
     return np.round(np.clip(px, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
 
 
-def _fill(image: Pixels, px: Array, bgr: Array) -> None:
+def _fill(image: BgrImage, px: Array, bgr: Array) -> None:
     cv2.fillConvexPoly(image, _fixed(px), np.clip(bgr, 0, 255).tolist(), cv2.LINE_AA, _SHIFT)
 
 
 def _lines(
-    image: Pixels, view: Viewpoint, points_m: Array, bgr: Sequence[float], closed: bool = False
+    image: BgrImage, view: Viewpoint, points_m: Array, bgr: Sequence[float], closed: bool = False
 ) -> None:
     px, depth = view.project(points_m)
     if len(px) > 1 and np.all(depth > _NEAR_M):
@@ -82,11 +82,11 @@ def draw(
     scene: Scene,
     view: Viewpoint,
     sun: Array,
-    target: Pose,
-    chasers: dict[int, Pose],
+    target: BodyPose,
+    chasers: dict[int, BodyPose],
     paths: dict[int | None, Array],
     seeing: frozenset[int],
-) -> Pixels:
+) -> BgrImage:
     """Draw target and chasers into an image (height, width, 3), BGR.
 
     ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
@@ -96,7 +96,7 @@ def draw(
     for body, points in paths.items():
         shade = _TARGET_PATH if body is None else (0.75 * tint(body)).tolist()
         _lines(image, view, points, shade)
-    bodies: list[tuple[Pose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
+    bodies: list[tuple[BodyPose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
     bodies += [(pose, scene.chaser, tint(i)) for i, pose in chasers.items()]
     eye = view.centre_m + view.axes()[2] * view.distance_m
     visible = []

@@ -15,7 +15,7 @@ import numpy as np
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError
 
-from .chase_camera import Pixels, Pose, Viewpoint, draw, tint
+from .chase_camera import BgrImage, BodyPose, Viewpoint, draw, tint
 from .columns import nanoseconds
 from .flight import RecordedFlight, Track, load_flight
 from .images import Pair, columns_for, shots
@@ -96,7 +96,7 @@ def frames(
     width_px: int,
     height_px: int,
     part_s: tuple[float, float] = (0.0, math.inf),
-) -> Iterator[tuple[float, Pixels]]:
+) -> Iterator[tuple[float, BgrImage]]:
     """Yield simulated time (s) and video frame (height, width, 3), BGR, every ``every_s`` of simulated time in ``part_s``."""
     number = len(flight.scenario.chasers)
     camera = flight.scenario.camera
@@ -121,7 +121,7 @@ def frames(
         yield time_s, frame
 
 
-def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: int) -> Pixels:
+def _camera(flight: RecordedFlight, chaser: int, pair: Pair | None, width_px: int) -> BgrImage:
     height = round(width_px * flight.scenario.camera.height_px / flight.scenario.camera.width_px)
     status = "no image yet"
     if pair is not None:
@@ -166,7 +166,7 @@ class _ExternalView:
             if (s := flight.sightings.get(i)) is not None
         }
 
-    def draw(self, time_s: float) -> Pixels:
+    def draw(self, time_s: float) -> BgrImage:
         """Draw the mission at a simulated time, with clock and phases."""
         chasers = {i: _pose(own, time_s) for i, own in self.chasers.items()}
         paths: dict[int | None, Any] = {None: _trail(self.target, time_s)}
@@ -179,7 +179,7 @@ class _ExternalView:
         self._write(image, time_s)
         return image
 
-    def _write(self, image: Pixels, time_s: float) -> None:
+    def _write(self, image: BgrImage, time_s: float) -> None:
         def put(text: str, x: int, y: int, bgr: Any, size: float = 0.5) -> None:
             cv2.putText(image, text, (x, y), cv2.FONT_HERSHEY_SIMPLEX, size, bgr, 1, cv2.LINE_AA)
 
@@ -203,7 +203,7 @@ def _time_of(track: Track, time_s: float) -> float:
     return float(track.time_s[_row(track, time_s)])
 
 
-def _pose(track: Track, time_s: float) -> Pose:
+def _pose(track: Track, time_s: float) -> BodyPose:
     """Return the pose at the last tick up to a time, as in an image of that time."""
     row = _row(track, time_s)
     return track.position_m[row], track.q_wxyz[row]

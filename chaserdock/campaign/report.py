@@ -10,7 +10,7 @@ import os
 from pathlib import Path
 
 from .plan import Campaign, Run
-from .table import Row, causes, metrics_of, numbers_of, rank_correlation, rerun_command, wilson
+from .table import RunRow, causes, metrics_of, numbers_of, rank_correlation, rerun_command, wilson
 
 _SHOWN = (
     ("steady_position_mse_m2", "steady position RMS, mm", lambda v: math.sqrt(v) * 1e3),
@@ -30,7 +30,7 @@ code { font-size: .85em; overflow-wrap: anywhere; } .big { font-size: 1.6rem; }
 """
 
 
-def page(campaign: Campaign, rows: list[Row], folder: Path) -> str:
+def page(campaign: Campaign, rows: list[RunRow], folder: Path) -> str:
     """Return the report as HTML; links to logs are relative to ``folder``. Raise ValueError without any run."""
     passed, finished = sum(bool(r["success"]) for r in rows), len(rows)
     low, high = wilson(passed, finished)
@@ -54,7 +54,7 @@ def page(campaign: Campaign, rows: list[Row], folder: Path) -> str:
     return head + "".join(parts) + "</html>\n"
 
 
-def _causes(rows: list[Row]) -> str:
+def _causes(rows: list[RunRow]) -> str:
     counted = causes(rows)
     if not counted:
         return ""
@@ -62,7 +62,7 @@ def _causes(rows: list[Row]) -> str:
     return f"<h2>Outcomes by cause</h2><table><tr><th>runs</th><th>first failure (# stands for a number)</th></tr>{body}</table>"
 
 
-def _sensitivities(campaign: Campaign, rows: list[Row]) -> str:
+def _sensitivities(campaign: Campaign, rows: list[RunRow]) -> str:
     numeric = [p for p in campaign.parameters if numbers_of(rows, f"vary.{p}") is not None]
     categorical = [p for p in campaign.parameters if p not in numeric]
     out = []
@@ -74,7 +74,7 @@ def _sensitivities(campaign: Campaign, rows: list[Row]) -> str:
     return "<h2>Sensitivity</h2>" + "".join(out) if out else ""
 
 
-def _figure(parameters: list[str], rows: list[Row]) -> str:
+def _figure(parameters: list[str], rows: list[RunRow]) -> str:
     from matplotlib.figure import Figure
 
     shown = [m for m in _SHOWN if m[0] in metrics_of(rows)]
@@ -104,7 +104,7 @@ def _figure(parameters: list[str], rows: list[Row]) -> str:
     return text.getvalue()[text.getvalue().index("<svg") :]
 
 
-def _correlations(parameters: list[str], rows: list[Row]) -> str:
+def _correlations(parameters: list[str], rows: list[RunRow]) -> str:
     head = "".join(f"<th>{html.escape(p)}</th>" for p in parameters)
     body = []
     for metric in ["success", *metrics_of(rows)]:
@@ -117,8 +117,8 @@ def _correlations(parameters: list[str], rows: list[Row]) -> str:
     return f"<h3>Rank correlation (Spearman)</h3><table><tr><th></th>{head}</tr>{''.join(body)}</table>"
 
 
-def _by_value(parameter: str, rows: list[Row]) -> str:
-    groups: dict[str, list[Row]] = {}
+def _by_value(parameter: str, rows: list[RunRow]) -> str:
+    groups: dict[str, list[RunRow]] = {}
     for r in rows:
         groups.setdefault(str(r[f"vary.{parameter}"]), []).append(r)
     body = ""
@@ -132,7 +132,7 @@ def _by_value(parameter: str, rows: list[Row]) -> str:
     return f"<h3>{html.escape(parameter)}</h3><table><tr><th>value</th><th>passed</th><th>95 %</th></tr>{body}</table>"
 
 
-def _failures(campaign: Campaign, rows: list[Row], folder: Path) -> str:
+def _failures(campaign: Campaign, rows: list[RunRow], folder: Path) -> str:
     failed = [r for r in rows if not r["success"]]
     if not failed:
         return ""

@@ -17,7 +17,7 @@ from chaserdock.exit_codes import DONE, FAILED, STOPPED
 from .plan import Campaign, Run, load_campaign
 from .report import page
 from .table import rerun_command, rows_of, wilson, write_table
-from .worker import CampaignError, Keep, Result, fly, fly_campaign
+from .worker import CampaignError, FinishedRun, Keep, fly, fly_campaign
 
 
 def direct(
@@ -34,7 +34,7 @@ def direct(
     try:
         with stop_on_signal() as stop:
             finished = fly_campaign(
-                campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, Progress(), stop
+                campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, CampaignProgress(), stop
             )
     except OSError as error:
         raise CampaignError(f"{folder}: cannot be written: {error.strerror or error}") from None
@@ -86,14 +86,14 @@ def stop_on_signal() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-class Progress:
+class CampaignProgress:
     """Prints one line per finished run: its outcome and the estimated time left."""
 
     def __init__(self) -> None:
         self._start_s = time.monotonic()
         self._finished_before: int | None = None
 
-    def __call__(self, finished: int, total: int, run: Run, result: Result) -> None:
+    def __call__(self, finished: int, total: int, run: Run, result: FinishedRun) -> None:
         if self._finished_before is None:
             self._finished_before = finished - 1
         per_run_s = (time.monotonic() - self._start_s) / (finished - self._finished_before)

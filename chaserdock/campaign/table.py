@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from .plan import Run
-from .worker import Result
+from .worker import FinishedRun
 
-Row = dict[str, Any]
+RunRow = dict[str, Any]
 _FIXED = ("run", "index", "seed", "success", "cause", "failures", "digest", "log")
 
 
-def row_of(run: Run, result: Result) -> Row:
+def row_of(run: Run, result: FinishedRun) -> RunRow:
     """Return a run as a row of plain values: varied values (``vary.NAME``), outcome and results in SI units.
 
     No value depends on the speed of the machine: equal campaigns give equal tables.
@@ -26,7 +26,7 @@ def row_of(run: Run, result: Result) -> Row:
     failures = list(s.get("failures", [])) or (
         [result.last_words or "ended without output"] if result.status else []
     )
-    row: Row = {
+    row: RunRow = {
         "run": run.name,
         "index": run.index,
         "seed": run.seed,
@@ -74,14 +74,14 @@ def cause_of(failure: str) -> str:
     return re.sub(r"[-+]?\d+(\.\d+)?(e[-+]?\d+)?", "#", failure)
 
 
-def rows_of(finished: list[tuple[Run, Result]]) -> list[Row]:
+def rows_of(finished: list[tuple[Run, FinishedRun]]) -> list[RunRow]:
     """Return the table in the campaign's order; all rows have the same columns."""
     rows = [row_of(run, result) for run, result in finished]
     columns = list(dict.fromkeys(key for row in rows for key in row))
     return [{c: row.get(c, math.nan) for c in columns} for row in rows]
 
 
-def metrics_of(rows: list[Row]) -> list[str]:
+def metrics_of(rows: list[RunRow]) -> list[str]:
     """Return the names of the columns with numerical results."""
     names = [c for c in (rows[0] if rows else {}) if c not in _FIXED and not c.startswith("vary.")]
     return [c for c in names if any(isinstance(r[c], int | float) and math.isfinite(r[c]) for r in rows)]
@@ -97,7 +97,7 @@ def wilson(passed: int, total: int, confidence: float = 0.95) -> tuple[float, fl
     return float(interval.low), float(interval.high)
 
 
-def causes(rows: list[Row]) -> list[tuple[str, int]]:
+def causes(rows: list[RunRow]) -> list[tuple[str, int]]:
     """Return the causes of failures and their numbers of runs, most frequent first."""
     return sorted(
         Counter(r["cause"] for r in rows if not r["success"]).items(), key=lambda item: (-item[1], item[0])
@@ -118,7 +118,7 @@ def rank_correlation(x: list[float], y: list[float]) -> float:
     return float(result.statistic)
 
 
-def numbers_of(rows: list[Row], column: str) -> list[float] | None:
+def numbers_of(rows: list[RunRow], column: str) -> list[float] | None:
     """Return a column as numbers, or None when it contains text."""
     values = [r[column] for r in rows]
     if any(isinstance(v, str) for v in values):
@@ -132,7 +132,7 @@ def rerun_command(run: Run) -> str:
     return f"chaserdock run {run.scenario} {sets}"
 
 
-def write_table(rows: list[Row], path: Path) -> None:
+def write_table(rows: list[RunRow], path: Path) -> None:
     """Write the table as Parquet; column names include units."""
     import pyarrow as pa
     import pyarrow.parquet as pq

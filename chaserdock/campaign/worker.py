@@ -32,7 +32,7 @@ class CampaignError(ChaserdockError):
     """The campaign cannot continue."""
 
 
-class Result(msgspec.Struct, frozen=True):
+class FinishedRun(msgspec.Struct, frozen=True):
     """Outcome of a run: exit status, summary (None without one), last output line, path of a kept log."""
 
     name: str
@@ -47,11 +47,11 @@ def result_path(folder: Path, run: Run) -> Path:
     return folder / "runs" / run.name / "result.json"
 
 
-def read_result(folder: Path, run: Run) -> Result | None:
+def read_result(folder: Path, run: Run) -> FinishedRun | None:
     """Return the result of an earlier run, or None. Raise CampaignError for a damaged file."""
     path = result_path(folder, run)
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Result)
+        return msgspec.json.decode(path.read_bytes(), type=FinishedRun)
     except FileNotFoundError:
         return None
     except (OSError, msgspec.DecodeError) as error:
@@ -60,7 +60,7 @@ def read_result(folder: Path, run: Run) -> Result | None:
         ) from None
 
 
-def write_result(folder: Path, run: Run, result: Result) -> None:
+def write_result(folder: Path, run: Run, result: FinishedRun) -> None:
     """Write a result atomically."""
     path = result_path(folder, run)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -72,7 +72,7 @@ def write_result(folder: Path, run: Run, result: Result) -> None:
     temporary.replace(path)
 
 
-def fly(run: Run, keep: Keep, logs: Path) -> Result:
+def fly(run: Run, keep: Keep, logs: Path) -> FinishedRun:
     """Fly one run in a temporary folder; move its log to ``logs`` if ``keep`` says so.
 
     Also runs on Dask workers, so that arguments and result are plain values. Where ``logs`` is not writable (no shared
@@ -97,7 +97,7 @@ def fly(run: Run, keep: Keep, logs: Path) -> Result:
         keep_log = keep == "all" or (keep == "failures" and done.returncode != 0)
         log = out / LOG_NAME
         kept = _move_log(log, logs / run.name) if keep_log and log.is_file() else None
-        return Result(run.name, done.returncode, summary, output[-1] if output else "", kept)
+        return FinishedRun(run.name, done.returncode, summary, output[-1] if output else "", kept)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 
@@ -115,7 +115,7 @@ def _move_log(log: Path, folder: Path) -> str:
 
 def fly_locally(
     runs: list[Run], keep: Keep, folder: Path, jobs: int, stop: threading.Event
-) -> Iterator[tuple[Run, Result]]:
+) -> Iterator[tuple[Run, FinishedRun]]:
     """Fly ``jobs`` runs at a time on this machine; yield each as it ends. Start none after ``stop``."""
     waiting = iter(runs)
     with ThreadPoolExecutor(jobs) as pool:
@@ -131,7 +131,7 @@ def fly_locally(
 
 def fly_on_cluster(
     runs: list[Run], keep: Keep, folder: Path, address: str, stop: threading.Event
-) -> Iterator[tuple[Run, Result]]:
+) -> Iterator[tuple[Run, FinishedRun]]:
     """Fly runs on the workers of the Dask scheduler at ``address``; yield each as it ends. Raise CampaignError."""
     try:
         from distributed import Client, as_completed
@@ -163,9 +163,9 @@ def fly_campaign(
     keep: Keep,
     jobs: int,
     cluster: str | None,
-    report_progress: Callable[[int, int, Run, Result], None],
+    report_progress: Callable[[int, int, Run, FinishedRun], None],
     stop: threading.Event,
-) -> list[tuple[Run, Result]]:
+) -> list[tuple[Run, FinishedRun]]:
     """Fly the runs without a result; return all finished runs in the campaign's order.
 
     ``report_progress`` receives the number of finished runs, the number of runs, and the run that has just ended.

@@ -12,7 +12,7 @@ import typer
 from .options import JsonOpt, LogArg, fail, print_result
 
 
-class Format(StrEnum):
+class FigureFormat(StrEnum):
     """File formats of figures."""
 
     svg = "svg"
@@ -44,7 +44,7 @@ def report(
 def figures(
     log: LogArg,
     out: Annotated[Path, typer.Option(help="folder to write to")],
-    format: Annotated[Format, typer.Option("--format", help="file format")] = Format.svg,
+    format: Annotated[FigureFormat, typer.Option("--format", help="file format")] = FigureFormat.svg,
 ) -> None:
     """Draw figures of a recorded flight, one file each: trajectories, errors, distances, inputs, estimate, cameras."""
     from chaserdock.analysis.figures import write_figures

@@ -31,7 +31,7 @@ LogFilesArg = Annotated[
 FolderOpt = Annotated[Path, typer.Option("--out", help="folder to write into")]
 
 
-class Format(StrEnum):
+class TableFormat(StrEnum):
     """File formats of tables."""
 
     parquet = "parquet"
@@ -81,8 +81,8 @@ def export(
     log: LogFilesArg,
     out: FolderOpt,
     format: Annotated[
-        Format, typer.Option(help="parquet keeps types and units; csv is readable everywhere")
-    ] = Format.parquet,
+        TableFormat, typer.Option(help="parquet keeps types and units; csv is readable everywhere")
+    ] = TableFormat.parquet,
     images: Annotated[bool, typer.Option("--images", help="include the bytes of the images")] = False,
 ) -> None:
     """Write one table per topic, all chasers together."""

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from chaserdock_protocol.messages import CommandReply
 
 
-class Command(StrEnum):
+class CommandName(StrEnum):
     """Operator commands to a chaser."""
 
     approach = "approach"
@@ -40,7 +40,7 @@ class Command(StrEnum):
 
 @with_link_options("listen", "lease")
 def command(
-    what: Annotated[Command, typer.Argument(help="command")],
+    what: Annotated[CommandName, typer.Argument(help="command")],
     number: ChaserArg,
     offset: Annotated[
         tuple[float, float, float] | None,
@@ -69,7 +69,7 @@ def command(
     )
 
 
-class FaultKind(StrEnum):
+class ThrusterFaultKind(StrEnum):
     """Thruster failures, and the end of one."""
 
     stuck_on = "stuck_on"
@@ -82,7 +82,7 @@ class FaultKind(StrEnum):
 def thruster_fault(
     number: ChaserArg,
     thruster: Annotated[int, typer.Argument(min=0, max=254, help="thruster number, from 0")],
-    kind: Annotated[FaultKind, typer.Argument(help="failure; healthy ends it")],
+    kind: Annotated[ThrusterFaultKind, typer.Argument(help="failure; healthy ends it")],
     factor: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="weak: fraction of the nominal thrust")
     ] = None,

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from chaserdock.launch.progress import Show
 
 
-class Mode(StrEnum):
+class ModeOption(StrEnum):
     """How simulated time advances."""
 
     lockstep = "lockstep"
@@ -66,7 +66,7 @@ SetOpt = Annotated[
 ]
 SeedOpt = Annotated[int | None, typer.Option(min=0, max=2**32 - 1, help="seed of all random numbers")]
 ModeOpt = Annotated[
-    Mode,
+    ModeOption,
     typer.Option(
         help="lockstep: simulated time waits for every process (reproducible); realtime: it follows the wall clock"
     ),

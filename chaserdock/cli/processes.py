@@ -15,8 +15,8 @@ from .options import (
     ChaserArg,
     JoinTimeoutOpt,
     LinkOptions,
-    Mode,
     ModeOpt,
+    ModeOption,
     OutOpt,
     ScenarioArg,
     SeedOpt,
@@ -51,7 +51,7 @@ def start_process(name: str, options: ProcessOptions) -> None:
 @with_link_options()
 def world(
     scenario: ScenarioArg,
-    mode: ModeOpt = Mode.lockstep,
+    mode: ModeOpt = ModeOption.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
     recorder: Annotated[bool, typer.Option(help="wait for a recorder before the first tick")] = True,

@@ -19,8 +19,8 @@ from .options import (
     JsonLinesOpt,
     KeysOpt,
     LinkOptions,
-    Mode,
     ModeOpt,
+    ModeOption,
     OutOpt,
     QuietOpt,
     ScenarioArg,
@@ -36,7 +36,7 @@ from .options import (
 def run(
     scenario: ScenarioArg,
     out: OutOpt = None,
-    mode: ModeOpt = Mode.lockstep,
+    mode: ModeOpt = ModeOption.lockstep,
     seed: SeedOpt = None,
     overrides: SetOpt = None,
     quiet: QuietOpt = False,

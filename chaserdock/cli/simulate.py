@@ -14,10 +14,10 @@ import typer
 
 from chaserdock.exit_codes import DONE, FAILED
 
-from .options import Mode, ScenarioArg, fail
+from .options import ModeOption, ScenarioArg, fail
 
 if TYPE_CHECKING:
-    from chaserdock.simulation.swarm import Result
+    from chaserdock.simulation.swarm import SimulationResult
 
 
 def _seed_range(text: str) -> range:
@@ -38,7 +38,9 @@ def simulate(
         ),
     ] = None,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="processes to fly on")] = 1,
-    mode: Annotated[Mode | None, typer.Option(help="fly all seeds in this mode; drawn by default")] = None,
+    mode: Annotated[
+        ModeOption | None, typer.Option(help="fly all seeds in this mode; drawn by default")
+    ] = None,
     images: Annotated[
         bool, typer.Option("--images", help="render images instead of drawing measurements (slower)")
     ] = False,
@@ -66,7 +68,7 @@ def simulate(
     if seeds is None:
         raise typer.Exit(_fly_one(scenario, out, mode))
     begin_s = time.monotonic()
-    results: list[Result] = []
+    results: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
     swarm = Swarm(scenario, images, None if mode is None else mode.value)
     for result in fly_seeds(swarm, _seed_range(seeds), jobs):

@@ -17,7 +17,7 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET, Physics
 
 from .in_process import InProcessMission
-from .perception import Perception
+from .perception import PerceptionModel
 from .transfers import load_shipped
 
 APPROACH_AT_S = 4.0
@@ -79,7 +79,7 @@ class ConservationMission(InProcessMission):
     The impulse of the actuators is subtracted step by step; ``linear_error`` and ``angular_error`` are relative.
     """
 
-    def __init__(self, scenario: Scenario, perception: Perception) -> None:
+    def __init__(self, scenario: Scenario, perception: PerceptionModel) -> None:
         super().__init__(scenario, perception)
         body = target_body(scenario)
         self.linear_error: float | None = None
@@ -157,7 +157,7 @@ def momentum(physics: Physics, masses: dict[str, tuple[float, Array]]) -> tuple[
 
 
 @dataclass
-class Outcome:
+class DockingOutcome:
     """How one flight ended.
 
     ``touch``: the one at which the latch closed. ``contacts``: pairs of bodies that collided. ``peak_m``: the largest
@@ -235,10 +235,10 @@ def order(command: Literal["approach", "abort"]) -> OperatorCommand:
 def dock(
     seed: int,
     scenario: Scenario,
-    perception_of: Callable[[Scenario], Perception],
+    perception_of: Callable[[Scenario], PerceptionModel],
     failure: Failure | None = None,
     approach_at_s: float = APPROACH_AT_S,
-) -> Outcome:
+) -> DockingOutcome:
     """Fly one approach until it is verified, or the time limit."""
     ordered, peak_m = False, 0.0
     ticks = detections = 0
@@ -257,7 +257,7 @@ def dock(
             detections += bool(record.outputs and record.outputs.target.accepted)
         verified = flight.phase(0) == "verified"
         cause, verified_s = cause_of(flight, verified), flight.time_s if verified else None
-    return Outcome(
+    return DockingOutcome(
         seed,
         cause,
         verified,
@@ -286,8 +286,8 @@ def offset_error_m(flight: InProcessMission) -> float:
 
 
 def abort(
-    seed: int, scenario: Scenario, perception_of: Callable[[Scenario], Perception], again: bool
-) -> Outcome:
+    seed: int, scenario: Scenario, perception_of: Callable[[Scenario], PerceptionModel], again: bool
+) -> DockingOutcome:
     """Fly an approach that is aborted at a random time and, with ``again``, a second one until it is verified."""
     abort_at_s = APPROACH_AT_S + float(np.random.default_rng([seed, 0xAB0]).uniform(0.0, ABORT_WITHIN_S))
     with InProcessMission(scenario, perception_of(scenario)) as flight:
@@ -312,7 +312,7 @@ def abort(
     cause = f"aborted in {phase}: " + ("opened" if opened_s is not None else "NOT opened")
     if flight.contacts:
         cause += ", COLLISION"
-    return Outcome(
+    return DockingOutcome(
         seed,
         cause,
         bool(verified),

@@ -11,9 +11,10 @@ from chaserdock_controller.interfaces import TickOutputs
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.rendering.cameras import States
 
 from .in_process import InProcessMission, TickRecord
-from .perception import Perception, States
+from .perception import PerceptionModel
 
 
 @dataclass(frozen=True)
@@ -54,7 +55,7 @@ class FlightRecord:
 
 def record_flight(
     scenario: Scenario,
-    perception: Perception | None = None,
+    perception: PerceptionModel | None = None,
     *,
     actuator_gain: float = 1.0,
     solve_delay_s: Callable[[float], float] | None = None,

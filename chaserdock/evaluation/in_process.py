@@ -29,10 +29,11 @@ from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_world.actuators.ideal import ActuatorOutput, fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
+from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import docking_status, odometry_of
 
-from .perception import Perception, States
+from .perception import PerceptionModel
 from .perfect_knowledge import PerfectEstimator
 
 
@@ -74,7 +75,7 @@ class InProcessMission:
     def __init__(
         self,
         scenario: Scenario,
-        perception: Perception | None = None,
+        perception: PerceptionModel | None = None,
         *,
         actuator_gain: float = 1.0,
         solve_delay_s: Callable[[float], float] | None = None,

@@ -12,12 +12,11 @@ from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Image, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_world.physics.simulation import TARGET, BodyState
-from chaserdock_world.rendering.cameras import Cameras
+from chaserdock_world.physics.simulation import TARGET
+from chaserdock_world.rendering.cameras import Cameras, States
 from chaserdock_world.sensors.errors import true_camera
 
-States = dict[str, BodyState]
-Perception = Callable[[int, int, int, States], Sighting]
+PerceptionModel = Callable[[int, int, int, States], Sighting]
 """Maps chaser, tick, time (ns) and the true states of all bodies to the chaser's sighting."""
 
 _LEAST_SIGMA = 1e-4
@@ -50,7 +49,7 @@ def measurement_model(
     position_sigma_m: float = 0.0,
     attitude_sigma_rad: float = 0.0,
     dropout: float = 0.0,
-) -> Perception:
+) -> PerceptionModel:
     """Return a perception that measures the target's true pose with white noise of these sigmas per axis.
 
     ``dropout``: the share of images without a detection. Each camera has the errors that the world gives it.

@@ -12,9 +12,10 @@ from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
 from chaserdock_world.physics.simulation import TARGET
+from chaserdock_world.rendering.cameras import States
 
 from .in_process import InProcessMission
-from .perception import Perception, States
+from .perception import PerceptionModel
 
 SYMMETRIC_EVERY = 4
 SMALL = {"width_px": 640, "height_px": 360}
@@ -105,7 +106,7 @@ class TransferOutcome:
         )
 
 
-def fly_transfer(seed: int, scenario: Scenario, perception: Perception) -> TransferOutcome:
+def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel) -> TransferOutcome:
     """Fly to the end; distances and goals are checked on ground truth at every tick."""
     out = TransferOutcome(seed)
     goals = {i: g for i in range(len(scenario.chasers)) if (g := scenario.goal_of(i)) is not None}

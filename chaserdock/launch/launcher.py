@@ -45,7 +45,7 @@ class RunError(ChaserdockError):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class MissionOutcome:
     """How a mission ended. ``summary`` is None when there is no readable log; ``failure`` then says why."""
 
     folder: Path
@@ -210,7 +210,7 @@ def fly_mission(
     keys: Path | None = None,
     stop_requested: Callable[[], bool] = never,
     emit: Callable[[JsonLine], None] = print_json_line,
-) -> Outcome:
+) -> MissionOutcome:
     """Fly a scenario; write log, summary and the processes' output to ``folder``.
 
     ``viewer_port``: serve the live viewer there until the end of the flight. ``keys``: connect through a router, over TLS,
@@ -337,7 +337,7 @@ def _failure_at_end(fleet: Fleet, end: MissionEnd) -> str | None:
     return bad[0].last_line() if bad else None
 
 
-def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter) -> Outcome:
+def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressReporter) -> MissionOutcome:
     """Write summary.json from the log in ``folder``; return and report the outcome."""
     from chaserdock.analysis.summary import summarize
 
@@ -345,7 +345,7 @@ def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressRep
     try:
         summary = summarize(folder / LOG_NAME)
     except LogError as error:
-        outcome = Outcome(folder, STOPPED if stopped else FAILED, None, failure or str(error))
+        outcome = MissionOutcome(folder, STOPPED if stopped else FAILED, None, failure or str(error))
         reporter.report(Failed(status=outcome.status, text=outcome.failure or ""))
         return outcome
     if failure is not None:
@@ -356,10 +356,10 @@ def judge(fleet: Fleet, folder: Path, failure: str | None, reporter: ProgressRep
     (folder / "summary.json").write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
     status = STOPPED if stopped else DONE if summary["success"] else FAILED
     reporter.report(Result(status=status, folder=str(folder), summary=summary))
-    return Outcome(folder, status, summary, summary["failures"][0] if summary["failures"] else None)
+    return MissionOutcome(folder, status, summary, summary["failures"][0] if summary["failures"] else None)
 
 
-def print_outcome(outcome: Outcome, show: Show) -> None:
+def print_outcome(outcome: MissionOutcome, show: Show) -> None:
     """Print the verdict: text on standard output unless that carries JSON lines, a failure on standard error."""
     from chaserdock.analysis.summary import text_of
 

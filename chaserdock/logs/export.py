@@ -15,7 +15,6 @@ from chaserdock_protocol.recording.log import LogError, LogSource, read_log
 
 from .tables import TopicTable
 
-Format = Literal["parquet", "csv"]
 _ROWS, _IMAGE_ROWS = 4096, 64
 
 
@@ -52,7 +51,9 @@ def _cell(value: Any) -> Any:
     return value.hex() if isinstance(value, bytes) else value
 
 
-def export(log: LogSource, folder: Path, format: Format, images: bool = False) -> dict[str, int]:
+def export(
+    log: LogSource, folder: Path, format: Literal["parquet", "csv"], images: bool = False
+) -> dict[str, int]:
     """Write every topic of a log into ``folder``, which is created; return the number of rows by file name.
 
     ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be used.

@@ -34,7 +34,7 @@ from msgspec import Struct
 if TYPE_CHECKING:
     import pyarrow
 
-Message = TypeVar("Message", bound=Struct)
+MessageT = TypeVar("MessageT", bound=Struct)
 
 
 def open_log(source: str | Path | Sequence[str | Path]) -> Log:
@@ -64,7 +64,7 @@ class Log:
         return read_log(self.source, self._keys(names) if names else None)
 
     @overload
-    def messages(self, kind: type[Message], /) -> Iterator[Message]: ...
+    def messages(self, kind: type[MessageT], /) -> Iterator[MessageT]: ...
     @overload
     def messages(self, *names: str | Topic) -> Iterator[Any]: ...
     def messages(self, *names: Any) -> Iterator[Any]:

@@ -116,7 +116,7 @@ def _field(name: str, type_: pa.DataType) -> pa.Field:
     return pa.field(name, type_, metadata=None if unit is None else {"unit": unit})
 
 
-class Rows:
+class TableRows:
     """Rows of one table, collected until they are taken."""
 
     def __init__(self, columns: list[Column]) -> None:
@@ -160,11 +160,11 @@ class TopicTable:
             ("time_s", pa.float64(), lambda r: r.message.sim_time_ns / 1e9),
         ]
         self.name = table_name(topic)
-        self._rows = Rows([*head, *((n, t, _of_message(reader)) for n, t, reader in columns)])
-        self.children: dict[str, Rows] = {}
+        self._rows = TableRows([*head, *((n, t, _of_message(reader)) for n, t, reader in columns)])
+        self.children: dict[str, TableRows] = {}
         for name in children:
             inner = _columns(_element(topic.kind, name), images)[0]
-            self.children[name] = Rows(
+            self.children[name] = TableRows(
                 [
                     ("key", pa.string(), lambda r: r[0].key),
                     ("seq", pa.int64(), lambda r: r[0].message.seq),

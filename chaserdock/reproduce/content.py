@@ -9,8 +9,8 @@ from typing import Any
 
 from chaserdock.evaluation.study_cases import StudyResult
 
-from .page import Section, Table
-from .paper import PAPER_S, ROWS, Row
+from .page import PageSection, Table
+from .paper import PAPER_S, ROWS, PaperRow
 from .plan import (
     ATTITUDE_BOUND_RAD,
     CHAIN,
@@ -23,11 +23,11 @@ from .plan import (
     ROTATION_BOUND_RAD,
     SOLVERS,
     TIMED_HORIZONS_S,
-    Plan,
+    ReproductionPlan,
     table_group,
 )
-from .record import Provenance, Record
-from .runner import Results
+from .record import ChainRecord, Provenance
+from .runner import ReproductionResults
 from .tables import (
     BAND,
     TREND_BAND,
@@ -47,7 +47,9 @@ NONE = "-"
 _NAMES = {CHAIN: "the paper's chain", "paper": "our chain, paper's settings", "default": "our default"}
 
 
-def sections(plan: Plan, results: Results, about: Provenance, recorded: Record | None) -> list[Section]:
+def sections(
+    plan: ReproductionPlan, results: ReproductionResults, about: Provenance, recorded: ChainRecord | None
+) -> list[PageSection]:
     """Return the whole page. ``recorded``: the record that stands in for the paper's chain, if it was not flown."""
     return [
         _method(plan, results, about, recorded),
@@ -85,12 +87,14 @@ def _cell(errors: Errors | None, form: Callable[[Errors], str]) -> str:
     return NONE if errors is None else form(errors)
 
 
-def _study_errors(results: Results, name: str) -> Errors | None:
+def _study_errors(results: ReproductionResults, name: str) -> Errors | None:
     result = results.studies.get(name)
     return None if result is None else errors_of_study(result)
 
 
-def _method(plan: Plan, results: Results, about: Provenance, recorded: Record | None) -> Section:
+def _method(
+    plan: ReproductionPlan, results: ReproductionResults, about: Provenance, recorded: ChainRecord | None
+) -> PageSection:
     """What was flown, where and when, definitions, and what is missing."""
     command = "chaserdock reproduce --quick" if plan.quick else "chaserdock reproduce"
     missing = sum(m.name not in results.missions for m in plan.missions)
@@ -143,10 +147,10 @@ def _method(plan: Plan, results: Results, about: Provenance, recorded: Record | 
             f"NOT COMPLETE: {missing} of {len(plan.missions)} runs with images and {missing_studies} of "
             f"{len(plan.studies)} on perfect knowledge have no result. Repeat the command to resume."
         )
-    return Section("Method", tuple(parts))
+    return PageSection("Method", tuple(parts))
 
 
-def _verdicts(plan: Plan, results: Results) -> Section:
+def _verdicts(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
     """Every figure of the paper's table beside ours, judged from both sides."""
     rows = []
     for row in ROWS:
@@ -176,10 +180,10 @@ def _verdicts(plan: Plan, results: Results) -> Section:
             "over the first 15 s, zero error afterwards).",
             Table(("our default", "measured", "verdict"), table),
         ]
-    return Section("Verdicts", tuple(parts))
+    return PageSection("Verdicts", tuple(parts))
 
 
-def _trends(plan: Plan, results: Results) -> Section:
+def _trends(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
     """Changes from the baseline row, and the spike, with explanations."""
 
     def percent(x: float) -> str:
@@ -220,10 +224,10 @@ def _trends(plan: Plan, results: Results) -> Section:
         f"the paper's is between {TREND_BAND[0]:g} and {TREND_BAND[1]:g}. The spike: attitude error of the target estimate "
         "from 20 s to 120 s."
     )
-    return Section("Trends", (text, Table(header, tuple(rows))))
+    return PageSection("Trends", (text, Table(header, tuple(rows))))
 
 
-def _table(plan: Plan, results: Results) -> Section:
+def _table(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
     """The nine rows in all columns, position, orientation and steady state."""
     columns = [
         (f"{_NAMES[column]}, {how}", column, how == "images")
@@ -231,7 +235,7 @@ def _table(plan: Plan, results: Results) -> Section:
         for how in ("images", "perfect knowledge")
     ]
 
-    def cells(row: Row, value: Callable[[Errors], float], form: Callable[[float], str]) -> list[str]:
+    def cells(row: PaperRow, value: Callable[[Errors], float], form: Callable[[float], str]) -> list[str]:
         out = []
         for _, column, images in columns:
             group = table_group(column, row.name)
@@ -259,16 +263,18 @@ def _table(plan: Plan, results: Results) -> Section:
         for r in ROWS
     ]
     parts += ["Failed runs.", Table(("row", "paper", *names), tuple(failed))]
-    return Section("The single-chaser table", tuple(parts))
+    return PageSection("The single-chaser table", tuple(parts))
 
 
-def _failed_text(plan: Plan, results: Results, column: str, images: bool, row: Row) -> str:
+def _failed_text(
+    plan: ReproductionPlan, results: ReproductionResults, column: str, images: bool, row: PaperRow
+) -> str:
     group = table_group(column, row.name)
     runs = with_images(plan, results, group) if images else with_perfect_knowledge(results, group)
     return f"{sum(e.failed for e in runs)} of {len(runs)}" if runs else NONE
 
 
-def _starts(results: Results) -> Section:
+def _starts(results: ReproductionResults) -> PageSection:
     rows = []
     for name in (n for n in results.studies if n.startswith("start/")):
         errors, result = _study_errors(results, name), results.studies[name]
@@ -303,10 +309,10 @@ def _starts(results: Results) -> Section:
         f"{_position_text(ROWS[0].position_mse_m2)}e-2 m^2, its best row {_position_text(best)}e-2: where that is below the "
         "lower bound, no controller that turns as ours does can have flown it from that start."
     )
-    return Section("Effect of the start", (text, Table(header, tuple(rows))))
+    return PageSection("Effect of the start", (text, Table(header, tuple(rows))))
 
 
-def _ingredients(results: Results) -> Section:
+def _ingredients(results: ReproductionResults) -> PageSection:
     base = _study_errors(results, f"start/{INFERRED}")
     rows = []
     for name in (n for n in results.studies if n.startswith("ingredient/")):
@@ -328,10 +334,10 @@ def _ingredients(results: Results) -> Section:
         "Baseline row from the nominal start, our chain in the paper's settings, perfect knowledge; one change at a time. "
         "With u_ref = 0 the input cost opposes the constant force that a tumbling reference needs: the steady error."
     )
-    return Section("Effect of each ingredient", (text, Table(header, tuple(rows))))
+    return PageSection("Effect of each ingredient", (text, Table(header, tuple(rows))))
 
 
-def _real_time(results: Results) -> Section:
+def _real_time(results: ReproductionResults) -> PageSection:
     rows = []
     for delay_s in DELAYS_S:
         cells = [f"{delay_s:g} s"]
@@ -352,7 +358,7 @@ def _real_time(results: Results) -> Section:
         if (name := f"measured/{horizon_s:g}/{solver}") in results.studies
     ]
     columns = ("solver", "median solve, ms", "longest, ms", "position, 1e-2 m^2", "orientation, 1e-3 rad^2")
-    return Section(
+    return PageSection(
         "Effect of the solve time",
         (
             "The runs above are in simulated time: a plan is never late. Here the command takes effect only after the given "
@@ -372,7 +378,7 @@ def _measured(name: str, result: StudyResult) -> tuple[str, ...]:
     return name, *times, _position_text(errors.position), _orientation_text(errors.orientation)
 
 
-def _other_runs(plan: Plan, results: Results) -> Section:
+def _other_runs(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
     """The baseline row with the paper's combiner alone, and our default on both targets."""
     rows = []
     for label, group in (
@@ -402,10 +408,10 @@ def _other_runs(plan: Plan, results: Results) -> Section:
         "steady RMS, deg",
         "failed",
     )
-    return Section("Estimators and targets", (Table(header, tuple(rows)),))
+    return PageSection("Estimators and targets", (Table(header, tuple(rows)),))
 
 
-def _missions(plan: Plan, results: Results) -> Section:
+def _missions(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
     """The paper's missions of several chasers."""
     rows = []
     for m in plan.missions:
@@ -432,7 +438,7 @@ def _missions(plan: Plan, results: Results) -> Section:
         'have `navigation.grade = "exact"`, no latency, forward Euler and u_ref = 0'
         + (", at the scenario's rate and image size." if plan.quick else ", 30 Hz and 1280 x 720 pixels.")
     )
-    return Section("Missions", (text, Table(header, tuple(rows))))
+    return PageSection("Missions", (text, Table(header, tuple(rows))))
 
 
 def _mission_cells(summary: dict[str, Any]) -> tuple[str, ...]:

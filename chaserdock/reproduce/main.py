@@ -15,9 +15,9 @@ from chaserdock.exit_codes import DONE, FAILED, STOPPED
 
 from .content import sections
 from .page import html, markdown
-from .plan import SCENARIO, Plan, make_plan, needs_open
-from .record import Provenance, Record, provenance, read_record, shown_fields, write_record
-from .runner import Results, code_digest, fly_missions, fly_studies, results_of, scenario_path
+from .plan import SCENARIO, ReproductionPlan, make_plan, needs_open
+from .record import ChainRecord, Provenance, provenance, read_record, shown_fields, write_record
+from .runner import ReproductionResults, code_digest, fly_missions, fly_studies, results_of, scenario_path
 
 TITLE = "Reproduction of the paper's results"
 
@@ -31,7 +31,7 @@ def reproduce(quick: bool, out: Path, jobs: int, keep_logs: bool) -> int:
     return fly_plan(make_plan(quick, str(scenario_path(SCENARIO))), out.absolute(), jobs, keep_logs)
 
 
-def fly_plan(plan: Plan, out: Path, jobs: int, keep_logs: bool) -> int:
+def fly_plan(plan: ReproductionPlan, out: Path, jobs: int, keep_logs: bool) -> int:
     """Fly any plan; return the exit status."""
     missing = missing_part()
     flyable = plan if missing is None else without_open(plan)
@@ -70,9 +70,9 @@ def begun(out: Path) -> Provenance:
     return msgspec.json.decode(path.read_bytes(), type=Provenance)
 
 
-def without_open(plan: Plan) -> Plan:
+def without_open(plan: ReproductionPlan) -> ReproductionPlan:
     """Return the part of a plan that does not need the paper's solver."""
-    return Plan(
+    return ReproductionPlan(
         plan.quick,
         plan.duration_s,
         tuple(m for m in plan.missions if not needs_open(m)),
@@ -80,14 +80,16 @@ def without_open(plan: Plan) -> Plan:
     )
 
 
-def add_recorded(plan: Plan, results: Results, record: Record) -> Results:
+def add_recorded(
+    plan: ReproductionPlan, results: ReproductionResults, record: ChainRecord
+) -> ReproductionResults:
     """Return results with the recorded runs of the plan that need the paper's solver."""
     missions = {m.name: record.missions[m.name] for m in plan.missions if m.name in record.missions}
     studies = {c.name: record.studies[c.name] for c in plan.studies if c.name in record.studies}
-    return Results({**missions, **results.missions}, {**studies, **results.studies})
+    return ReproductionResults({**missions, **results.missions}, {**studies, **results.studies})
 
 
-def _keep_record(plan: Plan, results: Results, about: Provenance, out: Path) -> None:
+def _keep_record(plan: ReproductionPlan, results: ReproductionResults, about: Provenance, out: Path) -> None:
     """Write the flights of the paper's chain as a record, if all of them are finished."""
     missions = [m.name for m in plan.missions if needs_open(m)]
     cases = [c.name for c in plan.studies if needs_open(c)]
@@ -101,10 +103,16 @@ def _keep_record(plan: Plan, results: Results, about: Provenance, out: Path) -> 
         if name in cases
     }
     shown = {name: shown_fields(results.missions[name]) for name in missions}
-    write_record(Record(provenance=about, quick=plan.quick, missions=shown, studies=studies), out)
+    write_record(ChainRecord(provenance=about, quick=plan.quick, missions=shown, studies=studies), out)
 
 
-def write_page(plan: Plan, results: Results, out: Path, about: Provenance, recorded: Record | None) -> None:
+def write_page(
+    plan: ReproductionPlan,
+    results: ReproductionResults,
+    out: Path,
+    about: Provenance,
+    recorded: ChainRecord | None,
+) -> None:
     """Write the page as Markdown and as HTML."""
     parts = sections(plan, results, about, recorded)
     for name, text in (

@@ -22,7 +22,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A heading, followed by paragraphs (plain text) and tables."""
 
     title: str
@@ -42,7 +42,7 @@ h2 { margin-top: 2rem; }
 """
 
 
-def markdown(title: str, sections: Sequence[Section]) -> str:
+def markdown(title: str, sections: Sequence[PageSection]) -> str:
     """Return the page as Markdown."""
     lines = [f"# {title}", ""]
     for section in sections:
@@ -63,7 +63,7 @@ def _markdown_table(table: Table) -> list[str]:
     return [line(table.header), rule, *map(line, table.rows), ""]
 
 
-def html(title: str, sections: Sequence[Section]) -> str:
+def html(title: str, sections: Sequence[PageSection]) -> str:
     """Return the page as HTML without external resources."""
     out = [
         '<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">',

@@ -10,7 +10,7 @@ PAPER_S = 120.0
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperRow:
     """A row of the paper's single-chaser table; ``failed`` of its three runs failed. ``name`` is a valid file name."""
 
     name: str
@@ -38,13 +38,13 @@ class Row:
 
 
 ROWS = (
-    Row("baseline", 3.0, 0.1, 0.0, 1.64e-2, 3.94e-3),
-    Row("T=0.5", 0.5, 0.1, 0.0, 64.8e-2, 229e-3, failed=1),
-    Row("T=10", 10.0, 0.1, 0.0, 126e-2, 943e-3, failed=2),
-    Row("dt=1-5", 3.0, 0.2, 0.0, 1.73e-2, 4.87e-3),
-    Row("dt=1-30", 3.0, 1 / 30, 0.0, 1.42e-2, 3.89e-3),
-    Row("alpha=10", 3.0, 0.1, 0.1, 1.65e-2, 4.09e-3),
-    Row("alpha=30", 3.0, 0.1, 0.3, 1.69e-2, 4.07e-3),
-    Row("alpha=60", 3.0, 0.1, 0.6, 1.75e-2, 4.25e-3),
-    Row("dt=1-30-alpha=30", 3.0, 1 / 30, 0.3, 1.59e-2, 4.02e-3),
+    PaperRow("baseline", 3.0, 0.1, 0.0, 1.64e-2, 3.94e-3),
+    PaperRow("T=0.5", 0.5, 0.1, 0.0, 64.8e-2, 229e-3, failed=1),
+    PaperRow("T=10", 10.0, 0.1, 0.0, 126e-2, 943e-3, failed=2),
+    PaperRow("dt=1-5", 3.0, 0.2, 0.0, 1.73e-2, 4.87e-3),
+    PaperRow("dt=1-30", 3.0, 1 / 30, 0.0, 1.42e-2, 3.89e-3),
+    PaperRow("alpha=10", 3.0, 0.1, 0.1, 1.65e-2, 4.09e-3),
+    PaperRow("alpha=30", 3.0, 0.1, 0.3, 1.69e-2, 4.07e-3),
+    PaperRow("alpha=60", 3.0, 0.1, 0.6, 1.75e-2, 4.25e-3),
+    PaperRow("dt=1-30-alpha=30", 3.0, 1 / 30, 0.3, 1.59e-2, 4.02e-3),
 )

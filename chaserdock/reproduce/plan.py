@@ -78,7 +78,7 @@ class Mission:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ReproductionPlan:
     """All missions and studies. ``duration_s``: of each single-chaser run."""
 
     quick: bool
@@ -254,7 +254,9 @@ def studies(quick: bool, scenario: str, duration_s: float) -> tuple[StudyCase, .
     return tuple(out)
 
 
-def make_plan(quick: bool, scenario: str) -> Plan:
+def make_plan(quick: bool, scenario: str) -> ReproductionPlan:
     """Return the whole plan; ``scenario`` is the path of ``paper-single``."""
     duration_s = QUICK_S if quick else PAPER_S
-    return Plan(quick, duration_s, missions(quick, duration_s), studies(quick, scenario, duration_s))
+    return ReproductionPlan(
+        quick, duration_s, missions(quick, duration_s), studies(quick, scenario, duration_s)
+    )

@@ -35,7 +35,7 @@ class Provenance(Struct, frozen=True, kw_only=True):
         return f"{self.date}, commit {self.commit}, {self.machine}"
 
 
-class Record(Struct, frozen=True, kw_only=True):
+class ChainRecord(Struct, frozen=True, kw_only=True):
     """Flights of the paper's chain by name: summaries of missions (the fields that the page shows), and studies."""
 
     provenance: Provenance
@@ -95,15 +95,15 @@ def shown_fields(summary: dict[str, Any]) -> dict[str, Any]:
     return {**{k: summary[k] for k in _SHOWN}, "chasers": chasers, "target_estimate": estimate}
 
 
-def write_record(record: Record, folder: Path) -> None:
+def write_record(record: ChainRecord, folder: Path) -> None:
     """Write a record into ``folder``."""
     (folder / RECORD_NAME).write_bytes(msgspec.json.format(msgspec.json.encode(record)) + b"\n")
 
 
-def read_record(folder: Path = _FOLDER) -> Record:
+def read_record(folder: Path = _FOLDER) -> ChainRecord:
     """Return the record in ``folder``, by default the shipped one. Raise ChaserdockError if it cannot be read."""
     path = folder / RECORD_NAME
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Record)
+        return msgspec.json.decode(path.read_bytes(), type=ChainRecord)
     except (OSError, msgspec.DecodeError) as error:
         raise ChaserdockError(f"{path}: cannot be read: {error}") from None

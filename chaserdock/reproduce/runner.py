@@ -20,12 +20,12 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
 
 from chaserdock.campaign.plan import Campaign, Run, make_run
-from chaserdock.campaign.scheduler import Progress
+from chaserdock.campaign.scheduler import CampaignProgress
 from chaserdock.campaign.table import rows_of, write_table
-from chaserdock.campaign.worker import CampaignError, Result, fly_campaign, read_result, result_path
+from chaserdock.campaign.worker import CampaignError, FinishedRun, fly_campaign, read_result, result_path
 from chaserdock.evaluation.study_cases import StudyCase, StudyResult, line_of, read_lines
 
-from .plan import SCENARIO, Mission, Plan
+from .plan import SCENARIO, Mission, ReproductionPlan
 
 _PACKAGES = (
     "chaserdock",
@@ -39,7 +39,7 @@ _POLL_S = 0.5
 
 
 @dataclass(frozen=True)
-class Results:
+class ReproductionResults:
     """Summaries of missions by name, results of studies by name."""
 
     missions: dict[str, dict[str, Any]]
@@ -93,7 +93,7 @@ def fly_missions(
     runs.sort(key=lambda run: -_effort(run[1]))
     campaign = Campaign("reproduction", ("group",), tuple(run for run, _ in runs))
     keep = "all" if keep_logs else "none"
-    finished = fly_campaign(campaign, folder, keep, jobs, None, Progress(), stop)
+    finished = fly_campaign(campaign, folder, keep, jobs, None, CampaignProgress(), stop)
     crashed = [(run, result) for run, result in finished if result.summary is None]
     for run, _ in crashed:
         result_path(folder, run).unlink()
@@ -103,7 +103,7 @@ def fly_missions(
         write_table(rows_of(sorted(finished, key=_plan_order)), folder / "results.parquet")
 
 
-def _plan_order(item: tuple[Run, Result]) -> int:
+def _plan_order(item: tuple[Run, FinishedRun]) -> int:
     return item[0].index
 
 
@@ -111,7 +111,7 @@ def _effort(scenario: Scenario) -> float:
     return scenario.duration_s * scenario.time.image_hz * len(scenario.chasers)
 
 
-def results_of(plan: Plan, folder: Path) -> Results:
+def results_of(plan: ReproductionPlan, folder: Path) -> ReproductionResults:
     """Return what is finished of ``plan``, in the plan's order."""
     missions = {}
     for mission in plan.missions:
@@ -120,7 +120,7 @@ def results_of(plan: Plan, folder: Path) -> Results:
             missions[mission.name] = result.summary
     finished = _finished_studies(folder)
     studies = {case.name: finished[case] for case in plan.studies if case in finished}
-    return Results(missions, studies)
+    return ReproductionResults(missions, studies)
 
 
 # -- studies ----------------------------------------------------------------------------------------------

@@ -13,8 +13,8 @@ import numpy as np
 from chaserdock.evaluation.study_cases import StudyResult
 
 from .paper import PAPER_S
-from .plan import DRAWS, Plan
-from .runner import Results
+from .plan import DRAWS, ReproductionPlan
+from .runner import ReproductionResults
 
 BAND = (1.0 / 1.35, 1.35)
 """Ratios of a measured value to the paper's that count as met."""
@@ -33,7 +33,7 @@ class Errors:
     failed: bool = False
 
 
-Quantity = Callable[[Errors], float]
+ErrorOf = Callable[[Errors], float]
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,7 @@ def errors_of_summary(summary: dict[str, Any]) -> Errors:
     )
 
 
-def with_images(plan: Plan, results: Results, group: str) -> list[Errors]:
+def with_images(plan: ReproductionPlan, results: ReproductionResults, group: str) -> list[Errors]:
     """Return the errors of a group's runs with images; empty without such runs or if one has no result."""
     members = [m for m in plan.missions if m.group == group]
     if any(m.name not in results.missions for m in members):
@@ -125,7 +125,7 @@ def with_images(plan: Plan, results: Results, group: str) -> list[Errors]:
     return [errors_of_summary(results.missions[m.name]) for m in members]
 
 
-def with_perfect_knowledge(results: Results, group: str) -> list[Errors]:
+def with_perfect_knowledge(results: ReproductionResults, group: str) -> list[Errors]:
     """Return the errors of a group's studies, one per draw; empty if one has no result."""
     names = [f"{group}/{draw}" for draw in DRAWS]
     if any(name not in results.studies for name in names):
@@ -133,7 +133,7 @@ def with_perfect_knowledge(results: Results, group: str) -> list[Errors]:
     return [errors_of_study(results.studies[name]) for name in names]
 
 
-def best_runs(plan: Plan, results: Results, group: str) -> tuple[list[Errors], str]:
+def best_runs(plan: ReproductionPlan, results: ReproductionResults, group: str) -> tuple[list[Errors], str]:
     """Return the errors of a table cell and how they were flown: all draws with images, else with perfect knowledge."""
     seen = with_images(plan, results, group)
     if len(seen) == len(DRAWS):
@@ -150,7 +150,7 @@ class Requirement:
     met: bool
 
 
-def own_requirements(plan: Plan, results: Results) -> list[Requirement]:
+def own_requirements(plan: ReproductionPlan, results: ReproductionResults) -> list[Requirement]:
     """Check what we require of our default settings, as far as results exist: the median over the starts."""
     out: list[Requirement] = []
     ours, how = best_runs(plan, results, "table/default/baseline")

@@ -14,9 +14,9 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario.bodies import Target
 
-from .paper import PAPER_S, ROWS, Row
-from .plan import CHAIN, DELAYS_S, DRAWS, INFERRED, TRACKING, Plan, table_group
-from .runner import Results
+from .paper import PAPER_S, ROWS, PaperRow
+from .plan import CHAIN, DELAYS_S, DRAWS, INFERRED, TRACKING, ReproductionPlan, table_group
+from .runner import ReproductionResults
 from .tables import (
     TREND_BAND,
     Errors,
@@ -31,7 +31,7 @@ from .tables import (
 UNEXPLAINED = "unexplained"
 SPIKE = 5.0
 """An error angle counts as a spike above this multiple of its RMS; of 3000 Gaussian ones the greatest is at 2.5."""
-Quantity = Literal["position", "orientation"]
+PaperQuantity = Literal["position", "orientation"]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class Trend:
     explanation: str
 
 
-def paper_change(row: Row, quantity: Quantity) -> float:
+def paper_change(row: PaperRow, quantity: PaperQuantity) -> float:
     """Return the paper's change of a row from its baseline."""
     a, b = row, ROWS[0]
     if quantity == "position":
@@ -52,7 +52,9 @@ def paper_change(row: Row, quantity: Quantity) -> float:
     return a.orientation_mse_rad2 / b.orientation_mse_rad2 - 1.0
 
 
-def changes(plan: Plan, results: Results, column: str, row: Row, quantity: Quantity) -> list[float]:
+def changes(
+    plan: ReproductionPlan, results: ReproductionResults, column: str, row: PaperRow, quantity: PaperQuantity
+) -> list[float]:
     """Return the changes from the baseline of the same start: with images if all were flown so, else perfect knowledge."""
     groups = [table_group(column, name) for name in (row.name, ROWS[0].name)]
     pair = [with_images(plan, results, group) for group in groups]
@@ -63,7 +65,7 @@ def changes(plan: Plan, results: Results, column: str, row: Row, quantity: Quant
     return [_value(a, quantity) / _value(b, quantity) - 1.0 for a, b in zip(*pair, strict=True)]
 
 
-def trends(plan: Plan, results: Results) -> list[Trend]:
+def trends(plan: ReproductionPlan, results: ReproductionResults) -> list[Trend]:
     """Return the trends of all rows in both errors, as far as results exist."""
     out = []
     for row in ROWS[1:]:
@@ -88,7 +90,7 @@ def trend_verdict(values: list[float], paper: float) -> str:
     return text if min(values) * max(values) > 0.0 else f"{text}; sign depends on the start"
 
 
-def explain(results: Results, row: Row, quantity: Quantity) -> str:
+def explain(results: ReproductionResults, row: PaperRow, quantity: PaperQuantity) -> str:
     """Return what was measured about a trend that differs from the paper's."""
     if row.failed:
         return _explain_by_delay(results, row, quantity)
@@ -100,16 +102,16 @@ def explain(results: Results, row: Row, quantity: Quantity) -> str:
     return " ".join(texts)
 
 
-def _value(errors: Errors, quantity: Quantity) -> float:
+def _value(errors: Errors, quantity: PaperQuantity) -> float:
     return errors.position if quantity == "position" else errors.orientation
 
 
-def _study(results: Results, name: str) -> Errors | None:
+def _study(results: ReproductionResults, name: str) -> Errors | None:
     result = results.studies.get(name)
     return None if result is None else errors_of_study(result)
 
 
-def _explain_by_weights(results: Results, row: Row, quantity: Quantity) -> str:
+def _explain_by_weights(results: ReproductionResults, row: PaperRow, quantity: PaperQuantity) -> str:
     """Compare with the same dt at stage weights that keep the sum of the stage costs."""
     text = "times 2" if row.dt_s > ROWS[0].dt_s else "by 3"
     step = "1/5 s" if row.dt_s > ROWS[0].dt_s else "1/30 s"
@@ -127,7 +129,7 @@ def _explain_by_weights(results: Results, row: Row, quantity: Quantity) -> str:
     return f"Ours is the number of stages, hence the share of the final cost: {measured}. The paper's is unexplained."
 
 
-def _explain_by_spread(results: Results, row: Row, quantity: Quantity) -> str:
+def _explain_by_spread(results: ReproductionResults, row: PaperRow, quantity: PaperQuantity) -> str:
     """Compare the paper's change with the spread of the baseline over the dispersed starts."""
     runs = with_perfect_knowledge(results, table_group("paper", ROWS[0].name))
     if not runs:
@@ -140,7 +142,7 @@ def _explain_by_spread(results: Results, row: Row, quantity: Quantity) -> str:
     return f"Not separable from the start, if the paper's runs varied as ours: {measured}."
 
 
-def _explain_by_delay(results: Results, row: Row, quantity: Quantity) -> str:
+def _explain_by_delay(results: ReproductionResults, row: PaperRow, quantity: PaperQuantity) -> str:
     """Find the delay of the command that brings our error to the paper's."""
     paper = row.position_mse_m2 if quantity == "position" else row.orientation_mse_rad2
     delayed = [(d, _study(results, f"delay/{row.horizon_s:g}/{d:g}")) for d in DELAYS_S]
@@ -191,7 +193,7 @@ def spike_of(summary: dict[str, Any]) -> Spike | None:
     return Spike(float(largest), float(rms)) if whole and largest and rms else None
 
 
-def spikes(results: Results) -> dict[str, Spike]:
+def spikes(results: ReproductionResults) -> dict[str, Spike]:
     """Return the spike measure of the two-chaser missions by column."""
     out = {}
     for column in (CHAIN, "paper", "default"):

@@ -17,7 +17,7 @@ from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
 from .shrinking import shrink
-from .swarm import Case, Result, case_text, draw_case, fly_case
+from .swarm import Case, SimulationResult, case_text, draw_case, fly_case
 
 NEES_LIMITS = (1.5, 12.0)
 """Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights whose sensors are honest."""
@@ -33,7 +33,7 @@ class Swarm:
     mode: str | None = None
 
 
-def fly_seed(swarm: Swarm, seed: int) -> Result:
+def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
     """Draw and fly the case of a seed. Raises ScenarioError."""
     path = find_scenario(swarm.scenario)
     name = str(path.resolve()) if path == Path(swarm.scenario) else path.stem
@@ -41,11 +41,11 @@ def fly_seed(swarm: Swarm, seed: int) -> Result:
     return fly_case(case, seed)
 
 
-def _fly(job: tuple[Swarm, int]) -> Result:
+def _fly(job: tuple[Swarm, int]) -> SimulationResult:
     return fly_seed(*job)
 
 
-def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Result]:
+def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[SimulationResult]:
     """Yield the results of the seeds, in their order."""
     if jobs == 1:
         yield from map(_fly, ((swarm, seed) for seed in seeds))
@@ -61,7 +61,7 @@ def fly_seeds(swarm: Swarm, seeds: Iterable[int], jobs: int = 1) -> Iterator[Res
             running += [pool.submit(_fly, (swarm, seed)) for seed in itertools.islice(remaining, 1)]
 
 
-def shrink_result(result: Result, attempts: int = 200) -> Case:
+def shrink_result(result: SimulationResult, attempts: int = 200) -> Case:
     """Return the simplest case found that violates the first violated invariant of a result."""
     first = result.violations[0]
 
@@ -74,7 +74,7 @@ def shrink_result(result: Result, attempts: int = 200) -> Case:
     return shrink(result.case, fails, first.time_s, attempts)
 
 
-def write_case(case: Case, result: Result, folder: Path) -> Path:
+def write_case(case: Case, result: SimulationResult, folder: Path) -> Path:
     """Write a case that fails as a scenario file, with what it violates in its first lines; return its path."""
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"seed-{result.seed}.toml"
@@ -83,13 +83,13 @@ def write_case(case: Case, result: Result, folder: Path) -> Path:
     return path
 
 
-def consistency(results: Iterable[Result]) -> tuple[float, int]:
+def consistency(results: Iterable[SimulationResult]) -> tuple[float, int]:
     """Return the mean NEES over the flights whose sensors are honest, each weighted equally, and their number."""
     means = [float(np.mean(r.nees)) for r in results if r.honest and r.nees]
     return (float(np.mean(means)) if means else float("nan")), len(means)
 
 
-def inconsistency(results: Iterable[Result]) -> str | None:
+def inconsistency(results: Iterable[SimulationResult]) -> str | None:
     """Return why the estimate's covariance is inconsistent over an ensemble, None if it is not or the ensemble is small."""
     mean, number = consistency(results)
     low, high = NEES_LIMITS

@@ -28,7 +28,7 @@ _START_S, _END_S = 30.0, 60.0
 
 
 @dataclass(frozen=True)
-class Flight:
+class SimulatedFlight:
     """A simulated flight. ``statuses``: exit status by process; None of one that was killed.
 
     ``crashes``: traceback by process. ``stalled``: processes that had not ended when the time was over. ``output``: what the
@@ -44,7 +44,9 @@ class Flight:
     traffic: Traffic = field(repr=False)
 
 
-def simulate(path: Path, folder: Path, overrides: tuple[str, ...] = (), tap: Tap | None = None) -> Flight:
+def simulate(
+    path: Path, folder: Path, overrides: tuple[str, ...] = (), tap: Tap | None = None
+) -> SimulatedFlight:
     """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes to ``folder``.
 
     ``tap`` sees every message when it is published: the sender's name, the sample. Raises ScenarioError.
@@ -78,7 +80,7 @@ def simulate(path: Path, folder: Path, overrides: tuple[str, ...] = (), tap: Tap
     finally:
         if collecting:
             gc.enable()
-    return Flight(
+    return SimulatedFlight(
         folder=folder,
         statuses={t.name: None if t.killed else t.result for t in tasks if t.name not in stalled},
         crashes={t.name: t.error for t in tasks if t.error},

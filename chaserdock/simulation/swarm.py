@@ -26,7 +26,7 @@ from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
 from .invariants import Invariants, Violation
-from .mission import Flight, simulate
+from .mission import SimulatedFlight, simulate
 
 KINDS: tuple[str, ...] = get_args(FaultKind)
 RECEIVED = {
@@ -41,7 +41,7 @@ Case = dict[str, Any]
 
 
 @dataclass(frozen=True)
-class Result:
+class SimulationResult:
     """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal flights.
 
     ``nees``: of the estimate, one value a second; ``honest``: no sensor lied, so that it should be consistent.
@@ -208,7 +208,7 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
     return sorted(timeline, key=lambda e: e["at_s"])
 
 
-def fly_case(case: Case, seed: int, folder: Path | None = None) -> Result:
+def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationResult:
     """Simulate a case and check the invariants; the log stays in ``folder`` if one is given. Raises ScenarioError."""
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_memory_folder())))
@@ -229,7 +229,7 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> Result:
         _check_recording(checks, flight)
         _check_queues(checks, flight)
     lies = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
-    return Result(
+    return SimulationResult(
         seed=seed,
         case=case,
         violations=tuple(checks.violations),
@@ -256,7 +256,7 @@ def _outcome(checks: Invariants) -> str:
     )
 
 
-def _check_recording(checks: Invariants, flight: Flight) -> None:
+def _check_recording(checks: Invariants, flight: SimulatedFlight) -> None:
     """Compare the log with what reached the recorder."""
     if "recorder" in flight.stalled or flight.statuses.get("recorder") is None:
         return
@@ -279,7 +279,7 @@ def _check_recording(checks: Invariants, flight: Flight) -> None:
             )
 
 
-def _check_queues(checks: Invariants, flight: Flight) -> None:
+def _check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
     """Queues stay short unless a flood or a slow or frozen reader fills them; they are bounded anyway."""
     s = checks.scenario
     if s.simulation.slow or s.simulation.partition or any(f.kind in ("flood", "freeze") for f in s.fault):

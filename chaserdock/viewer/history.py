@@ -34,7 +34,7 @@ MOST_POINTS = 40_000
 _MOST_LINES = 500
 _KEPT = 64
 
-Quantity = Literal[
+ChartQuantity = Literal[
     "position_error_mm",
     "orientation_error_deg",
     "distance_m",
@@ -112,7 +112,7 @@ class History:
     """Series by quantity and chaser (None: of the mission), trails by chaser, and event lines."""
 
     def __init__(self, chasers: int) -> None:
-        self.series: dict[tuple[Quantity, int | None], Series] = defaultdict(Series)
+        self.series: dict[tuple[ChartQuantity, int | None], Series] = defaultdict(Series)
         self.trails = [Trail() for _ in range(chasers)]
         self.lines: deque[Line] = deque(maxlen=_MOST_LINES)
         self.rejected: dict[str, int] = {}

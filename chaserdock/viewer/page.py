@@ -25,7 +25,7 @@ from .scene import VIEWS, SceneView
 from .snapshot import MissionState
 
 COMMANDS = ("approach", "hold", "retreat", "abort")
-Command = Callable[[str, int], None]
+SendCommand = Callable[[str, int], None]
 
 _IMAGE_PX = 400
 _SLOW_S = 0.5
@@ -59,7 +59,7 @@ class Page:
         *,
         dark: bool,
         truth: bool,
-        command: Command | None,
+        command: SendCommand | None,
         timeline: Timeline | None,
     ) -> None:
         self._server, self._scenario = server, scenario
@@ -89,7 +89,7 @@ class Page:
 
     # -- building -----------------------------------------------------------------------------------------
 
-    def _main_panel(self, dark: bool, command: Command | None) -> None:
+    def _main_panel(self, dark: bool, command: SendCommand | None) -> None:
         gui = self._server.gui
         gui.main_panel.dock_right()
         gui.main_panel.set_width(400)
@@ -107,7 +107,7 @@ class Page:
         with gui.add_folder("View", expand_by_default=False):
             self._view_options(dark)
 
-    def _buttons(self, command: Command) -> None:
+    def _buttons(self, command: SendCommand) -> None:
         gui = self._server.gui
         self._reply = gui.add_markdown("")
         for i in range(len(self._scenario.chasers)):

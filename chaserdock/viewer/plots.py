@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models.arrays import Array
 
-from .history import History, Quantity
+from .history import ChartQuantity, History
 
 POINTS = 240
 """Maximum number of points of a curve: about one per pixel."""
@@ -35,7 +35,7 @@ COLOURS = (
 ESTIMATE_COLOUR = "#e0a800"
 
 
-Curve = tuple[str, str, Quantity, int | None]
+Curve = tuple[str, str, ChartQuantity, int | None]
 """Label, colour, quantity, and chaser or None."""
 
 
@@ -50,7 +50,7 @@ class Plot:
 def plots_of(chasers: int, truth: bool) -> tuple[Plot, ...]:
     """Return the plots of the page; the estimation error only with ground truth."""
 
-    def each(quantity: Quantity) -> tuple[Curve, ...]:
+    def each(quantity: ChartQuantity) -> tuple[Curve, ...]:
         return tuple((str(i), COLOURS[i % len(COLOURS)], quantity, i) for i in range(chasers))
 
     estimate: tuple[Curve, ...] = (

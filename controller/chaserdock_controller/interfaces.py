@@ -33,7 +33,7 @@ from .nmpc.types import NmpcPlan
 
 LogEntry = tuple[Level, str]
 """Level and text of an event."""
-Mode = Literal["nmpc", "brake", "coast", "pull", "search"]
+ControlMode = Literal["nmpc", "brake", "coast", "pull", "search"]
 
 
 @dataclass(frozen=True)
@@ -141,7 +141,7 @@ class ReferencePose:
 class DirectCommand:
     """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC."""
 
-    mode: Mode
+    mode: ControlMode
     wrench: Array
 
 

@@ -54,7 +54,7 @@ def main(options: ProcessOptions) -> int:
         faults, realtime = process_faults_from_json(mission.faults), mission.mode == "realtime"
         now_s = node.host.now_s
         core = ControllerCore(scenario, now_s, realtime=realtime)
-        controller = Controller(node, scenario, core, realtime, now_s=now_s)
+        controller = ControllerProcess(node, scenario, core, realtime, now_s=now_s)
         node.message_filter = create_fault_layer(faults, node.name, scenario.timing, not realtime, node.host)
         controller.open(instance)
         node.host.finish_startup()
@@ -66,7 +66,7 @@ def main(options: ProcessOptions) -> int:
     return run_member("standby" if options.standby else "controller", "controller", options, work)
 
 
-class Controller:
+class ControllerProcess:
     """Barrier and I/O: a tick is processed once every message that it needs has arrived or is lost.
 
     In real time a tick is processed with what has arrived when its patience is over, by ``now_s``, or when the first

@@ -17,7 +17,7 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .core import ControllerCore
 from .interfaces import TickInputs, TickOutputs
-from .process import Controller
+from .process import ControllerProcess
 
 
 class _EstimationOnly:
@@ -75,7 +75,7 @@ def _play(
             restarted = is_target and received.message.seq < last_seq and leader == last_leader
             if controller is None or restarted:
                 node = ReplayNode("controller")
-                controller = Controller(cast(Node, node), scenario, core_of(), replaying=True)
+                controller = ControllerProcess(cast(Node, node), scenario, core_of(), replaying=True)
                 controller.heartbeat = cast(Any, SilentHeartbeat())
             if is_target:
                 last_seq = received.message.seq

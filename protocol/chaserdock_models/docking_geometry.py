@@ -15,7 +15,7 @@ from .arrays import Array
 from .rigid_body import BodyState
 
 
-class Port(Protocol):
+class PortGeometry(Protocol):
     """A docking port: position (3,) and outward axis (3,), both in TRF."""
 
     @property
@@ -62,18 +62,20 @@ class PortView:
         return ""
 
 
-def centre_offset(port: Port, reach_m: float, gap_m: float) -> Array:
+def centre_offset(port: PortGeometry, reach_m: float, gap_m: float) -> Array:
     """Return a chaser's centre (3,) in TRF when its tip is ``gap_m`` in front of the port and its +X along -axis."""
     return np.asarray(port.position_m) + np.asarray(port.axis) * (reach_m + gap_m)
 
 
-def axis_error_deg(port: Port, q_off_wxyz: Array) -> float:
+def axis_error_deg(port: PortGeometry, q_off_wxyz: Array) -> float:
     """Return the angle between a chaser's +X and the inward axis of its port; ``q_off_wxyz`` (4,) CRF to TRF."""
     ahead = rotations.rotate(q_off_wxyz, (1.0, 0.0, 0.0))
     return math.degrees(math.acos(min(1.0, max(-1.0, -float(ahead @ np.asarray(port.axis))))))
 
 
-def view_of(port: Port, reach_m: float, q_off_wxyz: Array, chaser: BodyState, target: BodyState) -> PortView:
+def view_of(
+    port: PortGeometry, reach_m: float, q_off_wxyz: Array, chaser: BodyState, target: BodyState
+) -> PortView:
     """Return the state of the tip relative to the port.
 
     ``reach_m``: distance of the tip from the chaser's centre along +X. ``q_off_wxyz`` (4,): docked attitude, CRF to

@@ -22,7 +22,7 @@ FailureKind = Literal["stuck_off", "stuck_on", "weak"]
 """Failure modes of a thruster: never opens, never closes, or delivers a fraction of its thrust."""
 
 
-class Thruster(Protocol):
+class ThrusterDynamics(Protocol):
     """Thrust (N), specific impulse (s) and valve times (s) of a thruster."""
 
     @property
@@ -70,7 +70,7 @@ def subtract_span(spans: Sequence[Span], cut: Span) -> list[Span]:
 class _Thruster:
     """One thruster: commanded pulses, failure, and the times its shut-off valve is closed."""
 
-    def __init__(self, thruster: Thruster) -> None:
+    def __init__(self, thruster: ThrusterDynamics) -> None:
         self.rise_ns, self.fall_ns = _ns(thruster.rise_s), _ns(thruster.fall_s)
         self.shortest_ns = _ns(thruster.min_on_s)
         self.pulses: list[Span] = []
@@ -106,7 +106,7 @@ class _Thruster:
 class Valves:
     """All thrusters of one body, by number."""
 
-    def __init__(self, thrusters: Sequence[Thruster]) -> None:
+    def __init__(self, thrusters: Sequence[ThrusterDynamics]) -> None:
         self._thrusters = [_Thruster(t) for t in thrusters]
         self._thrust_N = np.array([t.thrust_N for t in thrusters])
         self._exhaust_m_s = np.array([t.isp_s * G0_M_S2 for t in thrusters])

@@ -17,7 +17,7 @@ import numpy as np
 from .arrays import Array
 
 
-class Thruster(Protocol):
+class ThrusterMount(Protocol):
     """Position (m) and unit direction of force of a thruster, CRF."""
 
     @property
@@ -27,7 +27,7 @@ class Thruster(Protocol):
     def direction(self) -> tuple[float, float, float]: ...
 
 
-def wrench_matrix(thrusters: Sequence[Thruster]) -> Array:
+def wrench_matrix(thrusters: Sequence[ThrusterMount]) -> Array:
     """Return the matrix (6, n) of force and torque about the centre of mass for 1 N of each thruster."""
     directions = np.array([thruster.direction for thruster in thrusters], dtype=float).reshape(-1, 3)
     positions = np.array([thruster.position_m for thruster in thrusters], dtype=float).reshape(-1, 3)

@@ -42,7 +42,7 @@ Square6 = Annotated[tuple[float, ...], Meta(min_length=36, max_length=36)]
 Square12 = Annotated[tuple[float, ...], Meta(min_length=144, max_length=144)]
 
 
-Phase = Literal[
+PhaseName = Literal[
     "acquire",
     "searching",
     "hold",
@@ -320,7 +320,7 @@ class Reference(Message, frozen=True, kw_only=True):
     """
 
     chaser: ChaserId
-    phase: Phase
+    phase: PhaseName
     phase_time_s: float
     position_m: Vector3
     q_wxyz: Quaternion

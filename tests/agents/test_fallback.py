@@ -20,7 +20,7 @@ from chaserdock_agents.chaser.fallback import (
     is_at_rest,
     next_state,
 )
-from chaserdock_agents.chaser.process import Chaser
+from chaserdock_agents.chaser.process import ChaserProcess
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
@@ -195,7 +195,7 @@ def test_clearance_is_outside_of_keep_out_sphere_and_corridor() -> None:
 # -- the chaser process -----------------------------------------------------------------------------------------
 
 
-def deliver(chaser: Chaser, topic: Any, message: Any) -> list[tuple[Any, Any]]:
+def deliver(chaser: ChaserProcess, topic: Any, message: Any) -> list[tuple[Any, Any]]:
     """Hand the process one message; return what it publishes."""
     node: Any = chaser.node
     node.put(ReceivedMessage(topic, None if topic is topics.TICK else "0", message, 0))
@@ -235,8 +235,8 @@ def command(scenario: Scenario, tick: int, commander: str, term: int) -> WrenchC
 
 
 @pytest.fixture
-def chaser(scenario: Scenario) -> Chaser:
-    made = Chaser(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
+def chaser(scenario: Scenario) -> ChaserProcess:
+    made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     return made
 
@@ -251,7 +251,7 @@ def sources(published: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
     return [(m.source, m.term) for t, m in published if t is topics.ACTUATORS]
 
 
-def test_lost_controller_reports_each_fallback_mode_once(chaser: Chaser, scenario: Scenario) -> None:
+def test_lost_controller_reports_each_fallback_mode_once(chaser: ChaserProcess, scenario: Scenario) -> None:
     plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
@@ -271,7 +271,7 @@ def test_lost_controller_reports_each_fallback_mode_once(chaser: Chaser, scenari
     assert "fallback ends" in [m.what for t, m in published if t is topics.EVENT]
 
 
-def test_plan_without_its_command_is_not_executed(chaser: Chaser, scenario: Scenario) -> None:
+def test_plan_without_its_command_is_not_executed(chaser: ChaserProcess, scenario: Scenario) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
     deliver(chaser, topics.PLAN, straight(0.0))
@@ -279,7 +279,9 @@ def test_plan_without_its_command_is_not_executed(chaser: Chaser, scenario: Scen
     assert [s for s, _ in sources(published)] == ["hold"]
 
 
-def test_stale_terms_are_rejected_counted_and_reported_once(chaser: Chaser, scenario: Scenario) -> None:
+def test_stale_terms_are_rejected_counted_and_reported_once(
+    chaser: ChaserProcess, scenario: Scenario
+) -> None:
     for tick in (1, 2):
         deliver(chaser, topics.TICK, tick_of(scenario, tick, "standby", 2))
         deliver(chaser, topics.ODOMETRY, at(scenario, tick))
@@ -290,7 +292,9 @@ def test_stale_terms_are_rejected_counted_and_reported_once(chaser: Chaser, scen
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))) == [("command", 2)]
 
 
-def test_new_leader_within_a_tick_does_not_repeat_a_command(chaser: Chaser, scenario: Scenario) -> None:
+def test_new_leader_within_a_tick_does_not_repeat_a_command(
+    chaser: ChaserProcess, scenario: Scenario
+) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 3, "controller", 1))
     deliver(chaser, topics.ODOMETRY, at(scenario, 3))
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]

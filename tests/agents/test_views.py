@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import detect, pnp, views
 from chaserdock_agents.chaser.perception.native import LIBRARY
-from chaserdock_agents.chaser.perception.refine import CameraPose
+from chaserdock_agents.chaser.perception.refine import PoseInCamera
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
@@ -30,17 +30,17 @@ def _level(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> N
     )
 
 
-def poses(count: int) -> list[CameraPose]:
+def poses(count: int) -> list[PoseInCamera]:
     """Some far and in the image, some at its edge, some with the camera inside the target or it behind."""
     rng = np.random.default_rng(5)
     out = []
     for k in range(count):
         position = rng.uniform([-0.5, -0.4, 0.3], [0.5, 0.4, 2.0]) if k % 4 else rng.uniform(-0.3, 0.3, 3)
-        out.append(CameraPose(position, rotations.to_matrix(rotations.normalize(rng.normal(size=4)))))
+        out.append(PoseInCamera(position, rotations.to_matrix(rotations.normalize(rng.normal(size=4)))))
     return out
 
 
-def seen_from(pose: CameraPose, table: pnp.MarkerTable) -> tuple[Array, Array, Array]:
+def seen_from(pose: PoseInCamera, table: pnp.MarkerTable) -> tuple[Array, Array, Array]:
     at = table.corners @ pose.rotation.T + pose.position
     centres = table.origins @ pose.rotation.T + pose.position
     return at, centres, table.rotations[:, :, 2] @ pose.rotation.T

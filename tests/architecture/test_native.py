@@ -127,8 +127,8 @@ def test_corners_that_lie_nowhere_are_not_good(corner: float) -> None:
         corners.refine(image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
 
 
-def pose_at(position: list[float], rotation_vector: list[float]) -> refine.CameraPose:
-    return refine.CameraPose(np.array(position), refine.rotation_matrix(rotation_vector))
+def pose_at(position: list[float], rotation_vector: list[float]) -> refine.PoseInCamera:
+    return refine.PoseInCamera(np.array(position), refine.rotation_matrix(rotation_vector))
 
 
 @pytest.mark.parametrize("turn", [0.0, 1e-9, 0.3, 2.0])
@@ -141,7 +141,7 @@ def test_a_refined_pose_is_where_the_error_no_longer_falls(turn: float) -> None:
     at = points @ truth.rotation.T + truth.position
     pixels = at[:, :2] / at[:, 2:] * [600.0, 590.0] + [320.0, 240.0] + rng.normal(0.0, 0.2, (8, 2))
     weight = np.repeat(rng.uniform(0.5, 1.0, 8), 2)
-    start = refine.CameraPose(truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation)
+    start = refine.PoseInCamera(truth.position, refine.rotation_matrix([0.0, turn, 0.0]) @ truth.rotation)
     pose = refine.refine(matrix, points, pixels, weight, start)
     assert pose is not None
     np.testing.assert_allclose(pose.rotation @ pose.rotation.T, np.eye(3), atol=1e-14)

@@ -28,7 +28,7 @@ from chaserdock.campaign.report import page
 from chaserdock.campaign.table import cause_of, causes, rank_correlation, row_of, rows_of, wilson
 from chaserdock.campaign.worker import (
     CampaignError,
-    Result,
+    FinishedRun,
     fly_campaign,
     read_result,
     result_path,
@@ -197,12 +197,15 @@ def summary(failures: list[str]) -> dict[str, Any]:
     }
 
 
-def results_of(campaign: Campaign) -> list[tuple[Any, Result]]:
+def results_of(campaign: Campaign) -> list[tuple[Any, FinishedRun]]:
     out = []
     for k, run in enumerate(campaign.runs):
         bad = [f"chaser 0: steady RMS: 0.0{k} m"] if k % 2 else []
         out.append(
-            (run, Result(run.name, 1 if bad else 0, summary(bad), "", f"/logs/{k}.mcap" if bad else None))
+            (
+                run,
+                FinishedRun(run.name, 1 if bad else 0, summary(bad), "", f"/logs/{k}.mcap" if bad else None),
+            )
         )
     return out
 
@@ -217,7 +220,7 @@ def test_row_holds_the_worst_chaser_and_no_wall_clock_values(tmp_path: Path) -> 
     assert not any("wall" in column for column in rows[0])
     assert math.isnan(rows[0]["estimate_max_position_error_m"])
     assert causes(rows) == [(cause_of("chaser 0: steady RMS: 0.01 m"), 4)]
-    crashed = row_of(campaign.runs[0], Result(campaign.runs[0].name, 2, None, "chaserdock: no port"))
+    crashed = row_of(campaign.runs[0], FinishedRun(campaign.runs[0].name, 2, None, "chaserdock: no port"))
     assert not crashed["success"]
     assert crashed["cause"] == "chaserdock: no port"
 
@@ -252,13 +255,13 @@ def test_finished_run_is_not_flown_again(tmp_path: Path, monkeypatch: pytest.Mon
     campaign = campaign_of(GRID, tmp_path)
     flown: list[str] = []
 
-    def fly(run: Any, *_: Any) -> Result:
+    def fly(run: Any, *_: Any) -> FinishedRun:
         flown.append(run.name)
-        return Result(run.name, 0, summary([]), "")
+        return FinishedRun(run.name, 0, summary([]), "")
 
     monkeypatch.setattr("chaserdock.campaign.worker.fly", fly)
     earlier = campaign.runs[2]
-    write_result(tmp_path, earlier, Result(earlier.name, 1, None, "earlier"))
+    write_result(tmp_path, earlier, FinishedRun(earlier.name, 1, None, "earlier"))
     progress: list[int] = []
     results = fly_campaign(
         campaign,
@@ -279,7 +282,7 @@ def test_damaged_result_raises_an_error(tmp_path: Path) -> None:
     campaign = campaign_of(GRID, tmp_path)
     run = campaign.runs[0]
     assert read_result(tmp_path, run) is None
-    write_result(tmp_path, run, Result(run.name, 0, None, ""))
+    write_result(tmp_path, run, FinishedRun(run.name, 0, None, ""))
     result_path(tmp_path, run).write_text(result_path(tmp_path, run).read_text()[:-9])
     with pytest.raises(CampaignError, match="delete it"):
         read_result(tmp_path, run)

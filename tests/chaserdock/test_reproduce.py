@@ -21,12 +21,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from chaserdock.campaign.plan import Run
-from chaserdock.campaign.worker import CampaignError, Result
+from chaserdock.campaign.worker import CampaignError, FinishedRun
 from chaserdock.evaluation.study_cases import StudyCase, StudyError, StudyResult, line_of, read_lines
 from chaserdock.reproduce import main as reproduce_main
 from chaserdock.reproduce.content import sections
 from chaserdock.reproduce.main import add_recorded, fly_plan, without_open
-from chaserdock.reproduce.page import Section, Table, html, markdown
+from chaserdock.reproduce.page import PageSection, Table, html, markdown
 from chaserdock.reproduce.paper import PAPER_S, ROWS
 from chaserdock.reproduce.plan import (
     CHAIN,
@@ -39,15 +39,15 @@ from chaserdock.reproduce.plan import (
     SCENARIO,
     TRACKING,
     Mission,
-    Plan,
+    ReproductionPlan,
     dispersed_start,
     make_plan,
     needs_open,
     table_group,
 )
 from chaserdock.reproduce.record import (
+    ChainRecord,
     Provenance,
-    Record,
     commit_of,
     provenance,
     read_record,
@@ -55,7 +55,7 @@ from chaserdock.reproduce.record import (
     write_record,
 )
 from chaserdock.reproduce.runner import (
-    Results,
+    ReproductionResults,
     code_digest,
     fly_missions,
     mission_run,
@@ -79,7 +79,7 @@ from chaserdock.reproduce.trends import changes, pitch_rad, spikes, trend_verdic
 PATH = str(scenario_path(SCENARIO))
 
 
-def plan(quick: bool) -> Plan:
+def plan(quick: bool) -> ReproductionPlan:
     return make_plan(quick, PATH)
 
 
@@ -232,11 +232,11 @@ def study_result(case: StudyCase, position: float, orientation: float, floor: fl
     )
 
 
-def complete(p: Plan, factor: float = 1.0) -> Results:
+def complete(p: ReproductionPlan, factor: float = 1.0) -> ReproductionResults:
     """Results that are ``factor`` times the paper's baseline everywhere."""
     position, orientation = factor * ROWS[0].position_mse_m2, factor * ROWS[0].orientation_mse_rad2
     missions = {m.name: summary(position, orientation) for m in p.missions}
-    return Results(missions, {c.name: study_result(c, position, orientation) for c in p.studies})
+    return ReproductionResults(missions, {c.name: study_result(c, position, orientation) for c in p.studies})
 
 
 ABOUT = Provenance(date="2026-11-23", commit="0123456789ab-dirty", machine="a machine")
@@ -356,7 +356,9 @@ def test_explanations_quote_measurements_or_say_unexplained() -> None:
     found = {t.name: t.explanation for t in trends(p, results)}
     assert "+10.0 %, with stage weights by 3 by +1.0 %" in found["dt=1/30, position"]
     assert "0.0164 m^2 at 0.4 s, 2 m^2 at 0.5 s (paper: 1.26)" in found["T=10, position"]
-    without = Results(results.missions, {k: v for k, v in results.studies.items() if k.startswith("table/")})
+    without = ReproductionResults(
+        results.missions, {k: v for k, v in results.studies.items() if k.startswith("table/")}
+    )
     found = {t.name: t.explanation for t in trends(p, without)}
     assert found["dt=1/30, position"] == found["T=10, position"] == "unexplained"
 
@@ -415,7 +417,7 @@ class _Checker(HTMLParser):
 
 
 def test_page_is_well_formed_and_escaped() -> None:
-    section = Section(
+    section = PageSection(
         "A <b> & c", ("text with <script>", Table(("a | b", "n"), (("x | <y>", "1"), ("z", "2"))))
     )
     text = html("t & u", [section])
@@ -452,7 +454,7 @@ def test_page_of_a_complete_plan_has_all_rows_and_its_provenance() -> None:
 
 def test_page_reports_missing_results() -> None:
     p = plan(True)
-    text = markdown("t", sections(p, Results({}, {}), ABOUT, None))
+    text = markdown("t", sections(p, ReproductionResults({}, {}), ABOUT, None))
     n, k = len(p.missions), len(p.studies)
     assert f"NOT COMPLETE: {n} of {n} runs with images and {k} of {k} on perfect knowledge" in text
     assert "chaserdock reproduce --quick" in text
@@ -462,9 +464,9 @@ def test_page_reports_missing_results() -> None:
 # -- the paper's chain without its solver -----------------------------------------------------------------
 
 
-def record_of(p: Plan) -> Record:
+def record_of(p: ReproductionPlan) -> ChainRecord:
     results = complete(p)
-    return Record(
+    return ChainRecord(
         provenance=ABOUT,
         quick=p.quick,
         missions={m.name: shown_fields(results.missions[m.name]) for m in p.missions if needs_open(m)},
@@ -489,8 +491,8 @@ def test_missing_solver_is_one_error_and_a_failed_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     case = StudyCase(name="table/chain/baseline/0", scenario=PATH, overrides=("controller.solver='open'",))
-    p = Plan(True, 40.0, (), (case,))
-    record = Record(
+    p = ReproductionPlan(True, 40.0, (), (case,))
+    record = ChainRecord(
         provenance=ABOUT, quick=True, missions={}, studies={case.name: study_result(case, 1.0, 1.0)}
     )
     monkeypatch.setattr(reproduce_main, "missing_part", lambda: "solver 'open' needs cargo")
@@ -523,7 +525,7 @@ def test_incomplete_study_line_counts_as_not_flown(tmp_path: Path) -> None:
     path.parent.mkdir(parents=True)
     lines = [line_of(study_result(c, 1.0, 1.0)) for c in cases]
     path.write_text(lines[0] + lines[1][:40])
-    assert list(results_of(Plan(True, 40.0, (), cases), tmp_path).studies) == ["a"]
+    assert list(results_of(ReproductionPlan(True, 40.0, (), cases), tmp_path).studies) == ["a"]
     assert [c.name for c in open_cases(cases, tmp_path)] == ["b", "c"]
     changed = (StudyCase(name="a", scenario=PATH, delay_s=0.1),)
     assert open_cases(changed, tmp_path) == list(changed)
@@ -532,9 +534,9 @@ def test_incomplete_study_line_counts_as_not_flown(tmp_path: Path) -> None:
 def test_mission_without_summary_is_flown_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     attempts: list[str] = []
 
-    def crash(run: Run, *_: Any) -> Result:
+    def crash(run: Run, *_: Any) -> FinishedRun:
         attempts.append(run.name)
-        return Result(run.name, 2, None, "chaserdock: no port")
+        return FinishedRun(run.name, 2, None, "chaserdock: no port")
 
     monkeypatch.setattr("chaserdock.campaign.worker.fly", crash)
     missions = (Mission("group/0", "group", SCENARIO),)
@@ -578,7 +580,7 @@ def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[
         StudyCase(name=n, scenario=PATH, overrides=(*small, "time.image_hz=15"), floor=True)
         for n in (f"{group}/0", f"start/{INFERRED}")
     )
-    cut = Plan(True, 25.0, runs, cases)
+    cut = ReproductionPlan(True, 25.0, runs, cases)
     assert fly_plan(cut, tmp_path, 2, False) == 0
     flights = capsys.readouterr()
     assert "2 studies to fly, 0 are finished" in flights.err

@@ -31,7 +31,7 @@ from message_samples import BY_TYPE
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, Case, Result, case_text, draw_case
+from chaserdock.simulation.swarm import KINDS, Case, SimulationResult, case_text, draw_case
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
 
@@ -238,8 +238,8 @@ def test_crashes_stalls_and_early_ends_are_violations(scenario: Scenario) -> Non
     assert early.found == ["liveness"]
 
 
-def result(nees: float, honest: bool = True) -> Result:
-    return Result(1, {}, (), "docked", "", (nees,) * 5, honest, 25.0)
+def result(nees: float, honest: bool = True) -> SimulationResult:
+    return SimulationResult(1, {}, (), "docked", "", (nees,) * 5, honest, 25.0)
 
 
 def test_covariance_is_judged_over_honest_flights_only() -> None:

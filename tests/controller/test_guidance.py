@@ -21,8 +21,7 @@ from chaserdock_controller.guidance.phases import (
 from chaserdock_controller.interfaces import TickInputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.messages import Phase as PhaseName
+from chaserdock_protocol.messages import OperatorCommand, PhaseName
 from flight_cases import at, drain, odometry, points, quick, scenario
 from hypothesis import given
 from hypothesis import strategies as st

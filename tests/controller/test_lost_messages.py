@@ -8,9 +8,9 @@ from typing import Any, cast
 
 import msgspec
 import pytest
-from chaserdock_agents.chaser.process import Chaser
+from chaserdock_agents.chaser.process import ChaserProcess
 from chaserdock_controller.core import ControllerCore
-from chaserdock_controller.process import Controller
+from chaserdock_controller.process import ControllerProcess
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage
 from chaserdock_protocol.messages import Image, Message, Odometry, Sighting, Tick, WrenchCommand
@@ -66,8 +66,8 @@ def lost(scenario: Scenario, tick: int) -> LostMessage:
 
 
 @pytest.fixture
-def chaser(scenario: Scenario) -> Chaser:
-    made = Chaser(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
+def chaser(scenario: Scenario) -> ChaserProcess:
+    made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     return made
 
@@ -92,7 +92,7 @@ def actuated(published: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:
 @pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
 @pytest.mark.parametrize("how", ["lost", "none", "expired"])
 def test_chaser_without_command_actuates_once_per_tick(
-    chaser: Chaser, scenario: Scenario, order: tuple[int, ...], how: str
+    chaser: ChaserProcess, scenario: Scenario, order: tuple[int, ...], how: str
 ) -> None:
     """Tick, odometry and the lost command arrive in any order."""
     commands = {
@@ -111,13 +111,13 @@ def test_chaser_without_command_actuates_once_per_tick(
     assert any(t is topics.EVENT for t, _ in published)
 
 
-def test_lost_image_gives_empty_sighting(chaser: Chaser, scenario: Scenario) -> None:
+def test_lost_image_gives_empty_sighting(chaser: ChaserProcess, scenario: Scenario) -> None:
     ((topic, sighting),) = deliver(chaser, topics.IMAGE, 0, lost(scenario, 4))
     assert topic is topics.SIGHTING
     assert (sighting.tick, sighting.status, sighting.solutions) == (4, "bad_image", ())
 
 
-def test_duplicate_image_is_ignored(chaser: Chaser, scenario: Scenario) -> None:
+def test_duplicate_image_is_ignored(chaser: ChaserProcess, scenario: Scenario) -> None:
     image = Image(tick=3, chaser=0, width_px=8, height_px=8, encoding="mono8", data=bytes(64))
     first = [m for t, m in deliver(chaser, topics.IMAGE, 0, image) if t is topics.SIGHTING]
     assert len(first) == 1
@@ -125,7 +125,7 @@ def test_duplicate_image_is_ignored(chaser: Chaser, scenario: Scenario) -> None:
     assert chaser.node.counts.stale == 1
 
 
-def test_lost_odometry_is_extrapolated_and_braking_ends(chaser: Chaser, scenario: Scenario) -> None:
+def test_lost_odometry_is_extrapolated_and_braking_ends(chaser: ChaserProcess, scenario: Scenario) -> None:
     moving = msgspec.structs.replace(odometry(scenario, 0, 0), velocity_m_s=(0.5, 0.0, 0.0))
     deliver(chaser, topics.ODOMETRY, 0, moving)
     forces = {}
@@ -144,7 +144,7 @@ def test_lost_odometry_is_extrapolated_and_braking_ends(chaser: Chaser, scenario
     assert not any(forces[8])  # 0.8 s without odometry: no force
 
 
-def test_older_odometry_does_not_replace_newer(chaser: Chaser, scenario: Scenario) -> None:
+def test_older_odometry_does_not_replace_newer(chaser: ChaserProcess, scenario: Scenario) -> None:
     for tick in (2, 1):
         deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, tick))
     assert chaser.odometry is not None
@@ -155,8 +155,8 @@ def test_older_odometry_does_not_replace_newer(chaser: Chaser, scenario: Scenari
 
 
 @pytest.fixture
-def controller(scenario: Scenario) -> Controller:
-    made = Controller(ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0))  # type: ignore[arg-type]
+def controller(scenario: Scenario) -> ControllerProcess:
+    made = ControllerProcess(ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0))  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     return made
 
@@ -175,7 +175,11 @@ def sighting(scenario: Scenario, i: int, tick: int) -> Sighting:
 
 
 def run_tick(
-    controller: Controller, scenario: Scenario, tick: int, without: dict[Topic, set[int]], chasers: int = 2
+    controller: ControllerProcess,
+    scenario: Scenario,
+    tick: int,
+    without: dict[Topic, set[int]],
+    chasers: int = 2,
 ) -> dict[int, WrenchCommand]:
     """Run a tick without some of its messages; return the commands by chaser."""
     published = deliver(controller, topics.TICK, None, tick_of(scenario, tick, tuple(range(chasers))))
@@ -189,7 +193,7 @@ def run_tick(
 
 
 def test_controller_commands_without_lost_odometry_or_sightings(
-    controller: Controller, scenario: Scenario
+    controller: ControllerProcess, scenario: Scenario
 ) -> None:
     assert set(run_tick(controller, scenario, 1, {})) == {0, 1}
     without = run_tick(controller, scenario, 2, {topics.SIGHTING: {0, 1}})
@@ -198,18 +202,22 @@ def test_controller_commands_without_lost_odometry_or_sightings(
     assert {i: c.mode == "none" for i, c in extrapolated.items()} == {0: False, 1: False}
 
 
-def test_chaser_without_recent_odometry_gets_no_command(controller: Controller, scenario: Scenario) -> None:
+def test_chaser_without_recent_odometry_gets_no_command(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
     run_tick(controller, scenario, 1, {})
     modes = [run_tick(controller, scenario, k, {topics.ODOMETRY: {1}})[1].mode for k in range(2, 10)]
     assert [mode == "none" for mode in modes] == [False] * 5 + [True] * 3  # a command's lifetime is 0.5 s
     assert run_tick(controller, scenario, 10, {})[1].mode != "none"
 
 
-def test_chaser_without_any_odometry_gets_no_command(controller: Controller, scenario: Scenario) -> None:
+def test_chaser_without_any_odometry_gets_no_command(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
     assert run_tick(controller, scenario, 1, {topics.ODOMETRY: {1}})[1].mode == "none"
 
 
-def test_tick_waits_until_a_loss_is_known(controller: Controller, scenario: Scenario) -> None:
+def test_tick_waits_until_a_loss_is_known(controller: ControllerProcess, scenario: Scenario) -> None:
     deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0,)))
     deliver(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
     assert controller.done_tick == -1
@@ -226,11 +234,11 @@ class Clock:
         return self.now_s
 
 
-def in_real_time(scenario: Scenario) -> tuple[Controller, Clock]:
+def in_real_time(scenario: Scenario) -> tuple[ControllerProcess, Clock]:
     """Return a realtime controller that waits for the sightings of tick 1, and its clock."""
     clock = Clock()
     flight = ControllerCore(scenario, lambda: 0.0)
-    made = Controller(ReplayNode("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
+    made = ControllerProcess(ReplayNode("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
     deliver(made, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
     for i in (0, 1):

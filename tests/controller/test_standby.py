@@ -12,7 +12,7 @@ import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import Glide, Move, stay
-from chaserdock_controller.process import Controller
+from chaserdock_controller.process import ControllerProcess
 from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
 from chaserdock_controller.redundancy.serialization import decode, encode
 from chaserdock_controller.redundancy.standby import HotStandby
@@ -51,14 +51,14 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
     return {tick: came for tick, came in sorted(out.items()) if tick <= last}
 
 
-def member(scenario: Scenario, name: str, instance: str) -> Controller:
-    made = Controller(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
+def member(scenario: Scenario, name: str, instance: str) -> ControllerProcess:
+    made = ControllerProcess(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
     made.heartbeat = cast(Any, SilentHeartbeat())
     made.standby.instance = instance
     return made
 
 
-def hear(process: Controller, *messages: ReceivedMessage) -> list[tuple[Any, Any]]:
+def hear(process: ControllerProcess, *messages: ReceivedMessage) -> list[tuple[Any, Any]]:
     """Hands a controller messages; what it says to them, without what is measured by the wall clock."""
     tape = cast(ReplayNode, process.node)
     for message in messages:
@@ -184,7 +184,7 @@ def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Sc
 # -- the state ----------------------------------------------------------------------------------------------
 
 
-def memory(scenario: Scenario) -> tuple[Controller, Checkpoint]:
+def memory(scenario: Scenario) -> tuple[ControllerProcess, Checkpoint]:
     one = member(scenario, "controller", "c")
     return one, one.checkpoint
 

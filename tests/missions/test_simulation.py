@@ -13,7 +13,7 @@ from chaserdock_protocol.recording.log import read_log
 from harness import ROOT, run, summary
 
 from chaserdock.analysis.flight import load_flight
-from chaserdock.simulation.mission import Flight, simulate
+from chaserdock.simulation.mission import SimulatedFlight, simulate
 
 SMALL = (
     "camera.width_px=480",
@@ -40,7 +40,7 @@ CASES = {
 }
 
 
-def simulated(name: str, folder: Path, *overrides: str) -> Flight:
+def simulated(name: str, folder: Path, *overrides: str) -> SimulatedFlight:
     return simulate(ROOT / "scenarios" / f"{name}.toml", folder, overrides)
 
 

@@ -109,7 +109,7 @@ def test_every_key_reaches_its_readers_and_nobody_else(mission: Mission) -> None
 
 @pytest.mark.parametrize("query", rights.QUERIES, ids=lambda q: q.key)
 def test_only_its_answerer_answers_a_query_and_only_those_meant_may_ask(
-    query: rights.Query, mission: Mission
+    query: rights.QueryAccess, mission: Mission
 ) -> None:
     def answer(name: str):
         def arrived(asked: zenoh.Query) -> None:

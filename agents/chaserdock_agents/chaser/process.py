@@ -53,7 +53,7 @@ def main(options: ProcessOptions) -> int:
         faults = process_faults_from_json(mission.faults)
         lockstep = mission.mode == "lockstep"
         node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep, node.host)
-        chaser = Chaser(node, scenario, number, reports=FailureReports(faults.reported_failures))
+        chaser = ChaserProcess(node, scenario, number, reports=FailureReports(faults.reported_failures))
         chaser.open(instance, realtime=not lockstep)
         node.host.finish_startup()
         while not (chaser.ended or stop()):
@@ -65,7 +65,7 @@ def main(options: ProcessOptions) -> int:
 
 
 @dataclass
-class Chaser:
+class ChaserProcess:
     """The state of one chaser process: latest messages, last executed command and fallback.
 
     ``executed_tick`` and ``executed_ns``: tick of the last actuator command for which the world need not wait any more, and

@@ -12,20 +12,20 @@ from chaserdock_protocol.replay_node import Published, ReplayNode, SilentHeartbe
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
 
-from .process import Chaser
+from .process import ChaserProcess
 
 
 def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
     """Return the sightings of all chasers."""
     cv2.setNumThreads(1)
-    chasers: dict[int, tuple[ReplayNode, Chaser]] = {}
+    chasers: dict[int, tuple[ReplayNode, ChaserProcess]] = {}
     last_seq: dict[int, int] = {}
     for received in recorded:
         number, seq = received.message.chaser, received.message.seq
         is_sighting = received.topic is topics.SIGHTING
         if number not in chasers or (is_sighting and seq < last_seq.get(number, -1)):
             node = ReplayNode(f"chaser/{number}")
-            chaser = Chaser(cast(Node, node), scenario, number)
+            chaser = ChaserProcess(cast(Node, node), scenario, number)
             chaser.heartbeat = cast(Any, SilentHeartbeat())
             chasers[number] = node, chaser
         if is_sighting:

@@ -11,14 +11,12 @@ from typing import Any, Generic, TypeVar
 from chaserdock_models.arrays import Matrix3, Vector3
 
 from .parameters import MekfParameters
-from .target_hypotheses import HypothesisSet, apply_shocks
+from .target_hypotheses import StateT, apply_shocks
 from .types import EstimatorEvent, Shock, TargetState
-
-State = TypeVar("State", bound=HypothesisSet[Any])
 
 
 @dataclass(kw_only=True)
-class ReplayRecord(Generic[State]):
+class ReplayRecord(Generic[StateT]):
     """What a filter needs to process one time again, and the state and the events that result.
 
     ``parameters``, with the target's model, apply from the record before to this one; ``shocks`` change the rates after it.
@@ -27,36 +25,36 @@ class ReplayRecord(Generic[State]):
     time_ns: int
     parameters: MekfParameters
     shocks: list[Shock] = field(default_factory=list)
-    state: State | None = None
+    state: StateT | None = None
     events: tuple[EstimatorEvent, ...] = ()
 
 
-Record = TypeVar("Record", bound=ReplayRecord[Any])
+RecordT = TypeVar("RecordT", bound=ReplayRecord[Any])
 
 
 @dataclass
-class ReplayBuffer(Generic[Record, State]):
+class ReplayBuffer(Generic[RecordT, StateT]):
     """Records in order of time.
 
     base: the state just before the records. pending: events of no record, not yet drained. drained: events of records that are.
     """
 
-    records: list[Record] = field(default_factory=list)
-    base: State | None = None
+    records: list[RecordT] = field(default_factory=list)
+    base: StateT | None = None
     pending: list[EstimatorEvent] = field(default_factory=list)
     drained: set[EstimatorEvent] = field(default_factory=set)
 
     @property
-    def newest(self) -> State | None:
+    def newest(self) -> StateT | None:
         """Return the state after the newest record."""
         return self.records[-1].state if self.records else self.base
 
-    def state_at(self, time_ns: int) -> State | None:
+    def state_at(self, time_ns: int) -> StateT | None:
         """Return the state after the records up to ``time_ns``."""
         i = bisect_right(self.records, time_ns, key=lambda r: r.time_ns)
         return self.records[i - 1].state if i > 0 else self.base
 
-    def find(self, time_ns: int) -> tuple[int, Record | None]:
+    def find(self, time_ns: int) -> tuple[int, RecordT | None]:
         """Return the record of ``time_ns``, or None, and the index at which it is or belongs."""
         i = bisect_left(self.records, time_ns, key=lambda r: r.time_ns)
         found = i < len(self.records) and self.records[i].time_ns == time_ns
@@ -65,7 +63,7 @@ class ReplayBuffer(Generic[Record, State]):
     def replay(
         self,
         first: int,
-        process: Callable[[State | None, Record], tuple[State, tuple[EstimatorEvent, ...]]],
+        process: Callable[[StateT | None, RecordT], tuple[StateT, tuple[EstimatorEvent, ...]]],
     ) -> None:
         """Process the records from index ``first`` on; ``process`` maps the state before and the record to the state after."""
         state = self.records[first - 1].state if first > 0 else self.base
@@ -98,7 +96,7 @@ class ReplayBuffer(Generic[Record, State]):
         self.pending = []
         return events
 
-    def with_newest_only(self) -> ReplayBuffer[Record, State]:
+    def with_newest_only(self) -> ReplayBuffer[RecordT, StateT]:
         """Return the buffer with its newest record alone."""
         if len(self.records) < 2:
             return self
@@ -106,7 +104,7 @@ class ReplayBuffer(Generic[Record, State]):
         return replace(self, records=[newest], base=self.records[-2].state, drained=drained)
 
 
-class ReplayingFilter(Generic[Record, State]):
+class ReplayingFilter(Generic[RecordT, StateT]):
     """What both Kalman filters share: the model of the target, the buffer of what can be processed again, events, counters.
 
     target: model of the target, and parameters of its estimate. Counters: ``accepted`` and ``gated`` measurements,
@@ -117,7 +115,7 @@ class ReplayingFilter(Generic[Record, State]):
         self.target = target
         self.late_dropped = 0
         self.duplicates = 0
-        self._buffer = ReplayBuffer[Record, State]()
+        self._buffer = ReplayBuffer[RecordT, StateT]()
         self._was_lost = False
 
     @property

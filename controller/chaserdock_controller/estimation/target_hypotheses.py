@@ -38,11 +38,11 @@ class TargetHypothesis:
     log_likelihood: float = field(default=0.0, kw_only=True)
 
 
-Hypothesis = TypeVar("Hypothesis", bound=TargetHypothesis)
+HypothesisT = TypeVar("HypothesisT", bound=TargetHypothesis)
 
 
 @dataclass(frozen=True, eq=False)
-class HypothesisSet(Generic[Hypothesis]):
+class HypothesisSet(Generic[HypothesisT]):
     """State of a filter at ``time_ns``.
 
     hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is unresolved.
@@ -50,7 +50,7 @@ class HypothesisSet(Generic[Hypothesis]):
     """
 
     time_ns: int
-    hypotheses: tuple[Hypothesis, ...] = ()
+    hypotheses: tuple[HypothesisT, ...] = ()
     ambiguous_since_ns: int = 0
     last_accepted_ns: int = 0
     seen: tuple[int, ...] = ()
@@ -60,7 +60,7 @@ class HypothesisSet(Generic[Hypothesis]):
     reinitialisations: int = 0
 
 
-State = TypeVar("State", bound=HypothesisSet[Any])
+StateT = TypeVar("StateT", bound=HypothesisSet[Any])
 
 
 class TargetRates(NamedTuple):
@@ -94,13 +94,13 @@ def widened(covariance: Array, variances: Array, first: int = 0) -> Array:
     return wider
 
 
-def with_uncertain_rates(h: Hypothesis, p: MekfParameters) -> Hypothesis:
+def with_uncertain_rates(h: HypothesisT, p: MekfParameters) -> HypothesisT:
     """Return the hypothesis with the additional variances of a re-initialization."""
     added = rate_variances(p.reinitialised_velocity_m_s, p.reinitialised_omega_rad_s)
     return replace(h, covariance=widened(h.covariance, added))
 
 
-def apply_shocks(state: State, shocks: Sequence[Shock]) -> State:
+def apply_shocks(state: StateT, shocks: Sequence[Shock]) -> StateT:
     """Add the known part of ``shocks`` to the rates of every hypothesis, and the unknown part to the covariance."""
     for shock in shocks:
         added = rate_variances(shock.sigma_velocity_m_s, shock.sigma_omega_rad_s)
@@ -170,7 +170,7 @@ def difference(a: TargetHypothesis, b: TargetHypothesis) -> Array:
     return np.concatenate(moved)
 
 
-def count_measurements(state: State, accepted: Sequence[int], rejected: Sequence[int]) -> State:
+def count_measurements(state: StateT, accepted: Sequence[int], rejected: Sequence[int]) -> StateT:
     """Return the state with the chasers whose measurements were accepted and rejected at its time."""
     return replace(
         state,
@@ -182,7 +182,7 @@ def count_measurements(state: State, accepted: Sequence[int], rejected: Sequence
     )
 
 
-def before_restart(state: State) -> State:
+def before_restart(state: StateT) -> StateT:
     """Return the state in which the measurements of its time are not counted yet, and a re-initialization is."""
     return replace(
         state,
@@ -194,7 +194,7 @@ def before_restart(state: State) -> State:
     )
 
 
-def choose(state: State, p: MekfParameters, events: list[EstimatorEvent]) -> State:
+def choose(state: StateT, p: MekfParameters, events: list[EstimatorEvent]) -> StateT:
     """Sort the hypotheses by likelihood and drop those ruled out by log odds or timeout; append an event for that."""
     if len(state.hypotheses) < 2:
         return state

@@ -106,11 +106,13 @@ def pull_N(docking: Docking, in_phase_s: float) -> float:
     return docking.pull_N if into_s < docking.pull_s else -docking.pull_N
 
 
-Outcome = tuple[Trigger, str]
+TriggerReason = tuple[Trigger, str]
 """A trigger and its reason for the log."""
 
 
-def docking_trigger(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+def docking_trigger(
+    docking: Docking, now: PhaseProgress, observed: DockingObservation
+) -> TriggerReason | None:
     """Return the condition that ends the phase, with its reason, or None to stay."""
     if observed.latched and now.phase in CORRIDOR:
         return Trigger.LATCH_CLOSED, "the latch closed"
@@ -118,11 +120,11 @@ def docking_trigger(docking: Docking, now: PhaseProgress, observed: DockingObser
     return None if check is None else check(docking, now, observed)
 
 
-def _failed(reason: str) -> Outcome:
+def _failed(reason: str) -> TriggerReason:
     return Trigger.ATTEMPT_FAILED, reason
 
 
-def _check_align(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+def _check_align(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> TriggerReason | None:
     if now.move_complete and now.inside_s >= _ALIGNED_S:
         return Trigger.ALIGNED, "aligned"
     if now.in_phase_s > docking.align_timeout_s:
@@ -131,7 +133,9 @@ def _check_align(docking: Docking, now: PhaseProgress, observed: DockingObservat
     return None
 
 
-def _check_approach(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+def _check_approach(
+    docking: Docking, now: PhaseProgress, observed: DockingObservation
+) -> TriggerReason | None:
     if fault := observed.view.fault(docking.corridor, docking.corridor.closing_m_s):
         return _failed(f"left the corridor: {fault}")
     if now.reference_gap_m <= docking.final_m:
@@ -142,7 +146,7 @@ def _check_approach(docking: Docking, now: PhaseProgress, observed: DockingObser
     return None
 
 
-def _check_final(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+def _check_final(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> TriggerReason | None:
     if observed.contact:
         return Trigger.TIP_CONTACT, "the tip touches"
     if fault := observed.view.fault(docking.final, docking.corridor.closing_m_s):
@@ -152,7 +156,9 @@ def _check_final(docking: Docking, now: PhaseProgress, observed: DockingObservat
     return None
 
 
-def _check_contact(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+def _check_contact(
+    docking: Docking, now: PhaseProgress, observed: DockingObservation
+) -> TriggerReason | None:
     if fault := observed.view.fault(docking.corridor, docking.corridor.closing_m_s):
         return _failed(f"left the corridor: {fault}")
     if now.in_phase_s > docking.contact_timeout_s:
@@ -160,7 +166,9 @@ def _check_contact(docking: Docking, now: PhaseProgress, observed: DockingObserv
     return None
 
 
-def _check_latched(docking: Docking, now: PhaseProgress, observed: DockingObservation) -> Outcome | None:
+def _check_latched(
+    docking: Docking, now: PhaseProgress, observed: DockingObservation
+) -> TriggerReason | None:
     if not observed.latched:
         return _failed("the latch opened")
     if now.phase is not Phase.LATCHED or now.held is None:
@@ -176,7 +184,7 @@ def _check_latched(docking: Docking, now: PhaseProgress, observed: DockingObserv
     return None
 
 
-_CHECKS: dict[Phase, Callable[[Docking, PhaseProgress, DockingObservation], Outcome | None]] = {
+_CHECKS: dict[Phase, Callable[[Docking, PhaseProgress, DockingObservation], TriggerReason | None]] = {
     Phase.ALIGN: _check_align,
     Phase.APPROACH: _check_approach,
     Phase.FINAL: _check_final,

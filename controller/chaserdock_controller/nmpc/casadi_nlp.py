@@ -18,7 +18,7 @@ import numpy as np
 from .problem import Nlp, build_nlp
 from .slack import slack_l1_weight
 from .types import Array, NmpcInput, NmpcParameters, NmpcPlan
-from .warm_start import Frame, Task, status_of
+from .warm_start import Frame, PreparedProblem, status_of
 
 MAX_ITERATIONS = 200
 # Return codes for a usable solution, and for the iteration limit.
@@ -26,7 +26,7 @@ _GOOD = ("Solve_Succeeded", "Solved_To_Acceptable_Level")
 _LIMIT = ("Maximum_Iterations_Exceeded", "1")  # ipopt's and fatrop's
 
 
-def pack(params: NmpcParameters, task: Task) -> Array:
+def pack(params: NmpcParameters, task: PreparedProblem) -> Array:
     """Return the parameter vector p of `Nlp`."""
     p = task.problem
     parts: list[Any] = []
@@ -39,7 +39,7 @@ def pack(params: NmpcParameters, task: Task) -> Array:
     return np.concatenate(parts)
 
 
-def row_floor(nlp: Nlp, task: Task) -> Array:
+def row_floor(nlp: Nlp, task: PreparedProblem) -> Array:
     """Return the lower bounds (D, rows) of the distances: zero, and inactive where there is no corridor."""
     floor = np.zeros((nlp.stages, nlp.rows))
     used = np.any(task.corridors[:, 1:, :3] != 0.0, axis=-1)

@@ -170,7 +170,7 @@ class _Rows(Structure):
 
 
 @dataclass(frozen=True)
-class Rows:
+class HalfSpaceRows:
     """Half-spaces a' dp_k >= c of each chaser: stage (N, M), a (N, M, 3), c (N, M); the first n_rows (N,) are used."""
 
     stage: IntArray
@@ -179,14 +179,14 @@ class Rows:
     n_rows: IntArray
 
 
-def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> Rows:
+def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> HalfSpaceRows:
     """Build the rows of all chasers about rollouts x (N, D+1, 13); ``problem`` as `check_input` returns it.
 
     reach_m (N, D+1): how far admissible inputs can move a chaser from its rollout.
     """
     n, nodes, _ = x.shape
     width = (nodes - 1) * (n + 2)
-    rows = Rows(
+    rows = HalfSpaceRows(
         np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64)
     )  # fmt: skip
     zones, reach = _zones(problem, outer_m), np.ascontiguousarray(reach_m)

@@ -27,7 +27,7 @@ from .types import (
 
 
 @dataclass(frozen=True)
-class Task:
+class PreparedProblem:
     """A checked problem, the ids of its rows, and the initial inputs (N, D, 6) within the box."""
 
     problem: NmpcInput
@@ -61,27 +61,29 @@ class Frame:
         function("solve_tick")  # load the library before the first tick
         self.model, self.weights = model_of(self.params), Weights(self.params)
 
-    def begin(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None) -> Task:
+    def begin(self, problem: NmpcInput, shift_s: float, ids: Sequence[int] | None) -> PreparedProblem:
         """Check the problem and compute the warm start. Raises ValueError as the checks in `checks`."""
         checked = check_input(problem, self.params, self.n_max)
         names = check_ids(ids, len(checked.states))
         start = warm_start(self.plans, names, checked, check_shift(shift_s), self.params.dt_s)
-        return Task(checked, names, start)
+        return PreparedProblem(checked, names, start)
 
-    def rolled(self, task: Task, u: Array) -> Array:
+    def rolled(self, task: PreparedProblem, u: Array) -> Array:
         """Return the states (N, D+1, 13) of inputs ``u`` (N, D, 6) through the nonlinear model."""
         x = np.empty((len(u), self.params.stages + 1, 13))
         x[:, 0] = task.problem.states
         roll(self.model, x, u)
         return x
 
-    def evaluate(self, task: Task, x: Array, u: Array) -> tuple[Array, Array]:
+    def evaluate(self, task: PreparedProblem, x: Array, u: Array) -> tuple[Array, Array]:
         """Return the cost (eq. 6) (N,) and the deepest violation, m (N,), of a plan."""
         p = task.problem
         cost = plan_cost(self.weights, x, u, p.references, p.u_ref)
         return cost, plan_violation(p, x, self.params.max_reference_distance_m)
 
-    def finish(self, task: Task, u: Array, status: Sequence[str], iterations: IntArray) -> NmpcPlan:
+    def finish(
+        self, task: PreparedProblem, u: Array, status: Sequence[str], iterations: IntArray
+    ) -> NmpcPlan:
         """Return the plan of inputs ``u`` and keep it as the next warm start.
 
         ``status``: the back end's status of each row. A row at the iteration limit uses the better of its solution and

@@ -20,7 +20,7 @@ from chaserdock_controller.estimation import Mekf
 from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
 from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import JointFilterState, TickRecord
+from chaserdock_controller.estimation.joint.estimator import JointFilterState, JointTickRecord
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.replay import ReplayBuffer
@@ -32,7 +32,7 @@ from chaserdock_controller.ingest.odometry_validation import Known, OdometryVali
 
 from .serialization import decode, encode
 
-Part = TypeVar("Part", bound=Struct)
+PartT = TypeVar("PartT", bound=Struct)
 
 
 class CheckpointError(ValueError):
@@ -116,7 +116,7 @@ class JointEstimatorState(Struct, forbid_unknown_fields=True, tag=True):
     target: MekfParameters
     late_dropped: int
     duplicates: int
-    _buffer: ReplayBuffer[TickRecord, JointFilterState]
+    _buffer: ReplayBuffer[JointTickRecord, JointFilterState]
     _was_lost: bool
 
 
@@ -225,7 +225,7 @@ class Checkpoint:
         return vars(self._core.planning.solver).get("_frame")
 
 
-def _read(owner: Any, kind: type[Part]) -> Part:
+def _read(owner: Any, kind: type[PartT]) -> PartT:
     values = vars(owner)
     return kind(**{name: values[name] for name in kind.__struct_fields__})
 

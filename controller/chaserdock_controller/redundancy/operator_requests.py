@@ -8,22 +8,22 @@ from collections.abc import Callable
 
 from chaserdock_protocol.messages import CommandReply, OperatorCommand, Tick
 
-Reply = Callable[[CommandReply], None]
+SendReply = Callable[[CommandReply], None]
 
 
 class OperatorRequests:
     """Requests with the functions that send their replies."""
 
     def __init__(self) -> None:
-        self._requests: list[tuple[OperatorCommand, Reply]] = []
+        self._requests: list[tuple[OperatorCommand, SendReply]] = []
         self._lock = threading.Lock()
 
-    def add(self, command: OperatorCommand, reply: Reply) -> None:
+    def add(self, command: OperatorCommand, reply: SendReply) -> None:
         """Add a request; may be called on any thread."""
         with self._lock:
             self._requests.append((command, reply))
 
-    def take(self) -> list[tuple[OperatorCommand, Reply]]:
+    def take(self) -> list[tuple[OperatorCommand, SendReply]]:
         """Return and remove all requests."""
         with self._lock:
             requests, self._requests = self._requests, []

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-State = TypeVar("State")
+Decoded = TypeVar("Decoded")
 
 _DTYPES = {"f": np.float64, "i": np.int64, "b": np.bool_}
 
@@ -28,7 +28,7 @@ def encode(state: Any) -> bytes:
     return _ENCODER.encode(state)
 
 
-def decode(data: bytes, kind: type[State]) -> State:
+def decode(data: bytes, kind: type[Decoded]) -> Decoded:
     """Return the object of type ``kind`` that ``encode`` made ``data`` of.
 
     Raises ValueError (msgspec's errors are ones) for anything else, and for a number that is NaN.

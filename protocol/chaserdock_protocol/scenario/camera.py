@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 
 from .fields import Fraction, NotNegative, Number, Positive, Section, Vector
 
-Pixels = Annotated[int, Field(ge=64, le=4096)]
+SidePixels = Annotated[int, Field(ge=64, le=4096)]
 REPLACED_BY_INTRINSICS = ("width_px", "height_px", "hfov_deg")
 
 
@@ -53,8 +53,8 @@ class Effects(Section):
 class Intrinsics(Section):
     """Camera matrix and lens distortion of a calibration."""
 
-    width_px: Pixels = Field(description="Image width, pixels.")
-    height_px: Pixels = Field(description="Image height, pixels.")
+    width_px: SidePixels = Field(description="Image width, pixels.")
+    height_px: SidePixels = Field(description="Image height, pixels.")
     fx_px: Positive = Field(description="Focal length along x, pixels.")
     fy_px: Positive = Field(description="Focal length along y, pixels.")
     cx_px: Number = Field(description="Principal point, x, pixels.")
@@ -105,8 +105,8 @@ class EarthSection(Section):
 class FlightCamera(Section):
     """The calibration of every chaser's camera. It looks along +X of CRF, its top towards +Z."""
 
-    width_px: Pixels = Field(default=1280, description="Image width, pixels.")
-    height_px: Pixels = Field(default=720, description="Image height, pixels.")
+    width_px: SidePixels = Field(default=1280, description="Image width, pixels.")
+    height_px: SidePixels = Field(default=720, description="Image height, pixels.")
     hfov_deg: float = Field(
         default=60.0, gt=5, lt=150, allow_inf_nan=False, description="Horizontal field of view, degrees."
     )

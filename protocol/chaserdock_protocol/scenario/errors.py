@@ -14,7 +14,7 @@ from pydantic import BaseModel, ValidationError
 from chaserdock_protocol.errors import ChaserdockError
 
 from .fields import LARGEST
-from .json_schema import Node, expected_text, key_paths, node_at, schema_of
+from .json_schema import SchemaNode, expected_text, key_paths, node_at, schema_of
 
 _LONGEST_VALUE = 60
 _WITH_BOUNDS = ("greater_than_equal", "less_than_equal")
@@ -57,7 +57,7 @@ def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
     return lines
 
 
-def _line(error: Any, root: Node) -> str:
+def _line(error: Any, root: SchemaNode) -> str:
     path, kind, value = error["loc"], error["type"], error.get("input")
     if kind == "extra_forbidden":
         return unknown_key(path, root)
@@ -85,7 +85,7 @@ def _line(error: Any, root: Node) -> str:
     return f"{path_text(path) or '(scenario)'}: {message}{shown}"
 
 
-def unknown_key(path: Sequence[str | int], root: Node) -> str:
+def unknown_key(path: Sequence[str | int], root: SchemaNode) -> str:
     """Return the line for an unknown key, with the nearest known one or all keys of its table."""
     *above, key = path
     table = node_at(root, above) or {}

@@ -14,16 +14,16 @@ from pydantic import BaseModel
 from .fields import LARGEST
 from .migrations import FORMAT
 
-Node = dict[str, Any]
+SchemaNode = dict[str, Any]
 
 
 @cache
-def schema_of(model: type[BaseModel]) -> Node:
+def schema_of(model: type[BaseModel]) -> SchemaNode:
     """Return the JSON schema of a model, as pydantic derives it."""
     return model.model_json_schema()
 
 
-def resolved(node: Node, root: Node) -> Node:
+def resolved(node: SchemaNode, root: SchemaNode) -> SchemaNode:
     """Return the node that a reference, or an optional value, stands for."""
     while True:
         if "$ref" in node:
@@ -35,7 +35,7 @@ def resolved(node: Node, root: Node) -> Node:
         node = options[0]
 
 
-def item_of(node: Node, index: int = 0) -> Node | None:
+def item_of(node: SchemaNode, index: int = 0) -> SchemaNode | None:
     """Return the schema of an array's element."""
     fixed = node.get("prefixItems")
     if fixed:
@@ -43,9 +43,9 @@ def item_of(node: Node, index: int = 0) -> Node | None:
     return node.get("items")
 
 
-def node_at(root: Node, path: Sequence[str | int]) -> Node | None:
+def node_at(root: SchemaNode, path: Sequence[str | int]) -> SchemaNode | None:
     """Return the schema of the value at a path, or None for an unknown key."""
-    node: Node | None = root
+    node: SchemaNode | None = root
     for part in path:
         node = resolved(node, root)
         node = item_of(node, part) if isinstance(part, int) else node.get("properties", {}).get(part)
@@ -54,7 +54,7 @@ def node_at(root: Node, path: Sequence[str | int]) -> Node | None:
     return resolved(node, root)
 
 
-def description_of(node: Node, root: Node) -> str:
+def description_of(node: SchemaNode, root: SchemaNode) -> str:
     """Return the description of a key, or of the table that is its value."""
     if "description" in node:
         return node["description"]
@@ -69,7 +69,7 @@ def number_text(value: float) -> str:
     return str(int(value)) if float(value).is_integer() and abs(value) < 1e10 else f"{value:g}"
 
 
-def range_text(node: Node, every: bool = False) -> str:
+def range_text(node: SchemaNode, every: bool = False) -> str:
     """Return the range of a number in words. ``every``: include the bound that all numbers have."""
     bounds = {k: node[k] for k in ("minimum", "exclusiveMinimum", "maximum", "exclusiveMaximum") if k in node}
     if not every:
@@ -86,14 +86,14 @@ def range_text(node: Node, every: bool = False) -> str:
     return " and ".join(f"{words[k]} {v}" for k, v in text.items())
 
 
-def _count_text(node: Node) -> str:
+def _count_text(node: SchemaNode) -> str:
     low, high = node.get("minItems", 0), node.get("maxItems")
     if high is None:
         return f"at least {low} " if low else ""
     return f"{low} " if low == high else f"{low} to {high} " if low else f"at most {high} "
 
 
-def expected_text(node: Node, root: Node, every: bool = False) -> str:
+def expected_text(node: SchemaNode, root: SchemaNode, every: bool = False) -> str:
     """Return in words what a value must be, such as "a number greater than 0"; empty if the schema does not say."""
     if "enum" in node:
         return f"one of {', '.join(map(str, node['enum']))}"
@@ -111,10 +111,10 @@ def expected_text(node: Node, root: Node, every: bool = False) -> str:
     return {"boolean": "true or false", "string": "text", "object": "a table"}.get(str(kind), "")
 
 
-def key_paths(root: Node) -> Iterator[str]:
+def key_paths(root: SchemaNode) -> Iterator[str]:
     """Yield the dotted path of every key; ``N`` stands for the number of an array's element."""
 
-    def walk(node: Node, path: str) -> Iterator[str]:
+    def walk(node: SchemaNode, path: str) -> Iterator[str]:
         node = resolved(node, root)
         if (item := item_of(node)) is not None:
             yield from walk(item, f"{path}.N")
@@ -126,7 +126,7 @@ def key_paths(root: Node) -> Iterator[str]:
     return walk(root, "")
 
 
-def editor_schema(model: type[BaseModel]) -> Node:
+def editor_schema(model: type[BaseModel]) -> SchemaNode:
     """Return the schema of scenario files for editors (draft 7, which taplo and VS Code's Even Better TOML support).
 
     It describes files as written: with ``extends`` no other key is required, and ``model`` may be a path.

@@ -14,8 +14,8 @@ from .fields import Section
 Metres = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 MetresPerSecond = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Degrees = Annotated[float, Field(ge=0, le=90, allow_inf_nan=False)]
-Pixels = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
-Share = Annotated[float, Field(ge=0, le=0.1, allow_inf_nan=False)]
+OffsetPixels = Annotated[float, Field(ge=0, le=100, allow_inf_nan=False)]
+FocalShare = Annotated[float, Field(ge=0, le=0.1, allow_inf_nan=False)]
 Duration = Annotated[float, Field(ge=0.1, le=1e6, allow_inf_nan=False)]
 
 GRADES: dict[str, dict[str, float]] = {
@@ -166,10 +166,10 @@ class NavigationSection(Section):
     camera_shift_m: Metres | None = Field(
         default=None, description="Shift of each camera from its calibrated position (CRF), m."
     )
-    camera_focal_share: Share | None = Field(
+    camera_focal_share: FocalShare | None = Field(
         default=None, description="Relative error of each camera's focal length."
     )
-    camera_centre_px: Pixels | None = Field(
+    camera_centre_px: OffsetPixels | None = Field(
         default=None, description="Error of each camera's principal point, pixels."
     )
 

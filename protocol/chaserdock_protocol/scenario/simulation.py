@@ -10,7 +10,7 @@ from pydantic import Field
 from .faults import Process
 from .fields import NotNegative, Positive, Section
 
-Share = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
+MessageShare = Annotated[float, Field(ge=0, le=0.5, allow_inf_nan=False)]
 Delay = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -61,9 +61,11 @@ class SimulationSection(Section):
     jitter_s: Delay = Field(
         default=0.0, description="Mean of an exponentially distributed further latency, s."
     )
-    loss: Share = Field(default=0.0, description="Share of the messages that are lost.")
-    duplicate: Share = Field(default=0.0, description="Share of the messages that arrive twice.")
-    reorder: Share = Field(default=0.0, description="Share of the messages that later ones may overtake.")
+    loss: MessageShare = Field(default=0.0, description="Share of the messages that are lost.")
+    duplicate: MessageShare = Field(default=0.0, description="Share of the messages that arrive twice.")
+    reorder: MessageShare = Field(
+        default=0.0, description="Share of the messages that later ones may overtake."
+    )
     partition: tuple[Partition, ...] = Field(default=(), max_length=20)
     slow: tuple[SlowReader, ...] = Field(default=(), max_length=20)
     clock: tuple[ProcessClock, ...] = Field(default=(), max_length=20)

@@ -12,10 +12,9 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from .fields import Index, Number, Positive, Section, Vector
-from .navigation import Degrees, Duration, Metres, Pixels
-from .navigation import Share as FocalShare
+from .navigation import Degrees, Duration, FocalShare, Metres, OffsetPixels
 
-Share = Annotated[float, Field(ge=0, le=0.3, allow_inf_nan=False)]
+MismatchShare = Annotated[float, Field(ge=0, le=0.3, allow_inf_nan=False)]
 Offset = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Force = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
 Torque = Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)]
@@ -41,15 +40,17 @@ class ChaserTruth(Section):
     """Differences of each chaser's body and actuators: standard deviations per axis, drawn from the seed once per chaser
     and limited to three of them, unless stated otherwise. Without a figure: that of the preset."""
 
-    mass_share: Share | None = Field(default=None, description="Relative error of the mass.")
-    inertia_share: Share | None = Field(default=None, description="Relative error of each principal moment.")
+    mass_share: MismatchShare | None = Field(default=None, description="Relative error of the mass.")
+    inertia_share: MismatchShare | None = Field(
+        default=None, description="Relative error of each principal moment."
+    )
     inertia_turn_deg: Degrees | None = Field(
         default=None, description="Turn of the principal axes against CRF (rotation vector), degrees."
     )
     centre_of_mass_m: Offset | None = Field(
         default=None, description="Offset of the centre of mass from CRF's origin, m."
     )
-    thrust_share: Share | None = Field(
+    thrust_share: MismatchShare | None = Field(
         default=None,
         description="Relative error of each thruster's thrust; with ideal actuation, of force and torque per axis.",
     )
@@ -57,7 +58,7 @@ class ChaserTruth(Section):
         default=None,
         description="Error of each thruster's direction; with ideal actuation, of force and torque (rotation vector), degrees.",
     )
-    pulse_scatter_share: Share | None = Field(
+    pulse_scatter_share: MismatchShare | None = Field(
         default=None,
         description="Relative scatter of each pulse's width, not below the minimum on-time; with ideal actuation, of each "
         "command per axis.",
@@ -92,8 +93,10 @@ class TargetTruth(Section):
     """Differences of the target: standard deviations per axis. Mass, inertia and centre of mass need
     `target.motion = "torque_free"`. Without a figure: that of the preset."""
 
-    mass_share: Share | None = Field(default=None, description="Relative error of the mass.")
-    inertia_share: Share | None = Field(default=None, description="Relative error of each principal moment.")
+    mass_share: MismatchShare | None = Field(default=None, description="Relative error of the mass.")
+    inertia_share: MismatchShare | None = Field(
+        default=None, description="Relative error of each principal moment."
+    )
     inertia_turn_deg: Degrees | None = Field(
         default=None, description="Turn of the principal axes against TRF (rotation vector), degrees."
     )
@@ -111,7 +114,7 @@ class CameraTruth(Section):
     turn_deg: Degrees = Field(default=0.0, description="Rotation of the mounting, degrees.")
     shift_m: Metres = Field(default=0.0, description="Shift of the lens, m.")
     focal_share: FocalShare = Field(default=0.0, description="Relative error of the focal length.")
-    centre_px: Pixels = Field(default=0.0, description="Error of the principal point, pixels.")
+    centre_px: OffsetPixels = Field(default=0.0, description="Error of the principal point, pixels.")
 
 
 class SensorTruth(Section):

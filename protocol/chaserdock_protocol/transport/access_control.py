@@ -16,7 +16,7 @@ from chaserdock_protocol.topics import TOPICS, Role, Topic, may_read, may_write
 
 
 @dataclass(frozen=True)
-class Query:
+class QueryAccess:
     """A query key, the roles that may query it, and the role that replies."""
 
     key: str
@@ -26,10 +26,10 @@ class Query:
 
 # A starting world also queries the join key, to detect another world.
 QUERIES = (
-    Query(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
-    Query(topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"),
-    Query(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
-    Query(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
+    QueryAccess(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
+    QueryAccess(topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"),
+    QueryAccess(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
+    QueryAccess(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
 )
 OBSERVERS: frozenset[Role] = frozenset({"analysis", "viewer"})
 """Roles that publish nothing and have no process name on the network."""

@@ -13,21 +13,19 @@ from chaserdock_protocol.scenario import Scenario
 from .ideal import Actuators
 from .thrusters import ThrusterActuators
 
-Reply = Callable[[CommandReply], None]
-
 
 class ThrusterFaultHandler:
     """Collects thruster fault commands and applies them at the next tick. The chaser is not informed."""
 
     def __init__(self, scenario: Scenario, actuators: Mapping[str, Actuators]) -> None:
         self._scenario, self._actuators = scenario, actuators
-        self._requests: list[tuple[ThrusterFaultCommand, Reply]] = []
+        self._requests: list[tuple[ThrusterFaultCommand, Callable[[CommandReply], None]]] = []
         self._state: dict[tuple[int, int], tuple[str, float | None]] = {
             (f.chaser, f.thruster): (f.kind, f.factor) for f in scenario.thruster_failure
         }
         self._lock = threading.Lock()
 
-    def submit(self, command: ThrusterFaultCommand, reply: Reply) -> None:
+    def submit(self, command: ThrusterFaultCommand, reply: Callable[[CommandReply], None]) -> None:
         """Queue a command; the next ``apply_pending`` replies to it. Runs on Zenoh's thread."""
         with self._lock:
             self._requests.append((command, reply))

@@ -47,7 +47,7 @@ VisibleBox = np.dtype(
 )  # fmt: skip
 """native/scene.c: a visible box: number of its shape, pose in IRF, and the pixels that bound its outline."""
 
-Face = np.dtype(
+VisibleFace = np.dtype(
     [
         ("box", float), ("side", float), ("in_front", float), ("width_m", float), ("height_m", float),
         ("centre", float, 3), ("right", float, 3), ("up", float, 3), ("normal", float, 3),
@@ -134,7 +134,7 @@ def visible_faces(
     ``camera_pose`` (7,): position in WRF and attitude IRF to WRF; ``poses`` (bodies, 7): of the bodies, body to WRF.
     """
     n = len(shapes.table)
-    boxes, faces, counts = np.empty(n, VisibleBox), np.empty(6 * n, Face), np.zeros(2, np.int64)
+    boxes, faces, counts = np.empty(n, VisibleBox), np.empty(6 * n, VisibleFace), np.zeros(2, np.int64)
     function("visible_faces")(
         byref(frustum.native), address(camera_pose), address(poses), c_int64(n), address(shapes.table),
         address(_FACE_AXES), address(boxes), address(faces), address(counts),

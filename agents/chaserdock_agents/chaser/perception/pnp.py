@@ -22,7 +22,7 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.targets import TargetModel, clear_margin_m
 from numpy.typing import NDArray
 
-from .refine import CameraPose, refine, residual_of, rotation_matrix
+from .refine import PoseInCamera, refine, residual_of, rotation_matrix
 from .views import count_visible_markers, marker_errors, squared_errors
 
 Indices = NDArray[np.intp]
@@ -122,7 +122,7 @@ class _DetectedMarkers:
         return np.repeat(1.0 / self.sigma, 8)
 
     @cached_property
-    def plane_poses(self) -> list[CameraPose]:
+    def plane_poses(self) -> list[PoseInCamera]:
         """Cached `_plane_poses`: for a single marker both its candidates and its two poses."""
         return _plane_poses(self)
 
@@ -197,7 +197,7 @@ def pose_covariance(
     s^2 (J'J)^-1 with s^2 = rss / (2n - 6), s at least ``floor_px``, of which the part above the floor counts ``common``
     times. None if the pose is not observable or has points behind the camera.
     """
-    pose = CameraPose(position, rotation)
+    pose = PoseInCamera(position, rotation)
     found = residual_of(camera.matrix(), points_trf_m, pixels, np.repeat(1.0 / sigma, 2), pose)
     if found is None:
         return None
@@ -224,14 +224,14 @@ def reprojection_rms_px(
     camera: Camera, points_trf_m: Array, pixels: Array, position: Array, rotation: Array
 ) -> float:
     """Return the root mean squared distance, ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2)."""
-    squares = squared_errors(camera, points_trf_m, pixels, CameraPose(position, rotation))
+    squares = squared_errors(camera, points_trf_m, pixels, PoseInCamera(position, rotation))
     return math.sqrt(float(squares.sum()) / len(squares))
 
 
-def _consensus(seen: _DetectedMarkers) -> tuple[CameraPose, list[int]] | None:
+def _consensus(seen: _DetectedMarkers) -> tuple[PoseInCamera, list[int]] | None:
     """Return the refined pose with the most inliers, and their indices in ``seen``, ascending."""
     which: list[int] = seen.which.tolist()
-    best: tuple[tuple[int, float], CameraPose, list[float]] | None = None
+    best: tuple[tuple[int, float], PoseInCamera, list[float]] | None = None
     for candidate in _candidates(seen):
         candidate_error = _marker_errors(seen, candidate)
         # Distinct ids: of two detections of one id at most one is right.
@@ -266,7 +266,7 @@ def _consensus(seen: _DetectedMarkers) -> tuple[CameraPose, list[int]] | None:
     return pose, used
 
 
-def _candidates(seen: _DetectedMarkers) -> Iterator[CameraPose]:
+def _candidates(seen: _DetectedMarkers) -> Iterator[PoseInCamera]:
     """Yield coarse poses, the most likely first."""
     if len(seen.which) == 1:
         yield from seen.plane_poses
@@ -279,18 +279,18 @@ def _candidates(seen: _DetectedMarkers) -> Iterator[CameraPose]:
     except cv2.error:  # degenerate corners
         rvecs, tvecs = (), ()
     for rvec, tvec in zip(rvecs[:1], tvecs[:1], strict=True):
-        yield CameraPose(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
+        yield PoseInCamera(np.asarray(tvec, dtype=float).ravel(), rotation_matrix(rvec))
     size = np.abs(seen.pixels[:, (1, 2, 3, 0)] - seen.pixels).sum(axis=-1).min(axis=-1)
     for i in np.argsort(-size, kind="stable")[:_CANDIDATE_MARKERS].tolist():
         yield from seen.part([i]).plane_poses
 
 
-def _refined(seen: _DetectedMarkers, pose: CameraPose) -> CameraPose | None:
+def _refined(seen: _DetectedMarkers, pose: PoseInCamera) -> PoseInCamera | None:
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     return refine(seen.camera.matrix(), points, pixels, seen.weight, pose)
 
 
-def _plane_poses(seen: _DetectedMarkers) -> list[CameraPose]:
+def _plane_poses(seen: _DetectedMarkers) -> list[PoseInCamera]:
     """Return both IPPE poses from points in the plane of the first marker, or SQPnP's pose where IPPE fails."""
     to_trf, origin = seen.table.rotations[seen.which[0]], seen.table.origins[seen.which[0]]
     flat = (seen.points.reshape(-1, 3) - origin) @ to_trf
@@ -308,7 +308,7 @@ def _plane_poses(seen: _DetectedMarkers) -> list[CameraPose]:
         rotation = rotation_matrix(rvec) @ to_trf.T
         position = np.asarray(tvec, dtype=float).ravel() - rotation @ origin
         if _all_finite(rotation) and _all_finite(position):
-            poses.append(CameraPose(position, rotation))
+            poses.append(PoseInCamera(position, rotation))
     return poses
 
 
@@ -316,7 +316,7 @@ def _all_finite(values: Array) -> bool:
     return all(map(math.isfinite, values.ravel().tolist()))
 
 
-def _other_than(pose: CameraPose, candidates: list[CameraPose]) -> list[CameraPose]:
+def _other_than(pose: PoseInCamera, candidates: list[PoseInCamera]) -> list[PoseInCamera]:
     """Return ``candidates`` without the one that converges to the refined ``pose``, if of two one is several times nearer."""
     if len(candidates) != 2:
         return candidates
@@ -332,7 +332,7 @@ def _angle(a: Array, b: Array) -> float:
     return 2.0 * math.asin(min(math.sqrt(float(difference @ difference) / 8.0), 1.0))
 
 
-def _solutions(seen: _DetectedMarkers, poses: list[CameraPose], floor_px: float) -> list[TargetPose]:
+def _solutions(seen: _DetectedMarkers, poses: list[PoseInCamera], floor_px: float) -> list[TargetPose]:
     """Return refined, distinct poses, best first; later ones are about as likely as the first."""
     points, pixels = seen.points.reshape(-1, 3), seen.pixels.reshape(-1, 2)
     sigma = np.repeat(seen.sigma, 4)
@@ -368,12 +368,12 @@ def _one_of_each(which: list[int], error: list[float], gate_px: float) -> list[i
     return sorted(kept.values())
 
 
-def _marker_errors(seen: _DetectedMarkers, pose: CameraPose) -> list[float]:
+def _marker_errors(seen: _DetectedMarkers, pose: PoseInCamera) -> list[float]:
     return marker_errors(seen.camera, seen.points, seen.normals, seen.pixels, pose)
 
 
 def _is_single_marker_valid(camera: Camera, table: MarkerTable, row: int, solution: TargetPose) -> bool:
     """Return whether the pose of a single marker is observable and consistent with no other marker being detected."""
-    pose = CameraPose(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
+    pose = PoseInCamera(solution.position_irf_m, rotations.to_matrix(solution.q_irf_trf_wxyz))
     missing, cosine = count_visible_markers(camera, table.surface, row, pose, _FRAME_MARGIN_PX)
     return cosine >= MIN_SINGLE_COSINE and missing < _MAX_MISSING

@@ -17,7 +17,7 @@ _ZERO = np.zeros(3)
 
 
 @dataclass(frozen=True)
-class CameraPose:
+class PoseInCamera:
     """Pose of a target in the camera: ``position`` (3,) in IRF, metres; ``rotation`` (3, 3), TRF -> IRF."""
 
     position: Array
@@ -30,7 +30,7 @@ def rotation_matrix(rotation_vector: object) -> Array:
 
 
 def residual_of(
-    matrix: Array, points: Array, pixels: Array, weight: Array, pose: CameraPose
+    matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
 ) -> tuple[Array, Array] | None:
     """Return the weighted reprojection error (2n,) and its Jacobian (2n, 6) by a rotation phi in camera axes and by
     position, R_true = exp([phi]x) R; None for points behind the camera.
@@ -46,7 +46,9 @@ def residual_of(
     return (np.ravel(projected) - pixels.ravel()) * weight, jacobian[:, :6] * weight[:, None]
 
 
-def refine(matrix: Array, points: Array, pixels: Array, weight: Array, pose: CameraPose) -> CameraPose | None:
+def refine(
+    matrix: Array, points: Array, pixels: Array, weight: Array, pose: PoseInCamera
+) -> PoseInCamera | None:
     """Return the pose of minimum weighted squared error near ``pose``; None if points are behind the camera.
 
     Arguments as for `residual_of`; implemented in native/pose.c.
@@ -56,4 +58,4 @@ def refine(matrix: Array, points: Array, pixels: Array, weight: Array, pose: Cam
     out = np.empty(12)
     out[:3], out[3:] = pose.position, pose.rotation.ravel()
     refined = function("refine_pose", c_int64)(lens, *map(address, given), c_int64(len(points)), address(out))
-    return CameraPose(out[:3], out[3:].reshape(3, 3)) if refined else None
+    return PoseInCamera(out[:3], out[3:].reshape(3, 3)) if refined else None

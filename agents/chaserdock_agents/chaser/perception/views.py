@@ -14,11 +14,11 @@ from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 
 from .native import function
-from .refine import CameraPose
+from .refine import PoseInCamera
 
 
 def marker_errors(
-    camera: Camera, points_trf_m: Array, normals_trf: Array, pixels: Array, pose: CameraPose
+    camera: Camera, points_trf_m: Array, normals_trf: Array, pixels: Array, pose: PoseInCamera
 ) -> list[float]:
     """Return the largest corner error (n,) of each marker, pixels; infinite if behind the camera or facing away.
 
@@ -35,7 +35,7 @@ def marker_errors(
     return error.tolist()
 
 
-def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: CameraPose) -> Array:
+def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: PoseInCamera) -> Array:
     """Return squared distances (n,), ideal pixels, of projected points (n, 3) from ``pixels`` (n, 2); NaN for points
     behind the camera."""
     at, n = points_trf_m @ pose.rotation.T, len(points_trf_m)
@@ -46,7 +46,7 @@ def squared_errors(camera: Camera, points_trf_m: Array, pixels: Array, pose: Cam
 
 
 def count_visible_markers(
-    camera: Camera, surface_trf: Array, row: int, pose: CameraPose, frame_margin_px: float
+    camera: Camera, surface_trf: Array, row: int, pose: PoseInCamera, frame_margin_px: float
 ) -> tuple[int, float]:
     """Return how many markers other than ``row`` should be at least as visible if the pose is right, and the cosine of the
     viewing angle of that marker: 1 face-on, negative from behind.

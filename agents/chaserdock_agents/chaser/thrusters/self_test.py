@@ -12,11 +12,9 @@ from collections import deque
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from numpy.typing import NDArray
 
 from .allocation import Allocator
-
-Flags = NDArray[np.bool_]
+from .fault_detection import Flags
 
 _MIN_OBSERVATIONS = 2
 """Observations after which a thruster counts as known: a single one may be a disturbance."""

@@ -93,14 +93,14 @@ class JointFilterState(HypothesisSet[JointState]):
 
 
 @dataclass(kw_only=True)
-class TickRecord(ReplayRecord[JointFilterState]):
+class JointTickRecord(ReplayRecord[JointFilterState]):
     """A tick's inputs without sightings, and the sightings that were exposed at it, by chaser."""
 
     inputs: JointInputs
     sightings: dict[int, Sighting] = field(default_factory=dict)
 
 
-class JointEstimator(ReplayingFilter[TickRecord, JointFilterState]):
+class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
     """Estimate the target and the chasers from odometry, sightings and commands.
 
     Sightings that belong to no tick count as ``late_dropped``, too.
@@ -120,7 +120,7 @@ class JointEstimator(ReplayingFilter[TickRecord, JointFilterState]):
     def update(self, inputs: JointInputs) -> TargetState:
         """Process a tick and return the target's estimate at its time. Ticks must come in order."""
         records, own = self._buffer.records, replace(inputs, sightings=())
-        records.append(TickRecord(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
+        records.append(JointTickRecord(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
         first = len(records) - 1
         for sighting in sorted(inputs.sightings, key=lambda s: (s.sim_time_ns, s.chaser)):
             first = min(first, self._insert(sighting))
@@ -183,14 +183,14 @@ class JointEstimator(ReplayingFilter[TickRecord, JointFilterState]):
         return i
 
     def _process(
-        self, before: JointFilterState | None, record: TickRecord
+        self, before: JointFilterState | None, record: JointTickRecord
     ) -> tuple[JointFilterState, tuple[EstimatorEvent, ...]]:
         return process_tick(before, record, self.chasers, self._mounting, self._with(record.parameters))
 
 
 def process_tick(
     before: JointFilterState | None,
-    record: TickRecord,
+    record: JointTickRecord,
     chasers: int,
     mounting: CameraMounting,
     p: JointParameters,
@@ -217,7 +217,7 @@ def process_tick(
     return choose(now, p.target, events), tuple(events)
 
 
-def _propagate(state: JointState, record: TickRecord, p: JointParameters) -> JointState:
+def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -> JointState:
     """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured for long."""
     inputs = record.inputs
     state = predict(state, record.time_ns, inputs.impulses, p, inputs.latched, inputs.covered_s)

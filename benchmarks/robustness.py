@@ -135,9 +135,9 @@ def fly_all(flights: Sequence[Flight], jobs: int) -> Figures:
 def mean_figures(label: str, flights: Sequence[Array]) -> Figures:
     """Return the mean over flights, by name, and the largest NEES."""
     units = ("estimate_m", "estimate_rad", "tracking_m", "tracking_rad", "nees", "gated_share", "restarts")
-    values = dict(zip(units, np.mean(flights, axis=0), strict=True))
-    values["worst_nees"] = np.max([row[4] for row in flights])
-    return {f"{label}_{unit}": float(v) for unit, v in values.items() if not math.isnan(v)}
+    values = {unit: float(v) for unit, v in zip(units, np.mean(flights, axis=0), strict=True)}
+    values["worst_nees"] = max(float(row[4]) for row in flights)
+    return {f"{label}_{unit}": v for unit, v in values.items() if not math.isnan(v)}
 
 
 def grades(options: argparse.Namespace) -> Figures:

@@ -174,6 +174,7 @@ def test_no_false_alarm_with_another_plant_than_assumed(seed: int) -> None:
 def test_a_failure_is_found_with_another_plant_than_assumed(thruster: int, left: float) -> None:
     noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=4e-4)
     case = Case("tetra12", thruster, noise, odometry_noise=True, mismatched=True)
+    verdict = None
     for _ in range(200):
         asked = case.random()
         given = asked.copy()

@@ -32,7 +32,8 @@ from common import (
 
 from chaserdock.analysis.flight import load_flight
 from chaserdock.analysis.summary import summary_of
-from chaserdock.simulation.swarm import KINDS, draw_fault, toml
+from chaserdock.simulation.swarm import KINDS, draw_fault
+from chaserdock.toml_text import toml_value
 
 SCENARIO = "fault-drill"
 TIMEOUT_S = 300.0
@@ -66,7 +67,7 @@ def fly(number: int, mode: str) -> FaultResult:
     fault = fault_of(number)
     with tempfile.TemporaryDirectory() as folder:
         out, begin_s = Path(folder) / "run", time.monotonic()
-        changes = ("--mode", mode, "--set", f"fault=[{toml(fault)}]")
+        changes = ("--mode", mode, "--set", f"fault=[{toml_value(fault)}]")
         process = subprocess.Popen(
             chaserdock_command("run", SCENARIO, "--out", out, "-q", *changes),
             cwd=ROOT,
@@ -162,7 +163,7 @@ def main() -> None:
         append_line(options.out, asdict(result))
         log = "" if result.log_complete else ", log incomplete"
         print(
-            f"{number:4} {toml(result.fault)}: {result.outcome}{log}: {result.reason} ({result.wall_s:.0f} s)",
+            f"{number:4} {toml_value(result.fault)}: {result.outcome}{log}: {result.reason} ({result.wall_s:.0f} s)",
             flush=True,
         )
     flown = [results[n] for n in numbers]

@@ -3,17 +3,17 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
-from numbers import Integral, Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from chaserdock_protocol.errors import ChaserdockError
+
+from .toml_text import toml_value
 
 if TYPE_CHECKING:
     from chaserdock_protocol.scenario import Scenario
@@ -150,8 +150,13 @@ def list_scenarios() -> list[str]:
 
 def override_texts(overrides: Mapping[str, object] | None, changes: Mapping[str, object]) -> tuple[str, ...]:
     """Return overrides as ``key.path=VALUE`` in TOML's notation, nested tables flattened. Raises OverrideError."""
-    pairs = [*_flatten("", changes), *_flatten("", overrides or {})]
-    return tuple(f"{key}={_toml(key, value)}" for key, value in pairs)
+    texts: list[str] = []
+    for key, value in [*_flatten("", changes), *_flatten("", overrides or {})]:
+        try:
+            texts.append(f"{key}={toml_value(value)}")
+        except TypeError as error:
+            raise OverrideError(f"{key}: {error}") from None
+    return tuple(texts)
 
 
 def _flatten(prefix: str, table: Mapping[str, object]) -> Iterator[tuple[str, object]]:
@@ -160,26 +165,6 @@ def _flatten(prefix: str, table: Mapping[str, object]) -> Iterator[tuple[str, ob
             yield from _flatten(f"{prefix}{key}.", cast("Mapping[str, object]", value))
         else:
             yield f"{prefix}{key}", value
-
-
-def _toml(key: str, value: object) -> str:
-    """Return a value in TOML's notation."""
-    match value:
-        case bool():
-            return str(value).lower()
-        case str() | Path():
-            return json.dumps(str(value), ensure_ascii=False)
-        case Integral():
-            return str(int(value))
-        case Real():
-            return repr(float(value))
-        case Mapping():
-            items = cast("Mapping[str, object]", value).items()
-            return "{" + ", ".join(f"{json.dumps(k)} = {_toml(key, v)}" for k, v in items) + "}"
-        case list() | tuple():
-            return "[" + ", ".join(_toml(key, v) for v in cast("Sequence[object]", value)) + "]"
-        case _:
-            raise OverrideError(f"{key}: a value of type {type(value).__name__} cannot be set in a scenario")
 
 
 _folders: set[Path] = set()

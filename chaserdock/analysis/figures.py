@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import errors_of_writing
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -499,7 +499,7 @@ def write_figures(log: Path, out: Path, ending: str) -> tuple[list[Path], dict[s
     flight = load_flight(log)
     traces = load_traces(log, range(len(flight.scenario.chasers)), decimation(flight.world.ticks))
     files, missing = [], {}
-    try:
+    with errors_of_writing(out):
         out.mkdir(parents=True, exist_ok=True)
         for kind, figure in draw_figures(flight, traces):
             if isinstance(figure, str):
@@ -507,6 +507,4 @@ def write_figures(log: Path, out: Path, ending: str) -> tuple[list[Path], dict[s
                 continue
             files.append(out / f"{kind.name}.{ending}")
             save(figure, files[-1])
-    except OSError as error:
-        raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
     return files, missing

@@ -29,8 +29,8 @@ from chaserdock_protocol.messages import (
     Tick,
     WorldTruth,
 )
-from chaserdock_protocol.recording.log import LogSource, Record, read_log, read_scenario
-from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.recording.log import LogSource, Record, logged_scenario, read_log
+from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
 from .columns import Columns
@@ -323,8 +323,7 @@ def _sighting_history(columns: Columns) -> SightingHistory:
 
 def load_flight(log: LogSource) -> RecordedFlight:
     """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by chaserdock."""
-    text, run = read_scenario(log)
-    scenario = scenario_from_json(text, f"{log}: scenario")
+    scenario, run = logged_scenario(log)
     c = _Collector()
     for record in read_log(log):
         c.add(record)

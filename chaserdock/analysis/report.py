@@ -16,7 +16,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import errors_of_writing
 
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
@@ -36,10 +36,8 @@ def write_report(log: Path, out: Path | None = None) -> Path:
     """
     out = out or (log if log.is_dir() else log.parent) / "report.html"
     text = report_of(log)
-    try:
+    with errors_of_writing(out):
         out.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
     return out
 
 

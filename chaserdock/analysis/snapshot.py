@@ -12,10 +12,11 @@ import numpy as np
 from chaserdock_agents.chaser.sighting import BadImage, decode_image
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import Image, Sighting
-from chaserdock_protocol.recording.log import LogError, read_log, read_scenario
-from chaserdock_protocol.scenario import FlightScenario, scenario_from_json
-from chaserdock_protocol.topics import IMAGE, SIGHTING
+from chaserdock_protocol.recording.log import LogError, logged_scenario
+from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
+
+from .images import Pair, pairs
 
 _MARKER = (90, 220, 90)
 _TEXT = (235, 235, 235)
@@ -27,23 +28,18 @@ def snapshot(log: Path, at_s: float, width_px: int = 640) -> NDArray[np.uint8]:
 
     Raise LogError for an unreadable log or one without an image up to then.
     """
-    scenario = scenario_from_json(read_scenario(log)[0], f"{log}: scenario")
-    numbers = range(len(scenario.chasers))
-    images: dict[int, Image] = {}
-    sightings: dict[int, Sighting] = {}
-    keys = [t.key_of(i) for i in numbers for t in (IMAGE, SIGHTING)]
+    scenario, _ = logged_scenario(log)
+    latest: dict[int, Pair] = {}
     end_s = 0.0
-    for record in read_log(log, keys):
-        message = record.message
-        end_s = max(end_s, message.sim_time_ns / 1e9)
-        if message.sim_time_ns > at_s * 1e9:
-            continue
-        (images if isinstance(message, Image) else sightings)[message.chaser] = message
-    if not images:
+    for image, sighting in pairs(log, len(scenario.chasers)):
+        end_s = max(end_s, image.sim_time_ns / 1e9)
+        if image.sim_time_ns <= at_s * 1e9:
+            latest[image.chaser] = image, sighting
+    if not latest:
         raise LogError(f"{log}: holds no image up to {at_s:g} s")
     if at_s > end_s + 1.0 / scenario.time.image_hz:
         raise LogError(f"--at {at_s:g}: the last image of {log} is of {end_s:.2f} s")
-    views = [annotated_image(scenario, images[i], sightings.get(i), width_px) for i in sorted(images)]
+    views = [annotated_image(scenario, *latest[i], width_px) for i in sorted(latest)]
     columns = math.ceil(math.sqrt(len(views)))
     blank = np.zeros_like(views[0])
     views += [blank] * (-len(views) % columns)

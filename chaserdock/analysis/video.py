@@ -12,7 +12,7 @@ from typing import Any
 import av
 import cv2
 import numpy as np
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
 from chaserdock_protocol.recording.log import LogError
 
 from .chase_camera import BgrImage, BodyPose, Viewpoint, draw, tint
@@ -62,26 +62,23 @@ def write_video(
     if "target" not in flight.truth:
         raise LogError(f"{log}: holds no motion of the target; nothing to film")
     number = 0
-    try:
-        with av.open(str(out), "w") as container:
-            stream: Any = container.add_stream(_CODECS[ending], rate=fps)
-            stream.width, stream.height = width_px, height_px
-            stream.pix_fmt = {".mp4": "yuv420p", ".webp": "yuv420p", ".gif": "rgb8"}[ending]
-            stream.time_base = Fraction(1, fps)
-            if ending == ".mp4":
-                stream.options = {"crf": "21", "preset": "medium", "movflags": "+faststart"}
-            elif ending == ".webp":
-                stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
-            for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
-                report_progress(time_s)
-                image = av.VideoFrame.from_ndarray(frame, format="bgr24")
-                image.pts = number
-                container.mux(stream.encode(image))
-                number += 1
-            if number:
-                container.mux(stream.encode())
-    except OSError as error:
-        raise ChaserdockError(f"{out}: cannot be written: {error.strerror or error}") from None
+    with errors_of_writing(out), av.open(str(out), "w") as container:
+        stream: Any = container.add_stream(_CODECS[ending], rate=fps)
+        stream.width, stream.height = width_px, height_px
+        stream.pix_fmt = {".mp4": "yuv420p", ".webp": "yuv420p", ".gif": "rgb8"}[ending]
+        stream.time_base = Fraction(1, fps)
+        if ending == ".mp4":
+            stream.options = {"crf": "21", "preset": "medium", "movflags": "+faststart"}
+        elif ending == ".webp":
+            stream.options = {"quality": str(quality), "loop": "0", "compression_level": "6"}
+        for time_s, frame in frames(log, flight, speed / fps, width_px, height_px, part_s):
+            report_progress(time_s)
+            image = av.VideoFrame.from_ndarray(frame, format="bgr24")
+            image.pts = number
+            container.mux(stream.encode(image))
+            number += 1
+        if number:
+            container.mux(stream.encode())
     if not number:
         out.unlink(missing_ok=True)
         after = f" after {part_s[0]:g} s" if part_s[0] > 0.0 else ""

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-import json
 import tomllib
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -17,10 +16,12 @@ from typing import Annotated, Any, Literal
 import msgspec
 import numpy as np
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.scenario.errors import ScenarioError, explain
+from chaserdock_protocol.scenario.errors import ScenarioError, invalid
 from chaserdock_protocol.scenario.fields import Name, Number, Positive, Section
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
 from pydantic import Field, ValidationError, model_validator
+
+from chaserdock.toml_text import toml_value
 
 MAX_RUNS = 100_000
 Seed = Annotated[int, Field(ge=0, lt=2**32)]
@@ -100,7 +101,7 @@ def load_campaign(path: Path) -> Campaign:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise ScenarioError(f"{path}: not TOML: {error}") from None
     except ValidationError as error:
-        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error, CampaignFile))) from None
+        raise invalid(error, CampaignFile, path) from None
     local = path.parent / file.scenario
     try:
         scenario = local if local.is_file() else find_scenario(file.scenario)
@@ -167,15 +168,3 @@ def _reject_duplicates(runs: list[Run], path: Path) -> None:
                 "no effect"
             )
         seen[run.name] = run.index
-
-
-def toml_value(value: Any) -> str:
-    """Format a number, string, boolean, array or inline table as TOML, the notation of ``--set``."""
-    if isinstance(value, dict):
-        inner = ", ".join(f"{json.dumps(k, ensure_ascii=False)} = {toml_value(v)}" for k, v in value.items())
-        return "{" + inner + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(toml_value(v) for v in value) + "]"
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)

@@ -4,20 +4,21 @@
 from __future__ import annotations
 
 import os
-import signal
 import sys
-import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
+from chaserdock_protocol.errors import errors_of_writing
+
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
+from chaserdock.launch.signals import stop_on_signals
 
 from .plan import Campaign, Run, load_campaign
 from .report import page
 from .table import rerun_command, rows_of, wilson, write_table
 from .worker import CampaignError, FinishedRun, Keep, fly, fly_campaign
+
+AFTER_ACTIVE_RUNS = "stopping after the active runs"
 
 
 def direct(
@@ -31,13 +32,10 @@ def direct(
     folder = (out or Path("campaigns") / campaign.name).absolute()
     if only is not None:
         return _fly_one(campaign, folder, only)
-    try:
-        with stop_on_signal() as stop:
-            finished = fly_campaign(
-                campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, CampaignProgress(), stop
-            )
-    except OSError as error:
-        raise CampaignError(f"{folder}: cannot be written: {error.strerror or error}") from None
+    with errors_of_writing(folder, CampaignError), stop_on_signals(AFTER_ACTIVE_RUNS) as stop:
+        finished = fly_campaign(
+            campaign, folder, keep, jobs or os.cpu_count() or 1, cluster, CampaignProgress(), stop
+        )
     if not finished:
         print("chaserdock: stopped before any run ended", file=sys.stderr)
         return STOPPED
@@ -66,24 +64,6 @@ def _fly_one(campaign: Campaign, folder: Path, only: int) -> int:
     outcome = "passed" if result.status == 0 else result.last_words
     print(f"run {only} ({run.name}): {outcome}\n{result.log or 'no log'}")
     return DONE if result.status == 0 else FAILED
-
-
-@contextmanager
-def stop_on_signal() -> Iterator[threading.Event]:
-    """Provide an event that SIGINT or SIGTERM sets; active runs then finish and no new one starts."""
-    stop = threading.Event()
-
-    def request_stop(*_: object) -> None:
-        if not stop.is_set():
-            print("\nchaserdock: stopping after the active runs", file=sys.stderr)
-        stop.set()
-
-    before = {s: signal.signal(s, request_stop) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 class CampaignProgress:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, cast
 
 import typer
@@ -67,3 +67,20 @@ def first_sentence(text: str | None) -> str:
     """Return the first sentence of a docstring, without its full stop."""
     line = inspect.cleandoc(text or "").partition("\n\n")[0].replace("\n", " ")
     return line.partition(". ")[0].removesuffix(".")
+
+
+def command_group(name: str, description: str) -> typer.Typer:
+    """Return a group of commands, ``chaserdock NAME …``."""
+    return typer.Typer(
+        name=name,
+        cls=GroupedHelp,
+        context_settings=HELP_OPTIONS,
+        rich_markup_mode=None,
+        help=description,
+        no_args_is_help=True,
+    )
+
+
+def add_command(app: typer.Typer, function: Callable[..., None], **options: Any) -> None:
+    """Add a function to a program or group as a command."""
+    app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS, **options)(function)

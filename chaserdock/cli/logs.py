@@ -12,17 +12,10 @@ import typer
 
 from chaserdock.exit_codes import DONE, STOPPED
 
-from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .help import add_command, command_group
 from .options import JsonOpt, LinkOptions, print_result, with_link_options
 
-app = typer.Typer(
-    name="log",
-    cls=GroupedHelp,
-    context_settings=HELP_OPTIONS,
-    rich_markup_mode=None,
-    help="Inspect, repair, export and play a log.",
-    no_args_is_help=True,
-)
+app = command_group("log", "Inspect, repair, export and play a log.")
 
 LogFilesArg = Annotated[
     list[Path],
@@ -133,4 +126,4 @@ def play(
 
 
 for member in (info, recover, export, tracks, play):
-    app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)(member)
+    add_command(app, member)

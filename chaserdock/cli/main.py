@@ -17,7 +17,7 @@ from chaserdock.exit_codes import FAILED
 from . import logs, scenario
 from .analysis import figures, report, snapshot, summary, video
 from .compare import check, compare, replay, reproduce, study
-from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .help import HELP_OPTIONS, GroupedHelp, add_command
 from .operate import command, status, thruster_fault, view
 from .options import fail
 from .processes import chaser, controller, record, router, world
@@ -63,7 +63,7 @@ for panel, members in GROUPS.items():
         if isinstance(member, typer.Typer):
             app.add_typer(member, rich_help_panel=panel)
         else:
-            app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS, rich_help_panel=panel)(member)
+            add_command(app, member, rich_help_panel=panel)
 
 
 @app.callback()

@@ -3,14 +3,9 @@
 
 from __future__ import annotations
 
-import signal
 import sys
-import threading
-from collections.abc import Generator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from types import FrameType
 from typing import Annotated
 
 import typer
@@ -47,6 +42,7 @@ def run(
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
     import chaserdock
     from chaserdock.launch.launcher import print_outcome
+    from chaserdock.launch.signals import stop_on_signals
     from chaserdock.viewer.address import DEFAULT_HOST, free_port, url_of
 
     show = show_of(quiet, as_json)
@@ -68,22 +64,6 @@ def run(
         )
     print_outcome(outcome, show)
     raise typer.Exit(outcome.status)
-
-
-@contextmanager
-def stop_on_signals() -> Generator[threading.Event]:
-    """Set an event on SIGINT or SIGTERM; repeated signals change nothing until all processes have exited."""
-    stop = threading.Event()
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
 
 
 @with_link_options("listen")

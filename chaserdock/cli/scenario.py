@@ -4,27 +4,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from chaserdock_protocol.errors import ChaserdockError
 
 from chaserdock.exit_codes import BAD_INPUT
+from chaserdock.toml_text import toml_document
 
-from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .help import add_command, command_group
 from .options import JsonOpt, ScenarioArg, SetOpt, fail
 
 if TYPE_CHECKING:
     from chaserdock_protocol.scenario import Scenario
 
-app = typer.Typer(
-    name="scenario",
-    cls=GroupedHelp,
-    context_settings=HELP_OPTIONS,
-    rich_markup_mode=None,
-    help="List, check, show and create scenarios.",
-    no_args_is_help=True,
-)
+app = command_group("scenario", "List, check, show and create scenarios.")
 
 _NEW = """\
 # A scenario: what flies, and when a mission is a success. Every key: docs/scenario.md, or for editors
@@ -65,7 +59,6 @@ steady_orientation_rms_deg = 0.5
 """
 
 
-@app.command("list", cls=FiniteCommand, context_settings=HELP_OPTIONS)
 def list_scenarios(as_json: JsonOpt = False) -> None:
     """List the shipped scenarios with their duration and number of chasers."""
     import json
@@ -92,7 +85,6 @@ def list_scenarios(as_json: JsonOpt = False) -> None:
         print(f"{s.name:{width}}  {len(s.chasers):7}  {s.duration_s:6.0f} s  {s.description}")
 
 
-@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
 def validate(
     files: Annotated[list[str], typer.Argument(help="scenario files, or names of shipped scenarios")],
 ) -> None:
@@ -115,7 +107,6 @@ def validate(
         raise typer.Exit(BAD_INPUT)
 
 
-@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
 def show(
     scenario: ScenarioArg,
     overrides: SetOpt = None,
@@ -130,7 +121,6 @@ def show(
     print(as_toml(load_scenario(find_scenario(scenario), tuple(overrides or ())), changes), end="")
 
 
-@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
 def schema() -> None:
     """Print the JSON schema of scenario files, for editors (taplo, Even Better TOML)."""
     from chaserdock_protocol.scenario import Scenario
@@ -139,7 +129,6 @@ def schema() -> None:
     print(editor_schema_text(Scenario), end="")
 
 
-@app.command(cls=FiniteCommand, context_settings=HELP_OPTIONS)
 def new(
     name: Annotated[str, typer.Argument(metavar="NAME", help="name of the scenario, or path of its file")],
 ) -> None:
@@ -161,6 +150,11 @@ def new(
     print(f"{path}: run it with: chaserdock run {path}")
 
 
+add_command(app, list_scenarios, name="list")
+for member in (validate, show, schema, new):
+    add_command(app, member)
+
+
 def as_toml(scenario: Scenario, changes: bool = False) -> str:
     """Return a scenario in TOML's notation; ``changes``: without values that equal the default."""
     from chaserdock_protocol.scenario.camera import REPLACED_BY_INTRINSICS
@@ -171,7 +165,7 @@ def as_toml(scenario: Scenario, changes: bool = False) -> str:
     )
     if changes:
         values = {"format": scenario.format, **values, "chaser": _changed_body(scenario)}
-    return "\n".join(_table(values, ())).lstrip("\n") + "\n"
+    return toml_document(values)
 
 
 def _changed_body(scenario: Scenario) -> dict[str, Any]:
@@ -180,23 +174,3 @@ def _changed_body(scenario: Scenario) -> dict[str, Any]:
     values = scenario.chaser.model_dump(mode="json", exclude_none=True)
     changed = {k: v for k, v in values.items() if v != predefined[k]}
     return {"body": scenario.chaser.body, **changed} if scenario.chaser.body else changed
-
-
-def _table(values: dict[str, Any], path: tuple[str, ...]) -> list[str]:
-    """Return the lines of a table: plain values first, then tables and arrays of tables."""
-    from chaserdock.campaign.plan import toml_value
-
-    lines: list[str] = []
-    below: list[str] = []
-    for key, value in values.items():
-        name = ".".join((*path, key))
-        tables = cast("list[Any]", value) if isinstance(value, list) else []
-        if isinstance(value, dict):
-            inner = cast("dict[str, Any]", value)
-            below += ["", f"[{name}]", *_table(inner, (*path, key))] if inner else []
-        elif tables and isinstance(tables[0], dict):
-            for item in tables:
-                below += ["", f"[[{name}]]", *_table(item, (*path, key))]
-        else:
-            lines.append(f"{key} = {toml_value(value)}")
-    return [*lines, *below]

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from .help import HELP_OPTIONS, FiniteCommand, GroupedHelp
+from .help import add_command, command_group
 from .options import fail
 
 
@@ -90,14 +90,7 @@ def calibrate(
     print(out)
 
 
-keys = typer.Typer(
-    name="keys",
-    cls=GroupedHelp,
-    context_settings=HELP_OPTIONS,
-    rich_markup_mode=None,
-    help="Make the keys and certificates of a mission.",
-    no_args_is_help=True,
-)
+keys = command_group("keys", "Make the keys and certificates of a mission.")
 
 
 @keys.callback()
@@ -105,7 +98,6 @@ def group() -> None:
     """Make the keys and certificates of a mission."""
 
 
-@keys.command("init", cls=FiniteCommand, context_settings=HELP_OPTIONS)
 def init(
     folder: Annotated[Path, typer.Argument(help="folder to write to, one folder per process inside")],
     host: Annotated[
@@ -132,3 +124,6 @@ def init(
     hosts = ("localhost", "127.0.0.1", *(host or ()))
     init_keys(folder, chasers, hosts, days, now, shared=shared)
     print(f"{folder}: keys of {', '.join(names(chasers))}; router at {', '.join(hosts)}; {days} days")
+
+
+add_command(keys, init)

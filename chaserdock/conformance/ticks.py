@@ -9,8 +9,8 @@ import msgspec
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import Image, Tick, encoding_of
-from chaserdock_protocol.recording.log import LogSource, read_log, read_scenario
-from chaserdock_protocol.scenario import Scenario, flight_scenario_json, scenario_from_json
+from chaserdock_protocol.recording.log import LogSource, logged_scenario, read_log
+from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
 
@@ -84,12 +84,11 @@ def read_turns(log: LogSource, process: str, most: int) -> Recorded:
 
     Raise LogError, ScenarioError, or CheckError when there is nothing to play.
     """
-    text, run = read_scenario(log)
+    scenario, run = logged_scenario(log)
     if run.get("mode") == "realtime":
         raise CheckError(
             f"{log}: flown in real time; a check needs a lock-step log, in which every tick is complete"
         )
-    scenario = scenario_from_json(text, f"{log}: scenario")
     role, number = role_of(process, len(scenario.chasers))
     inputs = input_topics(role)
     keys = [

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 from chaserdock_models.rotations import rotate
+from chaserdock_protocol.errors import errors_of_writing
 from chaserdock_protocol.process import print_status
 from chaserdock_protocol.scenario import Scenario, load_scenario
 
@@ -29,11 +30,8 @@ def main(cases: Path, results: Path) -> int:
     for number, case in enumerate(todo, start=1):
         print_status("study", f"{number} of {len(todo)}: {case.name}")
         result = fly_case(case)
-        try:
-            with results.open("a", encoding="utf-8") as file:
-                file.write(line_of(result))
-        except OSError as error:
-            raise StudyError(f"{results}: cannot be written: {error.strerror or error}") from None
+        with errors_of_writing(results, StudyError), results.open("a", encoding="utf-8") as file:
+            file.write(line_of(result))
     return 0
 
 

@@ -6,43 +6,41 @@ from __future__ import annotations
 import csv
 import json
 from collections import Counter
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any, Literal
 
 import pyarrow as pa
 import pyarrow.parquet as pq
+from chaserdock_protocol.errors import errors_of_writing
 from chaserdock_protocol.recording.log import LogError, LogSource, read_log
 
 from .tables import TopicTable
 
+ExportFormat = Literal["parquet", "csv"]
 _ROWS, _IMAGE_ROWS = 4096, 64
 
 
-class _ParquetFile:
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
-        self._writer = pq.ParquetWriter(path, schema, compression="zstd")
-
-    def write(self, table: pa.Table) -> None:
-        self._writer.write_table(table)
-
-    def close(self) -> None:
-        self._writer.close()
-
-
 class _CsvFile:
-    """Lists become JSON text, missing values empty cells."""
+    """A CSV file with the interface of ``ParquetWriter``. Lists become JSON text, missing values empty cells."""
 
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self._file = path.open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
         self._writer.writerow(schema.names)
 
-    def write(self, table: pa.Table) -> None:
+    def write_table(self, table: pa.Table) -> None:
         columns = [[_cell(v) for v in column.to_pylist()] for column in table.columns]
         self._writer.writerows(zip(*columns, strict=True))
 
     def close(self) -> None:
         self._file.close()
+
+
+def _create_file(path: Path, schema: pa.Schema, format: ExportFormat) -> Any:
+    return (
+        pq.ParquetWriter(path, schema, compression="zstd") if format == "parquet" else _CsvFile(path, schema)
+    )
 
 
 def _cell(value: Any) -> Any:
@@ -51,9 +49,7 @@ def _cell(value: Any) -> Any:
     return value.hex() if isinstance(value, bytes) else value
 
 
-def export(
-    log: LogSource, folder: Path, format: Literal["parquet", "csv"], images: bool = False
-) -> dict[str, int]:
+def export(log: LogSource, folder: Path, format: ExportFormat, images: bool = False) -> dict[str, int]:
     """Write every topic of a log into ``folder``, which is created; return the number of rows by file name.
 
     ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be used.
@@ -68,11 +64,11 @@ def export(
             if name not in files:
                 if path.exists():
                     raise LogError(f"{path}: already exists; export into an empty folder")
-                files[name] = (_ParquetFile if format == "parquet" else _CsvFile)(path, chunk.schema)
-            files[name].write(chunk)
+                files[name] = open_files.enter_context(closing(_create_file(path, chunk.schema, format)))
+            files[name].write_table(chunk)
             rows[path.name] += chunk.num_rows
 
-    try:
+    with errors_of_writing(folder, LogError), ExitStack() as open_files:
         folder.mkdir(parents=True, exist_ok=True)
         for record in read_log(log):
             table = tables.get(record.topic.key)
@@ -83,9 +79,4 @@ def export(
                 write(table)
         for table in tables.values():
             write(table)
-    except OSError as error:
-        raise LogError(f"{folder}: cannot be written: {error.strerror or error}") from None
-    finally:
-        for file in files.values():
-            file.close()
     return dict(sorted(rows.items()))

@@ -9,10 +9,9 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.recording.log import LogSource, read_scenario
+from chaserdock_protocol.recording.log import LogSource, logged_scenario
 from chaserdock_protocol.recording.scan import VIEWER_PREFIX, FileState, log_files, stored_messages
 from chaserdock_protocol.recording.schema_migrations import decode_logged
-from chaserdock_protocol.scenario import scenario_from_json
 
 
 class FileInfo(msgspec.Struct):
@@ -59,8 +58,7 @@ class LogInfo(msgspec.Struct):
 
 def info_of(log: LogSource) -> LogInfo:
     """Read all of a log, check every checksum and message. Raises LogError where it is damaged."""
-    text, run = read_scenario(log)
-    scenario = scenario_from_json(text, f"{log}: scenario")
+    scenario, run = logged_scenario(log)
     keys: dict[str, KeyInfo] = {}
     last_seq: dict[str, int] = {}
     rejected: Counter[str] = Counter()

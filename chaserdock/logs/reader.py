@@ -24,10 +24,10 @@ from chaserdock_protocol.recording.log import (
     LogSource,
     Record,
     count_messages,
+    logged_scenario,
     read_log,
-    read_scenario,
 )
-from chaserdock_protocol.scenario import Scenario, scenario_from_json
+from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.topics import Topic
 from msgspec import Struct
 
@@ -40,8 +40,7 @@ MessageT = TypeVar("MessageT", bound=Struct)
 def open_log(source: str | Path | Sequence[str | Path]) -> Log:
     """Open a log: a file, the folder of a run, or the files of a rotated log. Raises LogError, ScenarioError."""
     paths = Path(source) if isinstance(source, str | Path) else [Path(s) for s in source]
-    text, run = read_scenario(paths)
-    return Log(paths, scenario_from_json(text, f"{source}: scenario"), run)
+    return Log(paths, *logged_scenario(paths))
 
 
 class Log:

@@ -37,6 +37,7 @@ from .tables import (
     floor_of_study,
     own_requirements,
     spread,
+    study_errors,
     verdict,
     with_images,
     with_perfect_knowledge,
@@ -85,11 +86,6 @@ def _spread_text(values: Sequence[float], form: Callable[[float], str]) -> str:
 def _cell(errors: Errors | None, form: Callable[[Errors], str]) -> str:
     """Format errors, or return a dash without any."""
     return NONE if errors is None else form(errors)
-
-
-def _study_errors(results: ReproductionResults, name: str) -> Errors | None:
-    result = results.studies.get(name)
-    return None if result is None else errors_of_study(result)
 
 
 def _method(
@@ -277,7 +273,7 @@ def _failed_text(
 def _starts(results: ReproductionResults) -> PageSection:
     rows = []
     for name in (n for n in results.studies if n.startswith("start/")):
-        errors, result = _study_errors(results, name), results.studies[name]
+        errors, result = study_errors(results, name), results.studies[name]
         floor = None if result.floor_m2_s is None else floor_of_study(result)
         if errors is None or floor is None:
             continue
@@ -313,10 +309,10 @@ def _starts(results: ReproductionResults) -> PageSection:
 
 
 def _ingredients(results: ReproductionResults) -> PageSection:
-    base = _study_errors(results, f"start/{INFERRED}")
+    base = study_errors(results, f"start/{INFERRED}")
     rows = []
     for name in (n for n in results.studies if n.startswith("ingredient/")):
-        errors = _study_errors(results, name)
+        errors = study_errors(results, name)
         if errors is None or base is None:
             continue
         rows.append(
@@ -342,7 +338,7 @@ def _real_time(results: ReproductionResults) -> PageSection:
     for delay_s in DELAYS_S:
         cells = [f"{delay_s:g} s"]
         for horizon_s in DELAYED_HORIZONS_S:
-            errors = _study_errors(results, f"delay/{horizon_s:g}/{delay_s:g}")
+            errors = study_errors(results, f"delay/{horizon_s:g}/{delay_s:g}")
             cells += [
                 _cell(errors, lambda e: _position_text(e.position)),
                 _cell(errors, lambda e: _orientation_text(e.orientation)),

@@ -8,10 +8,12 @@ from pathlib import Path
 
 import msgspec
 from chaserdock_controller.nmpc.open_backend import missing_part
+from chaserdock_protocol.errors import errors_of_writing
 
-from chaserdock.campaign.scheduler import stop_on_signal
+from chaserdock.campaign.scheduler import AFTER_ACTIVE_RUNS
 from chaserdock.campaign.worker import CampaignError
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
+from chaserdock.launch.signals import stop_on_signals
 
 from .content import sections
 from .page import html, markdown
@@ -35,10 +37,10 @@ def fly_plan(plan: ReproductionPlan, out: Path, jobs: int, keep_logs: bool) -> i
     """Fly any plan; return the exit status."""
     missing = missing_part()
     flyable = plan if missing is None else without_open(plan)
-    try:
+    with errors_of_writing(out, CampaignError):
         out.mkdir(parents=True, exist_ok=True)
         about = begun(out)
-        with stop_on_signal() as stop:
+        with stop_on_signals(AFTER_ACTIVE_RUNS) as stop:
             fly_studies(flyable.studies, out, jobs, stop, _report)
             fly_missions(flyable.missions, out, jobs, keep_logs, stop)
         results = results_of(flyable, out)
@@ -49,8 +51,6 @@ def fly_plan(plan: ReproductionPlan, out: Path, jobs: int, keep_logs: bool) -> i
             recorded = read_record()
             results = add_recorded(plan, results, recorded)
         write_page(plan, results, out, about, recorded)
-    except OSError as error:
-        raise CampaignError(f"{out}: cannot be written: {error.strerror or error}") from None
     if stop.is_set():
         _report("stopped; repeat the command to resume")
         return STOPPED

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,9 +31,6 @@ class Errors:
     steady_position: float
     steady_orientation: float
     failed: bool = False
-
-
-ErrorOf = Callable[[Errors], float]
 
 
 @dataclass(frozen=True)
@@ -92,6 +89,12 @@ def errors_of_study(result: StudyResult) -> Errors:
         steady_orientation=r.steady_orientation_mse_rad2,
         failed=r.failed_solves > 0,
     )
+
+
+def study_errors(results: ReproductionResults, name: str) -> Errors | None:
+    """Return the errors of a study by name; None without a result."""
+    result = results.studies.get(name)
+    return None if result is None else errors_of_study(result)
 
 
 def floor_of_study(result: StudyResult) -> float:

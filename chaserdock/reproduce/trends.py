@@ -21,8 +21,8 @@ from .tables import (
     TREND_BAND,
     Errors,
     Spread,
-    errors_of_study,
     spread,
+    study_errors,
     verdict,
     with_images,
     with_perfect_knowledge,
@@ -106,18 +106,13 @@ def _value(errors: Errors, quantity: PaperQuantity) -> float:
     return errors.position if quantity == "position" else errors.orientation
 
 
-def _study(results: ReproductionResults, name: str) -> Errors | None:
-    result = results.studies.get(name)
-    return None if result is None else errors_of_study(result)
-
-
 def _explain_by_weights(results: ReproductionResults, row: PaperRow, quantity: PaperQuantity) -> str:
     """Compare with the same dt at stage weights that keep the sum of the stage costs."""
     text = "times 2" if row.dt_s > ROWS[0].dt_s else "by 3"
     step = "1/5 s" if row.dt_s > ROWS[0].dt_s else "1/30 s"
-    base = _study(results, f"start/{INFERRED}")
-    plain = _study(results, f"ingredient/dt = {step}")
-    scaled = _study(results, f"ingredient/dt = {step}, stage weights {text}")
+    base = study_errors(results, f"start/{INFERRED}")
+    plain = study_errors(results, f"ingredient/dt = {step}")
+    scaled = study_errors(results, f"ingredient/dt = {step}, stage weights {text}")
     if base is None or plain is None or scaled is None:
         return UNEXPLAINED
     before, after = (100 * (_value(e, quantity) / _value(base, quantity) - 1.0) for e in (plain, scaled))
@@ -145,7 +140,7 @@ def _explain_by_spread(results: ReproductionResults, row: PaperRow, quantity: Pa
 def _explain_by_delay(results: ReproductionResults, row: PaperRow, quantity: PaperQuantity) -> str:
     """Find the delay of the command that brings our error to the paper's."""
     paper = row.position_mse_m2 if quantity == "position" else row.orientation_mse_rad2
-    delayed = [(d, _study(results, f"delay/{row.horizon_s:g}/{d:g}")) for d in DELAYS_S]
+    delayed = [(d, study_errors(results, f"delay/{row.horizon_s:g}/{d:g}")) for d in DELAYS_S]
     known = [(d, _value(e, quantity)) for d, e in delayed if e is not None]
     if not known:
         return UNEXPLAINED

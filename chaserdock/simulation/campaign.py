@@ -16,8 +16,10 @@ from chaserdock_protocol.process import SINGLE_THREADED
 from chaserdock_protocol.scenario import ScenarioError, load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 
+from chaserdock.toml_text import toml_document
+
 from .shrinking import shrink
-from .swarm import Case, SimulationResult, case_text, draw_case, fly_case
+from .swarm import Case, SimulationResult, draw_case, fly_case
 
 NEES_LIMITS = (1.5, 12.0)
 """Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights whose sensors are honest."""
@@ -79,7 +81,7 @@ def write_case(case: Case, result: SimulationResult, folder: Path) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"seed-{result.seed}.toml"
     lines = [f"# {violation}" for violation in result.violations]
-    path.write_text("\n".join([*lines, case_text(case)]), encoding="utf-8")
+    path.write_text("\n".join([*lines, toml_document(case)]), encoding="utf-8")
     return path
 
 

@@ -8,12 +8,10 @@ flight is a ``Case``: the keys of a scenario file that extends a shipped scenari
 from __future__ import annotations
 
 import contextlib
-import json
 import random
 import tempfile
 import zlib
 from collections import Counter
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -24,6 +22,8 @@ from chaserdock_protocol.scenario.faults import FaultKind
 from chaserdock_protocol.transport import RawSample
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
+
+from chaserdock.toml_text import toml_document
 
 from .invariants import Invariants, Violation
 from .mission import SimulatedFlight, simulate
@@ -214,7 +214,7 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationRes
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_memory_folder())))
         path = (folder or scratch) / "scenario.toml"
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(case_text(case), encoding="utf-8")
+        path.write_text(toml_document(case), encoding="utf-8")
         checks, fingerprint = Invariants(load_scenario(path)), 0
 
         def tap(sender: str, raw: RawSample) -> None:
@@ -291,45 +291,3 @@ def _check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
 
 QUEUE_LIMIT = 2000
 """Most messages that may wait for a reader which is neither slow nor flooded."""
-
-
-# -- scenario files ---------------------------------------------------------------------------------------------
-
-
-def case_text(case: Mapping[str, Any]) -> str:
-    """Return a case as the text of a scenario file."""
-    plain = {k: v for k, v in case.items() if not isinstance(v, Mapping | list) or _is_plain(v)}
-    lines = [f"{key} = {toml(value)}" for key, value in plain.items() if not isinstance(value, Mapping)]
-    for key, value in case.items():
-        lines += _table_lines(key, value)
-    return "\n".join(lines) + "\n"
-
-
-def _is_plain(value: Any) -> bool:
-    return isinstance(value, list) and not any(isinstance(v, Mapping) for v in value)
-
-
-def _table_lines(key: str, value: Any) -> list[str]:
-    if isinstance(value, Mapping) and value:
-        nested = {k: v for k, v in value.items() if isinstance(v, Mapping) or (v and _is_table_array(v))}
-        lines = [f"{k} = {toml(v)}" for k, v in value.items() if k not in nested and v != []]
-        out = ["", f"[{key}]", *lines] if lines else []
-        return out + [line for k, v in nested.items() for line in _table_lines(f"{key}.{k}", v)]
-    if _is_table_array(value):
-        return [
-            line
-            for row in value
-            for line in ("", f"[[{key}]]", *(f"{k} = {toml(v)}" for k, v in row.items()))
-        ]
-    return []
-
-
-def _is_table_array(value: Any) -> bool:
-    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
-
-
-def toml(value: Any) -> str:
-    """Return a value as inline TOML."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{k} = {toml(v)}" for k, v in value.items()) + "}"
-    return json.dumps(list(value) if isinstance(value, tuple) else value)

@@ -28,11 +28,10 @@ from chaserdock_protocol.messages import (
 )
 from chaserdock_protocol.topics import Topic
 
-from .snapshot import TARGET
+from .snapshot import TARGET, keep_newest
 
 MOST_POINTS = 40_000
 _MOST_LINES = 500
-_KEPT = 64
 
 ChartQuantity = Literal[
     "position_error_mm",
@@ -123,7 +122,7 @@ class History:
 
     def add_exposure(self, chaser: int, tick: int, sent_ns: int) -> None:
         """Add the wall-clock time at which an image was sent."""
-        _keep(self._exposed[chaser], tick, sent_ns)
+        keep_newest(self._exposed[chaser], tick, sent_ns)
 
     def update(self, topic: Topic, message: Any, sent_ns: int) -> None:
         """Add a message and the sender's wall-clock time."""
@@ -139,7 +138,7 @@ class History:
     def _add_measurement(self, message: Any) -> None:
         match message:
             case Odometry():
-                _keep(self._odometry[message.chaser], message.tick, message)
+                keep_newest(self._odometry[message.chaser], message.tick, message)
                 self._add_position(message)
             case Reference():
                 self._add_tracking_error(message)
@@ -147,7 +146,7 @@ class History:
                 self._target = message
                 self._add_estimation_error(message)
             case BodyTruth() if message.body == TARGET:
-                _keep(self._truth, message.sim_time_ns, message)
+                keep_newest(self._truth, message.sim_time_ns, message)
             case SolverStatus():
                 self.series["solve_ms", None].add(message.sim_time_ns / 1e9, message.wall_solve_s * 1e3)
             case Health():
@@ -220,9 +219,3 @@ def reply_text(reply: CommandReply) -> str:
     operator = f" (by {reply.operator})" if reply.operator else ""
     outcome = "accepted" if reply.accepted else "refused"
     return f"{reply.command} chaser {reply.chaser}{operator}: {outcome}, {reply.reason}"
-
-
-def _keep(store: OrderedDict[int, Any], key: int, value: Any) -> None:
-    store[key] = value
-    while len(store) > _KEPT:
-        store.popitem(last=False)

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.recording.log import read_scenario
+from chaserdock_protocol.recording.log import logged_scenario
 from chaserdock_protocol.recording.scan import (
     DAMAGE,
     VIEWER_PREFIX,
@@ -26,7 +26,6 @@ from chaserdock_protocol.recording.scan import (
     records,
 )
 from chaserdock_protocol.recording.schema_migrations import decode_logged
-from chaserdock_protocol.scenario import scenario_from_json
 from chaserdock_protocol.topics import Topic
 from mcap.opcode import Opcode
 from mcap.records import Channel
@@ -64,8 +63,7 @@ class LoggedMission:
     """A recorded mission: ``history`` covers all of it, ``at`` returns the state at any time. Raises LogError."""
 
     def __init__(self, source: LogSource) -> None:
-        text, self.run = read_scenario(source)
-        self.scenario = scenario_from_json(text, f"{source}: scenario")
+        self.scenario, self.run = logged_scenario(source)
         self.chasers = len(self.scenario.chasers)
         self.history = History(self.chasers)
         self.end_s = 0.0

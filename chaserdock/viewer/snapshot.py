@@ -44,7 +44,7 @@ OF_CHASERS = (
 OF_ALL = (topics.TICK, topics.TARGET, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
 
-_KEPT = 32
+_KEPT = 64
 _FIELDS = {
     Odometry: "odometry",
     Reference: "reference",
@@ -92,9 +92,9 @@ class ChaserState:
         """Store a message of this chaser."""
         setattr(self, _FIELDS[type(message)], message)
         if isinstance(message, Odometry):
-            _keep(self._odometries, message.tick, message)
+            keep_newest(self._odometries, message.tick, message)
         elif isinstance(message, Sighting):
-            _keep(self._sightings, message.sim_time_ns, message)
+            keep_newest(self._sightings, message.sim_time_ns, message)
 
     def error(self) -> tuple[float, float] | None:
         """Return distance (m) and angle (rad) from the reference, by odometry; None while unknown."""
@@ -110,7 +110,8 @@ class ChaserState:
         return self._sightings.get(image.sim_time_ns)
 
 
-def _keep(store: OrderedDict[int, Any], key: int, message: Any) -> None:
+def keep_newest(store: OrderedDict[int, Any], key: int, message: Any) -> None:
+    """Store a message and drop the oldest beyond 64."""
     store[key] = message
     while len(store) > _KEPT:
         store.popitem(last=False)

@@ -1,6 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Base class of errors for users: one line of text per fault, printed without a traceback."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
 
 class ChaserdockError(Exception):
     """A request cannot be carried out. The text states what failed, where, and what is valid."""
+
+
+@contextmanager
+def errors_of_writing(path: Path | str, kind: type[ChaserdockError] = ChaserdockError) -> Iterator[None]:
+    """Raise an OSError as an error of this ``kind``, which names the path and the reason."""
+    try:
+        yield
+    except OSError as error:
+        raise kind(f"{path}: cannot be written: {error.strerror or error}") from None

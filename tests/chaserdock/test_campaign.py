@@ -23,7 +23,7 @@ from harness import chaserdock, descendants, finished
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chaserdock.campaign.plan import Campaign, load_campaign, toml_value
+from chaserdock.campaign.plan import Campaign, load_campaign
 from chaserdock.campaign.report import page
 from chaserdock.campaign.table import cause_of, causes, rank_correlation, row_of, rows_of, wilson
 from chaserdock.campaign.worker import (
@@ -34,6 +34,7 @@ from chaserdock.campaign.worker import (
     result_path,
     write_result,
 )
+from chaserdock.toml_text import toml_value
 
 GRID = """
 name = "grid"

@@ -31,7 +31,8 @@ from message_samples import BY_TYPE
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, Case, SimulationResult, case_text, draw_case
+from chaserdock.simulation.swarm import KINDS, Case, SimulationResult, draw_case
+from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
 
@@ -50,7 +51,7 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
         case = draw_case("fault-drill", seed, scenario)
         assert case == draw_case("fault-drill", seed, scenario)
         path = tmp_path / "case.toml"
-        path.write_text(case_text(case))
+        path.write_text(toml_document(case))
         loaded = load_scenario(path)
         assert [f.kind for f in loaded.fault] == [f["kind"] for f in case["fault"]]
         assert loaded.simulation.model_dump(exclude_unset=True).keys() == case["simulation"].keys()
@@ -65,7 +66,7 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
 
 def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> None:
     path = tmp_path / "case.toml"
-    path.write_text(case_text({"extends": "fault-drill", "timeline": [], "success": {"docked": []}}))
+    path.write_text(toml_document({"extends": "fault-drill", "timeline": [], "success": {"docked": []}}))
     assert load_scenario(path).timeline == ()
 
 

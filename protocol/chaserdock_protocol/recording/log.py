@@ -26,6 +26,7 @@ from mcap.records import Message as McapMessage
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.messages import encoding_of, schema_of
+from chaserdock_protocol.scenario import Scenario, scenario_from_json
 from chaserdock_protocol.scenario.migrations import migrated
 from chaserdock_protocol.topics import Topic
 
@@ -58,7 +59,16 @@ _PACKAGES = (
     "opencv-python-headless",
 )
 
-__all__ = ["LogError", "LogSource", "LogWriter", "Record", "count_messages", "read_log", "read_scenario"]
+__all__ = [
+    "LogError",
+    "LogSource",
+    "LogWriter",
+    "Record",
+    "count_messages",
+    "logged_scenario",
+    "read_log",
+    "read_scenario",
+]
 
 
 @dataclass(frozen=True)
@@ -311,6 +321,12 @@ def read_scenario(source: LogSource) -> tuple[str, dict[str, str]]:
         if data.get("run_id") != first.get("run_id"):
             raise LogError(f"{path}: of another run than {files[0]}")
     return migrated(scenario), first
+
+
+def logged_scenario(source: LogSource) -> tuple[Scenario, dict[str, str]]:
+    """Return the scenario of a log, and the run's data and versions. Raises LogError, ScenarioError."""
+    text, run = read_scenario(source)
+    return scenario_from_json(text, f"{source}: scenario"), run
 
 
 def _scenario_of(path: Path) -> tuple[dict[str, str], str]:

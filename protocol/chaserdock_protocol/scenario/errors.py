@@ -57,6 +57,11 @@ def explain(error: ValidationError, model: type[BaseModel]) -> list[str]:
     return lines
 
 
+def invalid(error: ValidationError, model: type[BaseModel], source: object) -> ScenarioError:
+    """Return the error of validating ``model`` with values of ``source``, which begins each line."""
+    return ScenarioError("\n".join(f"{source}: {line}" for line in explain(error, model)))
+
+
 def _line(error: Any, root: SchemaNode) -> str:
     path, kind, value = error["loc"], error["type"], error.get("input")
     if kind == "extra_forbidden":

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from chaserdock_protocol import topics
 from chaserdock_protocol.topics import Role, Topic
 
-from .errors import ScenarioError, explain
+from .errors import invalid
 from .fields import Number, Positive, Section, Vector
 from .thrusters import ThrusterFailure
 
@@ -209,8 +209,7 @@ def process_faults_from_json(text: str) -> ProcessFaults:
     try:
         return ProcessFaults.model_validate_json(text)
     except ValidationError as error:
-        lines = explain(error, ProcessFaults)
-        raise ScenarioError("\n".join(f"the world's faults: {line}" for line in lines)) from None
+        raise invalid(error, ProcessFaults, "the world's faults") from None
 
 
 def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:

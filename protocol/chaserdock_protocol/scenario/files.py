@@ -14,7 +14,7 @@ import numpy as np
 from chaserdock_models.targets import TargetModel, target_model
 from pydantic import ValidationError
 
-from .errors import ScenarioError, explain
+from .errors import ScenarioError, invalid
 from .target import Geometry
 
 
@@ -55,7 +55,7 @@ def _geometry_values(path: Path) -> dict[str, Any]:
     try:
         Geometry.model_validate(values)
     except ValidationError as error:
-        raise ScenarioError("\n".join(f"{path}: {line}" for line in explain(error, Geometry))) from None
+        raise invalid(error, Geometry, path) from None
     _absolute_mesh(values, path.parent)
     return values
 

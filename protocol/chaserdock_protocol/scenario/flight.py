@@ -18,7 +18,7 @@ from .bodies import Body, FlightTarget
 from .camera import FlightCamera
 from .checks import check_flight
 from .docking import Docking
-from .errors import ScenarioError, explain
+from .errors import invalid
 from .fields import Name, Section
 from .migrations import FORMAT
 from .navigation import NavigationSection
@@ -109,6 +109,4 @@ def flight_scenario_from_json(text: str, source: str) -> FlightScenario:
     try:
         return FlightScenario.model_validate_json(text)
     except ValidationError as error:
-        raise ScenarioError(
-            "\n".join(f"{source}: {line}" for line in explain(error, FlightScenario))
-        ) from None
+        raise invalid(error, FlightScenario, source) from None

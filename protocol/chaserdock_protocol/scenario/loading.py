@@ -13,7 +13,7 @@ from chaserdock_protocol import plugins
 from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, shipped_scenario
 
 from .camera import REPLACED_BY_INTRINSICS
-from .errors import ScenarioError, explain, value_text
+from .errors import ScenarioError, explain, invalid, value_text
 from .files import read_toml, resolve_files
 from .migrations import old_format, old_keys
 from .mission import Scenario
@@ -47,7 +47,7 @@ def scenario_from_json(text: str, source: str) -> Scenario:
     try:
         return Scenario.model_validate_json(text)
     except ValidationError as error:
-        raise ScenarioError("\n".join(f"{source}: {line}" for line in explain(error, Scenario))) from None
+        raise invalid(error, Scenario, source) from None
 
 
 def _read_with_parents(path: Path) -> list[tuple[Path, Values]]:

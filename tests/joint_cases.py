@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.estimator import JointInputs
+from chaserdock_controller.estimation.joint.parameters import SightingNoise
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -191,9 +192,13 @@ class SyntheticFlight:
         return float(np.linalg.norm(e[:3])), float(np.linalg.norm(turn)), nees
 
 
-def parameters(scenario: Scenario, errors: NavigationErrors, **more: float) -> JointParameters:
+WHITE = SightingNoise(white_ratio=0.85, view_ratio=0.0, view_time_s=1.0)
+"""Sightings without a persistent error."""
+
+
+def parameters(scenario: Scenario, errors: NavigationErrors, **more: object) -> JointParameters:
     """Return the parameters of a filter that knows the errors' sigmas; sightings without a persistent error."""
-    options = {"view_ratio_single": 0.0, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
+    options = {"single_marker": WHITE, "floor_sighting_m": 0.0, "floor_sighting_rad": 0.0, **more}
     return JointParameters(MekfParameters(), scenario.chaser, scenario.camera_model(), errors, **options)  # type: ignore[arg-type]
 
 

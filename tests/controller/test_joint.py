@@ -17,7 +17,7 @@ from chaserdock_controller.estimation.joint.measurements import (
     mounting_of,
     predict_sighting,
 )
-from chaserdock_controller.estimation.joint.parameters import GATE_CHI_SQUARE_3
+from chaserdock_controller.estimation.joint.parameters import GATE_CHI_SQUARE_3, SightingNoise
 from chaserdock_controller.estimation.joint.prediction import predict
 from chaserdock_controller.estimation.joint.state import (
     ATTITUDE_DRIFT,
@@ -79,7 +79,10 @@ def estimator_for(errors: NavigationErrors, chasers: int) -> JointEstimator:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_jacobians_agree_with_finite_differences(seed: int) -> None:
-    state, p = random_state(seed), parameters(SCENARIO, navigation("orbit"), view_ratio_single=1.0)
+    state, p = (
+        random_state(seed),
+        parameters(SCENARIO, navigation("orbit"), single_marker=SightingNoise(1.0, 1.0, 30.0)),
+    )
     mounting = mounting_of(p.camera)
     flight = SyntheticFlight(SCENARIO, p.navigation, 2, seed)
     odometry, sighting = flight.inputs().odometry[1], flight.inputs().sightings[1].solutions[0]

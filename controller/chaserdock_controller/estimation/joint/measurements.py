@@ -143,7 +143,8 @@ def linearize_sighting(
     """Return the residual (6,) of a solution from so many ``markers``: position in IRF, m, and rotation in TRF, rad."""
     predicted = predict_sighting(state, i, mounting)
     stated = sighting_covariance(solution, p)
-    factor = p.view_ratio(markers) * np.linalg.cholesky(stated)
+    noise = p.sighting_noise(markers)
+    factor = noise.view_ratio * np.linalg.cholesky(stated)
     view = factor @ state.of(i, VIEW)
     r = np.empty(6)
     r[0:3] = solution.position_m - predicted.position_m - view[0:3]
@@ -151,7 +152,7 @@ def linearize_sighting(
     r[3:6] = turn - view[3:6]
     by_chaser = predicted.by_chaser
     by_chaser[:, VIEW] = factor
-    return LinearizedMeasurement(r, predicted.by_target, by_chaser, p.sighting_scale**2 * stated)
+    return LinearizedMeasurement(r, predicted.by_target, by_chaser, noise.white_ratio**2 * stated)
 
 
 def sighting_covariance(solution: PoseSolution, p: JointParameters) -> Array:

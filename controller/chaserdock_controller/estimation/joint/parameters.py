@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 from chaserdock_models.arrays import Vector3
 from chaserdock_models.camera import Camera
@@ -16,14 +18,32 @@ from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MekfPar
 GATE_CHI_SQUARE_3 = 21.107513466160444
 """0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with SciPy)."""
 
+TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-4, 1e-4)}
+
+
+class SightingNoise(NamedTuple):
+    """Errors of sightings as ratios to the stated sigma.
+
+    white_ratio: of white noise with the same effect on an average over seconds as the true errors, half of which are correlated
+        over about 0.5 s. view_ratio: of an error that persists while the view stays the same, with the time constant
+        ``view_time_s``.
+    """
+
+    white_ratio: float
+    view_ratio: float
+    view_time_s: float
+
+
+SINGLE_MARKER = SightingNoise(white_ratio=1.4, view_ratio=0.15, view_time_s=1000.0)
+SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
+
 
 @dataclass(frozen=True)
 class JointParameters:
     """Parameters of ``JointEstimator``; docs/estimation.md gives the reasons for the values.
 
-    target: motion model, process noise, initial sigmas and thresholds of the target; the filter uses none of its camera
-        errors. body: assumed mass properties of the chasers. camera: as calibrated. navigation: errors of the chasers'
-        sensors.
+    target: motion model, initial sigmas and thresholds of the target; the filter uses none of its camera errors and noises.
+    body: assumed mass properties of the chasers. camera: as calibrated. navigation: errors of the chasers' sensors.
     control_force_share, control_torque_share: sigma of a commanded impulse's effect, as a share of it; control_arm_m:
         offset of the force from the centre of mass. They cover errors of thrust, mass, inertia and alignment, which are the
         same at every tick: as white noise they are larger.
@@ -32,10 +52,10 @@ class JointParameters:
     latched_*: white acceleration of a chaser whose latch holds the target.
     contact_*: sigma of the change of a chaser's rates by a contact.
     floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
-    sighting_scale: factor on the stated covariance of a sighting for its white part.
-    view_ratio_single, view_ratio_several: sigma of the error of a sighting that persists while the view stays the same, as a ratio
-        of the stated sigma, with one marker and with several smaller ones, whose corners depend more on the pixel grid.
-    view_time_single_s, view_time_several_s: time constants of this error.
+    target_noise: square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular acceleration
+        (rad/s²/√Hz), by motion model. Torque-free motion depends on inertia ratios, which may be wrong by some 15 %.
+    single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
+        more on the pixel grid.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
         as by a stuck thruster; assumed only where velocity or rate does not fit otherwise.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
@@ -69,11 +89,9 @@ class JointParameters:
     floor_omega_rad_s: float = 1e-5
     floor_sighting_m: float = 2e-5
     floor_sighting_rad: float = math.radians(0.002)
-    sighting_scale: float = 0.85
-    view_ratio_single: float = 0.1
-    view_ratio_several: float = 1.3
-    view_time_single_s: float = 30.0
-    view_time_several_s: float = 3.0
+    target_noise: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TARGET_NOISE)
+    single_marker: SightingNoise = SINGLE_MARKER
+    several_markers: SightingNoise = SEVERAL_MARKERS
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.01
@@ -93,13 +111,9 @@ class JointParameters:
         turn = math.hypot(n.camera_turn_rad, n.camera_centre_px / self.camera.fx_px)
         object.__setattr__(self, "camera_turn_rad", turn)
 
-    def view_ratio(self, markers: int) -> float:
-        """Return the ratio of the persistent error of a sighting of this many markers to its stated sigma."""
-        return self.view_ratio_single if markers <= 1 else self.view_ratio_several
-
-    def view_time_s(self, markers: int) -> float:
-        """Return the time constant of this error, s."""
-        return self.view_time_single_s if markers <= 1 else self.view_time_several_s
+    def sighting_noise(self, markers: int) -> SightingNoise:
+        """Return the errors of a sighting of this many markers."""
+        return self.single_marker if markers <= 1 else self.several_markers
 
     @property
     def inertia(self) -> Vector3:

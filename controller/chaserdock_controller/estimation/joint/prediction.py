@@ -112,8 +112,8 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
 
 
 def _target_noise(dt: float, p: JointParameters) -> Array:
-    t = p.target
-    return process_noise(dt, t.acceleration_noise_m_s2_sqrt_hz**2, t.angular_noise_rad_s2_sqrt_hz**2)
+    linear, angular = p.target_noise[p.target.motion_model]
+    return process_noise(dt, linear**2, angular**2)
 
 
 def _fading(state: JointState, dt: float, p: JointParameters) -> Array:
@@ -125,7 +125,7 @@ def _fading(state: JointState, dt: float, p: JointParameters) -> Array:
     ):
         fade[:, part] = math.exp(-dt / time_s) if sigma > 0.0 else 1.0
     for i, markers in enumerate(state.markers.tolist()):
-        fade[i, VIEW] = math.exp(-dt / p.view_time_s(markers))
+        fade[i, VIEW] = math.exp(-dt / p.sighting_noise(markers).view_time_s)
     return fade
 
 

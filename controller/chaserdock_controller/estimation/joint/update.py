@@ -136,8 +136,8 @@ def sighted_pose(
     moved = replace(state, position_m=position, q_wxyz=so3.normalize(q))
     predicted = predict_sighting(moved, i, mounting)
     to_pose = np.linalg.inv(predicted.by_target[:, POSE])
-    stated = sighting_covariance(solution, p)
-    noise = (p.sighting_scale**2 + p.view_ratio(markers) ** 2) * stated
+    ratios = p.sighting_noise(markers)
+    noise = (ratios.white_ratio**2 + ratios.view_ratio**2) * sighting_covariance(solution, p)
     by_chaser = to_pose @ predicted.by_chaser
     cross = -by_chaser @ state.covariance[block(i), :]
     own = state.covariance[block(i), block(i)]

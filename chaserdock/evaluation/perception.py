@@ -13,7 +13,8 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Image, PoseSolution, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
-from chaserdock_world.rendering.cameras import Cameras, States
+from chaserdock_world.rendering.cameras import States
+from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.sensors.errors import true_camera
 
 PerceptionModel = Callable[[int, int, int, States], Sighting]
@@ -26,12 +27,12 @@ _LEAST_SIGMA = 1e-4
 class RenderedImages:
     """Render each chaser's image, with the scenario's camera errors and effects, and run its perception on it.
 
-    ``on_image`` sees every image, and returns the one that perception gets.
+    With statistical perception no image is rendered. ``on_image`` sees every image, and returns the one that perception gets.
     """
 
     def __init__(self, scenario: Scenario, on_image: Callable[[Image], Image] = lambda image: image) -> None:
         self._ticks_per_image = scenario.timing.ticks_per_image
-        self._cameras = Cameras(scenario)
+        self._cameras = make_cameras(scenario)
         self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
         self._last: dict[int, Sighting] = {}
         self._on_image = on_image

@@ -47,7 +47,7 @@ GRADES = ("lab", "orbit")
 CALIBRATE_AT_S, CALIBRATION_S = 15.0, 40.0
 
 
-class MissionOutcome(NamedTuple):
+class DispersedFlight(NamedTuple):
     """How a flight ended: the criteria that it missed (none if it succeeded), retreats and other events in words."""
 
     missed: tuple[str, ...]
@@ -80,7 +80,7 @@ def scenario_of(name: str, grade: str, seed: int, images: bool) -> Scenario:
     return load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
 
 
-def fly(name: str, grade: str, images: bool, seed: int) -> MissionOutcome:
+def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
     """Fly a mission to its end and judge it on the true motion."""
     scenario = scenario_of(name, grade, seed, images)
     end_s, success = scenario.duration_s, scenario.success
@@ -116,7 +116,7 @@ def fly(name: str, grade: str, images: bool, seed: int) -> MissionOutcome:
     if wrong < 0:
         missed.append(f"{-wrong} thruster failures are not detected")
     rms = [math.sqrt(sum(e[k] ** 2 for e in steady) / len(steady)) for k in (0, 1)]
-    return MissionOutcome(tuple(missed), len(mission.contacts), retreats, max(0, wrong), *rms)
+    return DispersedFlight(tuple(missed), len(mission.contacts), retreats, max(0, wrong), *rms)
 
 
 def _last_retreat(mission: InProcessMission, chaser: int) -> str:
@@ -131,7 +131,7 @@ def fly_all(options: argparse.Namespace, name: str) -> Figures:
     for grade in options.grades:
         key: dict[str, Any] = {"scenario": name, "grade": grade, "images": options.images}
         rows = [r for r in read_lines(options.results) if key.items() <= r.items()]
-        known = {r["seed"]: msgspec.convert(r["outcome"], MissionOutcome) for r in rows}
+        known = {r["seed"]: msgspec.convert(r["outcome"], DispersedFlight) for r in rows}
         todo = [seed for seed in range(number) if seed not in known]
         with ProcessPoolExecutor(options.jobs) as pool:
             for seed, outcome in zip(
@@ -147,7 +147,7 @@ def fly_all(options: argparse.Namespace, name: str) -> Figures:
     return figures
 
 
-def figures_of(label: str, outcomes: list[MissionOutcome]) -> Figures:
+def figures_of(label: str, outcomes: list[DispersedFlight]) -> Figures:
     """Return the figures of a scenario's flights by name, and print the causes of misses."""
     for cause, count in Counter(text for o in outcomes for text in o.missed).most_common():
         print(f"  {label}: {count} x {cause}")

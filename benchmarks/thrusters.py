@@ -71,15 +71,14 @@ def allocation(quick: bool) -> Figures:
         rng = np.random.default_rng(1)
         b = scenario(1.0, body).chaser
         allocator, full = allocator_of(b), thrusts_max(b.thrusters)
-        box = np.array([b.force_max_N] * 3 + [b.torque_max_N_m] * 3)
         worst, over, inexact, took = 0.0, 0.0, 0, []
         for _ in range(1000 if quick else 10_000):
             wrench = allocator.matrix @ (full * rng.uniform(0.0, 1.0, len(full)))
             begin = time.perf_counter()
             got = allocator.allocate(wrench, full)
             took.append(time.perf_counter() - begin)
-            error = np.abs((allocator.matrix @ got.thrusts_N - wrench) / box).max()
-            worst = max(worst, error / np.abs(wrench / box).max())
+            error = np.abs((allocator.matrix @ got.thrusts_N - wrench) / b.wrench_max).max()
+            worst = max(worst, error / np.abs(wrench / b.wrench_max).max())
             over = max(over, float((got.thrusts_N - full).max()), float(-got.thrusts_N.min()))
             inexact += not got.exact
         out |= {

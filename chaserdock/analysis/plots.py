@@ -21,7 +21,6 @@ INK, FAINT, GRID = "#1b1e23", "#5c6370", "#d9dce1"
 SERIES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7a6a00", "#6b4fa0")
 AXES_XYZ = ("#d55e00", "#009e73", "#0072b2")
 LIMIT = "#b3261e"
-FORMATS = ("svg", "png", "pdf")
 
 STYLE: dict[str, Any] = {
     "font.family": "sans-serif",

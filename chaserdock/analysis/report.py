@@ -11,12 +11,12 @@ import json
 import math
 from collections.abc import Iterable
 from html import escape
-from importlib.resources import files
 from pathlib import Path
-from string import Template
 from typing import Any
 
 from chaserdock_protocol.errors import errors_of_writing
+
+from chaserdock.html_page import PAGE_FILES, html_page, table
 
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
@@ -25,7 +25,6 @@ from .replay_scene import replay_data, small_images
 from .summary import summary_of
 from .time_series import load_traces
 
-_PAGE = files("chaserdock.analysis") / "page"
 _DASH = "–"  # noqa: RUF001
 
 
@@ -64,7 +63,7 @@ def report_of(log: Path) -> str:
         replay = _replay(data)
         # "</" would end the script element.
         text = json.dumps(data, separators=(",", ":")).replace("</", "<\\/")
-        code = (_PAGE / "replay.js").read_text(encoding="utf-8")
+        code = (PAGE_FILES / "replay.js").read_text(encoding="utf-8")
         script = (
             f'<script type="application/json" id="replay-data">{text}</script>\n<script>\n{code}</script>'
         )
@@ -86,26 +85,7 @@ def report_of(log: Path) -> str:
         _events(result, bool(replay)),
         _details(flight, result),
     ]
-    page = Template((_PAGE / "report.html").read_text(encoding="utf-8"))
-    return page.substitute(
-        title=escape(f"{flight.scenario.name} {_DASH} chaserdock"),
-        style=(_PAGE / "report.css").read_text(encoding="utf-8"),
-        body="\n".join(part for part in body if part),
-        script=script,
-    )
-
-
-def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
-    """Return a table as HTML; the first cell of each row is its header. Cells are plain text and are escaped."""
-    top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
-    lines = []
-    for row in rows:
-        first, *rest = row
-        cells = "".join(f"<td>{escape(cell)}</td>" for cell in rest)
-        lines.append(f'<tr><th scope="row">{escape(first)}</th>{cells}</tr>')
-    return (
-        f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
-    )
+    return html_page(f"{flight.scenario.name} {_DASH} chaserdock", body, script)
 
 
 def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:

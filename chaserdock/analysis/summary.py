@@ -281,49 +281,34 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         if int(i) in s.success.docked and not c["docked"]:
             out.append(f"chaser {i} is not docked")
         out += not_reached(s, int(i), c["reached_time_s"])
-        _limit(
-            out,
-            f"chaser {i}: steady position RMS",
-            c["steady"]["position_mse_m2"],
-            s.success.steady_position_rms_m,
-            1.0,
-            "m",
-        )
-        _limit(
-            out,
-            f"chaser {i}: steady orientation RMS",
-            c["steady"]["orientation_mse_rad2"],
-            s.success.steady_orientation_rms_deg,
-            180.0 / math.pi,
-            "deg",
+        position, angle = (c["steady"][k] for k in ("position_mse_m2", "orientation_mse_rad2"))
+        what = f"chaser {i}: steady"
+        out += _exceeded(f"{what} position RMS", _root(position), s.success.steady_position_rms_m, "m")
+        out += _exceeded(
+            f"{what} orientation RMS", _degrees(_root(angle)), s.success.steady_orientation_rms_deg, "deg"
         )
     out += capture_failures(result, s)
     estimate = result["target_estimate"]
-    for label, value, limit, unit, factor in (
-        ("position", estimate["max_position_error_m"], s.success.max_estimate_position_m, "m", 1.0),
-        (
-            "orientation",
-            estimate["max_orientation_error_rad"],
-            s.success.max_estimate_orientation_deg,
-            "deg",
-            180.0 / math.pi,
-        ),
-    ):
-        if limit is not None and (value is None or value * factor > limit):
-            shown = "unknown" if value is None else f"{value * factor:.4g} {unit}"
-            out.append(f"largest {label} error of the estimate: {shown}, at most {limit:g} {unit} allowed")
+    position, angle = estimate["max_position_error_m"], _degrees(estimate["max_orientation_error_rad"])
+    what = "error of the estimate"
+    out += _exceeded(f"largest position {what}", position, s.success.max_estimate_position_m, "m")
+    out += _exceeded(f"largest orientation {what}", angle, s.success.max_estimate_orientation_deg, "deg")
     return out
 
 
-def _limit(
-    out: list[str], what: str, mean_square: float | None, limit: float | None, factor: float, unit: str
-) -> None:
-    if limit is None:
-        return
-    value = None if mean_square is None else math.sqrt(mean_square) * factor
-    if value is None or value > limit:
+def _root(mean_square: float | None) -> float | None:
+    return None if mean_square is None else math.sqrt(mean_square)
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)
+
+
+def _exceeded(what: str, value: float | None, limit: float | None, unit: str) -> Iterator[str]:
+    """Yield a message if there is a limit and the value is beyond it or unknown."""
+    if limit is not None and (value is None or value > limit):
         shown = "unknown" if value is None else f"{value:.4g} {unit}"
-        out.append(f"{what}: {shown}, at most {limit:g} {unit} allowed")
+        yield f"{what}: {shown}, at most {limit:g} {unit} allowed"
 
 
 def text_of(result: dict[str, Any]) -> str:

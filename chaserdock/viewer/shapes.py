@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import centre_offset
+from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import NDArray
 
@@ -66,7 +67,7 @@ def polyline(points: Array) -> NDArray[np.float32]:
 
 def box_edges(size_m: tuple[float, float, float]) -> NDArray[np.float32]:
     """Return the twelve edges (12, 2, 3) of a box about the origin."""
-    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
+    corners = cuboid_corners(size_m)
     pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
     return np.array([[corners[a], corners[b]] for a, b in pairs], dtype=np.float32)
 

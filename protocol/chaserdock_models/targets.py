@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -36,6 +37,14 @@ class Box:
     position_m: Vector3 = (0.0, 0.0, 0.0)
     q_wxyz: Quaternion = (1.0, 0.0, 0.0, 0.0)
     shade: float = 0.5
+
+
+@lru_cache
+def cuboid_corners(size_m: Vector3) -> Array:
+    """Return the corners (8, 3) of a cuboid about the origin, z changing fastest; read-only."""
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
+    corners.setflags(write=False)
+    return corners
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native.build import X86_64
-from chaserdock_models.targets import target_model
+from chaserdock_models.targets import cuboid_corners, target_model
 
 CAMERA = Camera.from_hfov(640, 480, 1.0)
 MARGIN_PX = 8.0
@@ -89,7 +89,7 @@ def test_a_region_is_the_box_around_the_target_grown() -> None:
     model, some = target_model("paper"), 0
     for pose in poses(300):
         q = rotations.from_matrix(pose.rotation)
-        points = (detect._CUBE * model.size_m) @ rotations.to_matrix(q).T + pose.position
+        points = cuboid_corners(model.size_m) @ rotations.to_matrix(q).T + pose.position
         px = CAMERA.project(points)
         found = detect.region_of(CAMERA, model, pose.position, q)
         if points[:, 2].min() < 0.02:

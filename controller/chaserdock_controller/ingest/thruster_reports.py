@@ -15,8 +15,7 @@ class ThrusterReports:
     """Reports by chaser."""
 
     def __init__(self, scenario: FlightScenario) -> None:
-        body = scenario.chaser
-        self._nominal = np.array([body.force_max_N] * 3 + [body.torque_max_N_m] * 3)
+        self._nominal = scenario.chaser.wrench_max
         self._reports: dict[int, ThrusterReport] = {}
 
     def update(self, reports: Mapping[int, ThrusterReport]) -> None:

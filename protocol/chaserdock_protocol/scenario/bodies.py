@@ -5,6 +5,8 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
+import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_models.targets import TargetModel, target_model, target_names
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
@@ -136,8 +138,13 @@ class Body(Section):
         if self.inertia_kg_m2 is not None:
             _check_inertia(self.inertia_kg_m2)
         if self.actuation == "thrusters":
-            check_layout(self.thrusters, self.force_max_N, self.torque_max_N_m)
+            check_layout(self.thrusters, self.wrench_max)
         return self
+
+    @property
+    def wrench_max(self) -> Array:
+        """Largest force and torque (6,) per body axis, N and N m."""
+        return np.array([self.force_max_N] * 3 + [self.torque_max_N_m] * 3)
 
     @property
     def inertia(self) -> tuple[float, float, float]:

@@ -123,17 +123,16 @@ def thrusts_max(thrusters: Sequence[Thruster]) -> Array:
     return np.array([t.thrust_N for t in thrusters])
 
 
-def check_layout(thrusters: Sequence[Thruster], force_max_N: float, torque_max_N_m: float) -> None:
-    """Raise ValueError unless the thrusters can give every wrench within the limits, on all axes at once."""
+def check_layout(thrusters: Sequence[Thruster], wrench_max: Array) -> None:
+    """Raise ValueError unless the thrusters can give every wrench within ``wrench_max`` (6,), on all axes at once."""
     if not thrusters:
         raise ValueError("actuation thrusters needs thrusters, or a body with thrusters: slider, tetra12")
-    box = np.array([force_max_N] * 3 + [torque_max_N_m] * 3)
-    scale = wrench_set(wrench_matrix(thrusters)).box_scale(thrusts_max(thrusters), box)
+    scale = wrench_set(wrench_matrix(thrusters)).box_scale(thrusts_max(thrusters), wrench_max)
     if scale <= 1e-6:
         raise ValueError("thrusters cannot give force and torque in every direction: no 6-DoF control")
     if scale < 1.0:
         raise ValueError(
-            f"force_max_N {force_max_N:g} and torque_max_N_m {torque_max_N_m:g} on all axes at once are more than "
+            f"force_max_N {wrench_max[0]:g} and torque_max_N_m {wrench_max[3]:g} on all axes at once are more than "
             f"the thrusters can give; at most {scale:.3f} of both"
         )
 

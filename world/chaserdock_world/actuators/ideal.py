@@ -83,7 +83,7 @@ class IdealActuators:
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
         """See ``Actuators.command``."""
-        limit = np.repeat([self.body.force_max_N, self.body.torque_max_N_m], 3)
+        limit = self.body.wrench_max
         wrench = np.array([*command.force_N, *command.torque_N_m])
         self.saturated |= bool(np.any(np.abs(wrench) > limit * (1 + 1e-6)))
         self.late += effective_step < now_step

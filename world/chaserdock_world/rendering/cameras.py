@@ -13,6 +13,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.errors import ScenarioError
@@ -31,7 +32,6 @@ from .tinyrenderer import TinyRenderer
 
 # Motion blur: one sample of the exposure per this many pixels of motion, and at most so many.
 _BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
-_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 States = dict[str, BodyState]
 
@@ -153,7 +153,7 @@ class Cameras:
         """Return the pixels (8, 2) of the corners of a cuboid around the target."""
         position, attitude = self._camera_pose(chaser, states)
         target = states[TARGET]
-        at_w = rotations.rotate(target.q_wxyz, _CUBE * self._target.size_m) + target.position_m
+        at_w = rotations.rotate(target.q_wxyz, cuboid_corners(self._target.size_m)) + target.position_m
         return self._cameras[chaser].project_ideal(rotations.rotate_inverse(attitude, at_w - position))
 
 

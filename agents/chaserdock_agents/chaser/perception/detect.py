@@ -13,7 +13,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.targets import TargetModel
+from chaserdock_models.targets import TargetModel, cuboid_corners
 from numpy.typing import ArrayLike, NDArray
 
 # Minimum perimeter of a marker, pixels.
@@ -24,7 +24,6 @@ _REGION_SHARE, _REGION_MARGIN_PX = 0.25, 24.0
 _HALVED_PX = 300
 # A region with a larger share of the image is not used.
 _REGION_LIMIT = 0.7
-_CUBE = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 
 Region = tuple[int, int, int, int]
 
@@ -124,7 +123,7 @@ def region_of(
 ) -> Region | None:
     """Return the image region of a target with this predicted pose; None to search the whole image."""
     turn = rotations.to_matrix(q_irf_trf_wxyz)
-    points = _box(model.size_m) @ turn.T + np.asarray(position_irf_m)
+    points = cuboid_corners(model.size_m) @ turn.T + np.asarray(position_irf_m)
     # The sum is not finite if any coordinate is not.
     if not math.isfinite(float(points.sum())) or min(points[:, 2].tolist()) < 0.02:
         return None
@@ -138,12 +137,6 @@ def region_of(
     if (right - left) * (bottom - top) > _REGION_LIMIT * camera.width_px * camera.height_px:
         return None
     return left, top, right, bottom
-
-
-@lru_cache
-def _box(size_m: tuple[float, float, float]) -> Array:
-    """Return the corners (8, 3) of a box about the origin."""
-    return _CUBE * size_m
 
 
 def _grown(px: list[float], end: int) -> tuple[int, int] | None:

@@ -94,4 +94,4 @@ def _closest(rows: Array, target: Array, most: Array) -> tuple[Array, int]:
 
 def allocator_of(body: Body) -> Allocator:
     """Return the thruster allocation of a body; the units of the norm are its maximum force and torque."""
-    return Allocator(body.thrusters, np.array([body.force_max_N] * 3 + [body.torque_max_N_m] * 3))
+    return Allocator(body.thrusters, body.wrench_max)

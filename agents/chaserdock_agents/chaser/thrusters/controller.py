@@ -55,7 +55,7 @@ class ThrusterController:
         self._allocator = allocator_of(body)
         self._matrix = self._allocator.matrix
         self._full_N = thrusts_max(body.thrusters)
-        self._box = np.array([body.force_max_N] * 3 + [body.torque_max_N_m] * 3)
+        self._box = body.wrench_max
         self._set = wrench_set(self._matrix)
         self._modulator = Modulator(body.thrusters, body.modulation, scenario.timing)
         self._valves = Valves(body.thrusters)  # the chaser's model of the real valves

@@ -73,10 +73,15 @@ def flown(flight: RecordedFlight) -> list[int]:
     """Return the chasers whose motion is in the log. Raise MissingData without any, or without target."""
     if "target" not in flight.truth:
         raise MissingData("the log holds no ground truth of the target")
-    numbers = [i for i in range(len(flight.scenario.chasers)) if f"chaser/{i}" in flight.truth]
+    numbers = flight.flown
     if not numbers:
         raise MissingData("the log holds no ground truth of any chaser")
     return numbers
+
+
+def _span_s(times_s: Array) -> tuple[float, float]:
+    """Return the limits of a time axis, from zero, not empty."""
+    return 0.0, max(float(times_s[-1]), 1e-3)
 
 
 def _path(own: Track, target: Track) -> tuple[Array, Array]:
@@ -163,7 +168,7 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
         _mark_phases(axes, flight, axes is top)
         if limit is not None:
             limit_line(axes, limit, f"RMS limit in the shaded interval: {limit:g} {unit}")
-    top.set(ylabel="position error / m", xlim=(0, max(float(flight.truth["target"].time_s[-1]), 1e-3)))
+    top.set(ylabel="position error / m", xlim=_span_s(flight.truth["target"].time_s))
     bottom.set(ylabel="orientation error / °", xlabel="time / s")
     legend_above(top)
     return figure
@@ -177,8 +182,8 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
     nearest = np.inf
     for i in numbers:
         own = flight.truth[f"chaser/{i}"]
-        n = min(len(own.time_s), len(target.time_s))
-        distance = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)
+        distance = own.distance_to(target)
+        n = len(distance)
         nearest = min(nearest, float(distance.min()))
         d, time_s = decimated(n), own.time_s[:n]
         top.plot(time_s[d], distance[d], color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
@@ -201,9 +206,7 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
     )
     top.set(ylabel="distance to the target / m", ylim=(min(nearest, keep_out_m) * 0.5, None))
     limit_line(bottom, s.approach.max_speed_m_s * 1e3, "approach speed limit")
-    bottom.set(
-        ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=(0, max(float(target.time_s[-1]), 1e-3))
-    )
+    bottom.set(ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=_span_s(target.time_s))
     settled = s.approach.max_speed_m_s * 1e3
     bottom.set_ylim(-settled, 2.0 * settled)
     for axes in (top, bottom):
@@ -220,14 +223,14 @@ def separation(flight: RecordedFlight, _: Traces) -> Figure:
     figure, (axes,) = new_figure(1, height=2.8)
     for k, (i, j) in enumerate(combinations(numbers, 2)):
         a, b = flight.truth[f"chaser/{i}"], flight.truth[f"chaser/{j}"]
-        n = min(len(a.time_s), len(b.time_s))
-        distance = np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
+        distance = a.distance_to(b)
+        n = len(distance)
         d = decimated(n)
         axes.plot(a.time_s[:n][d], distance[d], color=colour(k), linestyle=dashes(k), label=f"{i}, {j}")
     least = flight.scenario.limits.min_distance_chasers_m
     limit_line(axes, least, f"limit {least:g} m")
     axes.set(ylabel="distance / m", xlabel="time / s", ylim=(0, None))
-    axes.set_xlim(0, max(float(flight.truth["target"].time_s[-1]), 1e-3))
+    axes.set_xlim(_span_s(flight.truth["target"].time_s))
     legend_above(axes)
     return figure
 
@@ -346,7 +349,7 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
         # The initial bounds are wide and do not set the scale.
         reach = 1.6 * max(float(np.max(s[settled])), float(np.max(np.abs(e[settled]))))
         axes[3 * row].set_ylim(-reach, reach)
-    axes[0].set_xlim(0, max(float(time_s[-1]), 1e-3))
+    axes[0].set_xlim(_span_s(time_s))
     return figure
 
 
@@ -371,7 +374,7 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
     axes.set_title(
         f"mean {np.mean(errors['nees']):.2f} (6 expected); {100 * outside:.1f} % outside the 95 % band"
     )
-    axes.set(ylabel="NEES", xlabel="time / s", xlim=(0, max(float(errors["time_s"][-1]), 1e-3)))
+    axes.set(ylabel="NEES", xlabel="time / s", xlim=_span_s(errors["time_s"]))
     return figure
 
 

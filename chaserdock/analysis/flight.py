@@ -53,6 +53,11 @@ class Track:
     q_wxyz: Array
     omega_rad_s: Array
 
+    def distance_to(self, other: Track) -> Array:
+        """Return the distance (K,), m, to another body while both are in the log."""
+        n = min(len(self.time_s), len(other.time_s))
+        return np.linalg.norm(self.position_m[:n] - other.position_m[:n], axis=1)
+
 
 class Tracks(Mapping[str, Track]):
     """Tracks by name. A long track occupies memory only while it is referenced."""
@@ -153,6 +158,11 @@ class RecordedFlight:
     latency_s: Array
     wall_time_s: float
     digest: str
+
+    @property
+    def flown(self) -> list[int]:
+        """Chasers whose motion is in the log."""
+        return [i for i in range(len(self.scenario.chasers)) if f"chaser/{i}" in self.truth]
 
     @property
     def estimate(self) -> Track:

@@ -63,10 +63,8 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
     if rows[-1] != len(target.time_s) - 1:
         rows = np.append(rows, len(target.time_s) - 1)
     chasers, reach_m = [], 0.3
-    for i in range(len(flight.scenario.chasers)):
-        own = flight.truth.get(f"chaser/{i}")
-        if own is None:
-            continue
+    for i in flight.flown:
+        own = flight.truth[f"chaser/{i}"]
         mine = rows[rows < len(own.time_s)]
         _, position, _ = tracking_errors(flight, i)
         distance = np.linalg.norm(own.position_m[mine] - target.position_m[mine], axis=1)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -133,11 +134,6 @@ def _percentiles(x: Array, names: dict[str, float]) -> dict[str, float | None]:
     return out | {"max": _greatest(x)}
 
 
-def _distance(a: Track, b: Track) -> Array:
-    n = min(len(a.time_s), len(b.time_s))
-    return np.linalg.norm(a.position_m[:n] - b.position_m[:n], axis=1)
-
-
 def dock_time(flight: RecordedFlight, chaser: int) -> float | None:
     """Return the time (s) from which on a chaser stays within the docking tolerances; None if it is not docked.
 
@@ -167,11 +163,10 @@ def _unanswered(flight: RecordedFlight) -> int:
 def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     """Evaluate a flight; return plain values for JSON."""
     s = flight.scenario
-    chasers, names = {}, [f"chaser/{i}" for i in range(len(s.chasers))]
+    chasers: dict[str, dict[str, Any]] = {}
     until = s.steady_until_s or s.duration_s
-    for i, name in enumerate(names):
-        if name not in flight.truth or "target" not in flight.truth:
-            continue
+    for i in flight.flown if "target" in flight.truth else ():
+        name = f"chaser/{i}"
         time_s, position, angle = tracking_errors(flight, i)
         steady = (time_s >= s.settling_s) & (time_s < until)
         docked_s = dock_time(flight, i)
@@ -185,18 +180,16 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             "docked": docked_s is not None,
             "dock_time_s": docked_s,
             "reached_time_s": reached_time(flight, i),
-            "min_distance_target_m": float(np.min(_distance(flight.truth[name], flight.truth["target"]))),
+            "min_distance_target_m": float(flight.truth[name].distance_to(flight.truth["target"]).min()),
             "impulse_N_s": flight.absolute_impulse_N_s[name],
             "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
         }
         if (capture := capture_of(flight, i)) is not None:
             chasers[str(i)]["capture"] = capture
-    flown = [n for n in names if n in flight.truth]
     between = [
-        float(np.min(_distance(flight.truth[a], flight.truth[b])))
-        for k, a in enumerate(flown)
-        for b in flown[:k]
+        float(flight.truth[f"chaser/{i}"].distance_to(flight.truth[f"chaser/{j}"]).min())
+        for i, j in combinations(flight.flown, 2)
     ]
     errors = estimate_errors(flight)
     late = errors["time_s"] >= s.settling_s

@@ -144,14 +144,14 @@ class _ExternalView:
         self.scene = scene_of(flight.scenario)
         sun = np.array(flight.scenario.camera.sun_direction)
         self.sun = sun / np.linalg.norm(sun)
-        self.numbers = [i for i in range(len(flight.scenario.chasers)) if f"chaser/{i}" in flight.truth]
+        self.numbers = flight.flown
         self.target = target = flight.truth["target"]
         self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
         reach = 0.3
         for own in self.chasers.values():
-            n = min(len(own.time_s), len(target.time_s))
-            shown = (own.time_s[:n] >= part_s[0]) & (own.time_s[:n] <= part_s[1])
-            away_m = np.linalg.norm(own.position_m[:n] - target.position_m[:n], axis=1)[shown]
+            away_m = own.distance_to(target)
+            time_s = own.time_s[: len(away_m)]
+            away_m = away_m[(time_s >= part_s[0]) & (time_s <= part_s[1])]
             reach = max(reach, float(away_m.max(initial=0.0)))
         # Distant chasers must not reduce the scale for all others.
         self.distance_m = 3.5 * min(reach, 3.0)

@@ -24,6 +24,7 @@ from chaserdock_world.rendering import native as rendering_native
 from chaserdock_world.rendering import scene_geometry as faces
 from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
 from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap
+from nmpc_kernels import build_rows
 from numpy.typing import NDArray
 from source_tree import ROOT
 
@@ -198,7 +199,7 @@ def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached(
     x = frame.rolled(task, task.start)
     room_m = 0.5 * (4.0 - 0.35 - 5e-3)
     for reach_m, rows in ((room_m - 1e-6, 0), (room_m + 1e-6, 30)):
-        found = kernels.build_rows(task.problem, x, 25.0, np.full((2, 31), reach_m))
+        found = build_rows(task.problem, x, 25.0, np.full((2, 31), reach_m))
         assert list(found.n_rows) == [rows, rows]
 
 

@@ -13,13 +13,14 @@ from chaserdock_controller.guidance.reference import (
     reference_trajectory,
 )
 from chaserdock_controller.nmpc import NmpcParameters
-from chaserdock_controller.nmpc.kernels import model_of, roll, roll_linearized
+from chaserdock_controller.nmpc.kernels import model_of, roll
 from chaserdock_controller.nmpc.problem import derivative, dynamics
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmpc_cases import SETTINGS
+from nmpc_kernels import roll_linearized
 
 MASS_KG = 30.0
 INERTIA = ((0.9, 0.02, -0.03), (0.02, 1.3, 0.05), (-0.03, 0.05, 1.7))

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from chaserdock_controller.nmpc import BACK_ENDS, NmpcInput, make_solver
 from chaserdock_controller.nmpc.checks import check_input
-from chaserdock_controller.nmpc.kernels import build_rows
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from nmpc_cases import D_MIN_M, PARAMS, Array, at_rest, far_start, fixed_problem, fly, fresh, swap
+from nmpc_kernels import build_rows
 
 # Eight stages, for speed.
 SHORT_HORIZON = replace(PARAMS, horizon_s=0.8)

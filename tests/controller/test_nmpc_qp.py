@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
 from chaserdock_controller.nmpc.checks import check_input
-from chaserdock_controller.nmpc.kernels import CONVERGED, FREE, MU_STOP, QpAnswer, plan_cost, solve_qp
+from chaserdock_controller.nmpc.kernels import plan_cost
 from chaserdock_controller.nmpc.slack import SLACK_L1, SLACK_L2
 from chaserdock_controller.nmpc.types import IntArray
 from chaserdock_models import rotations
@@ -23,6 +23,16 @@ from nmpc_cases import (
     fresh,
     solver,
     tumbling,
+)
+from nmpc_kernels import (
+    CONVERGED,
+    FREE,
+    MU_STOP,
+    QpAnswer,
+    build_rows,
+    quadratic_model,
+    roll_linearized,
+    solve_qp,
 )
 
 Model = tuple[Array, ...]  # as `quadratic_model` returns it
@@ -47,11 +57,11 @@ def qp_data(problem: NmpcInput, u: Array) -> list[Qp]:
     problem = check_input(problem, PARAMS, n)
     x, mats = np.empty((n, d + 1, 13)), np.empty((n, d, 12, 12))
     x[:, 0] = problem.states
-    kernels.roll_linearized(MODEL, x, u, problem.input_max, mats)
-    rows = kernels.build_rows(problem, x, 25.0, np.full((n, d + 1), 10.0))
+    roll_linearized(MODEL, x, u, problem.input_max, mats)
+    rows = build_rows(problem, x, 25.0, np.full((n, d + 1), 10.0))
     out = []
     for i in range(n):
-        model = kernels.quadratic_model(
+        model = quadratic_model(
             WEIGHTS, x[i], u[i], problem.references[i], problem.u_ref[i], problem.input_max[i]
         )
         m = rows.n_rows[i]

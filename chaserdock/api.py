@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
 
 from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.stall import DEFAULT_STALL_S
 
 from .toml_text import toml_value
 
@@ -51,6 +52,7 @@ def run(
     mode: Literal["lockstep", "realtime"] = "lockstep",
     seed: int | None = None,
     keys: StrPath | None = None,
+    stall_s: float = DEFAULT_STALL_S,
     overrides: Mapping[str, object] | None = None,
     on_event: Callable[[JsonLine], None] | None = None,
     **changes: object,
@@ -63,6 +65,7 @@ def run(
         mode: ``lockstep`` (reproducible) or ``realtime`` (simulated time follows the wall clock).
         seed: seed of all random numbers.
         keys: folder of a mission's keys: connect through a router, over TLS, with access rights.
+        stall_s: time (s) without progress after which a lock-step mission ends, with the reason.
         overrides: scenario values by dotted key, such as ``{"camera.width_px": 640}``.
         on_event: called in this thread with the objects that ``chaserdock run --json`` prints.
         **changes: scenario values; tables are merged: ``duration_s=20, camera={"width_px": 640}``.
@@ -82,6 +85,7 @@ def run(
         seed=seed,
         sets=override_texts(overrides, changes),
         keys=keys,
+        stall_s=stall_s,
         show=Show.none if on_event is None else Show.json,
         emit=on_event,
     )
@@ -99,6 +103,7 @@ def fly(
     sets: tuple[str, ...],
     keys: StrPath | None,
     show: Show,
+    stall_s: float = DEFAULT_STALL_S,
     viewer_port: int | None = None,
     stop_requested: Callable[[], bool] = lambda: False,
     emit: Callable[[JsonLine], None] | None = None,
@@ -121,6 +126,7 @@ def fly(
         None if keys is None else Path(keys),
         stop_requested,
         emit or print_json_line,
+        stall_s,
     )
 
 

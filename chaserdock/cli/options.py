@@ -84,6 +84,14 @@ JoinTimeoutOpt = Annotated[
     float | None,
     typer.Option("--timeout", min=0.1, help="seconds to wait for a world; unlimited by default"),
 ]
+StallOpt = Annotated[
+    float,
+    typer.Option(
+        "--stall-s",
+        min=1.0,
+        help="seconds without progress after which a lock-step mission ends, or without the world after which a process ends",
+    ),
+]
 ReplyTimeoutOpt = Annotated[float, typer.Option(min=0.1, max=3600.0, help="seconds to wait for the reply")]
 OperatorOpt = Annotated[str, typer.Option(help="name of the operator, for the log")]
 ChaserArg = Annotated[int, typer.Argument(min=0, max=255, help="chaser number, from 0")]

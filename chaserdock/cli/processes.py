@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from chaserdock_protocol.stall import DEFAULT_STALL_S
 
 from .options import (
     ChaserArg,
@@ -21,6 +22,7 @@ from .options import (
     ScenarioArg,
     SeedOpt,
     SetOpt,
+    StallOpt,
     WatchOpt,
     fail,
     with_link_options,
@@ -60,6 +62,7 @@ def world(
     rejoin_timeout: Annotated[
         float, typer.Option(min=0.0, help="lock-step: seconds to wait after all processes were lost")
     ] = 0.0,
+    stall_s: StallOpt = DEFAULT_STALL_S,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Simulate the world: physics, cameras, time. Listens on tcp/127.0.0.1:7447 by default."""
@@ -74,6 +77,7 @@ def world(
         mode=mode.value,
         recorder_expected=recorder,
         rejoin_s=rejoin_timeout,
+        stall_s=stall_s,
         watch_parent=watch_parent,
     )
     start_process("world", options)
@@ -85,13 +89,18 @@ def chaser(
     *,
     link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
+    stall_s: StallOpt = DEFAULT_STALL_S,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Run one chaser: measures the target's pose in its images, drives its actuators."""
     from chaserdock_protocol.process import ProcessOptions
 
     options = ProcessOptions(
-        link=link.link(f"chaser/{number}"), chaser=number, patience_s=timeout, watch_parent=watch_parent
+        link=link.link(f"chaser/{number}"),
+        chaser=number,
+        patience_s=timeout,
+        stall_s=stall_s,
+        watch_parent=watch_parent,
     )
     start_process("chaser", options)
 
@@ -104,13 +113,16 @@ def controller(
     *,
     link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
+    stall_s: StallOpt = DEFAULT_STALL_S,
     watch_parent: WatchOpt = False,
 ) -> None:
     """Run the central controller: fuses all chasers' measurements, plans for all chasers."""
     from chaserdock_protocol.process import ProcessOptions
 
     own = link.link("standby" if standby else "controller")
-    options = ProcessOptions(link=own, patience_s=timeout, watch_parent=watch_parent, standby=standby)
+    options = ProcessOptions(
+        link=own, patience_s=timeout, stall_s=stall_s, watch_parent=watch_parent, standby=standby
+    )
     start_process("controller", options)
 
 
@@ -121,6 +133,7 @@ def record(
     *,
     link: LinkOptions,
     timeout: JoinTimeoutOpt = None,
+    stall_s: StallOpt = DEFAULT_STALL_S,
     rotate_size: Annotated[
         float | None,
         typer.Option(min=1, max=1e9, help="start a new file (mission-0000.mcap …) after this many megabytes"),
@@ -144,6 +157,7 @@ def record(
         rotation=Rotation(None if rotate_size is None else round(rotate_size * 1e6), rotate_time),
         viewer_layer=viewer,
         patience_s=timeout,
+        stall_s=stall_s,
         watch_parent=watch_parent,
     )
     start_process("record", options)

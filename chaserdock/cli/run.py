@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from chaserdock_protocol.stall import DEFAULT_STALL_S
 
 from .options import (
     JsonLinesOpt,
@@ -21,6 +22,7 @@ from .options import (
     ScenarioArg,
     SeedOpt,
     SetOpt,
+    StallOpt,
     errors_as_json,
     fail,
     show_of,
@@ -38,6 +40,7 @@ def run(
     as_json: JsonLinesOpt = False,
     view: Annotated[bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")] = False,
     keys: KeysOpt = None,
+    stall_s: StallOpt = DEFAULT_STALL_S,
 ) -> None:
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
     import chaserdock
@@ -58,6 +61,7 @@ def run(
             seed=seed,
             sets=tuple(overrides or ()),
             keys=keys,
+            stall_s=stall_s,
             show=show,
             viewer_port=port,
             stop_requested=stop.is_set,

@@ -26,6 +26,7 @@ from chaserdock_protocol.process import SINGLE_THREADED, Mode
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
 
@@ -37,6 +38,8 @@ from .progress import ProgressReporter, Show, print_json_line
 
 _START_TIMEOUT_S = 120
 _END_TIMEOUT_S = 30.0
+_WORLD_ENDS_S = 15.0
+"""Time (s) that the world has for ending a stalled mission itself."""
 STOPPED_BY_OPERATOR = "stopped by the operator"
 
 
@@ -210,11 +213,13 @@ def fly_mission(
     keys: Path | None = None,
     stop_requested: Callable[[], bool] = never,
     emit: Callable[[JsonLine], None] = print_json_line,
+    stall_s: float = DEFAULT_STALL_S,
 ) -> MissionOutcome:
     """Fly a scenario; write log, summary and the processes' output to ``folder``.
 
     ``viewer_port``: serve the live viewer there until the end of the flight. ``keys``: connect through a router, over TLS,
-    with access rights. ``stop_requested`` is polled. Installs no signal handler; an exception ends all processes.
+    with access rights. ``stall_s``: longest time (s) without progress. ``stop_requested`` is polled. Installs no signal handler; an
+    exception ends all processes.
     Raises RunError, ScenarioError or TransportError when the mission cannot start.
     """
     scenario = load_scenario(path, overrides)
@@ -239,11 +244,12 @@ def fly_mission(
             network = network_options(namespace, endpoint, lease_ms)
         if viewer_port is not None:
             observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
-        start_all(fleet, scenario, path, folder, mode, overrides, network)
+        stall = ["--stall-s", f"{stall_s:g}"]
+        start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
         reporter = ProgressReporter(scenario, show, emit)
         reporter.report(start_line(scenario, mode, folder))
         try:
-            failure = watch(fleet, hub, reporter, stop_requested)
+            failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
         finally:
             reporter.close()
     finally:
@@ -290,16 +296,26 @@ def start_all(
 
 
 def watch(
-    fleet: Fleet, hub: Node, reporter: ProgressReporter, stop_requested: Callable[[], bool]
+    fleet: Fleet,
+    hub: Node,
+    reporter: ProgressReporter,
+    stop_requested: Callable[[], bool],
+    silent_s: float,
 ) -> str | None:
-    """Show the flight until it ends; return why it failed, or None."""
+    """Show the flight until it ends; return why it failed, or None.
+
+    A flight without a tick for ``silent_s`` has failed: the world hangs.
+    """
     hub.subscribe(topics.END)
     reporter.subscribe(hub)
     stopping = False
     measured_s = 0.0
+    silence = StallTimer(time.monotonic)
     end: MissionEnd | None = None
     while end is None:
         received = hub.receive(0.1)
+        if not reporter.flying or (received is not None and received.topic is topics.TICK):
+            silence.reset()
         if received is not None:
             reporter.update(received.message)
             if isinstance(received.message, MissionEnd):
@@ -313,6 +329,8 @@ def watch(
             reporter.print_text("stopping: the log is being closed")
             fleet.children[0].process.send_signal(signal.SIGTERM)
         failure = None if end is not None else _premature_end(fleet, reporter, stopping)
+        if silence.update() > silent_s and end is None:
+            failure = f"world: hangs; no tick for {silence.waited_s:.0f} s"
         if failure is not None:
             return failure
     fleet.wait(_END_TIMEOUT_S)

@@ -314,6 +314,7 @@ class SimulatedConnection:
 
     def __init__(self, network: SimulatedNetwork, name: str, host: SimulatedHost) -> None:
         self.network, self.name, self.host = network, name, host
+        self.source = name
         self.closed = False
         self.token = ""
         self.queryables: dict[str, Callable[[Query], None]] = {}
@@ -324,13 +325,13 @@ class SimulatedConnection:
         self, key: str, encoding: str, qos: str, *, express: bool, blocking: bool
     ) -> Callable[[bytes], None]:
         def send(payload: bytes) -> None:
-            raw = RawSample(key, encoding, payload, self.host.wall_ns())
+            raw = RawSample(key, encoding, payload, self.host.wall_ns(), self.source)
             self.network.publish(self, raw, qos, blocking)
 
         return send
 
     def put(self, raw: RawSample) -> None:
-        sent = RawSample(raw.key, raw.encoding, raw.payload, self.host.wall_ns())
+        sent = RawSample(raw.key, raw.encoding, raw.payload, self.host.wall_ns(), self.source)
         self.network.publish(self, sent, "state", blocking=True)
 
     def subscribe(self, expression: str, arrived: Callable[[RawSample], None]) -> None:

@@ -28,6 +28,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
+from chaserdock_protocol.stall import DEFAULT_STALL_S
 from chaserdock_protocol.transport import Node, ReceivedMessage
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
 
@@ -56,9 +57,9 @@ def main(options: ProcessOptions) -> int:
         core = ControllerCore(scenario, now_s, realtime=realtime)
         controller = ControllerProcess(node, scenario, core, realtime, now_s=now_s)
         node.message_filter = create_fault_layer(faults, node.name, scenario.timing, not realtime, node.host)
-        controller.open(instance)
+        controller.open(instance, options.stall_s)
         node.host.finish_startup()
-        while not (controller.ended or stop()):
+        while not (controller.ended or stop() or controller.heartbeat.world_is_gone()):
             controller.listen()
         controller.farewell()
         return 0 if controller.ended else 1
@@ -101,7 +102,7 @@ class ControllerProcess:
         self._patience_s = _PATIENCE_TICKS / scenario.time.rate_hz
         self._deadline_s = 0.0
 
-    def open(self, instance: str) -> None:
+    def open(self, instance: str, stall_s: float = DEFAULT_STALL_S) -> None:
         """Advertise and subscribe the topics, then start the heartbeat."""
         node = self.node
         self.standby.instance, self._on_network = instance, True
@@ -113,7 +114,7 @@ class ControllerProcess:
         inputs = (topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.THRUSTERS)
         for topic in (topics.TICK, topics.END, *inputs, topics.STATE):
             node.subscribe(topic)
-        self.heartbeat = Heartbeat(node, instance)
+        self.heartbeat = Heartbeat(node, instance, stall_s)
 
     def operate(self, command: OperatorCommand, reply: Callable[[CommandReply], None]) -> None:
         """Queue an operator command for the next tick. Runs on Zenoh's thread."""
@@ -130,6 +131,8 @@ class ControllerProcess:
         released = self.standby.release(self.done_tick)
         received = released or self.node.receive(self._timeout_s())
         self._idle_receives = 0 if received is not None else self._idle_receives + 1
+        if self._on_network:
+            self.heartbeat.report_waiting(received, self._missing_keys)
         if released is not None:
             self._dispatch(released)
         elif received is not None and not self._dispatch_leadership(received.message):
@@ -139,6 +142,13 @@ class ControllerProcess:
         tick = self.tick
         if tick is not None and tick.tick > self.done_tick and self._is_ready(tick):
             self._process(tick)
+
+    def _missing_keys(self) -> tuple[str, ...]:
+        """Return the keys of the messages that the open tick waits for, or that the next one begins with."""
+        tick = self.tick
+        if tick is None or tick.tick <= self.done_tick:
+            return (topics.TICK.key_of(),)
+        return self.inputs.missing_keys(tick) or (topics.STATE.key_of(),)
 
     def _open_tick(self) -> Tick | None:
         """Return the tick that waits for its deadline, in real time."""

@@ -496,11 +496,15 @@ class ThrusterFaultCommand(Struct, frozen=True, kw_only=True):
 
 
 class Presence(Message, frozen=True, kw_only=True):
-    """Heartbeat of a process. ``heard``: processes whose presence it has received, name to instance."""
+    """Heartbeat of a process. ``heard``: processes whose presence it has received, name to instance.
+
+    ``waiting_for``: keys of the messages that it waits for, if it has nothing else to do.
+    """
 
     process: Text
     instance: Text
     heard: Names
+    waiting_for: Annotated[tuple[Text, ...], Meta(max_length=1024)] = ()
 
 
 class Farewell(Message, frozen=True, kw_only=True):
@@ -521,6 +525,7 @@ class JoinReply(Struct, frozen=True, kw_only=True):
     """The world's reply: the flight scenario as JSON, or the reason of a rejection.
 
     ``faults``: JSON of what the test bed injects at this process. For the code around the flight software only.
+    ``source``: identity of the world's session, which stamps its messages; others on its keys are ignored. Empty: unknown.
     """
 
     accepted: bool
@@ -529,6 +534,7 @@ class JoinReply(Struct, frozen=True, kw_only=True):
     mode: Literal["lockstep", "realtime"] = "lockstep"
     scenario_json: ScenarioText = ""
     faults: ScenarioText = "{}"
+    source: Text = ""
 
 
 class ScenarioRequest(Struct, frozen=True, kw_only=True):

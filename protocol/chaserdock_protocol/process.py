@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from .stall import DEFAULT_STALL_S
 from .transport import Link
 
 Mode = Literal["lockstep", "realtime"]
@@ -57,6 +58,7 @@ class ProcessOptions:
     watch_parent: bool = False
     patience_s: float | None = None
     rejoin_s: float = 0.0
+    stall_s: float = DEFAULT_STALL_S
     by_run: bool = False
     until: str | None = None
     standby: bool = False

@@ -56,6 +56,9 @@ class SilentHeartbeat:
     def take(self, message: Any) -> None:
         """Ignore a presence."""
 
+    def report_waiting(self, received: Any, missing_keys: Any) -> None:
+        """Ignore what the process waits for."""
+
 
 @dataclass(frozen=True)
 class Stage:

@@ -122,6 +122,8 @@ TOPICS: tuple[Topic, ...] = (
 
 EXPRESS = (WRENCH, ACTUATORS, ACK, STATE)
 """Sent at once (not batched), together with messages of their priority published before."""
+WORLD_BRANCHES = ("world/", "truth/")
+"""Beginnings of the keys that only the world writes."""
 NEVER_DROPPED = (END, FAREWELL)
 """Published once, at the end, and never dropped, not even in real time."""
 

@@ -101,6 +101,7 @@ class World:
             scenario_json=flight_scenario_json(scenario),
             faults_of=lambda process: faults_of(scenario, process).model_dump_json(),
             instance=node.host.unique_id(),
+            source=node.source,
             now_s=node.host.now_s,
         )
         node.blocking = not self._realtime
@@ -150,8 +151,8 @@ class World:
             self._expose_images(tick, states)
             if self._realtime:
                 self._step_realtime(tick)
-            else:
-                self._await_replies_and_step(tick, stop)
+            elif stalled := self._await_replies_and_step(tick, stop):
+                return self._end_mission(tick, stalled, complete=False)
             if stop() or self._barrier.lost_all_chasers(self._options.rejoin_s, stop):
                 return self._end_mission(tick, "stopped" if stop() else "no chaser is left", complete=False)
             tick += 1
@@ -195,15 +196,20 @@ class World:
         for image in self._cameras.images(chasers, *exposure) if self._realtime else one_by_one:
             self._node.publish(topics.IMAGE, image, image.chaser)
 
-    def _await_replies_and_step(self, tick: int, stop: StopSignal) -> None:
-        """Lock-step: step the physics to the end of the tick, waiting for all replies before they take effect."""
+    def _await_replies_and_step(self, tick: int, stop: StopSignal) -> str:
+        """Lock-step: step the physics to the end of the tick, waiting for all replies before they take effect.
+
+        Returns why the tick cannot end, empty if it does.
+        """
         timing, barrier = self._timing, self._barrier
         end = timing.step_of_tick(tick + 1)
         self._contacts = set()
         # No reply takes effect before the latency has passed: simulate that far while the others compute.
         self._step_to(min(end, timing.step_of_tick(tick) + timing.latency_steps))
-        if barrier.wait_until(barrier.is_complete, stop, barrier.pending):
+        stalled = barrier.await_replies(stop, self._options.stall_s)
+        if not stalled and not stop():
             self._step_to(end)
+        return stalled
 
     def _step_realtime(self, tick: int) -> None:
         """Real time: step the physics with the wall clock, in slices, so that a command acts as soon as it arrives."""

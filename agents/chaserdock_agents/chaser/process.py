@@ -18,6 +18,7 @@ from chaserdock_protocol.messages import (
     Image,
     JoinReply,
     Level,
+    Message,
     MissionEnd,
     Odometry,
     Plan,
@@ -30,6 +31,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
+from chaserdock_protocol.stall import DEFAULT_STALL_S
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.session import Heartbeat, create_health, run_member
@@ -54,9 +56,9 @@ def main(options: ProcessOptions) -> int:
         lockstep = mission.mode == "lockstep"
         node.message_filter = create_fault_layer(faults, node.name, scenario.timing, lockstep, node.host)
         chaser = ChaserProcess(node, scenario, number, reports=FailureReports(faults.reported_failures))
-        chaser.open(instance, realtime=not lockstep)
+        chaser.open(instance, realtime=not lockstep, stall_s=options.stall_s)
         node.host.finish_startup()
-        while not (chaser.ended or stop()):
+        while not (chaser.ended or stop() or chaser.heartbeat.world_is_gone()):
             chaser.listen()
         chaser.publish_farewell()
         return 0 if chaser.ended else 1
@@ -107,7 +109,7 @@ class ChaserProcess:
         )
         self._perception = make_perception(self.scenario)
 
-    def open(self, instance: str, realtime: bool) -> None:
+    def open(self, instance: str, realtime: bool, stall_s: float = DEFAULT_STALL_S) -> None:
         """Advertise and subscribe the topics, then start the heartbeat."""
         node, i = self.node, self.number
         self.realtime = realtime
@@ -123,7 +125,7 @@ class ChaserProcess:
         node.subscribe(topics.TARGET)
         node.subscribe(topics.TICK)
         node.subscribe(topics.END)
-        self.heartbeat = Heartbeat(node, instance)
+        self.heartbeat = Heartbeat(node, instance, stall_s)
 
     def publish_farewell(self) -> None:
         """Publish the last messages of this process."""
@@ -135,6 +137,7 @@ class ChaserProcess:
     def listen(self) -> None:
         """Wait for one message and handle it."""
         received = self.node.receive(0.2)
+        self.heartbeat.report_waiting(received, self._missing_keys)
         match received.message if received is not None else None:
             case Image() as image:
                 self._process_image(image)
@@ -158,6 +161,19 @@ class ChaserProcess:
                 self.ended = True
             case LostMessage() as lost if received is not None:
                 self._replace_lost(received.topic, lost)
+
+    def _missing_keys(self) -> tuple[str, ...]:
+        """Return the keys of the messages that this chaser needs to reply to the open tick, or to get the next one."""
+        tick = self.tick
+        if tick is None or tick.tick <= self.executed_tick or self.number not in tick.chasers:
+            return (topics.TICK.key_of(),)
+        latest: dict[Topic, Message | None] = {topics.ODOMETRY: self.odometry}
+        if self._has_port:
+            latest[topics.DOCKING] = self.docking
+        missing = [topic for topic, last in latest.items() if last is None or last.tick < tick.tick]
+        if tick.images and tick.tick not in self._processed_images:
+            missing.append(topics.IMAGE)
+        return tuple(topic.key_of(self.number) for topic in missing or [topics.WRENCH])
 
     def _begin_tick(self, tick: Tick) -> None:
         self.tick = tick

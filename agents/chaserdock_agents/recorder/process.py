@@ -78,12 +78,14 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
         faults = create_fault_layer(injected, node.name, scenario.timing, lockstep, node.host)
         node.message_filter = faults
         recorder = Recorder(node, recording, faults)
-        recorder.open(instance)
+        recorder.open(instance, options.stall_s)
         if mission.mode == "realtime":
             # Flight processes have priority; received messages wait in the queue.
             node.host.lower_priority()
         while not recorder.finished() and not (stop() and recorder.idle()):
             recorder.write_next(0.1)
+            if recorder.ended_s is None and recorder.heartbeat.world_is_gone():
+                break
     finally:
         recording.close()
     if recorder.ended_s is None:
@@ -117,11 +119,11 @@ class Recorder:
     def __post_init__(self) -> None:
         self._queue: BoundedQueue[RawSample] = self.node.host.new_queue()
 
-    def open(self, instance: str) -> None:
+    def open(self, instance: str, stall_s: float) -> None:
         """Subscribe to all topics, then start the heartbeat."""
         self.node.advertise(topics.ACK)
         self.node.subscribe_raw("**", self._enqueue)
-        self.heartbeat = Heartbeat(self.node, instance)
+        self.heartbeat = Heartbeat(self.node, instance, stall_s)
 
     def _enqueue(self, raw: RawSample) -> None:
         if not self._queue.put(raw, len(raw.payload)):
@@ -134,6 +136,8 @@ class Recorder:
         try:
             raw = self._queue.get(timeout_s)
         except queue.Empty:
+            self.recording.flush_if_due()
+            self.heartbeat.waiting_for = self._missing_keys()
             return
         found, message = topics.topic_of_key(raw.key), None
         if found is not None and found[0] in _DECODED:
@@ -144,6 +148,8 @@ class Recorder:
         self._process(raw.key, message)
 
     def _process(self, key: str, message: object) -> None:
+        if key.startswith(topics.WORLD_BRANCHES):
+            self.heartbeat.world_heard()
         match message:
             case Presence():
                 self.heartbeat.take(message)
@@ -165,9 +171,15 @@ class Recorder:
             case MissionEnd():
                 self.ended_s = self.node.host.now_s()
 
+    def _missing_keys(self) -> tuple[str, ...]:
+        """Return the keys of the messages that the next acknowledgement waits for."""
+        return tuple(sorted(key for key in self._awaited() if self._latest.get(key, -1) <= self._acked))
+
+    def _awaited(self) -> set[str]:
+        return self._expected | {topics.TICK.key_of()}
+
     def _acknowledge(self) -> None:
-        keys = self._expected | {topics.TICK.key_of()}
-        held = min(self._latest.get(key, -1) for key in keys)
+        held = min(self._latest.get(key, -1) for key in self._awaited())
         if held > self._acked:
             self._acked = held
             self.node.publish(topics.ACK, RecorderAck(tick=held))

@@ -73,6 +73,10 @@ class Recording:
         if self._viewer is not None and message is not None:
             self._viewer.write(message)
 
+    def flush_if_due(self) -> None:
+        """Write what is buffered to the file if it is old enough; call it when no message arrives."""
+        self._writer.flush_if_due()
+
     def _is_full(self) -> bool:
         size, seconds = self._rotation.size_bytes, self._rotation.seconds
         if size is not None and self._writer.size_bytes >= size:

@@ -73,16 +73,24 @@ class TickInputCollector:
 
     def is_complete(self, tick: Tick) -> bool:
         """Return whether every message that a tick needs has arrived or is lost."""
-        return all(self._has_inputs(tick, i) for i in tick.chasers)
+        return not any(self._missing(tick, i) for i in tick.chasers)
 
-    def _has_inputs(self, tick: Tick, i: int) -> bool:
+    def missing_keys(self, tick: Tick) -> tuple[str, ...]:
+        """Return the keys of the messages that a tick still needs."""
+        return tuple(topic.key_of(i) for i in tick.chasers for topic in self._missing(tick, i))
+
+    def _missing(self, tick: Tick, i: int) -> list[Topic]:
+        missing = []
+        if not self._has_arrived(topics.ODOMETRY, self._odometry, i, tick):
+            missing.append(topics.ODOMETRY)
+        if self._has_thrusters and not self._has_arrived(topics.THRUSTERS, self._thrusters, i, tick):
+            missing.append(topics.THRUSTERS)
+        if self._has_port[i] and not self._has_arrived(topics.DOCKING, self._docking, i, tick):
+            missing.append(topics.DOCKING)
         sighting = (tick.tick, i) in self._received_sightings or self._is_lost(topics.SIGHTING, i, tick)
-        return (
-            self._has_arrived(topics.ODOMETRY, self._odometry, i, tick)
-            and (not self._has_thrusters or self._has_arrived(topics.THRUSTERS, self._thrusters, i, tick))
-            and (not self._has_port[i] or self._has_arrived(topics.DOCKING, self._docking, i, tick))
-            and (not tick.images or sighting)
-        )
+        if tick.images and not sighting:
+            missing.append(topics.SIGHTING)
+        return missing
 
     def _has_arrived(
         self,

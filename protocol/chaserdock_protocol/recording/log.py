@@ -193,9 +193,7 @@ class LogWriter:
             self.unreadable += 1
         self._add(channel, self.last_time_ns, payload, sent_ns or self.last_time_ns)
         self.messages += 1
-        flown_ns = self.last_time_ns - self._flushed_ns
-        if self._now_s() - self._flushed_s >= _FLUSH_S or flown_ns >= _FLUSH_S * 1e9:
-            self.flush()
+        self.flush_if_due()
 
     def write_view(self, topic: str, schema: tuple[str, str, bytes], payload: bytes, time_ns: int) -> None:
         """Append a message of the viewer layer; ``topic`` begins with ``/viewer/``.
@@ -239,6 +237,12 @@ class LogWriter:
     def _broken_by(self, error: OSError) -> LogError:
         self._broken = True
         return LogError(f"{self.path}: cannot be written: {error.strerror or error}")
+
+    def flush_if_due(self) -> None:
+        """Flush every 0.5 s; called with every message, and to be called while none arrives."""
+        flown_ns = self.last_time_ns - self._flushed_ns
+        if self._now_s() - self._flushed_s >= _FLUSH_S or flown_ns >= _FLUSH_S * 1e9:
+            self.flush()
 
     def flush(self) -> None:
         """Write the chunk in progress to the file."""

@@ -66,12 +66,13 @@ class Host(Protocol):
 
 
 class RawSample(Struct, frozen=True):
-    """A sample from the wire, not decoded."""
+    """A sample from the wire, not decoded. ``source``: session that stamped it, which is its publisher's (see ``Connection``)."""
 
     key: str
     encoding: str
     payload: bytes
     sent_ns: int
+    source: str = ""
 
 
 class Query(Protocol):
@@ -102,6 +103,11 @@ class Reply:
 
 class Connection(Protocol):
     """One node's access to the network. Callbacks run on threads of the network and must not block."""
+
+    @property
+    def source(self) -> str:
+        """Identity of this session, the ``source`` of the samples that it publishes."""
+        ...
 
     def declare_publisher(
         self, key: str, encoding: str, qos: str, *, express: bool, blocking: bool

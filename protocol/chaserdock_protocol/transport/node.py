@@ -75,9 +75,39 @@ class Node:
         self._last_seq: dict[str, int] = {}
         self._queryables: dict[str, Undo] = {}
         self._close_callbacks: list[Callable[[], None]] = []
+        self._world_source = ""
+        self._on_foreign: Callable[[str, str, Message | None], None] = lambda key, source, newest: None
+        self._foreign_sources: set[str] = set()
+        self._foreign: deque[tuple[str, str]] = deque()
+        self._newest: Message | None = None
         network: Network = ZenohNetwork(link) if link.network is None else link.network
         self._connection, self.host = network.open(name)
         self._inbox: BoundedQueue[_Arrival | None] = self.host.new_queue()
+
+    @property
+    def source(self) -> str:
+        """Identity of this node's session on the network."""
+        return self._connection.source
+
+    def expect_world(self, source: str, on_foreign: Callable[[str, str, Message | None], None]) -> None:
+        """Ignore messages on the world's keys that another session than ``source`` publishes; empty: accept all.
+
+        ``on_foreign(key, source, newest)`` runs on the reader's thread for the first of each session; ``newest``: the
+        last valid message.
+        """
+        self._world_source, self._on_foreign = source, on_foreign
+
+    def _is_foreign(self, raw: RawSample) -> bool:
+        """Count a message on the world's keys that is not the world's. Runs on the network's thread."""
+        if raw.source == self._world_source or not self._world_source:
+            return False
+        if not raw.key.startswith(topics.WORLD_BRANCHES):
+            return False
+        self.counts.rejected[f"{raw.key}:foreign publisher"] += 1
+        if raw.source not in self._foreign_sources:
+            self._foreign_sources.add(raw.source)
+            self._foreign.append((raw.key, raw.source))
+        return True
 
     # -- publishing ---------------------------------------------------------------------------------------
 
@@ -137,6 +167,8 @@ class Node:
 
         def arrived(raw: RawSample) -> None:
             key = raw.key
+            if self._is_foreign(raw):
+                return
             found = topics.topic_of_key(key)
             if found is None or found[0] is not topic:
                 self.counts.rejected["key"] += 1
@@ -184,13 +216,20 @@ class Node:
         """Pass every sample on a key expression to ``arrived`` on the network's thread. Only for recorder and analysis."""
         if self.role not in ("recorder", "analysis"):
             raise PermissionError(f"{self.role} may not read {expression}")
-        self._connection.subscribe(expression, arrived)
+
+        def own_mission(raw: RawSample) -> None:
+            if not self._is_foreign(raw):
+                arrived(raw)
+
+        self._connection.subscribe(expression, own_mission)
 
     def receive(self, timeout_s: float | None) -> ReceivedMessage | None:
         """Return the next valid message, or None on timeout.
 
         Counts invalid messages in ``counts.rejected`` by topic and reason, and gaps in ``seq`` in ``counts.lost``.
         """
+        if self._foreign:
+            self._on_foreign(*self._foreign.popleft(), self._newest)
         if self._ready:
             return self._ready.popleft()
         if timeout_s == 0 and self._inbox.empty():
@@ -215,6 +254,8 @@ class Node:
         if last is not None and seq > last + 1:
             self.counts.lost[raw.key] += seq - last - 1
         self._last_seq[raw.key] = seq
+        if received.message.tick >= 0:
+            self._newest = received.message
         if self.message_filter is None:
             return received
         delivered = self.message_filter.incoming(topic, place, received.message, raw.payload)

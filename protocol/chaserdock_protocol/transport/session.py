@@ -17,18 +17,21 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import (
     MAX_COUNT,
+    Event,
     Farewell,
     Health,
     JoinReply,
     JoinRequest,
+    Message,
     Presence,
     ScenarioReply,
     ScenarioRequest,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
+from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 
-from . import Node
+from . import Node, ReceivedMessage
 
 EARLY_PERIOD_S = 0.05
 STEADY_PERIOD_S = 1.0
@@ -96,6 +99,7 @@ def run_member(
         if mission is None:
             return 1
         node.blocking = mission.mode == "lockstep"
+        watch_for_foreign_publishers(node, mission.source)
         node.declare_liveliness()  # before the start-up work (compilation): reserves the process' name
         return work(node, mission, instance, stop)
     except ChaserdockError as error:
@@ -104,6 +108,27 @@ def run_member(
     finally:
         if node is not None:
             node.close()
+
+
+def watch_for_foreign_publishers(node: Node, world_source: str) -> None:
+    """Make a node ignore messages on the world's keys that are not the world's, and name their publisher in a warning."""
+
+    def warn(key: str, source: str, newest: Message | None) -> None:
+        who = "a session without time stamps" if source == node.source else f"session {source}"
+        detail = f"{who} publishes on {key}, which is the world's (session {world_source}); ignored"
+        print_status(node.name, f"foreign publisher: {detail}")
+        stamp = (-1, 0) if newest is None else (newest.tick, newest.sim_time_ns)
+        warning = Event(
+            tick=stamp[0],
+            sim_time_ns=stamp[1],
+            process=node.name,
+            level="warning",
+            what="foreign publisher",
+            detail=detail,
+        )
+        node.publish(topics.EVENT, warning, node.name)
+
+    node.expect_world(world_source, warn)
 
 
 def required_peers(process: str, present: set[str]) -> set[str]:
@@ -116,12 +141,15 @@ def required_peers(process: str, present: set[str]) -> set[str]:
 class Heartbeat:
     """Publishes this process' presence at intervals in the background, and collects that of the others.
 
-    Construct it after all other subscriptions of the node.
+    Construct it after all other subscriptions of the node. ``waiting_for``: see ``Presence``. ``stall_s``: after so long
+    without the world's presence the world is gone.
     """
 
-    def __init__(self, node: Node, instance: str) -> None:
+    def __init__(self, node: Node, instance: str, stall_s: float = DEFAULT_STALL_S) -> None:
         self._node = node
         self._instance = instance
+        self._stall_s, self._without_world = stall_s, StallTimer(node.host.now_s)
+        self.waiting_for: tuple[str, ...] = ()
         self._heard: dict[str, str] = {}
         self._lock = threading.Lock()
         self.in_flight = threading.Event()
@@ -135,8 +163,30 @@ class Heartbeat:
 
     def take(self, message: Presence) -> None:
         """Record a presence that the process' loop received."""
+        if message.process == "world":
+            self.world_heard()
         with self._lock:
             self._heard[message.process] = message.instance
+
+    def report_waiting(
+        self, received: ReceivedMessage | None, missing_keys: Callable[[], tuple[str, ...]]
+    ) -> None:
+        """Let presence name the messages that the process waits for, from when it receives none (``received`` is None)."""
+        if received is None:
+            self.waiting_for = missing_keys()
+        elif received.topic is not topics.PRESENCE:
+            self.waiting_for = ()
+
+    def world_heard(self) -> None:
+        """Take note of a message of the world."""
+        self._without_world.reset()
+
+    def world_is_gone(self) -> bool:
+        """Return, and print, whether the world has been silent for too long. Call it at least twice a second."""
+        gone = self._without_world.update() >= self._stall_s
+        if gone:
+            print_status(self._node.name, f"the world is gone: no presence of it for {self._stall_s:g} s")
+        return gone
 
     def heard(self) -> dict[str, str]:
         """Return the processes whose presence was received, with their instances."""
@@ -150,7 +200,12 @@ class Heartbeat:
 
     def _publish(self) -> float:
         """Publish the presence; return after how many seconds to publish the next."""
-        message = Presence(process=self._node.name, instance=self._instance, heard=self.heard())
+        message = Presence(
+            process=self._node.name,
+            instance=self._instance,
+            heard=self.heard(),
+            waiting_for=self.waiting_for,
+        )
         self._node.publish(topics.PRESENCE, message, self._node.name)
         return STEADY_PERIOD_S if self.in_flight.is_set() else EARLY_PERIOD_S
 

@@ -82,7 +82,8 @@ def _tls_values(tls: Tls) -> dict[str, Any]:
 def _raw_sample(sample: zenoh.Sample, key: str) -> RawSample:
     stamp = sample.timestamp
     sent_ns = stamp.get_time_as_ntp64().as_nanos() if stamp is not None else 0
-    return RawSample(key, str(sample.encoding), sample.payload.to_bytes(), sent_ns)
+    source = str(stamp.get_id()) if stamp is not None else ""
+    return RawSample(key, str(sample.encoding), sample.payload.to_bytes(), sent_ns, source)
 
 
 class ZenohNetwork:
@@ -106,6 +107,7 @@ class _ZenohConnection:
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._declared: list[Any] = []
+        self.source = str(session.zid())
 
     def declare_publisher(
         self, key: str, encoding: str, qos: str, *, express: bool, blocking: bool

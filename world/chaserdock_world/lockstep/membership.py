@@ -13,6 +13,8 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.messages import JoinReply, JoinRequest, Presence
 from chaserdock_protocol.transport.session import required_peers
 
+from .stall import WaitReport
+
 JOIN_TIMEOUT_S = 5.0
 """An admitted process keeps its name reserved for so long before its liveliness token appears."""
 
@@ -21,9 +23,9 @@ JOIN_TIMEOUT_S = 5.0
 class Membership:
     """The processes of a mission as the world knows them. Thread-safe: called from Zenoh's threads and the main loop.
 
-    ``instance``: the world's own; ``flying``: set at the first tick, from when on connected processes no longer wait for
-    processes that are only joining (see ``connected``). ``scenario_json``: the flight scenario; ``faults_of``: JSON of the
-    faults to inject at a process, by its name.
+    ``instance`` and ``source``: the world's own instance and session. ``flying``: set at the first tick, from when on
+    connected processes no longer wait for processes that are only joining (see ``connected``). ``scenario_json``: the
+    flight scenario. ``faults_of``: JSON of the faults to inject at a process, by its name.
     """
 
     chasers: int
@@ -32,12 +34,14 @@ class Membership:
     scenario_json: str
     faults_of: Callable[[str], str] = lambda process: "{}"
     instance: str = ""
+    source: str = ""
     now_s: Callable[[], float] = time.monotonic
     flying: bool = False
     _alive: set[str] = field(default_factory=set)
     _admitted: dict[str, str] = field(default_factory=dict)
     _admitted_s: dict[str, float] = field(default_factory=dict)
     _heard: dict[str, dict[str, str]] = field(default_factory=dict)
+    _reports: dict[str, tuple[tuple[str, ...], float]] = field(default_factory=dict)
     _departed: list[str] = field(default_factory=list)
     _connected: set[str] = field(default_factory=set)
     _lock: threading.Lock = field(default_factory=threading.Lock)
@@ -62,6 +66,7 @@ class Membership:
             mode="realtime" if self.realtime else "lockstep",
             scenario_json=self.scenario_json,
             faults=self.faults_of(request.process),
+            source=self.source,
         )
 
     def _refusal(self, request: JoinRequest) -> str:
@@ -88,6 +93,7 @@ class Membership:
             elif name in self._alive:
                 self._alive.discard(name)
                 self._heard.pop(name, None)
+                self._reports.pop(name, None)
                 self._connected.discard(name)
                 self._admitted_s.pop(name, None)
                 self._departed.append(name)
@@ -98,7 +104,14 @@ class Membership:
             if self._admitted.get(message.process) != message.instance:
                 return False
             self._heard[message.process] = dict(message.heard)
+            self._reports[message.process] = (message.waiting_for, self.now_s())
             return True
+
+    def progress(self) -> dict[str, WaitReport]:
+        """Return what each living process waits for by its last presence, and the age of that presence."""
+        with self._lock:
+            now_s = self.now_s()
+            return {name: WaitReport(keys, now_s - at_s) for name, (keys, at_s) in self._reports.items()}
 
     def take_departed(self) -> list[str]:
         """Return the processes lost since the last call."""

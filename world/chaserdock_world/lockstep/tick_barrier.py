@@ -10,6 +10,7 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import FaultLayer, LostMessage
 from chaserdock_protocol.messages import ActuatorCommand, Event, Latch, Presence, RecorderAck, Tick
 from chaserdock_protocol.process import print_status
+from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.session import Heartbeat, create_health
 
@@ -17,6 +18,7 @@ from chaserdock_world.actuators.ideal import Actuators
 
 from .leader_election import LeaderElection, lease_s
 from .membership import Membership
+from .stall import explain_stall
 
 RECORDER_WINDOW_TICKS = 8
 """The flight is at most this far ahead of the recorder's acknowledgements, which bounds the data in the network."""
@@ -111,10 +113,32 @@ class TickBarrier:
         keeps_up = not self._recorder_expected or self._recorded_tick >= self._tick - RECORDER_WINDOW_TICKS
         return keeps_up and self._replied.issuperset(self.chasers)
 
-    def pending(self) -> str:
-        """Return the names of the processes that the open tick waits for."""
-        late = [f"chaser/{i}" for i in self.chasers if i not in self._replied]
-        return ", ".join(late) or "recorder"
+    def await_replies(self, stopped: Callable[[], bool], stall_s: float) -> str:
+        """Process messages until the open tick is complete or ``stopped``; return why it never will be, empty otherwise.
+
+        Without any reply to the tick for ``stall_s``, the text names who owes which message.
+        """
+        timer, progress = StallTimer(self._node.host.now_s), (0, 0, 0)
+
+        def over() -> bool:
+            nonlocal progress
+            now = (len(self._replied), self._recorded_tick, self._revision)
+            if now != progress:
+                progress = now
+                timer.reset()
+            return self.is_complete() or timer.update() >= stall_s
+
+        self.wait_until(over, stopped, lambda: ", ".join(self._owed()))
+        if stopped() or self.is_complete():
+            return ""
+        owed, leader = self._owed(), self.election.term.commander
+        explained = explain_stall(owed, leader, self._membership.progress())
+        return f"stalled: no progress for {stall_s:g} s in tick {self._tick}: {explained}"
+
+    def _owed(self) -> dict[str, str]:
+        """Return the keys of the messages that the open tick waits for, by the process that owes them."""
+        late = [i for i in self.chasers if i not in self._replied]
+        return {f"chaser/{i}": topics.ACTUATORS.key_of(i) for i in late} or {"recorder": topics.ACK.key_of()}
 
     def lost_all_chasers(self, rejoin_s: float, stopped: Callable[[], bool]) -> bool:
         """Return whether no chaser is left and none returns within ``rejoin_s`` of wall time.

@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""No endless waits: a lost message, a process that hangs, a world that dies, and messages of a foreign publisher."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+from chaserdock_protocol import codec, topics
+from chaserdock_protocol.messages import MissionEnd, Tick, encoding_of
+from chaserdock_protocol.recording.log import read_log
+from chaserdock_protocol.transport import Link
+from chaserdock_protocol.transport.bounded_queue import BoundedQueue
+from chaserdock_protocol.transport.zenoh_network import zenoh_config
+from chaserdock_world.process import World
+from harness import ROOT, SHORT, ByHand, sets, wait_for_log
+
+from chaserdock.simulation.mission import SimulatedFlight, simulate
+from chaserdock.simulation.network import SimulatedHost
+
+DRILL = (
+    "duration_s=3.0",
+    "timeline=[]",
+    "success.docked=[]",
+    "settling_s=1.0",
+    "perception.name='statistical'",
+    "camera.width_px=480",
+    "camera.height_px=270",
+)
+
+
+def simulated(folder: Path, *overrides: str) -> SimulatedFlight:
+    flight = simulate(ROOT / "scenarios" / "fault-drill.toml", folder, (*DRILL, *overrides))
+    assert flight.crashes == {}
+    return flight
+
+
+def end_of(folder: Path) -> MissionEnd:
+    return next(r.message for r in read_log(folder / "mission.mcap", [topics.END.key_of()]))
+
+
+def test_process_that_hangs_ends_the_mission_with_its_name(tmp_path: Path) -> None:
+    flight = simulated(tmp_path, "fault=[{kind='freeze',at_s=2.0,duration_s=900.0,process='chaser/1'}]")
+    end = end_of(tmp_path)
+    assert not end.complete
+    assert end.reason.startswith("stalled: no progress for 60 s in tick 20: ")
+    assert "in tick 20: chaser/1 owes chaser/1/" in end.reason
+    assert "(hangs or is cut off: silent for 6" in end.reason
+    assert flight.statuses["world"] == 1
+    assert flight.stalled == ("chaser/1",)
+
+
+def test_message_lost_in_lockstep_ends_the_mission_with_who_owes_what(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lost_tick = 15
+    key = topics.SIGHTING.key_of(2)
+
+    class Overflowing(BoundedQueue[Any]):
+        def put(self, item: Any, size: int) -> bool:
+            if isinstance(item, tuple) and item[2].key == key:
+                sighting: Any = codec.decode(topics.SIGHTING.kind, item[2].payload)
+                if sighting.tick == lost_tick:
+                    return False
+            return super().put(item, size)
+
+    new_queue = SimulatedHost.new_queue
+
+    def overflowing_queue(self: SimulatedHost) -> BoundedQueue[Any]:
+        made = new_queue(self)
+        return made if self.name != "controller" else Overflowing(items=made._items)
+
+    monkeypatch.setattr(SimulatedHost, "new_queue", overflowing_queue)
+    flight = simulated(tmp_path)
+    reason = end_of(tmp_path).reason
+    assert f"in tick {lost_tick}: " in reason
+    assert f"controller owes controller/chaser/2/wrench (waits for {key})" in reason
+    assert f"chaser/2 owes {key} (waits for controller/chaser/2/wrench)" in reason
+    assert flight.statuses["world"] == 1
+    assert flight.stalled == ()
+
+
+def test_processes_notice_that_the_world_has_died_and_the_log_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def die(self: World, tick: int) -> None:
+        if tick == 20:
+            self._node.host.kill()
+        open_tick(self, tick)
+
+    open_tick = World._open_tick
+    monkeypatch.setattr(World, "_open_tick", die)
+    flight = simulated(tmp_path)
+    assert flight.stalled == ()
+    assert flight.statuses.pop("world") is None
+    assert set(flight.statuses.values()) == {1}
+    assert "chaser/0: the world is gone: no presence of it for 60 s" in flight.output
+    ticks = [r.message.tick for r in read_log(tmp_path / "mission.mcap", [topics.TICK.key_of()])]
+    assert ticks[-1] == 19
+
+
+@pytest.mark.slow
+def test_foreign_ticks_are_ignored_and_their_publisher_is_named(tmp_path: Path) -> None:
+    by_hand = ByHand.at_free_port("foreign")
+    log = tmp_path / "mission.mcap"
+    try:
+        changes = (*SHORT, "duration_s=10.0", "perception.name='statistical'")
+        by_hand.start("world", "world", "two-chaser-tracking", *sets(*changes), "--stall-s", "20")
+        by_hand.start("recorder", "record", "--out", str(tmp_path))
+        by_hand.start("controller", "controller")
+        for i in range(2):
+            by_hand.start(f"chaser/{i}", "chaser", str(i))
+        wait_for_log(log, 100_000)
+        link = Link(by_hand.namespace, (by_hand.endpoint,))
+        with zenoh.open(zenoh_config(link)) as session:
+            intruder = str(session.zid())
+            time.sleep(1.0)
+            for k in range(20):
+                tick = Tick(tick=5000 + k, sim_time_ns=10**12, images=True, chasers=(0, 1), controller=True)
+                session.put(topics.TICK.key_of(), codec.encode(tick), encoding=encoding_of(Tick))
+            time.sleep(1.0)
+        for name in ("world", "controller", "recorder", "chaser/0", "chaser/1"):
+            status, output = by_hand.said(name)
+            assert status == 0, f"{name}: {output}"
+            if name != "world":
+                assert f"foreign publisher: session {intruder} publishes on world/tick" in output
+    finally:
+        by_hand.end()
+    records = list(read_log(log))
+    assert max(r.message.tick for r in records) < 5000
+    warnings = [r.message for r in records if getattr(r.message, "what", "") == "foreign publisher"]
+    assert {w.process for w in warnings} == {"controller", "recorder", "chaser/0", "chaser/1"}

@@ -146,7 +146,12 @@ def main() -> None:
             "mcap": lambda: mcap_reader(programs, log),
             "rerun": lambda: rerun(programs, log, options.image.resolve()),
         }.items():
-            figures, good = check()
+            try:
+                figures, good = check()
+            except RuntimeError as error:
+                print(f"{tool}: FAILED: {error}", flush=True)
+                passed = False
+                continue
             print(f"{tool}: {'passed' if good else 'FAILED'}", flush=True)
             print_figures(figures)
             result |= figures

@@ -15,11 +15,10 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.recording.log import logged_scenario
 from chaserdock_protocol.recording.scan import (
-    DAMAGE,
     VIEWER_PREFIX,
     FileState,
-    LogError,
     LogSource,
+    errors_of_parsing,
     log_files,
     parse_chunk,
     record_at,
@@ -87,10 +86,8 @@ class LoggedMission:
         for opcode, content in records(path, state):
             if opcode != Opcode.CHUNK:
                 continue
-            try:
+            with errors_of_parsing(path):
                 inside = parse_chunk(content)
-            except DAMAGE as error:
-                raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
             channels |= {record.id: record for record in inside if isinstance(record, Channel)}
             number = len(self._chunks)
             self._chunks.append((path, state.place))
@@ -134,10 +131,8 @@ class LoggedMission:
     def _read_chunk(self, number: int) -> dict[str, list[tuple[Channel, McapMessage]]]:
         """Return the messages of a chunk by key."""
         path, place = self._chunks[number]
-        try:
+        with errors_of_parsing(path):
             inside = parse_chunk(record_at(path, place))
-        except DAMAGE as error:
-            raise LogError(f"{path}: damaged: {error or type(error).__name__}") from None
         out: dict[str, list[tuple[Channel, McapMessage]]] = defaultdict(list)
         for record in inside:
             if isinstance(record, McapMessage):

@@ -31,7 +31,6 @@ _IMAGE_PX = 400
 _SLOW_S = 0.5
 _IMAGES_S = 0.25
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
-_COLOURS = {"approach": "green", "hold": "blue", "retreat": "orange", "abort": "red"}
 
 
 @dataclass

@@ -180,7 +180,6 @@ class DockingOutcome:
     failure: Failure | None = None
     peak_m: float | None = None
     verified_s: float | None = None
-    detection_share: float | None = None
 
     def detection_delay_s(self) -> float | None:
         """Return the time from the thruster's failure to its correct diagnosis; None if there was none."""
@@ -241,7 +240,6 @@ def dock(
 ) -> DockingOutcome:
     """Fly one approach until it is verified, or the time limit."""
     ordered, peak_m = False, 0.0
-    ticks = detections = 0
     with ConservationMission(scenario, perception_of(scenario)) as flight:
         while flight.time_s < approach_at_s + LIMIT_S and flight.phase(0) != "verified":
             due = not ordered and flight.time_s >= approach_at_s
@@ -253,8 +251,6 @@ def dock(
                 and flight.phase(0) not in ("latched", "verified")
             ):
                 peak_m = max(peak_m, record.tracking_errors[0][0])
-            ticks += 1
-            detections += bool(record.outputs and record.outputs.target.accepted)
         verified = flight.phase(0) == "verified"
         cause, verified_s = cause_of(flight, verified), flight.time_s if verified else None
     return DockingOutcome(
@@ -270,7 +266,6 @@ def dock(
         failure=failure,
         peak_m=None if failure is None else peak_m,
         verified_s=verified_s,
-        detection_share=detections / max(ticks, 1),
     )
 
 

@@ -21,7 +21,7 @@ from .perception import PerceptionModel
 class FlightRecord:
     """A flight of N chasers over K - 1 ticks.
 
-    ``time_s`` (K,): every tick and the end. ``target_states`` (K, 13) and ``states`` (K, N, 13): p, v (WRF), q_wxyz,
+    ``time_s`` (K,): every tick and the end. ``states`` (K, N, 13): p, v (WRF), q_wxyz,
     omega (body). ``position_error_m``, ``orientation_error_rad`` (K, N): from the reference pose on the true target.
     ``solve_s``: wall-clock seconds of every controller tick. ``commands``: by tick, then chaser. Per chaser (N,):
     ``absolute_impulse_N_s`` (integral of the force components' magnitudes), ``thruster_impulse_N_s``, ``propellant_kg``.
@@ -29,7 +29,6 @@ class FlightRecord:
     """
 
     time_s: Array
-    target_states: Array
     states: Array
     position_error_m: Array
     orientation_error_rad: Array
@@ -69,14 +68,13 @@ def record_flight(
         errors.append(_rows(mission, {i: mission.tracking_error(i, final) for i in mission.chasers}))
         events = mission.thruster_events
         end_s = mission.time_s
-    names = ["target", *(f"chaser/{i}" for i in mission.chasers)]
+    names = [f"chaser/{i}" for i in mission.chasers]
     states = np.array([_state_rows(s, names) for s in (*(t.states for t in ticks), final)])
     solved = [t.outputs for t in ticks if t.outputs is not None]
     error = np.array(errors)
     return FlightRecord(
         time_s=np.array([*(t.time_s for t in ticks), end_s]),
-        target_states=states[:, 0],
-        states=states[:, 1:],
+        states=states,
         position_error_m=error[..., 0],
         orientation_error_rad=error[..., 1],
         solve_s=np.array([o.solver.wall_solve_s if o.solver is not None else 0.0 for o in solved]),

@@ -150,7 +150,7 @@ def test_a_lost_thruster_is_found_after_some_pulses(body: str, thruster: int, le
     assert verdict.factor == pytest.approx(left, abs=0.15)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
     noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=5e-4)
     case = Case(("tetra12", "slider")[seed % 2], seed, noise, odometry_noise=True)
@@ -160,7 +160,7 @@ def test_no_false_alarm_with_scatter_and_noisy_odometry(seed: int) -> None:
         assert case.step(asked, given) is None
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_false_alarm_with_another_plant_than_assumed(seed: int) -> None:
     noise = ImpulseNoise(velocity_m_s=5e-4, omega_rad_s=4e-4)
     case = Case("tetra12", seed, noise, odometry_noise=True, mismatched=True)

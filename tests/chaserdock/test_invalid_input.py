@@ -25,7 +25,7 @@ INVALID = [
     ("--nothing", "No such option: --nothing"),
     # run
     ("run", "Missing argument"),
-    ("run nowhere", "nowhere: no such scenario file"),
+    ("run nowhere", "nowhere: no such scenario file or shipped scenario; shipped: abort, "),
     ("run single extra", "extra"),
     ("run single --nothing", "No such option: --nothing"),
     ("run single --mode fast", "'fast' is not one of 'lockstep', 'realtime'"),
@@ -38,6 +38,18 @@ INVALID = [
     ("run single --set duration_s=-1", "duration_s"),
     ("run single --set \"duration_s='30'\"", "duration_s: must be a number"),
     ("run single --set camera.widht_px=640", "widht_px"),
+    ("run single --set chaser.mass_kg=-3", "chaser.mass_kg"),
+    ("run single --set estimator.name=magic", "estimator.name"),
+    ("run single --set chasers.0.q_wxyz=[1,1,0,0]", "unit length"),
+    ("run single --set name=a/b", "name"),
+    (
+        "run two-chaser-tracking --set chasers.1.position_m=[-1.0,0.0,0.0] --set chasers.1.start_offset_m=[-0.2,0.03,0.0]",
+        "nearer than limits.min_distance_chasers_m",
+    ),
+    ("simulate single --seeds=5:3", "must be FIRST:LAST or one number, below 2^32"),
+    ("simulate single --seeds=x", "must be FIRST:LAST or one number, below 2^32"),
+    ("simulate single --seeds=-1", "must be FIRST:LAST or one number, below 2^32"),
+    ("simulate single --seeds=1:5000000000", "must be FIRST:LAST or one number, below 2^32"),
     ("run single --keys nowhere", "--keys nowhere"),
     # processes
     ("world nowhere", "nowhere: no such scenario file"),

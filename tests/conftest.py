@@ -48,9 +48,3 @@ def short_flight(shared_flight: Fly) -> Path:
 def drill_flight(shared_flight: Fly) -> Path:
     """A six-second flight of ``fault-drill`` without faults, with which faulty ones are compared."""
     return shared_flight("drill", *DRILL)
-
-
-@pytest.fixture(scope="session")
-def main_job(shared_flight: Fly) -> Path:
-    """The main job in full length."""
-    return shared_flight("main-job", "four-chaser-docking", timeout_s=1800)

@@ -16,7 +16,9 @@ from typing import Any
 import psutil
 from chaserdock_protocol.process import SINGLE_THREADED
 
+from chaserdock.analysis.flight import load_flight
 from chaserdock.launch.launcher import free_port
+from chaserdock.simulation.mission import simulate
 
 ROOT = Path(__file__).resolve().parents[1]
 SHORT = (
@@ -63,6 +65,13 @@ def run(
     """``chaserdock run``; status and output."""
     arguments = ["run", scenario, "--out", str(out), *options.pop("arguments", ()), *sets(*overrides)]
     return finished(*arguments, timeout_s=timeout_s, **options)
+
+
+def simulated_digest(scenario: str, out: Path, *overrides: str) -> str:
+    """Simulate a shipped scenario in this process, every process of it to its end; the digest of its log."""
+    flight = simulate(ROOT / "scenarios" / f"{scenario}.toml", out, overrides)
+    assert (flight.crashes, flight.stalled) == ({}, ())
+    return load_flight(out / "mission.mcap").digest
 
 
 def summary(out: Path) -> dict[str, Any]:

@@ -323,7 +323,7 @@ def table(folder: Path) -> list[dict[str, Any]]:
 @pytest.mark.slow
 def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -> None:
     file, here, there = tmp_path / "c.toml", tmp_path / "here", tmp_path / "there"
-    file.write_text(TINY.replace(", -0.08", ""))
+    file.write_text(TINY.replace(", -0.06, -0.08", ""))
     first = chaserdock("campaign", str(file), "--out", str(here), "--jobs", "1", stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 120
     while not list(here.glob("runs/*/result.json")) and time.monotonic() < deadline:
@@ -335,11 +335,11 @@ def test_table_is_equal_after_kill_and_resume_and_on_a_cluster(tmp_path: Path) -
         if child.is_running():
             child.send_signal(signal.SIGKILL)
     before = {p: p.stat().st_mtime_ns for p in here.glob("runs/*/result.json")}
-    assert 1 <= len(before) < 3
+    assert len(before) == 1
     status, said = finished("campaign", str(file), "--out", str(here), "--jobs", "2", timeout_s=600.0)
     assert status == 0, said
     assert {p: p.stat().st_mtime_ns for p in before} == before
-    assert len(table(here)) == len({row["digest"] for row in table(here)}) == 3
+    assert len(table(here)) == len({row["digest"] for row in table(here)}) == 2
 
     from distributed import LocalCluster
 

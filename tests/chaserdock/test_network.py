@@ -18,7 +18,7 @@ import pytest
 from chaserdock_protocol.messages import Tick
 from chaserdock_protocol.recording.log import read_log
 from cryptography import x509
-from harness import ROOT, SHORT, all_gone, chaserdock, find_child, finished, sets, wait_for_log
+from harness import ROOT, SHORT, all_gone, chaserdock, find_child, finished, run, sets, wait_for_log
 from mission_keys import make_keys
 
 from chaserdock.launch import container
@@ -96,7 +96,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
     endpoint = f"tls/127.0.0.1:{free_port()}"
     reach = ["-e", endpoint, "--lease", "10"]
-    short = sets(*SHORT, "duration_s=45.0")  # long enough for `status` and for the restart of the router
+    short = sets(*SHORT, "duration_s=30.0")  # long enough for `status` and for the restart of the router
     processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(name: str, *arguments: str) -> None:
@@ -157,43 +157,31 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert "denied" not in said_by["router"]  # no process tries what it may not do
     summary = json.loads((logs[0].parent / "summary.json").read_text())
     assert summary["success"]
-    assert summary["sim_time_s"] == 45.0
+    assert summary["sim_time_s"] == 30.0
     assert "</html>" in (logs[0].parent / "report.html").read_text()
     ticks = [r.message for r in read_log(logs[0], ["world/tick"])]
     assert ticks[-1].chasers == (0, 1)
     assert ticks[-1].controller
 
 
-def test_run_with_keys_equals_run_without(tmp_path: Path) -> None:
+def test_run_with_keys_equals_run_without(short_flight: Path, tmp_path: Path) -> None:
     """The digests are equal; the router enforced access rights and denied nothing."""
-    keys = make_keys(tmp_path / "keys")
-    digests = []
-    for name, options in (("with", ["--keys", str(keys)]), ("without", [])):
-        out = tmp_path / name
-        run = [
-            "run",
-            "two-chaser-tracking",
-            "-q",
-            *sets(*SHORT, "duration_s=3.0"),
-            "--out",
-            str(out),
-            *options,
-        ]
-        status, said = finished(*run, timeout_s=240.0)
-        assert status in (0, 1), said
-        summary = json.loads((out / "summary.json").read_text())
-        assert summary["sim_time_s"] == 3.0, said
-        digests.append(summary["digest"])
+    keys = ["--keys", str(make_keys(tmp_path / "keys"))]
+    status, said = run("two-chaser-tracking", tmp_path / "run", *SHORT, arguments=keys)
+    assert status == 0, said
+    digests = [
+        json.loads((f / "summary.json").read_text())["digest"] for f in (tmp_path / "run", short_flight)
+    ]
     assert digests[0] == digests[1]
-    words = (tmp_path / "with" / "processes" / "router.txt").read_text()
+    words = (tmp_path / "run" / "processes" / "router.txt").read_text()
     assert "TLS, with access rules" in words
     assert "denied" not in words
-    assert not (tmp_path / "without" / "processes" / "router.txt").exists()
+    assert not (short_flight / "processes" / "router.txt").exists()
 
 
 def test_run_with_missing_keys_is_rejected(tmp_path: Path) -> None:
-    run = ["run", "two-chaser-tracking", "--keys", str(tmp_path / "none"), "--out", str(tmp_path / "out")]
-    status, said = finished(*run)
+    keys = ["--keys", str(tmp_path / "none")]
+    status, said = run("two-chaser-tracking", tmp_path / "out", arguments=keys)
     assert status == 2
     assert "it contains no keys; make a mission's keys with `chaserdock keys init" in said
     assert len(said.strip().splitlines()) == 1

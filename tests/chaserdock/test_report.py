@@ -24,7 +24,7 @@ from chaserdock_protocol.codec import encode
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError, LogWriter
 from flight_cases import scenario
-from harness import SHORT, finished, run
+from harness import finished
 
 from chaserdock.analysis.chase_camera import Viewpoint, draw
 from chaserdock.analysis.figures import FIGURES, thrusters, write_figures
@@ -38,15 +38,6 @@ from chaserdock.analysis.video import frames, write_video
 
 TICK_NS = 1_000_000_000 // 15
 SIZE = {"width_px": 96, "height_px": 64}
-
-
-@pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A real, short flight of two chasers: its folder."""
-    out = tmp_path_factory.mktemp("flown") / "run"
-    status, said = run("two-chaser-tracking", out, *SHORT, "duration_s=3.0", "settling_s=1.0")
-    assert status == 0, said
-    return out
 
 
 def put(writer: LogWriter, topic: topics.Topic, place: Any, message: Any) -> None:
@@ -138,20 +129,20 @@ def checked(text: str) -> Page:
 
 
 @pytest.fixture(scope="module")
-def page(flown: Path) -> Page:
-    return checked(report_of(flown / "mission.mcap"))
+def page(short_flight: Path) -> Page:
+    return checked(report_of(short_flight / "mission.mcap"))
 
 
-def test_report_has_every_figure_and_no_external_reference(flown: Path, page: Page) -> None:
+def test_report_has_every_figure_and_no_external_reference(short_flight: Path, page: Page) -> None:
     drawn = {i for i in page.ids if i.startswith("figure-")}
     assert drawn >= {f"figure-{k.name}" for k in FIGURES if k.name != "thrusters"}
     assert {"replay-section", "events", "scenario", "versions"} <= set(page.ids)
-    assert json.loads((flown / "summary.json").read_text())["digest"] in page.words
+    assert json.loads((short_flight / "summary.json").read_text())["digest"] in page.words
 
 
-def test_replay_data_equal_the_recorded_motion(flown: Path, page: Page) -> None:
+def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -> None:
     data = json.loads(page.data)
-    truth = load_flight(flown / "mission.mcap").truth
+    truth = load_flight(short_flight / "mission.mcap").truth
     assert np.all(np.diff(data["times"]) > 0)
     assert data["times"][-1] == pytest.approx(truth["target"].time_s[-1], abs=1e-3)
     assert [c["id"] for c in data["chasers"]] == [0, 1]
@@ -170,8 +161,8 @@ def test_equal_logs_give_equal_reports(tmp_path: Path) -> None:
     assert report_of(log) == report_of(log)
 
 
-def test_truncated_log_gives_a_report(flown: Path, tmp_path: Path) -> None:
-    whole = (flown / "mission.mcap").read_bytes()
+def test_truncated_log_gives_a_report(short_flight: Path, tmp_path: Path) -> None:
+    whole = (short_flight / "mission.mcap").read_bytes()
     cut = tmp_path / "cut.mcap"
     cut.write_bytes(whole[: int(0.6 * len(whole))])
     page = checked(report_of(cut))
@@ -280,9 +271,9 @@ def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
 # -- images and video ---------------------------------------------------------------------------------------
 
 
-def test_images_are_paired_with_sightings_of_the_same_exposure(flown: Path) -> None:
-    found = list(pairs(flown / "mission.mcap", 2))
-    counts = load_flight(flown / "mission.mcap").counts
+def test_images_are_paired_with_sightings_of_the_same_exposure(short_flight: Path) -> None:
+    found = list(pairs(short_flight / "mission.mcap", 2))
+    counts = load_flight(short_flight / "mission.mcap").counts
     assert len(found) == counts["world/chaser/0/image"] + counts["world/chaser/1/image"]
     for image, sighting in found:
         assert sighting is not None
@@ -332,15 +323,15 @@ def test_drawn_target_shows_its_markers(model: str, azimuth: float, elevation: f
         np.testing.assert_allclose(np.reshape(found, (4, 2)), expected, atol=2.0)
 
 
-def test_video_is_playable(flown: Path, tmp_path: Path) -> None:
+def test_video_is_playable(short_flight: Path, tmp_path: Path) -> None:
     out = tmp_path / "film.mp4"
-    number = write_video(flown, out, speed=2.0, fps=10, width_px=640, height_px=360)
+    number = write_video(short_flight, out, speed=2.0, fps=10, width_px=640, height_px=360)
     with av.open(str(out)) as container:
         stream: Any = container.streams.video[0]
         assert (stream.codec_context.name, stream.codec_context.pix_fmt) == ("h264", "yuv420p")
         assert (stream.width, stream.height, stream.average_rate) == (640, 360, 10)
         images = [frame.to_ndarray(format="gray") for frame in container.decode(video=0)]
-    assert len(images) == number == 16  # 3 s at double speed, both ends
+    assert len(images) == number == 31  # 6 s at double speed, both ends
     assert np.mean(np.abs(images[0].astype(float) - images[-1])) > 0.3  # something moves
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import msgpack
-import numpy as np
 import pytest
 from chaserdock_protocol import topics
 from chaserdock_protocol.recording.log import count_messages
@@ -21,12 +20,6 @@ from mcap.reader import make_reader
 from chaserdock.analysis.flight import load_flight
 
 TWO = "two-chaser-tracking"
-OTHER_SIMD = {
-    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX512-COMMON,AVX2,FMA3,AVX",
-    "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX2 FMA3",
-    "OPENBLAS_CORETYPE": "Prescott",
-}
-"""Disables AVX and newer instructions in OpenCV, NumPy and OpenBLAS."""
 
 
 def test_other_seed_gives_another_digest(short_flight: Path, tmp_path: Path) -> None:
@@ -72,16 +65,6 @@ def test_digest_is_independent_of_suspended_processes(short_flight: Path, tmp_pa
         mission.wait()
     assert summary(tmp_path / "run")["digest"] == summary(short_flight)["digest"]
     assert summary(tmp_path / "run")["wall_time_s"] > 10.0  # they were suspended during the flight
-
-
-def separations_m(first: Path, second: Path) -> dict[str, float]:
-    """Return the largest distance between two flights by body, m, while the second lasts."""
-    a, b = load_flight(first / "mission.mcap"), load_flight(second / "mission.mcap")
-    separations: dict[str, float] = {}
-    for name, track in b.truth.items():
-        apart_m = a.truth[name].position_m[: len(track.time_s)] - track.position_m
-        separations[name] = float(np.linalg.norm(apart_m, axis=1).max())
-    return separations
 
 
 def test_log_contains_every_topic_at_its_rate(short_flight: Path) -> None:
@@ -153,8 +136,9 @@ def test_realtime_flight_completes(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["single", TWO])
 def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> None:
-    """The scenario's criteria hold after 60 s already; the estimate is never off by more than 1 cm or 1 degree."""
-    status, output = run(scenario, tmp_path / "run", "duration_s=60.0", timeout_s=1200)
+    """The scenario's criteria hold after 40 s already; the estimate is never off by more than 1 cm or 1 degree."""
+    changes = ("duration_s=40.0", "camera.width_px=800", "camera.height_px=450")
+    status, output = run(scenario, tmp_path / "run", *changes)
     assert status == 0, output
     estimate = summary(tmp_path / "run")["target_estimate"]
     assert estimate["max_position_error_m"] < 0.01
@@ -164,7 +148,7 @@ def test_tracking_mission_meets_its_criteria(scenario: str, tmp_path: Path) -> N
 @pytest.mark.slow
 def test_collision_avoidance_mission(tmp_path: Path) -> None:
     """Chaser 0 passes the target at 0.35 m or more within 60 s, guided by the sightings of chaser 1."""
-    images = ("camera.width_px=800", "camera.height_px=450")
+    images = ("camera.width_px=640", "camera.height_px=360")
     status, output = run("collision-avoidance", tmp_path / "run", *images)
     assert status == 0, output
     result = summary(tmp_path / "run")
@@ -177,18 +161,11 @@ def test_collision_avoidance_mission(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_four_chaser_docking_on_another_simd_level(main_job: Path, tmp_path: Path) -> None:
-    """Compared for 75 s, of which 15 s are the approach."""
-    changes = ("duration_s=75.0", "success.docked=[]")
-    status, output = run("four-chaser-docking", tmp_path / "run", *changes, timeout_s=1800, env=OTHER_SIMD)
+def test_four_chaser_docking(tmp_path: Path) -> None:
+    """The main job as shipped."""
+    status, output = run("four-chaser-docking", tmp_path / "run", timeout_s=1100)
     assert status == 0, output
-    # Not zero, or the variables that disable instructions had no effect.
-    assert 0.0 < max(separations_m(main_job, tmp_path / "run").values()) < 3e-3
-
-
-@pytest.mark.slow
-def test_four_chaser_docking(main_job: Path) -> None:
-    result = summary(main_job)
+    result = summary(tmp_path / "run")
     assert result["success"]
     assert result["collisions"] == 0
     assert result["min_distance_chasers_m"] >= 0.35

@@ -40,36 +40,6 @@ FLYING_BYTES = 300_000
 LONG = (*SHORT, "duration_s=60.0")
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        (["chaser.mass_kg=-3"], "chaser.mass_kg"),
-        (["estimator.name='magic'"], "estimator.name"),
-        (["chasers.0.q_wxyz=[1,1,0,0]"], "unit length"),
-        (
-            ["chasers.1.position_m=[-1.0,0.0,0.0]", "chasers.1.start_offset_m=[-0.2,0.03,0.0]"],
-            "nearer than limits.min_distance_chasers_m",
-        ),
-        (["name='a/b'"], "name"),
-    ],
-)
-def test_invalid_scenario_gives_one_error_line(overrides: list[str], message: str, tmp_path: Path) -> None:
-    status, output = run(TWO, tmp_path / "run", *overrides, timeout_s=30)
-    assert status == 2
-    assert message in output
-    assert "Traceback" not in output
-    assert len(output.strip().splitlines()) == 1
-
-
-def test_missing_scenario_error_lists_shipped_scenarios(tmp_path: Path) -> None:
-    status, output = run("no-such-mission", tmp_path / "run", timeout_s=30)
-    assert status == 2
-    assert output.startswith(
-        "chaserdock: no-such-mission: no such scenario file or shipped scenario; shipped: abort, "
-    )
-    assert len(output.strip().splitlines()) == 1
-
-
 def test_existing_log_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "mission.mcap").write_bytes(b"precious")
     status, output = run("single", tmp_path, timeout_s=30)
@@ -142,7 +112,7 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
     reach = ["--namespace", by_hand.namespace, "-e", by_hand.endpoint]
     log = tmp_path / "mission.mcap"
     try:
-        by_hand.start("world", "world", TWO, *sets(*LONG, "duration_s=40.0"))
+        by_hand.start("world", "world", TWO, *sets(*LONG, "duration_s=30.0"))
         by_hand.start("recorder", "record", "--out", str(tmp_path))
         by_hand.start("controller", "controller")
         for i in range(2):
@@ -173,7 +143,7 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
     finally:
         by_hand.end()
     flight = load_flight(log)
-    assert len(flight.truth["target"].time_s) == 40 * 15 + 1
+    assert len(flight.truth["target"].time_s) == 30 * 15 + 1
     assert {r.command: r.accepted for r in flight.replies} == {"approach": True, "retreat": False}
     reasons = {name.rpartition(":")[2] for name in flight.rejected}
     assert {"not_finite", "not_unit_quaternion", "format", "encoding", "chaser"} <= reasons

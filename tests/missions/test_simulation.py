@@ -8,59 +8,52 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 from chaserdock_protocol.recording.log import read_log
-from harness import ROOT, run, summary
+from harness import DRILL, ROOT, SHORT, simulated_digest, summary
 
 from chaserdock.analysis.flight import load_flight
-from chaserdock.simulation.mission import SimulatedFlight, simulate
+from chaserdock.simulation.mission import simulate
 
-SMALL = (
-    "camera.width_px=480",
-    "camera.height_px=270",
-    "settling_s=1.0",
-    "success.steady_position_rms_m=9.0",
-    "success.steady_orientation_rms_deg=180.0",
-)
-DRILL = ("timeline=[]", "success.docked=[]", "settling_s=1.0")
-CASES = {
-    "single": ("single", ("duration_s=2.0", *SMALL)),
-    "two-chaser-tracking": ("two-chaser-tracking", ("duration_s=2.0", *SMALL)),
-    "fault-drill": ("fault-drill", ("duration_s=2.0", *DRILL)),
-    "fault-drill with faults and a standby": (
-        "fault-drill",
-        (
-            "duration_s=3.0",
-            *DRILL,
-            "controller.standby=true",
-            "fault=[{kind='kill',at_s=2.0,process='controller'},"
-            "{kind='drop',at_s=1.0,duration_s=1.0,process='chaser/0',topic='wrench',share=0.5}]",
-        ),
-    ),
+BRIEF = ("duration_s=2.0", "timeline=[]", "success.docked=[]", "settling_s=1.0")
+OTHER_SIMD = {
+    "OPENCV_CPU_DISABLE": "AVX512-SKX,AVX512-COMMON,AVX2,FMA3,AVX",
+    "NPY_DISABLE_CPU_FEATURES": "AVX512F AVX2 FMA3",
+    "OPENBLAS_CORETYPE": "Prescott",
 }
+"""Disables AVX and newer instructions in OpenCV, NumPy and OpenBLAS."""
 
 
-def simulated(name: str, folder: Path, *overrides: str) -> SimulatedFlight:
-    return simulate(ROOT / "scenarios" / f"{name}.toml", folder, overrides)
+def simulate_elsewhere(out: Path, *overrides: str, env: dict[str, str]) -> None:
+    """Simulate ``fault-drill`` in an interpreter with other environment variables."""
+    code = (
+        "import sys, pathlib; from chaserdock.simulation.mission import simulate;"
+        "simulate(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), tuple(sys.argv[3:]))"
+    )
+    arguments = [str(ROOT / "scenarios" / "fault-drill.toml"), str(out), *overrides]
+    subprocess.run([sys.executable, "-c", code, *arguments], env={**os.environ, **env}, cwd=ROOT, check=True)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_digest_equals_that_of_separate_processes_over_zenoh(case: str, tmp_path: Path) -> None:
-    name, overrides = CASES[case]
-    _, text = run(name, tmp_path / "run", *overrides)
-    flight = simulated(name, tmp_path / "simulated", *overrides)
-    assert (flight.crashes, flight.stalled) == ({}, ())
-    digest = load_flight(tmp_path / "simulated" / "mission.mcap").digest
-    assert digest == summary(tmp_path / "run")["digest"], text
+@pytest.mark.parametrize(
+    ("flown", "overrides"),
+    [("short_flight", ("two-chaser-tracking", *SHORT)), ("drill_flight", DRILL)],
+)
+def test_digest_equals_that_of_separate_processes_over_zenoh(
+    flown: str, overrides: tuple[str, ...], request: pytest.FixtureRequest, tmp_path: Path
+) -> None:
+    """So do those with faults, a standby and thrusters, in the tests of those."""
+    folder = request.getfixturevalue(flown)
+    assert simulated_digest(overrides[0], tmp_path, *overrides[1:]) == summary(folder)["digest"]
 
 
 def test_latency_does_not_change_a_lockstep_flight(tmp_path: Path) -> None:
-    name, overrides = CASES["fault-drill"]
     late = ("simulation.latency_s=0.003", "simulation.jitter_s=0.02")
     cut = "simulation.partition=[{at_s=0.5,duration_s=1.0,processes=['controller','chaser/1']}]"
     digests = []
     for k, conditions in enumerate(((), (*late, cut))):
-        flight = simulated(name, tmp_path / str(k), *overrides, *conditions)
+        path = ROOT / "scenarios" / "fault-drill.toml"
+        flight = simulate(path, tmp_path / str(k), (*BRIEF, *conditions))
         assert set(flight.statuses.values()) == {0}
         digests.append(load_flight(tmp_path / str(k) / "mission.mcap").digest)
     assert digests[0] == digests[1]
@@ -78,16 +71,24 @@ _HARSH = (
 
 
 def test_a_seed_repeats_every_byte_whatever_the_hash_seed(tmp_path: Path) -> None:
-    overrides = ("duration_s=2.0", *DRILL, *_HARSH)
     contents = []
     for k in range(2):
-        code = (
-            "import sys, pathlib; from chaserdock.simulation.mission import simulate;"
-            "simulate(pathlib.Path(sys.argv[1]), pathlib.Path(sys.argv[2]), tuple(sys.argv[3:]))"
-        )
-        arguments = [str(ROOT / "scenarios" / "fault-drill.toml"), str(tmp_path / str(k)), *overrides]
-        environment = {**os.environ, "PYTHONHASHSEED": str(k)}
-        subprocess.run([sys.executable, "-c", code, *arguments], env=environment, cwd=ROOT, check=True)
+        simulate_elsewhere(tmp_path / str(k), *BRIEF, *_HARSH, env={"PYTHONHASHSEED": str(k)})
         contents.append([(r.key, r.message, r.sent_ns) for r in read_log(tmp_path / str(k) / "mission.mcap")])
     assert len(contents[0]) > 500
     assert contents[0] == contents[1]
+
+
+@pytest.mark.slow
+def test_four_chasers_dock_along_the_same_paths_on_another_simd_level(tmp_path: Path) -> None:
+    """The complete drill: 5 s at a distance, then an approach to the docking distance."""
+    for name, env in (("native", {}), ("other", OTHER_SIMD)):
+        simulate_elsewhere(tmp_path / name, env=env)
+    native, other = (load_flight(tmp_path / name / "mission.mcap").truth for name in ("native", "other"))
+    separations_m = [
+        np.linalg.norm(native[body].position_m - track.position_m, axis=1).max()
+        for body, track in other.items()
+    ]
+    assert len(separations_m) == 5
+    # Not zero, or the variables that disable instructions had no effect.
+    assert 0.0 < max(separations_m) < 3e-3

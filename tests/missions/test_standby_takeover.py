@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from chaserdock_protocol.messages import ActuatorCommand, Event, Tick
 from chaserdock_protocol.recording.log import LogError, read_log
-from harness import DRILL, ByHand, run, sets, summary, wait_for_log
+from harness import DRILL, ByHand, run, sets, simulated_digest, summary, wait_for_log
 
 from chaserdock.analysis.flight import RecordedFlight, load_flight
 from chaserdock.replay.run import replay
@@ -21,6 +21,9 @@ from chaserdock.replay.run import replay
 WITH_STANDBY = (*DRILL[1:], "duration_s=4.0", "controller.standby=true")
 
 pytestmark = pytest.mark.slow
+
+
+KILLED = 'kind="kill", at_s=2.0, process="controller"'
 
 
 def fly(out: Path, fault: str = "", *overrides: str) -> tuple[int, RecordedFlight, dict[str, Any]]:
@@ -54,7 +57,7 @@ def test_takeover_from_killed_controller_leaves_trajectories_unchanged(
     drill_flight: Path, tmp_path: Path
 ) -> None:
     """The reference flight has no standby and flies on for longer."""
-    status, killed, result = fly(tmp_path / "killed", 'kind="kill", at_s=2.0, process="controller"')
+    status, killed, result = fly(tmp_path / "killed", KILLED)
     assert status == 0, result["failures"]
     events = [(e.what, e.detail) for e in killed.events]
     assert ("hand-over", "term 2: standby leads: controller lost") in events
@@ -66,6 +69,8 @@ def test_takeover_from_killed_controller_leaves_trajectories_unchanged(
     assert (ticks[-1].term, ticks[-1].commander, ticks[-1].standing_by) == (2, "standby", {})
     check_fencing(tmp_path / "killed" / "mission.mcap")
     assert replay(tmp_path / "killed" / "mission.mcap", "controller").equal
+    overrides = (*WITH_STANDBY, f"fault=[{{{KILLED}}}]")
+    assert simulated_digest(DRILL[0], tmp_path / "simulated", *overrides) == result["digest"]
     assert not [e for e in killed.events if e.what.startswith(("fallback", "no command", "command refused"))]
 
 
@@ -110,7 +115,7 @@ def test_restarted_controller_stands_by_and_takes_over_again(tmp_path: Path) -> 
     """Kill the controller, restart it, then kill the standby."""
     by_hand = ByHand.at_free_port("standby")
     log = tmp_path / "mission.mcap"
-    changes = (*WITH_STANDBY, "duration_s=40.0")
+    changes = (*WITH_STANDBY, "duration_s=30.0")
     try:
         by_hand.start("world", "world", DRILL[0], *sets(*changes))
         by_hand.start("recorder", "record", "--out", str(tmp_path))

@@ -80,7 +80,7 @@ def add_errors(out: Figures, name: str, errors: tuple[float, float]) -> None:
 
 
 def tracking(duration_s: float) -> Figures:
-    """Steady errors at the paper's tumble with perfect knowledge, starting 0.85 m behind the reference."""
+    """Measure steady errors at the paper's tumble with perfect knowledge, starting 0.85 m behind the reference."""
     out: Figures = {}
     for name, overrides, gain in (
         ("feed_forward", (), 1.0),
@@ -94,7 +94,7 @@ def tracking(duration_s: float) -> Figures:
 
 
 def tracking_with_images(duration_s: float) -> Figures:
-    """Steady errors at the paper's tumble with images; the worst chaser of each flight."""
+    """Measure steady errors at the paper's tumble with images; the worst chaser of each flight."""
     out: Figures = {}
     length = f"duration_s={duration_s}"
     servicer = load_shipped("single", "target.model='servicer'", length)

@@ -65,7 +65,7 @@ def fly(s: Scenario) -> FlightRecord:
 
 
 def allocation(quick: bool) -> Figures:
-    """Accuracy and time of the allocation of random feasible wrenches, up to full thrust."""
+    """Measure accuracy and time of the allocation of random feasible wrenches, up to full thrust."""
     out: Figures = {}
     for body in ("tetra12", "slider"):
         rng = np.random.default_rng(1)
@@ -91,7 +91,7 @@ def allocation(quick: bool) -> Figures:
 
 
 def pulses(quick: bool) -> Figures:
-    """Largest difference of delivered and commanded impulse over a second of random thrusts, in minimum pulses.
+    """Measure the largest difference of delivered and commanded impulse over a second of random thrusts, in minimum pulses.
 
     ``less_late``: without what was commanded within a carrier period after its pulse had been sent, which is zero where
     every tick begins a period.
@@ -146,7 +146,7 @@ class CommandedImpulse:
 
 
 def tracking(quick: bool) -> Figures:
-    """Steady errors and impulse with thrusters, beside ideal actuation."""
+    """Measure steady errors and impulse with thrusters, beside ideal actuation."""
     out: Figures = {}
     duration_s = 40.0 if quick else 120.0
     for body in ("tetra12", "slider"):
@@ -175,7 +175,7 @@ def _isolated_s(record: FlightRecord, thruster: int) -> float:
 
 
 def failures(quick: bool) -> Figures:
-    """Every thruster fails at 30 s, not reported: time to isolation, wrongly isolated thrusters, errors afterwards."""
+    """Let every thruster fail at 30 s, not reported: time to isolation, wrongly isolated thrusters, errors afterwards."""
     out: Figures = {}
     thrusters = (0, 5, 10) if quick else range(12)
     for kind in ("stuck_on", "stuck_off"):
@@ -205,7 +205,7 @@ def failures(quick: bool) -> Figures:
 
 
 def healthy(quick: bool) -> Figures:
-    """False alarms without failures: random starts, up to three times the paper's rates, noisy measurements, both bodies."""
+    """Count false alarms without failures: random starts, up to three times the paper's rates, noisy measurements, both bodies."""
     alarms, flights = 0, 4 if quick else 20
     for seed in range(flights):
         rng = np.random.default_rng(100 + seed)

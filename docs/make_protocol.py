@@ -162,7 +162,7 @@ def _range(least: float | None, most: float | None) -> str:
 
 
 def nested(kind: type[Struct]) -> list[type[Struct]]:
-    """Types that lie in a message's fields."""
+    """Return the types within a message's fields."""
     found: list[type[Struct]] = []
 
     def walk(shape: shapes.Type) -> None:
@@ -183,7 +183,7 @@ def nested(kind: type[Struct]) -> list[type[Struct]]:
 
 
 def fields_of(kind: type[Struct]) -> list[str]:
-    """Table of a type's own fields; the three that all messages have are described once."""
+    """Return a table of a type's own fields; the three that all messages have are described once."""
     shape = shapes.type_info(kind)
     assert isinstance(shape, shapes.StructType)
     common = set(messages.Message.__struct_fields__) if issubclass(kind, messages.Message) else set()
@@ -199,12 +199,12 @@ def fields_of(kind: type[Struct]) -> list[str]:
 
 
 def doc_of(kind: type[Struct]) -> str:
-    """Docstring as Markdown."""
+    """Return a type's docstring as Markdown."""
     return re.sub(r"``(.+?)``", r"`\1`", inspect.cleandoc(kind.__doc__ or ""))
 
 
 def topic_table() -> list[str]:
-    """One row a topic."""
+    """Return a table with a row for each topic."""
     rows = [
         "| key | type | written by | read by | how often | kind of traffic |",
         "| --- | --- | --- | --- | --- | --- |",
@@ -224,7 +224,7 @@ def _readers(topic: Topic) -> str:
 
 
 def page() -> str:
-    """The whole page."""
+    """Return the whole page."""
     parts = [INTRODUCTION, "## Topics", *topic_table(), ""]
     parts += ["Queries: request, answer.", "", "| key | request | answer |", "| --- | --- | --- |"]
     for key, asked, answered in (

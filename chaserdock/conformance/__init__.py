@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a foreign process keep the protocol? It is run against a recorded log, and all that it says is checked."""
+"""Check of a foreign process against the protocol: it runs against a recorded log, and all its messages are checked."""

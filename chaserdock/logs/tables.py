@@ -27,7 +27,7 @@ Column = tuple[str, pa.DataType, Reader]
 
 
 def unit_of(name: str) -> str | None:
-    """The unit in a field's name, None if it has none."""
+    """Return the unit in a field's name, None if it has none."""
     for unit in UNITS:
         if name.endswith(f"_{unit}"):
             return unit
@@ -51,7 +51,7 @@ def _json(name: str) -> Reader:
 
 
 def _plain(kind: inspect.Type) -> pa.DataType | None:
-    """Arrow's type of a plain value or a list of such, None for what is neither."""
+    """Return Arrow's type of a plain value or a list of such, None for another type."""
     match kind:
         case inspect.BoolType():
             return pa.bool_()
@@ -73,7 +73,7 @@ def _plain(kind: inspect.Type) -> pa.DataType | None:
 
 
 def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], list[str]]:
-    """Columns of a structure, and the names of its fields that become tables of their own."""
+    """Return the columns of a structure, and the names of its fields that become tables of their own."""
     columns: list[Column] = []
     children: list[str] = []
     info: Any = inspect.type_info(kind)
@@ -103,7 +103,7 @@ def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], li
 
 
 def _element(kind: type[msgspec.Struct], field: str) -> type[msgspec.Struct]:
-    """The structure in a field that holds a tuple of them."""
+    """Return the structure in a field that holds a tuple of them."""
     hint = get_type_hints(kind)[field]
     while get_origin(hint) is not tuple:
         hint = get_args(hint)[0]
@@ -126,13 +126,13 @@ class TableRows:
         self.number = 0
 
     def add(self, row: Any) -> None:
-        """One row, from whatever the columns read."""
+        """Add a row with the values that the columns read."""
         for values, reader in zip(self._values, self._readers, strict=True):
             values.append(reader(row))
         self.number += 1
 
     def take(self) -> pa.Table:
-        """The rows so far, which are forgotten here."""
+        """Return the rows since the last call."""
         arrays = [pa.array(v, f.type) for v, f in zip(self._values, self.schema, strict=True)]
         self._values = [[] for _ in self._values]
         self.number = 0
@@ -140,7 +140,7 @@ class TableRows:
 
 
 def table_name(topic: Topic) -> str:
-    """Name of a topic's table, such as ``chaser_sighting`` or ``world_chaser_image``."""
+    """Return the name of a topic's table, such as ``chaser_sighting`` or ``world_chaser_image``."""
     return (
         topic.key.replace("/{chaser}", "")
         .replace("{process}/", "")
@@ -181,7 +181,7 @@ class TopicTable:
         return max(self._rows.number, *(c.number for c in self.children.values()), 0)
 
     def add(self, record: Record) -> None:
-        """One message."""
+        """Add a message."""
         self._rows.add(record)
         for name, rows in self.children.items():
             for index, item in enumerate(getattr(record.message, name)):
@@ -192,7 +192,7 @@ class TopicTable:
         return self._rows.take()
 
     def take_all(self) -> Iterator[tuple[str, pa.Table]]:
-        """All tables' rows so far, by table name."""
+        """Return the rows of all tables since the last call, by table name."""
         yield self.name, self._rows.take()
         for name, rows in self.children.items():
             yield f"{self.name}_{name}", rows.take()

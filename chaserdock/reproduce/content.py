@@ -91,7 +91,7 @@ def _cell(errors: Errors | None, form: Callable[[Errors], str]) -> str:
 def _method(
     plan: ReproductionPlan, results: ReproductionResults, about: Provenance, recorded: ChainRecord | None
 ) -> PageSection:
-    """What was flown, where and when, definitions, and what is missing."""
+    """Return what was flown, where and when, definitions, and what is missing."""
     command = "chaserdock reproduce --quick" if plan.quick else "chaserdock reproduce"
     missing = sum(m.name not in results.missions for m in plan.missions)
     missing_studies = sum(c.name not in results.studies for c in plan.studies)
@@ -147,7 +147,7 @@ def _method(
 
 
 def _verdicts(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
-    """Every figure of the paper's table beside ours, judged from both sides."""
+    """Return every figure of the paper's table beside ours, judged from both sides."""
     rows = []
     for row in ROWS:
         for quantity, paper in (
@@ -180,7 +180,7 @@ def _verdicts(plan: ReproductionPlan, results: ReproductionResults) -> PageSecti
 
 
 def _trends(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
-    """Changes from the baseline row, and the spike, with explanations."""
+    """Return the changes from the baseline row, and the spike, with explanations."""
 
     def percent(x: float) -> str:
         return f"{100 * x:+.3g} %"
@@ -224,7 +224,7 @@ def _trends(plan: ReproductionPlan, results: ReproductionResults) -> PageSection
 
 
 def _table(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
-    """The nine rows in all columns, position, orientation and steady state."""
+    """Return the nine rows in all columns, position, orientation and steady state."""
     columns = [
         (f"{_NAMES[column]}, {how}", column, how == "images")
         for column in (CHAIN, "paper", "default")
@@ -375,7 +375,7 @@ def _measured(name: str, result: StudyResult) -> tuple[str, ...]:
 
 
 def _other_runs(plan: ReproductionPlan, results: ReproductionResults) -> PageSection:
-    """The baseline row with the paper's combiner alone, and our default on both targets."""
+    """Return the baseline row with the paper's combiner alone, and our default on both targets."""
     rows = []
     for label, group in (
         ("paper's settings, our chain", table_group("paper", "baseline")),

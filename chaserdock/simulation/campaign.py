@@ -22,7 +22,7 @@ from .shrinking import shrink
 from .swarm import Case, SimulationResult, draw_case, fly_case
 
 NEES_LIMITS = (1.5, 12.0)
-"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights whose sensors are honest."""
+"""Bounds of the mean normalized squared error of the target's pose (6 if consistent) over flights without lying sensors."""
 LEAST_NEES_FLIGHTS = 20
 
 
@@ -86,7 +86,7 @@ def write_case(case: Case, result: SimulationResult, folder: Path) -> Path:
 
 
 def consistency(results: Iterable[SimulationResult]) -> tuple[float, int]:
-    """Return the mean NEES over the flights whose sensors are honest, each weighted equally, and their number."""
+    """Return the mean NEES over the flights without lying sensors, each weighted equally, and their number."""
     means = [float(np.mean(r.nees)) for r in results if r.honest and r.nees]
     return (float(np.mean(means)) if means else float("nan")), len(means)
 

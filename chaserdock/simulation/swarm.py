@@ -44,7 +44,7 @@ Case = dict[str, Any]
 class SimulationResult:
     """One simulated flight. ``fingerprint``: of all messages with their times; equal in equal flights.
 
-    ``nees``: of the estimate, one value a second; ``honest``: no sensor lied, so that it should be consistent.
+    ``nees``: of the estimate, one value a second; ``honest``: no sensor lies, so that it should be consistent.
     """
 
     seed: int
@@ -280,7 +280,7 @@ def _check_recording(checks: Invariants, flight: SimulatedFlight) -> None:
 
 
 def _check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
-    """Queues stay short unless a flood or a slow or frozen reader fills them; they are bounded anyway."""
+    """Check that queues stay short unless a flood or a slow or frozen reader fills them."""
     s = checks.scenario
     if s.simulation.slow or s.simulation.partition or any(f.kind in ("flood", "freeze") for f in s.fault):
         return

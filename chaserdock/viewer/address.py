@@ -46,7 +46,7 @@ def url_of(host: str, port: int) -> str:
 
 
 def may_connect(origin: str | None, requested_host: str, host: str) -> bool:
-    """Return whether a web socket may be opened: by our own page (``Origin`` equals ``Host``) or by a program (no
+    """Return whether a web socket may be opened: by the viewer's page (``Origin`` equals ``Host``) or by a program (no
     ``Origin``). On a loopback address ``Host`` must be a loopback name, which prevents DNS rebinding."""
     name = urlsplit(f"//{requested_host}").hostname
     if host in _LOOPBACK and name not in _LOOPBACK:

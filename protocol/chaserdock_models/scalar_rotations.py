@@ -19,7 +19,7 @@ from .arrays import Array
 
 
 def product_components(aw, ax, ay, az, bw, bx, by, bz) -> list:
-    """Components of the Hamilton product a (x) b (Sola eq. 12)."""
+    """Return the components of the Hamilton product a (x) b (Sola eq. 12)."""
     return [
         aw * bw - ax * bx - ay * by - az * bz,
         aw * bx + ax * bw + ay * bz - az * by,
@@ -29,12 +29,12 @@ def product_components(aw, ax, ay, az, bw, bx, by, bz) -> list:
 
 
 def cross_components(ax, ay, az, bx, by, bz) -> list:
-    """Components of the cross product a x b."""
+    """Return the components of the cross product a x b."""
     return [ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]
 
 
 def rotated_components(w, x, y, z, vx, vy, vz) -> list:
-    """Components of v rotated by the unit quaternion (w, u): v + w t + u x t with t = 2 u x v."""
+    """Return the components of v rotated by the unit quaternion (w, u): v + w t + u x t with t = 2 u x v."""
     tx, ty, tz = 2.0 * (y * vz - z * vy), 2.0 * (z * vx - x * vz), 2.0 * (x * vy - y * vx)
     return [
         vx + w * tx + (y * tz - z * ty),
@@ -44,7 +44,7 @@ def rotated_components(w, x, y, z, vx, vy, vz) -> list:
 
 
 def matrix_components(w, x, y, z) -> list[list]:
-    """Rows of the rotation matrix of a unit quaternion."""
+    """Return the rows of the rotation matrix of a unit quaternion."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],

@@ -71,7 +71,7 @@ def dynamics(params: NmpcParameters, integrator: str | None = None) -> ca.Functi
 
 
 def pose_cost(x: Any, reference: Any, weight_position: Any, weight_orientation: Any) -> Any:
-    """Q_p |p_ref - p|^2 + Q_q |vec(q (x) q_ref*)|^2; ``reference`` (7) is p, q_wxyz.
+    """Return Q_p |p_ref - p|^2 + Q_q |vec(q (x) q_ref*)|^2; ``reference`` (7) is p, q_wxyz.
 
     The paper weights all four components of q (x) q_ref*, whose norm is always one. The vector part vanishes on the
     reference, and both signs of a quaternion cost the same.

@@ -75,7 +75,7 @@ def current_key(key: str) -> str:
 
 
 def decode_logged(kind: type[T], payload: bytes, encoding: str) -> T:
-    """Message of type ``kind`` from a log, upgraded if it is of an older version, and checked.
+    """Return a message of type ``kind`` from a log, upgraded if it is of an older version, and checked.
 
     Raises Rejected as ``codec.decode``; with reason ``encoding`` also when no upgrade leads to the present version.
     """

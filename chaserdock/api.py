@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, cast
@@ -20,8 +18,6 @@ if TYPE_CHECKING:
     from chaserdock_protocol.scenario import Scenario
 
     from .launch.json_events import JsonLine
-    from .launch.launcher import MissionOutcome
-    from .launch.progress import Show
     from .logs.reader import Log
     from .summary import Summary
 
@@ -74,60 +70,24 @@ def run(
     override, RunError when the mission cannot start or leaves no log. An exception, such as KeyboardInterrupt, ends all
     processes of the mission.
     """
-    from .launch.launcher import RunError
-    from .launch.progress import Show
+    from .launch.launcher import RunError, fly_mission
+    from .launch.progress import Show, print_json_line
     from .summary import Summary
 
-    outcome = fly(
+    outcome = fly_mission(
         scenario,
-        out=out,
-        mode=mode,
+        None if out is None else Path(out),
+        mode,
+        override_texts(overrides, changes),
         seed=seed,
-        sets=override_texts(overrides, changes),
-        keys=keys,
-        stall_s=stall_s,
         show=Show.none if on_event is None else Show.json,
-        emit=on_event,
+        keys=None if keys is None else Path(keys),
+        emit=on_event or print_json_line,
+        stall_s=stall_s,
     )
     if outcome.summary is None:
         raise RunError(outcome.failure or f"{outcome.folder}: no readable log")
     return RunResult(Summary.from_dict(outcome.summary), outcome.folder)
-
-
-def fly(
-    scenario: StrPath,
-    *,
-    out: StrPath | None,
-    mode: Literal["lockstep", "realtime"],
-    seed: int | None,
-    sets: tuple[str, ...],
-    keys: StrPath | None,
-    show: Show,
-    stall_s: float = DEFAULT_STALL_S,
-    viewer_port: int | None = None,
-    stop_requested: Callable[[], bool] = lambda: False,
-    emit: Callable[[JsonLine], None] | None = None,
-) -> MissionOutcome:
-    """Fly a scenario with ``KEY=VALUE`` overrides; the common part of ``run`` here and on the command line."""
-    from chaserdock_protocol.shipped_scenarios import find_scenario
-
-    from .launch.launcher import fly_mission
-    from .launch.progress import print_json_line
-
-    path = find_scenario(str(scenario))
-    folder = Path(out) if out is not None else _new_folder(path.stem)
-    return fly_mission(
-        path,
-        folder,
-        mode,
-        sets if seed is None else (*sets, f"seed={seed}"),
-        show,
-        viewer_port,
-        None if keys is None else Path(keys),
-        stop_requested,
-        emit or print_json_line,
-        stall_s,
-    )
 
 
 def open_log(source: StrPath | Sequence[StrPath]) -> Log:
@@ -171,19 +131,3 @@ def _flatten(prefix: str, table: Mapping[str, object]) -> Iterator[tuple[str, ob
             yield from _flatten(f"{prefix}{key}.", cast("Mapping[str, object]", value))
         else:
             yield f"{prefix}{key}", value
-
-
-_folders: set[Path] = set()
-_folders_lock = threading.Lock()
-
-
-def _new_folder(name: str) -> Path:
-    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended where needed."""
-    base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
-    folder, number = base, 1
-    with _folders_lock:
-        while folder.exists() or folder in _folders:
-            number += 1
-            folder = base.with_name(f"{base.name}-{number}")
-        _folders.add(folder)
-    return folder

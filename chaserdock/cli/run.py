@@ -43,8 +43,7 @@ def run(
     stall_s: StallOpt = DEFAULT_STALL_S,
 ) -> None:
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
-    import chaserdock
-    from chaserdock.launch.launcher import print_outcome
+    from chaserdock.launch.launcher import fly_mission, print_outcome
     from chaserdock.launch.signals import stop_on_signals
     from chaserdock.viewer.address import DEFAULT_HOST, free_port, url_of
 
@@ -54,12 +53,12 @@ def run(
         if view:
             port = free_port(DEFAULT_HOST, None)
             print(f"the viewer is at {url_of(DEFAULT_HOST, port)}", file=sys.stderr, flush=True)
-        outcome = chaserdock.api.fly(
+        outcome = fly_mission(
             scenario,
-            out=out,
-            mode=mode.value,
+            out,
+            mode.value,
+            tuple(overrides or ()),
             seed=seed,
-            sets=tuple(overrides or ()),
             keys=keys,
             stall_s=stall_s,
             show=show,

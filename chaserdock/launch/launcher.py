@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 import uuid
 from collections.abc import Callable
@@ -26,6 +27,7 @@ from chaserdock_protocol.process import SINGLE_THREADED, Mode
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
@@ -204,10 +206,12 @@ def never() -> bool:
 
 
 def fly_mission(
-    path: Path,
-    folder: Path,
+    scenario_name: str | Path,
+    folder: Path | None = None,
     mode: Mode = "lockstep",
     overrides: tuple[str, ...] = (),
+    *,
+    seed: int | None = None,
     show: Show = Show.none,
     viewer_port: int | None = None,
     keys: Path | None = None,
@@ -215,14 +219,17 @@ def fly_mission(
     emit: Callable[[JsonLine], None] = print_json_line,
     stall_s: float = DEFAULT_STALL_S,
 ) -> MissionOutcome:
-    """Fly a scenario; write log, summary and the processes' output to ``folder``.
+    """Fly a scenario; write log, summary and the processes' output to ``folder``, by default a new one in ``runs/``.
 
-    ``viewer_port``: serve the live viewer there until the end of the flight. ``keys``: connect through a router, over TLS,
-    with access rights. ``stall_s``: longest time (s) without progress. ``stop_requested`` is polled. Installs no signal handler; an
-    exception ends all processes.
+    ``scenario_name``: a file, or the name of a shipped scenario. ``viewer_port``: serve the live viewer there until the end of
+    the flight. ``keys``: connect through a router, over TLS, with access rights. ``stall_s``: longest time (s) without
+    progress. ``stop_requested`` is polled. Installs no signal handler; an exception ends all processes.
     Raises RunError, ScenarioError or TransportError when the mission cannot start.
     """
+    path = find_scenario(str(scenario_name))
+    overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
+    folder = folder or _new_folder(path.stem)
     output = folder / "processes"
     if keys is not None:
         check_keys(keys, len(scenario.chasers))
@@ -258,6 +265,22 @@ def fly_mission(
             hub.close()
         observers.end()
     return judge(fleet, folder, failure, reporter)
+
+
+_folders: set[Path] = set()
+_folders_lock = threading.Lock()
+
+
+def _new_folder(name: str) -> Path:
+    """Return a folder ``runs/NAME-TIME`` that does not exist, with a number appended where needed."""
+    base = Path("runs") / f"{name}-{datetime.now():%Y%m%d-%H%M%S}"
+    folder, number = base, 1
+    with _folders_lock:
+        while folder.exists() or folder in _folders:
+            number += 1
+            folder = base.with_name(f"{base.name}-{number}")
+        _folders.add(folder)
+    return folder
 
 
 def start_line(scenario: Scenario, mode: Mode, folder: Path) -> Start:

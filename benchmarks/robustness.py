@@ -3,10 +3,13 @@
 
 Parts: ``grades`` (rendered images; the grades of ``[navigation]`` and ``harsh-light``, also after ``calibrate``, with plant
 mismatch unless ``--nominal``), ``sources`` (statistical sightings; each error source alone, from 0 to 10 times its figure in the
-grade ``lab``). Figures are RMS over all chasers in the steady state (from 32 s on in ``grades``, 15 s after the end of a
-calibration; from 20 s on in ``sources``), mean over the seeds, in closed loop: the error of each chaser's pose relative to the
-target, ``estimate``, and of its distance from the reference on the true target, ``tracking``; ``nees`` of the relative pose (6
-expected); ``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes odometry as exact; its relative
+grade ``lab``), ``failures`` (``lab`` with plant mismatch and the statistical perception; no sight for 20 s, and odometry of one
+chaser that jumps by 50 mm and 5 degrees, states 20 mm/s too much, or a tenth of its sigma of position).
+
+Figures of ``grades`` and ``sources`` are RMS over all chasers in the steady state (from 32 s on in ``grades``, 15 s after the end
+of a calibration; from 20 s on in ``sources``), mean over the seeds, in closed loop: the error of each chaser's pose relative to
+the target, ``estimate``, and of its distance from the reference on the true target, ``tracking``; ``nees`` of the relative pose
+(6 expected); ``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes odometry as exact; its relative
 pose is that of odometry and target estimate.
 """
 
@@ -15,16 +18,20 @@ from __future__ import annotations
 import argparse
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
+import msgspec
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import Odometry, Sighting
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.navigation import GRADES
+from chaserdock_world.rendering.cameras import States
 from common import ROOT, Figures, make_parser, print_figures, run_parts
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
@@ -182,14 +189,113 @@ def sources(options: argparse.Namespace) -> Figures:
     return fly_all(flights, options.jobs)
 
 
-PARTS = {"grades": grades, "sources": sources}
+def jumped(odometry: Odometry) -> Odometry:
+    """Return odometry 50 mm and 5 degrees off."""
+    q = rotations.multiply(odometry.q_wxyz, rotations.exp([math.radians(5.0), 0.0, 0.0]))
+    x, y, z = odometry.position_m
+    return msgspec.structs.replace(odometry, position_m=(x, y + 0.05, z), q_wxyz=vector(q))
+
+
+def with_wrong_velocity(odometry: Odometry) -> Odometry:
+    """Return odometry that states 20 mm/s that the chaser does not move."""
+    x, y, z = odometry.velocity_m_s
+    return msgspec.structs.replace(odometry, velocity_m_s=(x, y + 0.02, z))
+
+
+def overconfident(odometry: Odometry) -> Odometry:
+    """Return odometry that states a hundredth of its covariance of position."""
+    covariance = tuple(1e-2 * value for value in odometry.position_covariance_m2)
+    return msgspec.structs.replace(odometry, position_covariance_m2=covariance)
+
+
+ODOMETRY_FAILURES: dict[str, Callable[[Odometry], Odometry]] = {
+    "jump": jumped,
+    "wrong_velocity": with_wrong_velocity,
+    "overconfident": overconfident,
+}
+FAILED_AT_S, BLIND_S, FAILED_CHASER = 35.0, 20.0, 1
+
+
+class FailureMission(InProcessMission):
+    """A mission with a failure from ``FAILED_AT_S`` on: of all cameras for ``BLIND_S``, or of the odometry of one chaser."""
+
+    def __init__(self, scenario: Scenario, failure: str) -> None:
+        see = RenderedImages(scenario)
+
+        def blind(chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+            sighting = see(chaser, tick, time_ns, states)
+            if FAILED_AT_S <= time_ns / 1e9 < FAILED_AT_S + BLIND_S:
+                return msgspec.structs.replace(
+                    sighting, status="nothing", solutions=(), marker_ids=(), corners_px=()
+                )
+            return sighting
+
+        super().__init__(scenario, blind if failure == "blind" else see)
+        self._change = ODOMETRY_FAILURES.get(failure)
+
+    def measure(self, chaser: int, time_ns: int, states: States) -> Odometry:
+        odometry = super().measure(chaser, time_ns, states)
+        failed = self._change is not None and chaser == FAILED_CHASER and time_ns / 1e9 >= FAILED_AT_S
+        return self._change(odometry) if self._change is not None and failed else odometry
+
+
+def fly_failure(failure: str, seed: int) -> Array:
+    """Return RMS tracking error (m) of the failed chaser before and after the failure, the largest tracking error of all
+    chasers after it (m), and the time until a warning names the failed odometry (s)."""
+    overrides = ('navigation.grade="lab"', 'truth.preset="mismatch"', 'perception.name="statistical"')
+    scenario = scenario_of("four-chaser-docking", "joint", seed, FAILED_AT_S + BLIND_S + 10.0, *overrides)
+    before, after, largest = [], [], 0.0
+    with FailureMission(scenario, failure) as mission:
+        for tick in mission.ticks():
+            if tick.time_s < 20.0:
+                continue
+            own_m, _ = tick.tracking_errors[FAILED_CHASER]
+            (before if tick.time_s < FAILED_AT_S else after).append(own_m**2)
+            if tick.time_s >= FAILED_AT_S:
+                largest = max(largest, *(distance_m for distance_m, _ in tick.tracking_errors.values()))
+        reports = [
+            time_s - FAILED_AT_S
+            for time_s, level, text in mission.events
+            if level == "warning"
+            and time_s >= FAILED_AT_S
+            and text.startswith(f"chaser {FAILED_CHASER}: odometry")
+        ]
+    reported_s = min(reports, default=math.nan)
+    return np.array([math.sqrt(np.mean(before)), math.sqrt(np.mean(after)), largest, reported_s])
+
+
+def failures(options: argparse.Namespace) -> Figures:
+    """Fly four chasers without sight, and with failures of one chaser's odometry."""
+    figures: Figures = {}
+    kinds = ("blind", *ODOMETRY_FAILURES)
+    seeds = 1 if options.quick else options.seeds
+    with ProcessPoolExecutor(options.jobs) as pool:
+        for kind in kinds:
+            rows = np.array(list(pool.map(partial(fly_failure, kind), range(seeds))))
+            part = {
+                f"{kind}_tracking_before_m": float(np.mean(rows[:, 0])),
+                f"{kind}_tracking_after_m": float(np.mean(rows[:, 1])),
+                f"{kind}_largest_tracking_m": float(np.max(rows[:, 2])),
+            }
+            if kind != "blind":
+                part[f"{kind}_reported_max_s"] = float(np.max(rows[:, 3]))
+            print_figures(part)
+            figures |= part
+    return figures
+
+
+PARTS = {"grades": grades, "sources": sources, "failures": failures}
 
 
 def main() -> None:
     """Run the parts."""
     parser = make_parser(__doc__, PARTS)
     parser.add_argument(
-        "--seeds", type=int, default=20, metavar="N", help="flights per row of grades (default: 20)"
+        "--seeds",
+        type=int,
+        default=20,
+        metavar="N",
+        help="flights per row of grades and failures (default: 20)",
     )
     parser.add_argument("--nominal", action="store_true", help="without plant mismatch in grades")
     parser.add_argument(

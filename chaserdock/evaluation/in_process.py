@@ -140,7 +140,7 @@ class InProcessMission:
         docking = {x.chaser: docking_status(x, self.tick, time_ns) for x in self.physics.latches.values()}
         for latch in self.physics.latches.values():
             self.touches += latch.take_touches()
-        odometry = {i: self._odometry(i, time_ns, states) for i in self.chasers}
+        odometry = {i: self.measure(i, time_ns, states) for i in self.chasers}
         reports = {}
         for i, thrusters in self.thrusters.items():
             touched = i in docking and (docking[i].contact or docking[i].latched)
@@ -163,7 +163,8 @@ class InProcessMission:
         self.tick += 1
         return record
 
-    def _odometry(self, chaser: int, time_ns: int, states: States) -> Odometry:
+    def measure(self, chaser: int, time_ns: int, states: States) -> Odometry:
+        """Return a chaser's odometry; to be overridden where it fails."""
         return odometry_of(self._odometry_sensor, chaser, states[f"chaser/{chaser}"], self.tick, time_ns)
 
     def _validated(self, odometry: Odometry) -> Odometry:

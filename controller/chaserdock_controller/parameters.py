@@ -67,10 +67,10 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         navigation=errors,
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
-        unexpected_velocity_m_s=math.sqrt(3.0) * body.force_max_N / body.mass_kg / scenario.time.rate_hz,
-        unexpected_omega_rad_s=math.sqrt(3.0)
-        * body.torque_max_N_m
+        unexpected_velocity_m_s=body.force_max_N / body.mass_kg / scenario.time.rate_hz / math.sqrt(3.0),
+        unexpected_omega_rad_s=body.torque_max_N_m
         / min(body.inertia)
-        / scenario.time.rate_hz,
+        / scenario.time.rate_hz
+        / math.sqrt(3.0),
     )
     return JointEstimator(joint, len(scenario.chasers))

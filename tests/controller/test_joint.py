@@ -188,26 +188,29 @@ def test_late_sightings_give_the_same_state() -> None:
     np.testing.assert_array_equal(prompt.state.extra, late.state.extra)
 
 
-def test_odometry_that_lies_is_dropped_and_reported() -> None:
-    """The position of chaser 1 jumps by 50 mm: it is reported within a second, and the relative pose stays good."""
+@pytest.mark.parametrize(("channel", "shift"), [("position", 0.05), ("velocity", 0.02)])
+def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) -> None:
+    """The position of chaser 1 jumps by 50 mm, or it states 20 mm/s too much: it is reported within a second, and the relative
+    pose stays good."""
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
     estimator = estimator_for(flight.errors, 2)
     fly(estimator, flight, 10.0)
     usual_m = flight.relative_error(estimator, 1)[0]
+    field = {"position": "position_m", "velocity": "velocity_m_s"}[channel]
 
     def lie(inputs: JointInputs) -> JointInputs:
         o = inputs.odometry[1]
-        moved = msgspec.structs.replace(o, position_m=vector(np.add(o.position_m, [0.05, 0.0, 0.0])))
-        return replace(inputs, odometry={**inputs.odometry, 1: moved})
+        wrong = msgspec.structs.replace(o, **{field: vector(np.add(getattr(o, field), [shift, 0.0, 0.0]))})
+        return replace(inputs, odometry={**inputs.odometry, 1: wrong})
 
     estimator.drain_events()
     fly(estimator, flight, 1.0, lie)
     texts = [e.text for e in estimator.drain_events()]
-    assert "chaser 1: odometry position contradicts the estimate; not used" in texts
+    assert f"chaser 1: odometry {channel} contradicts the estimate; not used" in texts
     fly(estimator, flight, 5.0, lie)
     assert flight.relative_error(estimator, 1)[0] < 2.0 * usual_m + 1e-3
     fly(estimator, flight, 2.0)
-    assert "chaser 1: odometry position used again" in [e.text for e in estimator.drain_events()]
+    assert f"chaser 1: odometry {channel} used again" in [e.text for e in estimator.drain_events()]
 
 
 def test_odometry_noisier_than_stated_is_reported() -> None:

@@ -57,7 +57,8 @@ class JointParameters:
     single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
         more on the pixel grid.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
-        as by a stuck thruster; assumed only where velocity or rate does not fit otherwise.
+        as by a stuck thruster: a third of the greatest change. It is assumed where it explains a velocity or rate that does not
+        fit. Such a channel is held out for ``rates_held_out`` ticks, in which the others show whether the chaser moves so.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
     iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
@@ -94,8 +95,9 @@ class JointParameters:
     several_markers: SightingNoise = SEVERAL_MARKERS
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
-    unexpected_velocity_m_s: float = 0.01
-    unexpected_omega_rad_s: float = 0.05
+    unexpected_velocity_m_s: float = 0.003
+    unexpected_omega_rad_s: float = 0.02
+    rates_held_out: int = 4
     rejections_to_drop: int = 5
     collective_rejections: int = 3
     iterated_updates: int = 5

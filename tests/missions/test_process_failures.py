@@ -15,7 +15,7 @@ import psutil
 import pytest
 import zenoh
 from chaserdock_protocol import codec, topics
-from chaserdock_protocol.messages import Odometry, Sighting, WrenchCommand, encoding_of
+from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting, WrenchCommand, encoding_of
 from chaserdock_protocol.recording.log import read_log
 from chaserdock_protocol.transport import Link
 from chaserdock_protocol.transport.zenoh_network import zenoh_config
@@ -91,12 +91,16 @@ def malformed_messages() -> list[tuple[str, bytes, str]]:
     sighting = Sighting(
         chaser=0, status="nothing", solutions=(), marker_ids=(), corners_px=(), rejected_ids=()
     )
+    turned = PoseSolution(
+        position_m=zero, q_wxyz=(1.0, 1.0, 0.0, 0.0), covariance=(0.0,) * 36, reprojection_rms_px=0.0
+    )
     shape = msgspec.to_builtins(wrench) | {"force_N": [1.0, 2.0]}
     return [
-        (topics.ODOMETRY.key_of(0), codec.encode(msgspec.structs.replace(odometry, position_m=(math.nan, 0.0, 0.0))),
-         encoding_of(Odometry)),
-        (topics.ODOMETRY.key_of(0), codec.encode(msgspec.structs.replace(odometry, q_wxyz=(1.0, 1.0, 0.0, 0.0))),
-         encoding_of(Odometry)),
+        (topics.ODOMETRY.key_of(0), codec.encode(odometry), encoding_of(Odometry)),
+        (topics.WRENCH.key_of(0), codec.encode(msgspec.structs.replace(wrench, force_N=(math.nan, 0.0, 0.0))),
+         encoding_of(WrenchCommand)),
+        (topics.SIGHTING.key_of(0), codec.encode(msgspec.structs.replace(sighting, solutions=(turned,))),
+         encoding_of(Sighting)),
         (topics.WRENCH.key_of(0), msgspec.msgpack.encode(shape), encoding_of(WrenchCommand)),
         (topics.WRENCH.key_of(0), codec.encode(wrench), "application/msgpack;chaserdock.WrenchCommand.v99"),
         (topics.WRENCH.key_of(0), codec.encode(msgspec.structs.replace(wrench, chaser=1)), encoding_of(WrenchCommand)),
@@ -146,7 +150,14 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
     assert len(flight.truth["target"].time_s) == 30 * 15 + 1
     assert {r.command: r.accepted for r in flight.replies} == {"approach": True, "retreat": False}
     reasons = {name.rpartition(":")[2] for name in flight.rejected}
-    assert {"not_finite", "not_unit_quaternion", "format", "encoding", "chaser"} <= reasons
+    assert {
+        "not_finite",
+        "not_unit_quaternion",
+        "format",
+        "encoding",
+        "chaser",
+        "foreign publisher",
+    } <= reasons
 
 
 def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:

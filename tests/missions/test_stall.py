@@ -32,6 +32,9 @@ DRILL = (
 )
 
 
+open_tick = World._open_tick
+
+
 def simulated(folder: Path, *overrides: str) -> SimulatedFlight:
     flight = simulate(ROOT / "scenarios" / "fault-drill.toml", folder, (*DRILL, *overrides))
     assert flight.crashes == {}
@@ -91,7 +94,6 @@ def test_processes_notice_that_the_world_has_died_and_the_log_is_whole(
             self._node.host.kill()
         open_tick(self, tick)
 
-    open_tick = World._open_tick
     monkeypatch.setattr(World, "_open_tick", die)
     flight = simulated(tmp_path)
     assert flight.stalled == ()
@@ -100,6 +102,17 @@ def test_processes_notice_that_the_world_has_died_and_the_log_is_whole(
     assert "chaser/0: the world is gone: no presence of it for 60 s" in flight.output
     ticks = [r.message.tick for r in read_log(tmp_path / "mission.mcap", [topics.TICK.key_of()])]
     assert ticks[-1] == 19
+
+
+def test_processes_notice_that_the_world_hangs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def hang(self: World, tick: int) -> None:
+        if tick == 20:
+            self._node.host.sleep(900.0)
+
+    monkeypatch.setattr(World, "_open_tick", lambda self, tick: (hang(self, tick), open_tick(self, tick)))
+    flight = simulated(tmp_path, "duration_s=20.0")
+    assert flight.stalled == ("world",)
+    assert set(flight.statuses.values()) == {1}
 
 
 @pytest.mark.slow

@@ -150,6 +150,8 @@ class Heartbeat:
         self._instance = instance
         self._stall_s, self._without_world = stall_s, StallTimer(node.host.now_s)
         self.waiting_for: tuple[str, ...] = ()
+        self.hangs: Callable[[], bool] = lambda: False
+        """Whether the process' loop has stopped: its presence, published in the background, then stops, too."""
         self._heard: dict[str, str] = {}
         self._lock = threading.Lock()
         self.in_flight = threading.Event()
@@ -199,7 +201,9 @@ class Heartbeat:
             self._heard.pop(process, None)
 
     def _publish(self) -> float:
-        """Publish the presence; return after how many seconds to publish the next."""
+        """Publish the presence unless the process hangs; return after how many seconds to publish the next."""
+        if self.hangs():
+            return STEADY_PERIOD_S
         message = Presence(
             process=self._node.name,
             instance=self._instance,

@@ -22,6 +22,8 @@ from .stall import explain_stall
 
 RECORDER_WINDOW_TICKS = 8
 """The flight is at most this far ahead of the recorder's acknowledgements, which bounds the data in the network."""
+LONGEST_STEP_S = 5.0
+"""Time (s) without a look at its messages after which the world publishes no presence, as if it were gone."""
 _STATUS_INTERVAL_S = 5.0
 _POLL_S = 0.02
 _MAX_CLOCK_ERROR_NS = 1_000_000_000
@@ -70,6 +72,8 @@ class TickBarrier:
         self._commanded_ns: dict[str, int] = {}
         self._replied: set[int] = set()
         self._no_chaser_since_s: float | None = None
+        self._polled_s = node.host.now_s()
+        heartbeat.hangs = lambda: node.host.now_s() - self._polled_s > LONGEST_STEP_S
 
     # -- before, between and after ticks ---------------------------------------------------------------------
 
@@ -203,6 +207,7 @@ class TickBarrier:
 
     def process_message(self, timeout_s: float) -> None:
         """Process one message, if one arrives in time, and the departure of processes."""
+        self._polled_s = self._node.host.now_s()
         received = self._node.receive(timeout_s)
         match received.message if received is not None else None:
             case ActuatorCommand() as command:

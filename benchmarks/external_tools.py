@@ -148,7 +148,7 @@ def main() -> None:
         }.items():
             try:
                 figures, good = check()
-            except RuntimeError as error:
+            except (RuntimeError, subprocess.TimeoutExpired) as error:
                 print(f"{tool}: FAILED: {error}", flush=True)
                 passed = False
                 continue

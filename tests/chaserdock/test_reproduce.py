@@ -592,8 +592,9 @@ def test_small_plan_is_flown_once(tmp_path: Path, capsys: pytest.CaptureFixture[
     seen, study = with_images(cut, results, group)[0], results.studies[f"{group}/0"]
     perfect = errors_of_study(study)
     assert not seen.failed
-    # The cost of vision is small, even with images in which the marker is only 20 pixels wide at the start.
-    assert perfect.position < seen.position < 1.4 * perfect.position
+    # The cost of vision is small, even with images in which the marker is only 20 pixels wide at the start: half of the error
+    # under perfect knowledge comes in addition, mostly by the tilt of a single marker that nothing moves.
+    assert perfect.position < seen.position < 1.7 * perfect.position
     assert floor_of_study(study) < perfect.position
     assert fly_plan(cut, tmp_path, 2, False) == 0
     assert "run" not in capsys.readouterr().out

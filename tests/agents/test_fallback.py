@@ -271,6 +271,39 @@ def test_lost_controller_reports_each_fallback_mode_once(chaser: ChaserProcess, 
     assert "fallback ends" in [m.what for t, m in published if t is topics.EVENT]
 
 
+@pytest.mark.parametrize("topic", [topics.PLAN, topics.TARGET])
+def test_fallback_does_not_depend_on_order_of_arrival(scenario: Scenario, topic: topics.Topic) -> None:
+    x = start()
+    x[:3] = (0.3, 0.0, 0.0)  # inside the hold position, so that the wrench depends on the target's place
+    odometry = {k: msgspec.structs.replace(at(scenario, k), position_m=vector(x[:3])) for k in range(3)}
+
+    def replies(order: tuple[str, ...]) -> list[Any]:
+        made = ChaserProcess(ReplayNode("chaser/0"), scenario, 0)  # type: ignore[arg-type]
+        made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
+        published = []
+        for tick in (0, 1):
+            deliver(made, topics.TICK, tick_of(scenario, tick, "controller", 1))
+            deliver(made, topics.ODOMETRY, odometry[tick])
+            stamp = {"tick": tick, "sim_time_ns": odometry[tick].sim_time_ns}
+            messages = {
+                "plan": (topics.PLAN, msgspec.structs.replace(straight(0.1), **stamp)),
+                "target": (topics.TARGET, msgspec.structs.replace(target(0.1 * tick), **stamp)),
+                "wrench": (topics.WRENCH, command(scenario, tick, "controller", 1)),
+            }
+            if topic is topics.TARGET:
+                del messages["plan"]  # without a plan the wrench follows the target
+            for name in order:
+                if name in messages:
+                    deliver(made, *messages[name])
+        deliver(made, topics.TICK, tick_of(scenario, 2, "", 1))
+        published += deliver(made, topics.ODOMETRY, odometry[2])
+        return [m for t, m in published if t is topics.ACTUATORS]
+
+    expected = replies(("plan", "target", "wrench"))
+    assert [m.source for m in expected] == ["plan" if topic is topics.PLAN else "hold"]
+    assert replies(("wrench", "target", "plan")) == expected
+
+
 def test_plan_without_its_command_is_not_executed(chaser: ChaserProcess, scenario: Scenario) -> None:
     deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))

@@ -150,7 +150,7 @@ class ChaserProcess:
             case Plan() as plan:
                 self._update_plan(plan)
             case TargetEstimate() as target:
-                self._target = target
+                self._update_target(target)
             case WrenchCommand() as command:
                 self._handle_command(command)
             case Tick() as tick:
@@ -198,6 +198,11 @@ class ChaserProcess:
         self._plan = plan
         if plan.tick == self._last_tick:  # the plan arrived after its command
             self._last = LastCommand(plan, self._last.target)
+
+    def _update_target(self, target: TargetEstimate) -> None:
+        self._target = target
+        if target.tick == self._last_tick:  # the estimate arrived after its command
+            self._last = LastCommand(self._last.plan, target)
 
     def _replace_lost(self, topic: Topic, lost: LostMessage) -> None:
         """Lock-step: handle the loss of a message, so that the tick is still replied to."""

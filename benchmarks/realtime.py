@@ -17,6 +17,7 @@ a share of one core. Measures wall time: run nothing else beside it. Prints medi
 from __future__ import annotations
 
 import asyncio
+import os
 import signal
 import tempfile
 import threading
@@ -38,6 +39,7 @@ from common import ROOT, Figures, make_parser, percentiles, print_figures, run_p
 from websockets.asyncio.client import connect
 
 from chaserdock.launch.launcher import Fleet, free_port, open_hub
+from chaserdock.viewer.address import TOKEN_VARIABLE, page_token
 
 SCENARIO = ROOT / "scenarios" / "four-chaser-docking.toml"
 CHASERS = 4
@@ -124,12 +126,14 @@ CONDITIONS = {"undisturbed": undisturbed, "frozen": frozen, "slow": slow}
 ROUND = ("undisturbed", "frozen", "undisturbed", "slow")
 
 
-async def read_viewer(port: int) -> None:
+async def read_viewer(port: int, token: str) -> None:
     """Read everything that the viewer sends, as a browser would."""
     offered = [websockets.Subprotocol(f"viser-v{viser.__version__}")]
     while True:
         try:
-            async with connect(f"ws://127.0.0.1:{port}", subprotocols=offered, max_size=None) as socket:
+            async with connect(
+                f"ws://127.0.0.1:{port}/{token}", subprotocols=offered, max_size=None
+            ) as socket:
                 async for _ in socket:
                     pass
         except (OSError, websockets.WebSocketException):
@@ -180,9 +184,10 @@ def fly(part: str, seconds: float, rounds: int, keep: Path | None) -> Figures:
             world = ["--mode", "realtime", *changes, "-l", "tcp/127.0.0.1:0"]
             output = start_mission(fleet, Path(folder), SCENARIO, CHASERS, network, world)
             if part == "viewer":
-                port = free_port()
+                port, token = free_port(), page_token()
+                os.environ[TOKEN_VARIABLE] = token
                 fleet.start("viewer", ["view", *network, "--port", str(port)], output)
-                threading.Thread(target=lambda: asyncio.run(read_viewer(port)), daemon=True).start()
+                threading.Thread(target=lambda: asyncio.run(read_viewer(port, token)), daemon=True).start()
             process = psutil.Process(next(c.process.pid for c in fleet.children if c.name == part))
             wait_for_images(observer, round(SETTLE_S * RATE_HZ), fleet, hub)
             for condition in ROUND * rounds:

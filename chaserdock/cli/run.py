@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from enum import StrEnum
 from pathlib import Path
@@ -45,14 +46,15 @@ def run(
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
     from chaserdock.launch.launcher import fly_mission, print_outcome
     from chaserdock.launch.signals import stop_on_signals
-    from chaserdock.viewer.address import DEFAULT_HOST, free_port, url_of
+    from chaserdock.viewer.address import DEFAULT_HOST, TOKEN_VARIABLE, free_port, page_token, url_of
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json), stop_on_signals() as stop:
         port = None
         if view:
             port = free_port(DEFAULT_HOST, None)
-            print(f"the viewer is at {url_of(DEFAULT_HOST, port)}", file=sys.stderr, flush=True)
+            os.environ[TOKEN_VARIABLE] = token = page_token()  # read by the viewer's process
+            print(f"the viewer is at {url_of(DEFAULT_HOST, port, token)}", file=sys.stderr, flush=True)
         outcome = fly_mission(
             scenario,
             out,

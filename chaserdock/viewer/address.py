@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+import os
+import re
+import secrets
 import socket
+from hmac import compare_digest
 from urllib.parse import urlsplit
 
 from chaserdock_protocol.errors import ChaserdockError
@@ -12,6 +16,8 @@ DEFAULT_HOST = "127.0.0.1"
 DEFAULT_PORT = 8080
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _TRIES = 20
+TOKEN_VARIABLE = "CHASERDOCK_VIEWER_TOKEN"
+"""Environment variable with the token of the page: unlike an argument, other users cannot read it."""
 
 
 class ViewError(ChaserdockError):
@@ -39,14 +45,30 @@ def free_port(host: str, port: int | None) -> int:
     raise ViewError(f"{which} of {host}: {reason}; choose another with --port")
 
 
-def url_of(host: str, port: int) -> str:
+def page_token() -> str:
+    """Return the token of the page: that of the environment, otherwise a random one. Raise ViewError."""
+    token = os.environ.get(TOKEN_VARIABLE) or secrets.token_urlsafe(16)
+    if not re.fullmatch(r"[A-Za-z0-9_-]{16,}", token):
+        raise ViewError(f"{TOKEN_VARIABLE}: give at least 16 letters, digits, - or _")
+    return token
+
+
+def url_of(host: str, port: int, token: str) -> str:
     """Return the URL of the page for a browser on this machine."""
     shown = DEFAULT_HOST if host in ("0.0.0.0", "::") else host
-    return f"http://[{shown}]:{port}" if ":" in shown else f"http://{shown}:{port}"
+    return f"http://[{shown}]:{port}/{token}/" if ":" in shown else f"http://{shown}:{port}/{token}/"
 
 
-def may_connect(origin: str | None, requested_host: str, host: str) -> bool:
-    """Return whether a web socket may be opened: by the viewer's page (``Origin`` equals ``Host``) or by a program (no
+def path_below_token(path: str, token: str) -> str | None:
+    """Return the path and query of a request without the token in front, or None if it has no valid token."""
+    first, rest = re.fullmatch(r"/?([^/?]*)(.*)", path, re.DOTALL).groups()  # type: ignore[union-attr]
+    if not compare_digest(first.encode(errors="replace"), token.encode()):
+        return None
+    return rest if rest.startswith("/") else f"/{rest}"
+
+
+def is_own_origin(origin: str | None, requested_host: str, host: str) -> bool:
+    """Return whether a web socket is opened by the viewer's page (``Origin`` equals ``Host``) or by a program (no
     ``Origin``). On a loopback address ``Host`` must be a loopback name, which prevents DNS rebinding."""
     name = urlsplit(f"//{requested_host}").hostname
     if host in _LOOPBACK and name not in _LOOPBACK:

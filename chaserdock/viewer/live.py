@@ -25,7 +25,7 @@ from chaserdock_protocol.scenario import flight_scenario_from_json
 from chaserdock_protocol.transport import Link, Node, ReceivedMessage
 from chaserdock_protocol.transport.network import unique_id
 
-from .address import DEFAULT_HOST, url_of
+from .address import DEFAULT_HOST, page_token, url_of
 from .history import History, reply_text
 from .page import Page
 from .server import page_server
@@ -53,7 +53,7 @@ class ViewOptions:
 
 def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> int:
     """Serve the page until stopped; return 0. Raise ViewError or TransportError if it cannot start."""
-    stop = StopSignal(watch_parent)
+    stop, token = StopSignal(watch_parent), page_token()
     with ThreadPoolExecutor(1, "session") as opener:
         opener.submit(int).result()
         # Only drawing has a low priority. Zenoh's threads inherit the priority of the thread that opens the session
@@ -63,9 +63,10 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
         def connect() -> Node:
             return opener.submit(Node, "viewer", "viewer", link).result()
 
-        with page_server(options.host, options.port) as server:
+        with page_server(options.host, options.port, token) as server:
             print_status(
-                "viewer", f"{url_of(options.host, server.get_port())} shows the mission; Ctrl-C ends this"
+                "viewer",
+                f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends this",
             )
             run_id = ""
             while not stop():

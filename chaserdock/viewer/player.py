@@ -8,7 +8,7 @@ import time
 from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.recording.scan import LogError, LogSource
 
-from .address import url_of
+from .address import page_token, url_of
 from .live import PERIOD_S, ViewOptions
 from .logged import LoggedMission
 from .page import Page, Timeline
@@ -22,7 +22,7 @@ def view_log(
 
     Raise LogError, or ViewError if the page cannot be served.
     """
-    stop = StopSignal(watch_parent)
+    stop, token = StopSignal(watch_parent), page_token()
     mission = LoggedMission(source)
     line = Timeline(mission.end_s)
     if at_s is not None and at_s > mission.end_s:
@@ -30,10 +30,12 @@ def view_log(
     if at_s is not None:
         line.at_s, line.playing = at_s, False
     mode = f"log of run {mission.run.get('run_id', '?')}, {mission.run.get('mode', '?')}"
-    with page_server(options.host, options.port) as server:
+    with page_server(options.host, options.port, token) as server:
         truth = mission.truth and options.truth
         page = Page(server, mission.scenario, dark=options.dark, truth=truth, command=None, timeline=line)
-        print_status("viewer", f"{url_of(options.host, server.get_port())} shows the log; Ctrl-C ends this")
+        print_status(
+            "viewer", f"{url_of(options.host, server.get_port(), token)} shows the log; Ctrl-C ends this"
+        )
         before_s = time.monotonic()
         while not stop():
             begun_s = time.monotonic()

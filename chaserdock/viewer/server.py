@@ -1,24 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Web server of the page: viser's, bound to one address, without public sharing, closed to pages of other origins."""
+"""Web server of the page: viser's, bound to one address, without public sharing, closed to pages of other origins and
+to programs without the page's token."""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import http
 import io
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import viser
+import websockets.asyncio.server
 from viser import _messages as viser_messages
+from websockets.asyncio.server import ServerConnection, serve
+from websockets.http11 import Request, Response
 
-from .address import ViewError, free_port, may_connect
+from .address import ViewError, free_port, is_own_origin, path_below_token
+
+_RequestHandler = Callable[[ServerConnection, Request], Response | None]
 
 
 @contextlib.contextmanager
-def page_server(host: str, port: int | None) -> Iterator[viser.ViserServer]:
-    """Run a page server on ``host``; without a ``port``, on the first free one from 8080 on. Raise ViewError."""
-    server = _open(host, port)
+def page_server(host: str, port: int | None, token: str) -> Iterator[viser.ViserServer]:
+    """Run a page server on ``host``; without a ``port``, on the first free one from 8080 on. Raise ViewError.
+
+    ``token``: first segment of the path of the page and of its web socket, which is rejected without it.
+    """
+    server = _open(host, port, token)
     try:
         yield server
     finally:
@@ -26,35 +37,65 @@ def page_server(host: str, port: int | None) -> Iterator[viser.ViserServer]:
             server.stop()
 
 
-def _open(host: str, port: int | None) -> viser.ViserServer:
+def _open(host: str, port: int | None, token: str) -> viser.ViserServer:
     chosen = free_port(host, port)
     # Requests other than a browser's are not errors of this process.
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     # Suppress viser's message on standard output.
-    with contextlib.redirect_stdout(io.StringIO()):
+    with contextlib.redirect_stdout(io.StringIO()), _checked_requests(host, token):
         server = viser.ViserServer(host=host, port=chosen, verbose=False)
     if server.get_port() != chosen:
         server.stop()
         raise ViewError(f"port {chosen} of {host} has just been taken; try again or choose one with --port")
-    _restrict_access(server, host)
+    _disable_sharing(server)
     return server
 
 
-def _restrict_access(server: viser.ViserServer, host: str) -> None:
-    """Disable sharing over viser's public relay, and reject web sockets of pages of other origins.
-
-    A browser lets any web site open a socket to this machine, which could then send commands. viser has no public
-    option for either, so this uses internals of version 1.1; tests/chaserdock/test_viewer_page.py checks the effect.
-    """
+def _disable_sharing(server: viser.ViserServer) -> None:
+    """Disable sharing over viser's public relay. viser 1.1 has no public option for it."""
     inner: Any = server._websock_server
     for message in (viser_messages.ShareUrlRequest, viser_messages.ShareUrlDisconnect):
         inner.unregister_handler(message)
 
-    async def admit(client: Any) -> None:
-        connection = inner._live_connections[client.client_id]
-        headers = connection.request.headers
-        if not may_connect(headers.get("Origin"), headers.get("Host", ""), host):
-            logging.getLogger(__name__).warning("rejected a page of origin %s", headers.get("Origin"))
-            await connection.close(1008, "origin not allowed")
 
-    inner.on_client_connect(admit)
+@contextlib.contextmanager
+def _checked_requests(host: str, token: str) -> Iterator[None]:
+    """Make a viser server that starts meanwhile check every request before it accepts a web socket.
+
+    A browser lets any web site open a socket to this machine, which could then send commands. viser has no option for
+    this check, and its callback for a new client comes after the handshake, when frames may already be buffered. So
+    this replaces the function that starts its server; tests/chaserdock/test_viewer.py checks the effect.
+    """
+
+    def serve_checked(*args: Any, process_request: _RequestHandler, **options: Any) -> serve:
+        return serve(*args, process_request=request_check(process_request, host, token), **options)
+
+    websockets.asyncio.server.serve = serve_checked
+    try:
+        yield
+    finally:
+        websockets.asyncio.server.serve = serve
+
+
+def request_check(respond: _RequestHandler, host: str, token: str) -> _RequestHandler:
+    """Return ``respond`` restricted to requests with the token and, for web sockets, of the page's own origin.
+
+    ``respond`` returns None to accept a web socket. The files of viser's client are public.
+    """
+
+    def check(connection: ServerConnection, request: Request) -> Response | None:
+        path = path_below_token(request.path, token)
+        response = respond(connection, dataclasses.replace(request, path=path or request.path))
+        if response is None:
+            origin, requested_host = request.headers.get("Origin"), request.headers.get("Host", "")
+            if not is_own_origin(origin, requested_host, host):
+                logging.getLogger(__name__).warning("rejected a page of origin %s", origin)
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "origin not allowed\n")
+        if path is None and (response is None or request.path.partition("?")[0] == "/"):
+            return connection.respond(
+                http.HTTPStatus.FORBIDDEN,
+                "The address needs its token: open the one that chaserdock has printed.\n",
+            )
+        return response
+
+    return check

@@ -3,11 +3,18 @@
 
 from __future__ import annotations
 
+import socket
 import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
+import viser
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
@@ -26,10 +33,11 @@ from harness import ROOT, finished
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mission_keys import client, make_keys, router_with_rights
+from websockets.frames import Frame, Opcode
 
 from chaserdock.viewer import plots, shapes
 from chaserdock.viewer import text as words
-from chaserdock.viewer.address import ViewError, may_connect, url_of
+from chaserdock.viewer.address import TOKEN_VARIABLE, ViewError, is_own_origin, page_token, url_of
 from chaserdock.viewer.history import History, Series
 from chaserdock.viewer.logged import LoggedMission
 from chaserdock.viewer.page import Timeline
@@ -37,6 +45,7 @@ from chaserdock.viewer.player import advance
 from chaserdock.viewer.server import page_server
 from chaserdock.viewer.snapshot import MissionState
 
+TOKEN = "0123456789abcdefghijkl"
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 quick = settings(derandomize=True, deadline=None, max_examples=60)
@@ -288,20 +297,109 @@ def test_corridor_covers_the_allowed_region() -> None:
 def test_only_our_own_page_may_connect(
     origin: str | None, requested_host: str, host: str, allowed: bool
 ) -> None:
-    assert may_connect(origin, requested_host, host) is allowed
+    assert is_own_origin(origin, requested_host, host) is allowed
+
+
+def address(server: viser.ViserServer) -> str:
+    return f"http://127.0.0.1:{server.get_port()}"
+
+
+CAMERA = {
+    "type": "ViewerCameraMessage",
+    "wxyz": UPRIGHT,
+    "position": (3.0, 0.0, 0.0),
+    "fov": 1.0,
+    "near": 0.1,
+    "far": 100.0,
+    "image_height": 480,
+    "image_width": 640,
+    "look_at": (0.0, 0.0, 0.0),
+    "up_direction": (0.0, 0.0, 1.0),
+}
+"""First message of a page: viser ignores clicks before it."""
+
+
+@contextmanager
+def sent_clicks(
+    server: viser.ViserServer, path: str, origin: str, button: viser.GuiButtonHandle
+) -> Iterator[bytes]:
+    """Open a web socket and send 16 clicks at once; yield the first line of the response."""
+    click = {"type": "GuiUpdateMessage", "uuid": button._impl.uuid, "updates": {"value": True}}
+    head = (
+        f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1:{server.get_port()}\r\nOrigin: {origin}\r\n"
+        "Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\n"
+        f"Sec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\nSec-WebSocket-Protocol: viser-v{viser.__version__}\r\n\r\n"
+    )
+    frames = [
+        Frame(Opcode.BINARY, msgspec.msgpack.encode(message)).serialize(mask=True)
+        for message in (CAMERA, *[click] * 16)
+    ]
+    with socket.create_connection(("127.0.0.1", server.get_port())) as connection:
+        connection.sendall(head.encode())
+        with connection.makefile("rb") as response:
+            status = response.readline()
+            with suppress(ConnectionError):  # closed after a rejection
+                connection.sendall(b"".join(frames))
+            yield status
+
+
+def test_rejected_web_socket_executes_no_buffered_message() -> None:
+    """Clicks sent directly behind the handshake are executed for the page with its token only."""
+    clicked: list[str] = []
+    with page_server("127.0.0.1", None, TOKEN) as server:
+
+        def button(name: str) -> viser.GuiButtonHandle:
+            handle = server.gui.add_button(name)
+            handle.on_click(lambda _: clicked.append(name))
+            return handle
+
+        own, foreign = address(server), "https://evil.example"
+        for name, path, origin in (
+            ("foreign page", f"/{TOKEN}", foreign),
+            ("program without token", "/", own),
+            ("program with another token", f"/{TOKEN[::-1]}", own),
+        ):
+            with sent_clicks(server, path, origin, button(name)) as status:
+                assert status == b"HTTP/1.1 403 Forbidden\r\n", name
+        with sent_clicks(server, f"/{TOKEN}", own, button("page")) as status:
+            assert b" 101 " in status
+            deadline = time.monotonic() + 60.0
+            while clicked.count("page") < 16 and time.monotonic() < deadline:
+                time.sleep(0.01)
+    assert clicked == ["page"] * 16
+
+
+def test_page_is_served_below_its_token_only() -> None:
+    with page_server("127.0.0.1", None, TOKEN) as server:
+        with urllib.request.urlopen(f"{address(server)}/{TOKEN}/?darkMode") as response:
+            assert b"<html" in response.read()
+        with pytest.raises(urllib.error.HTTPError, match="403") as rejected:
+            urllib.request.urlopen(f"{address(server)}/?darkMode")
+        assert b"open the one that chaserdock has printed" in rejected.value.read()
+        rejected.value.close()
+
+
+def test_token_is_random_or_that_of_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    assert page_token() != page_token()
+    monkeypatch.setenv(TOKEN_VARIABLE, TOKEN)
+    assert page_token() == TOKEN
+    monkeypatch.setenv(TOKEN_VARIABLE, "short/")
+    with pytest.raises(ViewError, match=f"{TOKEN_VARIABLE}: give at least 16 letters"):
+        page_token()
 
 
 def test_occupied_port_is_reported_or_skipped() -> None:
-    with page_server("127.0.0.1", None) as first:
+    with page_server("127.0.0.1", None, TOKEN) as first:
         with pytest.raises(
             ViewError, match=f"port {first.get_port()} of 127.0.0.1: .*; choose another with --port"
         ):
-            page_server("127.0.0.1", first.get_port()).__enter__()
-        with page_server("127.0.0.1", None) as second:
+            page_server("127.0.0.1", first.get_port(), TOKEN).__enter__()
+        with page_server("127.0.0.1", None, TOKEN) as second:
             assert second.get_port() != first.get_port()
-            assert url_of("127.0.0.1", second.get_port()) == f"http://127.0.0.1:{second.get_port()}"
+            assert url_of("127.0.0.1", second.get_port(), TOKEN) == f"{address(second)}/{TOKEN}/"
     with pytest.raises(ViewError, match=r"--host 203\.0\.113\.7"):
-        page_server("203.0.113.7", None).__enter__()
+        page_server("203.0.113.7", None, TOKEN).__enter__()
 
 
 def test_access_rights_give_ground_truth_to_viewers_only(tmp_path: Path) -> None:

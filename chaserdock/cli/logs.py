@@ -120,7 +120,7 @@ def play(
     from chaserdock.logs.player import play as publish
 
     stop = StopSignal(watch_parent=False)
-    count = publish(_source(log), link.link("world"), speed, timeout, stopped=stop)
+    count = publish(_source(log), link.link("world", timeout), speed, timeout, stopped=stop)
     print(f"{count} messages sent")
     raise typer.Exit(STOPPED if stop() else DONE)
 

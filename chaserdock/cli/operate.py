@@ -65,7 +65,10 @@ def command(
     from chaserdock.launch.operator import send_command
 
     _print_reply(
-        send_command(link.link(), what.value, number, offset, timeout, thruster, operator, before), as_json
+        send_command(
+            link.link(timeout_s=timeout), what.value, number, offset, timeout, thruster, operator, before
+        ),
+        as_json,
     )
 
 
@@ -99,7 +102,10 @@ def thruster_fault(
     from chaserdock.launch.operator import send_thruster_fault
 
     _print_reply(
-        send_thruster_fault(link.link(), number, thruster, kind.value, factor, timeout, operator), as_json
+        send_thruster_fault(
+            link.link(timeout_s=timeout), number, thruster, kind.value, factor, timeout, operator
+        ),
+        as_json,
     )
 
 
@@ -122,7 +128,7 @@ def status(
 
     from chaserdock.launch.status import observe, table_of
 
-    observed = observe(link.link(), duration)
+    observed = observe(link.link(timeout_s=duration), duration)
     if as_json:
         print_result(True, observed.as_dict(), ())
     else:

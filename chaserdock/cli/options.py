@@ -82,7 +82,9 @@ KeysOpt = Annotated[
 ]
 JoinTimeoutOpt = Annotated[
     float | None,
-    typer.Option("--timeout", min=0.1, help="seconds to wait for a world; unlimited by default"),
+    typer.Option(
+        "--timeout", min=0.1, help="seconds to wait for a router and for a world; unlimited by default"
+    ),
 ]
 StallOpt = Annotated[
     float,
@@ -191,8 +193,11 @@ class LinkOptions:
         float, typer.Option(min=0.1, max=86_400.0, help="seconds after which a silent peer counts as lost")
     ] = 60.0
 
-    def link(self, process: str = "operator") -> Link:
-        """Return the link of ``process``; with ``keys``, to a router over TLS. The world listens on the default endpoint."""
+    def link(self, process: str = "operator", timeout_s: float | None = None) -> Link:
+        """Return the link of ``process``; with ``keys``, to a router over TLS. The world listens on the default endpoint.
+
+        ``timeout_s``: wall time after which a client that no router accepts gives up; unlimited by default.
+        """
         from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
 
         connect, listen = self.connect, self.listen
@@ -212,7 +217,16 @@ class LinkOptions:
         if self.keys is not None:
             endpoints = tuple(connect or [DEFAULT_ENDPOINT.replace("tcp/", "tls/")])
             tls = tls_of(self.keys, process)
-            return Link(self.namespace, endpoints, (), "client", self.config, lease_ms, tls)
+            return Link(
+                self.namespace,
+                endpoints,
+                (),
+                "client",
+                self.config,
+                lease_ms,
+                tls,
+                connect_timeout_s=timeout_s,
+            )
         return Link(
             namespace=self.namespace,
             connect=tuple(connect if connect is not None else [DEFAULT_ENDPOINT]),
@@ -220,6 +234,7 @@ class LinkOptions:
             mode=self.net_mode.value,
             config=self.config,
             lease_ms=lease_ms,
+            connect_timeout_s=timeout_s,
         )
 
     def router_link(self) -> Link:

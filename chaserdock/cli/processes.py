@@ -96,7 +96,7 @@ def chaser(
     from chaserdock_protocol.process import ProcessOptions
 
     options = ProcessOptions(
-        link=link.link(f"chaser/{number}"),
+        link=link.link(f"chaser/{number}", timeout),
         chaser=number,
         patience_s=timeout,
         stall_s=stall_s,
@@ -119,7 +119,7 @@ def controller(
     """Run the central controller: fuses all chasers' measurements, plans for all chasers."""
     from chaserdock_protocol.process import ProcessOptions
 
-    own = link.link("standby" if standby else "controller")
+    own = link.link("standby" if standby else "controller", timeout)
     options = ProcessOptions(
         link=own, patience_s=timeout, stall_s=stall_s, watch_parent=watch_parent, standby=standby
     )
@@ -151,7 +151,7 @@ def record(
         (out or Path("runs")) if by_run else out or Path("runs") / f"record-{datetime.now():%Y%m%d-%H%M%S}"
     )
     options = ProcessOptions(
-        link=link.link("recorder"),
+        link=link.link("recorder", timeout),
         out=folder,
         by_run=by_run,
         rotation=Rotation(None if rotate_size is None else round(rotate_size * 1e6), rotate_time),

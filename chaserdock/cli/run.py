@@ -88,7 +88,7 @@ def judge(
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json):
-        raise typer.Exit(judge_mission(out, link.link(), timeout, world_timeout, show))
+        raise typer.Exit(judge_mission(out, link.link(timeout_s=timeout), timeout, world_timeout, show))
 
 
 class KeepLogs(StrEnum):

@@ -196,7 +196,15 @@ def start_router(
         if router.process.poll() is not None or time.monotonic() > deadline:
             raise RunError(f"the router does not listen: {router.last_line()}")
         time.sleep(0.05)
-    link = Link(namespace, (endpoint,), (), "client", lease_ms=lease_ms, tls=Tls.in_folder(keys / "operator"))
+    link = Link(
+        namespace,
+        (endpoint,),
+        (),
+        "client",
+        lease_ms=lease_ms,
+        tls=Tls.in_folder(keys / "operator"),
+        connect_timeout_s=_START_TIMEOUT_S,
+    )
     return Node("operator", "operator", link), [*network, *secured]
 
 

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import json
+import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,10 @@ import pytest
 from chaserdock_protocol import topics
 from chaserdock_protocol.transport import Link, Node, TransportError
 from chaserdock_protocol.transport.zenoh_network import zenoh_config
+from harness import finished
+from mission_keys import client, make_keys, router_with_rights
+
+from chaserdock.launch.launcher import free_port
 
 
 def test_defaults_are_safe() -> None:
@@ -49,6 +55,45 @@ def test_a_bad_file_is_named(tmp_path: Path) -> None:
 def test_bad_endpoint_raises_an_error() -> None:
     with pytest.raises(TransportError):
         zenoh_config(Link("run-1", listen=("nonsense",)))
+
+
+@pytest.mark.parametrize("refuses", [False, True])
+def test_client_without_a_router_gives_up(tmp_path: Path, refuses: bool) -> None:
+    if refuses:
+        with router_with_rights(make_keys(tmp_path / "keys")) as endpoint:
+            link = client(make_keys(tmp_path / "other-keys"), "operator", endpoint)
+            words = f"no router at {endpoint} accepts the connection; is it running, and are the keys valid"
+            with pytest.raises(TransportError, match=words):
+                Node("operator", "operator", replace(link, connect_timeout_s=0.5))
+        return
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    link = Link("run-1", (endpoint,), (), "client", connect_timeout_s=0.5)
+    with pytest.raises(TransportError, match=f"no router at {endpoint} accepts the connection"):
+        Node("operator", "operator", link)
+
+
+def test_signals_interrupt_a_client_without_a_router() -> None:
+    class InterruptedByTest(Exception):
+        """Raised by the signal handler."""
+
+    def interrupt(*_: object) -> None:
+        raise InterruptedByTest
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    try:
+        signal.setitimer(signal.ITIMER_REAL, 0.2)
+        with pytest.raises(InterruptedByTest):
+            Node("operator", "operator", Link("run-1", (f"tcp/127.0.0.1:{free_port()}",), (), "client"))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def test_command_without_a_router_ends_with_status_2() -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    status, said = finished("chaser", "0", "-m", "client", "-e", endpoint, "--timeout", "0.5", timeout_s=120)
+    assert status == 2, said
+    assert said.splitlines() == [f"chaser/0: no router at {endpoint} accepts the connection; is it running?"]
 
 
 def congestion_of(node: Node, topic: topics.Topic, place: int | str | None = None) -> str:

@@ -56,6 +56,7 @@ class Tls:
 class Link:
     """Endpoints and options of a Zenoh session. ``lease_ms``: time after which a silent peer counts as lost.
 
+    ``connect_timeout_s``: wall time after which a client that no router accepts gives up; None: it never does.
     ``access_control``: rules that a router enforces (see ``access_control.py``). ``network``: carries the messages in place
     of Zenoh; the other fields have no effect then.
     """
@@ -68,6 +69,7 @@ class Link:
     lease_ms: int = 60_000
     tls: Tls | None = None
     access_control: dict[str, Any] | None = None
+    connect_timeout_s: float | None = None
     network: Network | None = None
 
 
@@ -81,12 +83,20 @@ class ReceivedMessage(Struct, frozen=True):
     arrived_s: float = 0.0
 
 
+def is_unreachable(error: Exception) -> bool:
+    """Test whether a session could not be opened because no endpoint accepted the connection."""
+    return "unable to connect" in str(error).lower()
+
+
 def open_error(error: Exception, link: Link) -> str:
     """Return one line on why a session could not be opened."""
     text = _RUST_SOURCE.sub("", " ".join(str(error).split()))
     if link.config is not None:
         return f"cannot open the Zenoh session of {link.config}: {text}"
     listen, connect = ", ".join(link.listen) or "-", ", ".join(link.connect) or "-"
+    if is_unreachable(error):
+        keys = ", and are the keys valid and of its mission" if link.tls is not None else ""
+        return f"no router at {connect} accepts the connection; is it running{keys}?"
     if "in use" in text.lower():
         return (
             f"cannot listen on {listen}: the port is in use; stop its owner or choose another with --listen"

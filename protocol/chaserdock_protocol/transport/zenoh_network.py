@@ -7,12 +7,14 @@ Defaults: no multicast, loopback only, one namespace per run, no shared memory.
 from __future__ import annotations
 
 import json
+import math
+import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import zenoh
 
-from .config import QUEUE_OPTIONS, Link, Tls, TransportError, open_error
+from .config import QUEUE_OPTIONS, Link, Tls, TransportError, is_unreachable, open_error
 from .network import Connection, Host, Machine, Query, RawSample, Reply, Undo
 
 _PRIORITY = {
@@ -21,6 +23,9 @@ _PRIORITY = {
     "command": zenoh.Priority.REAL_TIME,
     "event": zenoh.Priority.DATA_LOW,
 }
+
+_FIRST_ATTEMPT_S, _LONGEST_ATTEMPT_S = 1.0, 5.0
+"""Wall time of the attempts of a client to connect."""
 
 
 def zenoh_config(link: Link) -> zenoh.Config:
@@ -95,10 +100,32 @@ class ZenohNetwork:
     def open(self, name: str) -> tuple[Connection, Host]:
         """Open a session. Raises TransportError."""
         zenoh.init_log_from_env_or("error")
+        config = zenoh_config(self._link)
         try:
-            return _ZenohConnection(zenoh.open(zenoh_config(self._link))), Machine()
+            if config.get_json("mode") == '"client"' and config.get_json("connect/timeout_ms") == "-1":
+                return _ZenohConnection(self._open_client(config)), Machine()
+            return _ZenohConnection(zenoh.open(config)), Machine()
         except zenoh.ZError as error:
             raise TransportError(open_error(error, self._link)) from None
+
+    def _open_client(self, config: zenoh.Config) -> zenoh.Session:
+        """Open a client session by attempts of limited duration. Raises ZError after the link's time.
+
+        Zenoh waits in native code, and Python handles signals such as Ctrl-C only between the attempts. Each is longer
+        than the one before, so that a slow TLS handshake succeeds, too.
+        """
+        limit_s = self._link.connect_timeout_s
+        end_s = math.inf if limit_s is None else time.monotonic() + limit_s
+        attempt_s = _FIRST_ATTEMPT_S
+        while True:
+            left_s = end_s - time.monotonic()
+            config.insert_json5("connect/timeout_ms", str(max(1, round(1000 * min(attempt_s, left_s)))))
+            try:
+                return zenoh.open(config)
+            except zenoh.ZError as error:
+                if left_s <= attempt_s or not is_unreachable(error):
+                    raise
+            attempt_s = min(2.0 * attempt_s, _LONGEST_ATTEMPT_S)
 
 
 class _ZenohConnection:

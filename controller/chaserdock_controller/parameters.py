@@ -68,9 +68,9 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
         unexpected_velocity_m_s=body.force_max_N / body.mass_kg / scenario.time.rate_hz / math.sqrt(3.0),
-        unexpected_omega_rad_s=body.torque_max_N_m
+        unexpected_omega_rad_s=math.sqrt(3.0)
+        * body.torque_max_N_m
         / min(body.inertia)
-        / scenario.time.rate_hz
-        / math.sqrt(3.0),
+        / scenario.time.rate_hz,
     )
     return JointEstimator(joint, len(scenario.chasers))

@@ -61,9 +61,10 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
     assert info.whole
     assert (info.viewer > 100) == ("--no-viewer" not in options)
     names = [path.name for path in log_files(tmp_path / "again")]
-    assert names == (
-        ["mission-0000.mcap", "mission-0001.mcap"] if "--rotate-time" in options else ["mission.mcap"]
-    )
+    rotated = [
+        f"mission-{k:04d}.mcap" for k in range(max(2, len(names)))
+    ]  # by wall time: two, or more under load
+    assert names == (rotated if "--rotate-time" in options else ["mission.mcap"])
     for path in log_files(tmp_path / "again"):  # each stands for itself
         assert read_scenario(path)[1]["run_id"] == read_scenario(GOLDEN)[1]["run_id"]
 

@@ -57,8 +57,8 @@ class JointParameters:
     single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
         more on the pixel grid.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
-        as by a stuck thruster: a third of the greatest change. It is assumed where it explains a velocity or rate that does not
-        fit. Such a channel is held out for ``rates_held_out`` ticks, in which the others show whether the chaser moves so.
+        as by a stuck thruster: for the velocity about a third of the greatest change under commands; for the rate all of it, as
+        the torque of a stuck thruster exceeds that of commands. It is assumed only where velocity or rate does not fit otherwise.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
     iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
@@ -96,8 +96,7 @@ class JointParameters:
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.003
-    unexpected_omega_rad_s: float = 0.02
-    rates_held_out: int = 4
+    unexpected_omega_rad_s: float = 0.05
     rejections_to_drop: int = 5
     collective_rejections: int = 3
     iterated_updates: int = 5

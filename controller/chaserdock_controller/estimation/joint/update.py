@@ -3,8 +3,7 @@
 
 A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
 until it has fitted as often: a jump or a constant error then changes nothing. A velocity or rate that suddenly does not fit, by no
-more than thrusters can cause, may be wrong or caused by a force without a command: the chaser's motion is widened, and the channel
-is tested again some ticks later, when the others have shown how the chaser moves. When most cameras are rejected together, the
+more than the thrusters can cause within a tick, is followed. When most cameras are rejected together, the
 target has moved in an unexpected way: its rates are widened, and if that does not help its pose starts anew.
 """
 
@@ -258,21 +257,15 @@ def _update_chaser(
     channels = _channels(odometry is not None, solution is not None, p)
     cross, s = covariance.innovation(i, z)
     state, fits = _gate(prior, i, channels, z.residual, s, p)
-    sudden = {k for k in _RATES if state.rejections[i, k] == 1 and prior.rejections[i, k] == 0}
-    if sudden:
+    if not all(fits.get(k, True) for k in _RATES):
         variances = _unexpected_motion(i, len(cross), p)
         covariance.widen(variances)
-        wide_cross, wide_s = covariance.innovation(i, z)
-        wide, wide_fits = _gate(prior, i, channels, z.residual, wide_s, p)
-        if all(wide_fits[k] for k in sudden):
-            cross, s = wide_cross, wide_s
-            rejections = wide.rejections.copy()
-            rejections[i, list(sudden)] = 1
-            state, fits = (
-                replace(wide, rejections=rejections, nis=state.nis),
-                wide_fits | dict.fromkeys(sudden, False),
-            )
-        else:  # more than any thruster can do: wrong
+        wider_cross, wider_s = covariance.innovation(i, z)
+        wider_state, wider_fits = _gate(prior, i, channels, z.residual, wider_s, p)
+        if all(fit for k, fit in wider_fits.items() if k != SIGHTING_CHANNEL):
+            cross, s, fits = wider_cross, wider_s, wider_fits
+            state = replace(wider_state, nis=state.nis)
+        else:
             covariance.widen(-variances)
     used = [c.rows for c in channels if fits[c.number]]
     if not used:
@@ -384,8 +377,7 @@ def _count(
 ) -> bool:
     """Update the count of a channel's rejections; return whether the channel is used."""
     count, limit = int(rejections[i, channel.number]), p.rejections_to_drop
-    held_out = channel.number in _RATES and 0 < count < p.rates_held_out
-    if held_out or not value <= channel.gate:  # rejects NaN as well
+    if not value <= channel.gate:  # rejects NaN as well
         rejections[i, channel.number] = min(count + 1, 2 * limit)
         return False
     rejections[i, channel.number] = count - 1 if count >= limit else 0

@@ -7,8 +7,9 @@ import math
 from typing import Any
 
 import pytest
-from chaserdock_protocol.scenario import ScenarioError, parse_scenario, scenario_from_json
+from chaserdock_protocol.scenario import ScenarioError, load_scenario, parse_scenario, scenario_from_json
 from chaserdock_protocol.scenario.navigation import GRADES, NavigationErrors, NavigationSection
+from harness import ROOT
 from scenario_samples import good
 
 
@@ -80,3 +81,9 @@ def test_an_impossible_figure_is_one_line_with_path_and_bound(figures: dict[str,
         errors_of(**figures)
     assert str(error.value).startswith(f"x: {line}")
     assert "\n" not in str(error.value)
+
+
+def test_shipped_scenarios_fly_on_lab_except_those_of_the_paper() -> None:
+    for path in sorted((ROOT / "scenarios").glob("*.toml")):
+        expected = "exact" if path.stem.startswith("paper-") else "lab"
+        assert load_scenario(path).navigation.grade == expected, path.name

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -212,12 +214,38 @@ def test_working_memory_is_enough() -> None:
     states = np.array([at_rest(0.3 * rng.normal(size=3)) for _ in range(n)])
     corridors = np.tile([1.0, 0, 0, 0.5, 0.0], (n, d + 1, 1))
     problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors})
-    kept = kernels._tick_memory
-    kept.cache_clear()
-    patch = pytest.MonkeyPatch()
-    patch.setattr(kernels, "_tick_memory", lambda n, d: guarded)
-    plan = make_solver("rti", PARAMS, n).solve(problem, 0.0)
-    patch.undo()
+    solver = make_solver("rti", PARAMS, n)
+    solver._workspace = guarded  # pyright: ignore[reportAttributeAccessIssue]
+    plan = solver.solve(problem, 0.0)
     assert plan.iterations.all()
     assert (guarded[doubles:] == 7.0).all()
     assert (guarded[:doubles] != 7.0).mean() > 0.5
+
+
+def test_solvers_in_two_threads_plan_as_in_one() -> None:
+    """Every tick of two flights at once, from different states, has the bits of the flight alone."""
+    problem_at, states = swap()
+
+    def flown(offset_m: float) -> list[Array]:
+        solver, inputs = make_solver("rti", PARAMS, 2), []
+        for tick in range(60):
+            moved = states.copy()
+            moved[:, 1] += offset_m + 1e-3 * tick
+            inputs.append(solver.solve(problem_at(moved, 0.1 * tick), 0.1 if tick else 0.0).inputs)
+        return inputs
+
+    offsets = (0.0, 0.07)
+    alone = [flown(offset_m) for offset_m in offsets]
+    with ThreadPoolExecutor(2) as threads:
+        together = list(threads.map(flown, offsets))
+    np.testing.assert_array_equal(together, alone)
+
+
+@pytest.mark.parametrize("folder", NATIVE_FOLDERS)
+def test_kernels_have_no_static_memory(folder: str) -> None:
+    """Static variables would be shared by threads; static constants and functions are not variables."""
+    sources = [path for pattern in ("*.c", "*.h") for path in sorted((ROOT / folder).glob(pattern))]
+    assert sources
+    for path in sources:
+        for declaration in re.findall(r"^[^/\n]*\bstatic\b[^;{=(]*[;{=(]", path.read_text(), re.MULTILINE):
+            assert declaration.endswith("(") or " const " in declaration, f"{path.name}: {declaration}"

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import ctypes
 from ctypes import Structure, c_double, c_int64, c_void_p
-from functools import cache
 
 import numpy as np
 from chaserdock_models.native import address, scratch
-from numpy.typing import NDArray
 
 from .native import function
 from .types import Array, IntArray, NmpcInput, NmpcParameters
@@ -150,22 +148,22 @@ class _Tick(Structure):
     ]
 
 
-@cache
-def _tick_memory(n: int, d: int) -> NDArray[np.float64]:
+def tick_workspace(n: int, d: int) -> Array:
+    """Allocate working memory of `solve_tick` for up to ``n`` chasers and ``d`` stages; for one thread at a time."""
     return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d)))
 
 
 def solve_tick(
     model: Model, weights: Weights, problem: NmpcInput, inputs: Array, outer_m: float, reach_m_per_N: Array, w1: Array,
-    w2: float, budget: int,
+    w2: float, budget: int, workspace: Array,
 ) -> tuple[IntArray, IntArray]:  # fmt: skip
     """Run one real-time iteration for every chaser; ``inputs`` (N, D, 6) hold the start and receive the solution.
 
     ``problem`` from `check_input`. reach_m_per_N (D+1,): displacement of a chaser by each stage for 1 N on each axis.
-    w1 (N,), w2: slack weights. ``budget``: total iterations. Returns code and iterations, each (N,); the inputs of a
-    chaser with code BROKEN are unchanged.
+    w1 (N,), w2: slack weights. ``budget``: total iterations. ``workspace`` from `tick_workspace`. Returns code and
+    iterations, each (N,); the inputs of a chaser with code BROKEN are unchanged.
     """
-    n, d, _ = inputs.shape
+    n = len(inputs)
     zones = zones_of(problem, outer_m)
     code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     tick = _Tick(
@@ -173,5 +171,5 @@ def solve_tick(
         address(problem.u_ref), address(problem.input_max), address(reach_m_per_N), address(w1), address(inputs), w2,
         budget, address(code), address(iterations),
     )  # fmt: skip
-    function("solve_tick")(ctypes.byref(tick), address(_tick_memory(n, d)))
+    function("solve_tick")(ctypes.byref(tick), address(workspace))
     return code, iterations

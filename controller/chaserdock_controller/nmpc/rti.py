@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick
+from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick, tick_workspace
 from .slack import SLACK_L2, slack_l1_weight
 from .types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
 from .warm_start import Frame, status_of
@@ -28,7 +28,8 @@ class RtiSolver:
 
     ``max_iterations`` bounds the interior point's iterations of all chasers together in one solve; each
     chaser may use an even share of the remaining iterations, at most `MAX_ITERATIONS`. It may be changed between
-    solves. A chaser that is stopped by this bound has the status "budget". Raises ValueError for n_chasers < 1 or a
+    solves. A chaser that is stopped by this bound has the status "budget". Solvers share no memory: each may run in its
+    own thread. Raises ValueError for n_chasers < 1 or a
     negative budget.
     """
 
@@ -37,6 +38,7 @@ class RtiSolver:
         if max_iterations is not None and max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, not {max_iterations}")
         self.max_iterations = max_iterations
+        self._workspace = tick_workspace(n_chasers, params.stages)
         # Largest displacement of a chaser by stage k for a change of the inputs by 1 N.
         times = params.dt_s * np.arange(params.stages + 1)
         self._reach = REACH_SAFETY * np.sqrt(3.0) / params.mass_kg * times**2
@@ -60,7 +62,7 @@ class RtiSolver:
         budget = self.max_iterations if self.max_iterations is not None else len(u) * MAX_ITERATIONS
         outer_m = frame.params.max_reference_distance_m
         code, iterations = solve_tick(
-            frame.model, frame.weights, p, u, outer_m, self._reach, w1, SLACK_L2, budget
+            frame.model, frame.weights, p, u, outer_m, self._reach, w1, SLACK_L2, budget, self._workspace
         )
         plan = frame.finish(task, u, [status_of(c != BROKEN, c == LIMIT) for c in code], iterations)
         cut_short = (code == LIMIT) & (iterations < MAX_ITERATIONS)

@@ -6,7 +6,8 @@ library ``kernels.so``. This module loads such libraries and provides the kernel
 
 A library contains every function once per instruction set (on x86-64: SSE4, and AVX2 with FMA). The copy is
 chosen at run time; all copies give the same bits. Arguments are addresses of C-contiguous float64 arrays (int64 or uint8
-where stated); callers check shapes.
+where stated); callers check shapes. Kernels keep nothing between calls and have no static memory: threads may call the
+same kernel at once, each with its own arrays.
 """
 
 from __future__ import annotations
@@ -57,8 +58,9 @@ class KernelLibrary:
         level = self.level if at_level is None else at_level
         kernel = self._functions.get((name, level))
         if kernel is None:
-            kernel = self._functions[name, level] = self.library[f"v{level}_{name}"]
-            kernel.restype = result
+            kernel = self.library[f"v{level}_{name}"]
+            kernel.restype = result  # before another thread can find it
+            self._functions[name, level] = kernel
         return kernel
 
 

@@ -87,7 +87,7 @@ def faults(state: MissionState, history: History, lost: set[str]) -> str:
 
 def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
     out = []
-    if chaser.wrench is not None and chaser.wrench.mode in ("brake", "coast"):
+    if chaser.wrench is not None and chaser.wrench.mode in ("track", "brake", "coast"):
         out.append(f"chaser {i}: the controller commands {chaser.wrench.mode}")
     if chaser.actuators is not None and chaser.actuators.source != "command":
         out.append(f"chaser {i}: fallback ({chaser.actuators.source}), no valid command")

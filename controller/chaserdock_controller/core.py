@@ -45,7 +45,8 @@ class ControllerCore:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
         observation = self.ingest.run(inputs, self.output.history)
         estimation = self.estimation.run(observation)
-        guidance = self.guidance.run(observation, estimation)
+        failures = self.planning.monitor.failures(observation.time_ns)
+        guidance = self.guidance.run(observation, estimation, failures)
         plan = self.planning.run(observation, estimation, guidance)
         return self.output.run(observation, estimation, guidance, plan)
 

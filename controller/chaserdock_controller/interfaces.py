@@ -29,11 +29,12 @@ from chaserdock_protocol.messages import (
 from .estimation.target_body import TargetBody
 from .estimation.types import RelativePose, TargetState
 from .guidance.phases import Phase
+from .nmpc.plan_monitor import ChaserPlan
 from .nmpc.types import NmpcPlan
 
 LogEntry = tuple[Level, str]
 """Level and text of an event."""
-ControlMode = Literal["nmpc", "brake", "coast", "pull", "search"]
+ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search"]
 
 
 @dataclass(frozen=True)
@@ -188,9 +189,13 @@ class GuidanceResult:
 
 @dataclass(frozen=True)
 class PlanResult:
-    """Result of planning: the plan of ``chasers``, row by row; None without a usable solve. ``wall_s``: time of the solve."""
+    """Result of planning: the plan of ``chasers``, row by row; None without a usable solve. ``wall_s``: time of the solve.
+
+    ``flyable``: the plan of each chaser that may be flown, an earlier one for a while after a failed solve.
+    """
 
     chasers: tuple[int, ...]
     plan: NmpcPlan | None
     wall_s: float
     events: tuple[LogEntry, ...]
+    flyable: Mapping[int, ChaserPlan]

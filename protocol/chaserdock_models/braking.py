@@ -39,9 +39,13 @@ class ActuatedBody(Protocol):
     def torque_max_N_m(self) -> float: ...
 
 
-def brake_wrench(odometry: MovingBody, body: ActuatedBody) -> Array:
-    """Return the force and torque (6,), body axes, that bring a chaser to rest in WRF."""
-    velocity = rotations.rotate_inverse(odometry.q_wxyz, odometry.velocity_m_s)
+def brake_wrench(
+    odometry: MovingBody, body: ActuatedBody, velocity_m_s: ArrayLike = (0.0, 0.0, 0.0)
+) -> Array:
+    """Return the force and torque (6,), body axes, that stop a chaser's rotation and its motion relative to
+    ``velocity_m_s`` (3,), WRF."""
+    relative = np.asarray(odometry.velocity_m_s) - np.asarray(velocity_m_s)
+    velocity = rotations.rotate_inverse(odometry.q_wxyz, relative)
     force = np.clip(-body.mass_kg / BRAKE_TIME_S * velocity, -body.force_max_N, body.force_max_N)
     torque = -np.asarray(body.inertia) / BRAKE_TIME_S * np.asarray(odometry.omega_rad_s)
     torque = np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m)

@@ -332,8 +332,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     """Commanded force and torque of a chaser, in body axes, from ``effective_time_ns`` to ``expires_ns``.
 
     ``tick`` is that of the odometry that it is based on. ``mode`` is its origin: the NMPC's plan, a safe command
-    (``brake`` to rest, ``coast`` without force), the ``search`` for a target that no chaser sees, the ``pull`` that
-    verifies a latch, or ``none``: no command, as the chaser's state is unknown.
+    (``track`` the reference without a plan, ``brake`` to rest, ``coast`` without force), the ``search`` for a target
+    that no chaser sees, the ``pull`` that verifies a latch, or ``none``: no command, as the chaser's state is unknown.
     ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
     healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
     thruster faults. ``term``, ``commander`` and ``instance`` are those of the ``Tick`` that put the sender in command.
@@ -342,7 +342,7 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "brake", "coast", "pull", "search", "none"]
+    mode: Literal["nmpc", "track", "brake", "coast", "pull", "search", "none"]
     force_N: Vector3
     torque_N_m: Vector3
     isolated: Thrusters = ()

@@ -145,6 +145,18 @@ def test_fallback_leaves_the_corridor_and_moves_with_the_target(scenario: Scenar
     np.testing.assert_allclose(x[-1, 3:6], drift, atol=1e-3)
 
 
+def test_fallback_brakes_relative_to_a_drifting_target(scenario: Scenario) -> None:
+    """A target that drifts towards the chaser comes no nearer while the chaser brakes."""
+    drift = (-0.034, 0.0, 0.0)
+    last = LastCommand(None, target(0.0, drift))
+    history, x = fly_fallback(scenario, last, start((-0.6, 0.0, 0.0), (-0.01, 0.0, 0.0)), 30.0)
+    assert modes_of(history) == ["brake", "hold"]
+    distance_m = np.linalg.norm(x[:, :3] - np.outer(np.arange(len(x)) * STEP_S, drift), axis=1)
+    brake = [a.mode for a in history].count("brake")
+    assert distance_m[: brake + 1].min() > 0.5
+    np.testing.assert_allclose(x[-1, 3:6], drift, atol=4e-3)
+
+
 def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
     history, x = fly_fallback(
         scenario, LastCommand(), start(velocity_m_s=(0.05, -0.02, 0.01), omega_rad_s=(0.05, 0.02, -0.1)), 60.0
@@ -152,7 +164,7 @@ def test_fallback_comes_to_rest_from_any_rotation(scenario: Scenario) -> None:
     assert modes_of(history) == ["brake", "hold"]
     assert history[-1].distance_m is None
     assert "the target is unknown" in history[-1].text()
-    assert is_at_rest(moving(x[-1], 60.0))
+    assert is_at_rest(moving(x[-1], 60.0), np.zeros(3))
 
 
 def test_fallback_modes_do_not_return(scenario: Scenario) -> None:

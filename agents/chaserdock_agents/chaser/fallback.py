@@ -2,8 +2,9 @@
 """Fallback of a chaser that receives no commands. Pure functions; SI units; WRF unless stated otherwise.
 
 Three modes in this order, recorded as events: fly the last plan to the end of its horizon (``plan``), come to rest
-(``brake``), hold a position relative to the target outside of the approach corridor (``hold``). The inputs are the plan
-and the target estimate of the last executed command; the target is extrapolated with constant velocity.
+relative to the target (``brake``), hold a position relative to it outside of the approach corridor (``hold``). The inputs
+are the plan and the target estimate of the last executed command; the target is extrapolated with constant velocity. Where
+the target was unknown, rest and position are those in WRF.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_models.docking_geometry import centre_offset
+from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
 from chaserdock_protocol.messages import Odometry, Plan, TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.bodies import Body
@@ -24,24 +26,10 @@ from chaserdock_protocol.scenario.bodies import Body
 FallbackMode = Literal["plan", "brake", "hold"]
 
 REST_M_S, REST_RAD_S = 0.004, math.radians(0.3)
-"""A chaser below these rates is at rest."""
+"""A chaser below these rates, relative to the target's velocity and in WRF, is at rest."""
 CLEARANCE_MARGIN_M = 0.05
 """Distance of the hold position beyond the entry of the corridor."""
-# Second-order control laws: natural frequencies of position (a few cm/s) and attitude, and their damping ratio.
-_POSITION_RAD_S, _ATTITUDE_RAD_S, _DAMPING = 0.3, 0.6, 0.9
 _KNOWN = ("tracking", "predicting")
-
-
-@dataclass(frozen=True)
-class Setpoint:
-    """Reference of the control law: position and velocity (3,) WRF, attitude (4,) body to WRF, rate (3,) body axes, and
-    feed-forward ``wrench`` (6,) in body axes."""
-
-    position_m: Array
-    velocity_m_s: Array
-    q_wxyz: Array
-    omega_rad_s: Array
-    wrench: Array
 
 
 @dataclass(frozen=True)
@@ -118,9 +106,17 @@ def clearance_m(scenario: FlightScenario, chaser: int) -> float:
     return max(scenario.limits.min_distance_target_m, entry_m) + CLEARANCE_MARGIN_M
 
 
-def is_at_rest(odometry: Odometry) -> bool:
-    """Return whether a chaser neither moves nor rotates, WRF."""
-    return math.hypot(*odometry.velocity_m_s) < REST_M_S and math.hypot(*odometry.omega_rad_s) < REST_RAD_S
+def target_velocity(target: TargetEstimate | None) -> Array:
+    """Return the velocity (3,) of the target's origin, WRF; zero if the target was not known."""
+    if target is None or target.status not in _KNOWN:
+        return np.zeros(3)
+    return np.asarray(target.velocity_m_s)
+
+
+def is_at_rest(odometry: Odometry, velocity_m_s: Array) -> bool:
+    """Return whether a chaser moves with ``velocity_m_s`` (3,), WRF, and does not rotate."""
+    relative = np.asarray(odometry.velocity_m_s) - velocity_m_s
+    return math.hypot(*relative) < REST_M_S and math.hypot(*odometry.omega_rad_s) < REST_RAD_S
 
 
 def next_state(
@@ -138,7 +134,7 @@ def next_state(
     mode = None if state is None else state.mode
     if mode in (None, "plan") and interpolate_plan(last.plan, effective_ns) is not None:
         return FallbackState("plan")
-    if mode != "hold" and not is_at_rest(odometry):
+    if mode != "hold" and not is_at_rest(odometry, target_velocity(last.target)):
         return FallbackState("brake")
     if state is not None and state.mode == "hold":
         return state
@@ -147,24 +143,6 @@ def next_state(
         return FallbackState("hold", position)
     distance_m = float(np.linalg.norm(position - target))
     return FallbackState("hold", (position - target) / distance_m, max(distance_m, min_distance_m))
-
-
-def track_setpoint(odometry: Odometry, body: Body, setpoint: Setpoint) -> Array:
-    """Return force and torque (6,), body axes, within the body's limits, that track a setpoint."""
-    position_error = setpoint.position_m - np.asarray(odometry.position_m)
-    velocity_error = setpoint.velocity_m_s - np.asarray(odometry.velocity_m_s)
-    acceleration = _POSITION_RAD_S**2 * position_error + 2 * _DAMPING * _POSITION_RAD_S * velocity_error
-    force = setpoint.wrench[:3] + body.mass_kg * rotations.rotate_inverse(odometry.q_wxyz, acceleration)
-    attitude_error = rotations.log(rotations.multiply(rotations.conjugate(odometry.q_wxyz), setpoint.q_wxyz))
-    rate_error = setpoint.omega_rad_s - np.asarray(odometry.omega_rad_s)
-    alpha = _ATTITUDE_RAD_S**2 * attitude_error + 2 * _DAMPING * _ATTITUDE_RAD_S * rate_error
-    torque = setpoint.wrench[3:] + np.asarray(body.inertia) * alpha
-    return np.concatenate(
-        [
-            np.clip(force, -body.force_max_N, body.force_max_N),
-            np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m),
-        ]
-    )
 
 
 def hold_setpoint(state: FallbackState, odometry: Odometry, last: LastCommand) -> Setpoint:
@@ -188,7 +166,7 @@ def fallback_wrench(
     current = interpolate_plan(last.plan, odometry.sim_time_ns) if state.mode == "plan" else None
     effective = interpolate_plan(last.plan, effective_ns)
     if current is None or effective is None:
-        return brake_wrench(odometry, body)
+        return brake_wrench(odometry, body, target_velocity(last.target))
     # Errors at the time of the odometry, feed-forward at the time the command takes effect.
     setpoint = Setpoint(
         current.position_m, current.velocity_m_s, current.q_wxyz, current.omega_rad_s, effective.wrench

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Level
 
 from .phases import Phase
 from .trajectories import Motion
@@ -54,4 +55,5 @@ class PhaseChange:
     chaser: int
     phase: Phase
     detail: str
+    level: Level = "info"
     calibration_complete: bool = False

@@ -7,7 +7,7 @@ Phases and transitions: ``phases``. Every phase change looks up its target in th
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Latch, OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import ArrayLike
+
+from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from . import command_validation as validation
 from .approach_cone import Cone, cone_of
@@ -67,6 +69,7 @@ class PhaseMachine:
         self._timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
         self._seen_s: float | None = None
         self._interrupted: set[int] = set()
+        self._planning_failures: dict[int, PlanningFailure] = {}
 
     # -- the target's estimate -------------------------------------------------------------------------------
 
@@ -119,6 +122,15 @@ class PhaseMachine:
             why = reason if trigger is Trigger.SIGHT_LOST else ""
             self._transition(i, trigger, now_s, stop(self.chasers[i].move, now_s), why)
         return phase
+
+    # -- planning ------------------------------------------------------------------------------------------------
+
+    def update_planning(self, now_s: float, failures: Mapping[int, PlanningFailure]) -> None:
+        """Let every chaser retreat for which planning fails, once per failure."""
+        for i, failure in failures.items():
+            if i not in self._planning_failures and self._permits(i, Trigger.PLANNING_FAILED):
+                self._back_out(i, Trigger.PLANNING_FAILED, now_s, failure.text())
+        self._planning_failures = dict(failures)
 
     # -- commands --------------------------------------------------------------------------------------------
 
@@ -197,6 +209,9 @@ class PhaseMachine:
     def _why_not(self, command: OperatorCommand, now_s: float) -> str:
         i, c, dock = command.chaser, self.chasers[command.chaser], self._docks[command.chaser]
         by_capture = dock is not None
+        failure = self._planning_failures.get(i)
+        if failure is not None and command.command in failure.refused:
+            return failure.text()
         if command.command == "calibrate":
             return validation.why_not_calibrate(self._scenario, c.phase, c.move.over_at(now_s))
         if next_phase(c.phase, trigger_of(command.command), by_capture) is None:
@@ -242,9 +257,9 @@ class PhaseMachine:
     def _continue_move(self, i: int, now_s: float) -> None:
         c = self.chasers[i]
         match c.then:
-            case NextMove.ATTEMPT:
+            case NextMove.ATTEMPT if i not in self._planning_failures:
                 self._align(i, Trigger.NEXT_ATTEMPT, now_s, c.attempt + 1)
-            case NextMove.NOMINAL:
+            case NextMove.ATTEMPT | NextMove.NOMINAL:
                 nominal, speed = self._scenario.chasers[i].position_m, self._back_out_speed(c.phase)
                 self.chasers[i] = replace(c, move=move_to(c.move, nominal, now_s, speed), then=NextMove.NONE)
             case NextMove.NONE:
@@ -404,8 +419,9 @@ class PhaseMachine:
         self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
         if phase is not before.phase:
             detail = f"from {before.phase}" + (f": {reason}" if reason else "")
+            level = "warning" if trigger is Trigger.PLANNING_FAILED else "info"
             complete = trigger is Trigger.CALIBRATION_COMPLETE
-            self._changes.append(PhaseChange(i, phase, detail, complete))
+            self._changes.append(PhaseChange(i, phase, detail, level, complete))
 
     def _back_out_speed(self, phase: Phase) -> float:
         factor = _ABORT_SPEED_FACTOR if phase is Phase.ABORT else 1.0

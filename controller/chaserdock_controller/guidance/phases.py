@@ -58,6 +58,7 @@ class Trigger(StrEnum):
     LATCH_CLOSED = "latch closed"
     PULL_WITHSTOOD = "pull test passed"
     ATTEMPT_FAILED = "limit violated or time-out"
+    PLANNING_FAILED = "planning failed"
 
 
 @dataclass(frozen=True)
@@ -118,6 +119,9 @@ TRANSITIONS = (
     Transition((_P.LATCHED,), _T.PULL_WITHSTOOD, _P.VERIFIED, by_capture=True),
     Transition((*CORRIDOR, *ATTACHED), _T.ATTEMPT_FAILED, _P.RETREAT, by_capture=True),
     Transition((_P.RETREAT,), _T.NEXT_ATTEMPT, _P.ALIGN, by_capture=True),
+    Transition((_P.HOLD, _P.CALIBRATE, _P.GOTO), _T.PLANNING_FAILED, _P.RETREAT),
+    Transition((_P.APPROACH, _P.DOCKED), _T.PLANNING_FAILED, _P.RETREAT, by_capture=False),
+    Transition((_P.WAIT, *CORRIDOR), _T.PLANNING_FAILED, _P.RETREAT, by_capture=True),
 )
 """All transitions. There is at most one for a phase, a trigger and a kind of docking."""
 

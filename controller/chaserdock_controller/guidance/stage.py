@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import view_of
@@ -20,6 +22,7 @@ from chaserdock_controller.interfaces import (
     ReferencePose,
     TargetEstimation,
 )
+from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from .chaser_state import ChaserGuidance
 from .docking import DockingObservation
@@ -45,9 +48,15 @@ class GuidanceStage:
         """Return the guidance state of every chaser."""
         return self.machine.chasers
 
-    def run(self, observation: Observation, estimation: TargetEstimation) -> GuidanceResult:
-        """Return what every chaser is to do in this tick."""
+    def run(
+        self,
+        observation: Observation,
+        estimation: TargetEstimation,
+        failures: Mapping[int, PlanningFailure],
+    ) -> GuidanceResult:
+        """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed."""
         self._follow_estimate(observation, estimation)
+        self.machine.update_planning(observation.time_s, failures)
         replies = self._apply_commands(observation)
         references: dict[int, ReferencePose] = {}
         if estimation.known:
@@ -167,7 +176,7 @@ class GuidanceStage:
 
     def _events(self, estimation: TargetEstimation) -> list[LogEntry]:
         changes = self.machine.drain_changes()
-        events: list[LogEntry] = [("info", f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in changes]
+        events: list[LogEntry] = [(c.level, f"chaser {c.chaser}: {c.phase} ({c.detail})") for c in changes]
         for change in changes:
             camera = next((c for c in estimation.cameras if c.chaser == change.chaser), None)
             if change.calibration_complete and camera is not None:

@@ -24,6 +24,7 @@ from chaserdock_controller.interfaces import (
 from . import make_solver
 from .budget import Bounded, SolveBudget
 from .lost_chasers import with_lost_chasers
+from .plan_monitor import PlanMonitor
 from .types import NmpcInput, NmpcParameters, NmpcPlan
 
 _ATTACHED_FACTOR, _ATTACHED_MARGIN = 1.2, 1e-3
@@ -32,7 +33,7 @@ _CANCELLED_SHARE = 0.5
 
 
 class PlanningStage:
-    """The solver with its warm starts, and in real time its budget.
+    """The solver with its warm starts, in real time its budget, and the plans of the last ticks.
 
     Raises PluginError for an installed solver that cannot be held to a budget when there is one.
     """
@@ -44,6 +45,7 @@ class PlanningStage:
         self._parameters, self._now_s = parameters, now_s
         self._min_distance_chasers_m = scenario.limits.min_distance_chasers_m
         self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
+        self.monitor = PlanMonitor()
         self._last_solve_ns: int | None = None
         self._budget: SolveBudget | None = None
         if realtime and c.solve_budget_s is not None:
@@ -56,14 +58,15 @@ class PlanningStage:
     def run(
         self, observation: Observation, estimation: TargetEstimation, guidance: GuidanceResult
     ) -> PlanResult:
-        """Plan for the chasers of the guidance horizon; lost chasers are obstacles.
+        """Plan for the chasers of the guidance horizon, or keep their last plans for a while; lost chasers are obstacles.
 
         The problem is solved for the input plus the estimated disturbance, which is then subtracted: the input cost keeps
         its reference, and the disturbance causes no offset.
         """
         horizon = guidance.horizon
         if horizon is None:
-            return PlanResult((), None, 0.0, ())
+            self.monitor.update((), None, observation.time_ns, observation.effective_ns)
+            return PlanResult((), None, 0.0, (), {})
         limits = {i: observation.input_limits[i] for i in horizon.chasers}
         disturbances = {i: _bounded(estimation.disturbances[i], limits[i]) for i in horizon.chasers}
         left = {i: limits[i] - np.abs(disturbances[i]) for i in horizon.chasers}
@@ -87,7 +90,8 @@ class PlanningStage:
             self._budget.note(wall_s, int(plan.iterations.sum()))
         if plan is not None:
             plan = _without(plan, [disturbances[i] for i in horizon.chasers])
-        return PlanResult(horizon.chasers, plan, wall_s, events)
+        self.monitor.update(horizon.chasers, plan, observation.time_ns, observation.effective_ns)
+        return PlanResult(horizon.chasers, plan, wall_s, events, self.monitor.plans(observation.time_ns))
 
     def problem(
         self, horizon: HorizonReference, states: Mapping[int, Array], input_limits: Mapping[int, Array]

@@ -17,19 +17,19 @@ from chaserdock_protocol.messages import (
 )
 
 from chaserdock_controller.interfaces import Directive, Observation, PlanResult, TargetEstimation
-from chaserdock_controller.nmpc.types import NmpcPlan
+from chaserdock_controller.nmpc.plan_monitor import ChaserPlan
 
 
-def plan_message(chaser: int, observation: Observation, step_s: float, plan: NmpcPlan, row: int) -> Plan:
-    """Return the plan of one chaser, in ``row`` of the solver's."""
+def plan_message(chaser: int, tick: int, step_s: float, plan: ChaserPlan) -> Plan:
+    """Return the plan that one chaser flies from a tick on."""
     return Plan(
-        tick=observation.tick,
-        sim_time_ns=observation.effective_ns,
+        tick=tick,
+        sim_time_ns=plan.time_ns,
         chaser=chaser,
         step_s=step_s,
-        positions_m=vector(plan.states[row, :, :3]),
-        quaternions_wxyz=vector(plan.states[row, :, 6:10]),
-        inputs=vector(plan.inputs[row]),
+        positions_m=vector(plan.states[:, :3]),
+        quaternions_wxyz=vector(plan.states[:, 6:10]),
+        inputs=vector(plan.inputs),
     )
 
 

@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import WrenchCommand
 from chaserdock_protocol.scenario import FlightScenario
@@ -12,6 +16,7 @@ from chaserdock_controller.ingest.latency_compensation import CommandHistory
 from chaserdock_controller.interfaces import (
     DirectCommand,
     GuidanceResult,
+    HorizonReference,
     LogEntry,
     Observation,
     PlanResult,
@@ -53,7 +58,7 @@ class OutputStage:
                 out.references[i] = reference_message(i, observation, directive)
             command = directive.direct
             if command is None:
-                command = self._plan_or_brake(i, observation, estimation, result, events, out)
+                command = self._planned_or_safe(i, observation, estimation, guidance, result, events, out)
             out.wrenches[i] = self._send(i, observation, guidance, command)
         for i, reason in observation.invalid.items():
             if i not in self._without_plan:
@@ -67,31 +72,42 @@ class OutputStage:
         out.events = [event_message(observation, level, text) for level, text in events]
         return out
 
-    def _plan_or_brake(
+    def _planned_or_safe(
         self,
         i: int,
         observation: Observation,
         estimation: TargetEstimation,
+        guidance: GuidanceResult,
         result: PlanResult,
         events: list[LogEntry],
         out: TickOutputs,
     ) -> DirectCommand:
-        """Return the first input of a chaser's plan, or a braking wrench without a usable plan."""
-        plan = result.plan
-        row = result.chasers.index(i) if i in result.chasers else 0
-        usable = plan is not None and plan.status[row] != "failed"
-        if usable != (i not in self._without_plan) and estimation.known:
-            if usable:
+        """Return the input of a chaser's plan; without one that may be flown, a safe wrench.
+
+        That follows the reference, and so moves with the target. Without a target it brakes to rest in WRF.
+        """
+        step_s = self._scenario.controller.dt_s
+        plan = result.flyable.get(i)
+        wrench = None if plan is None else plan.input_at(observation.effective_ns, step_s)
+        new = plan is not None and plan.time_ns == observation.effective_ns
+        if new != (i not in self._without_plan) and estimation.known:
+            if new:
                 events.append(("info", f"chaser {i}: planned again"))
                 self._without_plan.discard(i)
             else:
-                events.append(("error", f"chaser {i}: no plan, braking"))
+                action = "tracking its reference" if wrench is None else "flying its last plan"
+                events.append(("error", f"chaser {i}: no plan, {action}"))
                 self._without_plan.add(i)
-        if plan is None or not usable:
-            return DirectCommand("brake", brake_wrench(estimation.own[i], self._scenario.chaser))
-        step_s = self._scenario.controller.dt_s
-        out.plans[i] = plan_message(i, observation, step_s, plan, row)
-        return DirectCommand("nmpc", plan.inputs[row, 0])
+        if plan is not None and wrench is not None:
+            out.plans[i] = plan_message(i, observation.tick, step_s, plan)
+            return DirectCommand("nmpc", wrench)
+        body, horizon = self._scenario.chaser, guidance.horizon
+        if horizon is None or i not in horizon.chasers:
+            return DirectCommand("brake", brake_wrench(estimation.own[i], body))
+        setpoint = _setpoint(horizon, horizon.chasers.index(i), step_s)
+        return DirectCommand(
+            "track", track_setpoint(_body_state(estimation.own_at_effect[i]), body, setpoint)
+        )
 
     def _send(
         self, i: int, observation: Observation, guidance: GuidanceResult, command: DirectCommand
@@ -114,3 +130,15 @@ class OutputStage:
             trusted=directive.trusted,
             free=directive.free,
         )
+
+
+def _body_state(x: Array) -> BodyState:
+    """Return a state (13,) by its parts."""
+    return BodyState(x[:3], x[3:6], x[6:10], x[10:])
+
+
+def _setpoint(horizon: HorizonReference, row: int, step_s: float) -> Setpoint:
+    """Return the reference at the beginning of the horizon; its rates are those over the first stage."""
+    now, then = horizon.references[row, :2]
+    turn = rotations.log(rotations.multiply(rotations.conjugate(now[3:]), then[3:]))
+    return Setpoint(now[:3], (then[:3] - now[:3]) / step_s, now[3:], turn / step_s, horizon.u_ref[row, 0])

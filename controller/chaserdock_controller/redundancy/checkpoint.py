@@ -29,6 +29,7 @@ from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
+from chaserdock_controller.nmpc.plan_monitor import ChaserPlan, PlanningFailure
 
 from .serialization import decode, encode
 
@@ -50,6 +51,12 @@ class PlanningState(Struct, forbid_unknown_fields=True):
     _last_solve_ns: int | None
 
 
+class PlanMonitorState(Struct, forbid_unknown_fields=True):
+    _last: dict[int, ChaserPlan]
+    _failed_since_ns: dict[int, int]
+    _degraded_since_ns: dict[int, int]
+
+
 class OutputState(Struct, forbid_unknown_fields=True):
     _without_plan: set[int]
 
@@ -62,6 +69,7 @@ class GuidanceState(Struct, forbid_unknown_fields=True):
     _last_commands: dict[int, tuple[float, OperatorCommand]]
     _seen_s: float | None
     _interrupted: set[int]
+    _planning_failures: dict[int, PlanningFailure]
 
 
 class ThrusterReportState(Struct, forbid_unknown_fields=True):
@@ -146,6 +154,7 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
 
     sightings: SightingState
     planning: PlanningState
+    plan_monitor: PlanMonitorState
     output: OutputState
     guidance: GuidanceState
     timeline_left: int
@@ -173,6 +182,7 @@ class Checkpoint:
         return {
             "sightings": (vars(core.estimation)["_converter"], SightingState),
             "planning": (core.planning, PlanningState),
+            "plan_monitor": (core.planning.monitor, PlanMonitorState),
             "output": (core.output, OutputState),
             "guidance": (core.guidance.machine, GuidanceState),
             "thruster_reports": (core.ingest.thrusters, ThrusterReportState),

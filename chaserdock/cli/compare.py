@@ -99,7 +99,7 @@ def study(
     ],
     out: Annotated[Path, typer.Option(help="results are appended to this file")],
 ) -> None:
-    """Fly a file of cases in one process, with perfect knowledge of the target and without images."""
+    """Fly a file of cases in one process: with perfect knowledge of the target, or with images and an estimator."""
     if not cases.is_file():
         raise fail(f"{cases}: no such file")
     from chaserdock.evaluation.study import main as fly_cases

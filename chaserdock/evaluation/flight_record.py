@@ -11,6 +11,7 @@ from chaserdock_controller.interfaces import TickOutputs
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
 from .in_process import InProcessMission, TickRecord
@@ -23,6 +24,7 @@ class FlightRecord:
 
     ``time_s`` (K,): every tick and the end. ``states`` (K, N, 13): p, v (WRF), q_wxyz,
     omega (body). ``position_error_m``, ``orientation_error_rad`` (K, N): from the reference pose on the true target.
+    ``target_distance_m`` (K, N): between the centres of chaser and target.
     ``solve_s``: wall-clock seconds of every controller tick. ``commands``: by tick, then chaser. Per chaser (N,):
     ``absolute_impulse_N_s`` (integral of the force components' magnitudes), ``thruster_impulse_N_s``, ``propellant_kg``.
     ``thruster_events``: (time in s, chaser, text).
@@ -32,6 +34,7 @@ class FlightRecord:
     states: Array
     position_error_m: Array
     orientation_error_rad: Array
+    target_distance_m: Array
     solve_s: Array
     failed_solves: int
     commands: list[dict[int, ActuatorCommand]]
@@ -69,7 +72,9 @@ def record_flight(
         events = mission.thruster_events
         end_s = mission.time_s
     names = [f"chaser/{i}" for i in mission.chasers]
-    states = np.array([_state_rows(s, names) for s in (*(t.states for t in ticks), final)])
+    all_states = [*(t.states for t in ticks), final]
+    states = np.array([_state_rows(s, names) for s in all_states])
+    target_m = np.array([s[TARGET].position_m for s in all_states])
     solved = [t.outputs for t in ticks if t.outputs is not None]
     error = np.array(errors)
     return FlightRecord(
@@ -77,6 +82,7 @@ def record_flight(
         states=states,
         position_error_m=error[..., 0],
         orientation_error_rad=error[..., 1],
+        target_distance_m=np.linalg.norm(states[..., :3] - target_m[:, None], axis=2),
         solve_s=np.array([o.solver.wall_solve_s if o.solver is not None else 0.0 for o in solved]),
         failed_solves=sum(map(failed_solves, solved)),
         commands=[t.commands for t in ticks],

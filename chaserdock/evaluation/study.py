@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``chaserdock study``: fly a file of cases with perfect knowledge, one after the other, and append each result."""
+"""``chaserdock study``: fly a file of cases in one process, one after the other, and append each result."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from chaserdock_protocol.scenario import Scenario, load_scenario
 
 from .flight_record import FlightRecord, record_flight
 from .least_transient import gauss_times, least_square_integral
+from .perception import RenderedImages
 from .perfect_knowledge import PerfectEstimator
 from .study_cases import StudyCase, StudyError, StudyResult, line_of, read_lines
 
@@ -45,7 +46,7 @@ def fly_case(case: StudyCase) -> StudyResult:
         delay = _measured
     elif fixed_s is not None:
         delay = lambda _: fixed_s  # noqa: E731
-    flight = record_flight(scenario, solve_delay_s=delay)
+    flight = record_flight(scenario, RenderedImages(scenario) if case.images else None, solve_delay_s=delay)
     position, angle = flight.position_error_m[:, 0] ** 2, flight.orientation_error_rad[:, 0] ** 2
     late = flight.time_s >= scenario.settling_s
     return StudyResult(
@@ -55,6 +56,7 @@ def fly_case(case: StudyCase) -> StudyResult:
         orientation_mse_rad2=float(np.mean(angle)),
         steady_position_mse_m2=float(np.mean(position[late])),
         steady_orientation_mse_rad2=float(np.mean(angle[late])),
+        min_distance_target_m=float(flight.target_distance_m[:, 0].min()),
         failed_solves=flight.failed_solves,
         solve_p50_s=float(np.median(flight.solve_s)),
         solve_max_s=float(np.max(flight.solve_s)),
@@ -70,7 +72,7 @@ def _check(case: StudyCase, scenario: Scenario) -> None:
     fixed_s = case.delay_s
     if fixed_s is not None and (case.delay_measured or not 0.0 <= fixed_s < math.inf):
         raise StudyError(f"{case.name}: delay_s must be finite, not negative and not beside delay_measured")
-    if scenario.target.motion == "torque_free":
+    if scenario.target.motion == "torque_free" and (case.floor or not case.images):
         raise StudyError(f"{case.name}: target.motion must be constant_rates or static, not torque_free")
     if (fixed_s is not None or case.delay_measured) and scenario.chaser.actuation != "ideal":
         raise StudyError(f'{case.name}: a delay needs chaser.actuation = "ideal"')

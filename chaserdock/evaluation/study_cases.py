@@ -16,7 +16,7 @@ class StudyError(ChaserdockError):
 
 
 class StudyCase(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """A scenario (path) with overrides, flown with perfect knowledge of the target.
+    """A scenario (path) with overrides, flown with perfect knowledge of the target, or with ``images`` and an estimator.
 
     ``delay_s``: time from a tick to its command's effect, unknown to the controller, which skips the ticks meanwhile.
     ``delay_measured``: the wall-clock time of each solve as delay. ``floor``: compute the lower bound of the squared
@@ -26,13 +26,17 @@ class StudyCase(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     name: str
     scenario: str
     overrides: tuple[str, ...] = ()
+    images: bool = False
     delay_s: float | None = None
     delay_measured: bool = False
     floor: bool = False
 
 
 class StudyResult(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Chaser 0's errors from its commanded reference pose: mean squares over the run, and after ``settling_s``."""
+    """Chaser 0's errors from its commanded reference pose: mean squares over the run, and after ``settling_s``.
+
+    ``min_distance_target_m``: least distance of its centre to the target's. ``failed_solves``: ticks without a plan.
+    """
 
     case: StudyCase
     duration_s: float
@@ -40,6 +44,7 @@ class StudyResult(Struct, frozen=True, kw_only=True, forbid_unknown_fields=True)
     orientation_mse_rad2: float
     steady_position_mse_m2: float
     steady_orientation_mse_rad2: float
+    min_distance_target_m: float
     failed_solves: int
     solve_p50_s: float
     solve_max_s: float

@@ -320,6 +320,26 @@ def test_the_papers_method_works_where_it_can_and_fails_where_epnp_does():
     assert 0.2e-3 < np.median(errors) < 10e-3
 
 
+def test_iterative_pnp_solves_single_faces_on_which_epnp_fails():
+    worst = {}
+    for method in ("paper", "paper_iterative"):
+        scene = Scene("paper", 1280, 720, method=method)
+        errors = []
+        for k in range(10):
+            tilt = rotations.exp([0.2 * np.sin(k), 0.2 * np.cos(k), 0.1 * k])
+            position, q = (
+                np.array([0.05, 0.03, 0.8 + 0.08 * k]),
+                rotations.multiply(tilt, rotations.exp([np.pi / 2, 0, 0])),
+            )
+            sighting = scene.perception.estimate(scene.image(position, q, k))
+            if len(sighting.marker_ids) == 1:
+                errors.append(np.linalg.norm(error_of(sighting.solutions[0], position, q)[:3]))
+        assert len(errors) >= 8
+        worst[method] = max(errors)
+    assert worst["paper"] > 1.0
+    assert worst["paper_iterative"] < 0.03
+
+
 @pytest.mark.parametrize(
     "image",
     [

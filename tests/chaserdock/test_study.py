@@ -7,6 +7,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from chaserdock_models import rotations
@@ -153,6 +154,15 @@ def test_no_flight_is_better_than_the_floor(baseline: StudyResult) -> None:
     assert baseline.floor_m2_s is not None
     assert 1.0 < baseline.position_mse_m2 * 25.0 / baseline.floor_m2_s < 1.2
     assert baseline.failed_solves == 0
+
+
+def test_study_with_images_flies_the_estimator(baseline: StudyResult) -> None:
+    small = ("camera.width_px=480", "camera.height_px=270", "time.rate_hz=10", "time.image_hz=10")
+    blind = msgspec.structs.replace(baseline.case, overrides=("duration_s=21.0", *small), floor=False)
+    perfect, seen = fly_case(blind), fly_case(msgspec.structs.replace(blind, images=True))
+    assert seen.position_mse_m2 != perfect.position_mse_m2 == pytest.approx(seen.position_mse_m2, rel=0.5)
+    # From 1.85 m in front of the target to its reference pose at 1 m.
+    assert seen.min_distance_target_m == pytest.approx(1.0, abs=0.15)
 
 
 def test_delay_makes_long_horizons_fail_first() -> None:

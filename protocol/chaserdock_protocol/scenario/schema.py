@@ -25,7 +25,7 @@ from .fields import (
     Vector,
 )
 
-PERCEPTIONS = ("default", "paper", "statistical")
+PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
 ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""
@@ -76,8 +76,9 @@ class PerceptionSection(Section):
 
     name: Name = Field(
         default="default",
-        description="`default`, `paper` (the paper's method), `statistical` (no images: measurements are drawn around the true "
-        "pose, [simulation.md](simulation.md)), or an installed plugin.",
+        description="`default`, `paper` (the paper's method, with EPnP), `paper_iterative` (the same with OpenCV's iterative PnP, "
+        "as in the authors' public code), `statistical` (no images: measurements are drawn around the true pose, "
+        "[simulation.md](simulation.md)), or an installed plugin.",
     )
 
 

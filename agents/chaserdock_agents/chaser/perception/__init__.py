@@ -27,7 +27,7 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
     a function of (camera: Camera, target: TargetModel). Raises PluginError if it is not installed."""
     camera, target = scenario.camera_model(), scenario.target_model()
     match scenario.perception.name:
-        case "default" | "paper" as method:
+        case "default" | "paper" | "paper_iterative" as method:
             return Perception(camera, target, method)
         case "statistical":
             return StatisticalPerception(camera, target)

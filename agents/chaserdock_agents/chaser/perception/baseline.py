@@ -3,7 +3,8 @@
 
 Fourlas et al., "Vision Based Docking of Multiple Satellites with an Uncooperative Target", IFAC 2023, sec. 4.
 Corners by OpenCV's sub-pixel refinement. EPnP is OpenCV's and fails on about half of the views of a single
-face; that is part of the baseline. The only check is that the result is a finite pose in front of the camera.
+face; that is part of the baseline. The authors' public code calls OpenCV's ``estimatePoseBoard`` instead, which is the
+iterative PnP without an initial guess. The only check is that the result is a finite pose in front of the camera.
 """
 
 from __future__ import annotations
@@ -34,8 +35,10 @@ def detect(image: NDArray[np.uint8], camera: Camera, dictionary: cv2.aruco.Dicti
     )
 
 
-def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple[pnp.TargetPose, ...]:
-    """Solve EPnP with all corners (n, 4, 2), ideal pixels, of markers with corners at ``points_trf_m`` (n, 4, 3).
+def solve(
+    camera: Camera, points_trf_m: Array, corners_ideal_px: Array, iterative: bool = False
+) -> tuple[pnp.TargetPose, ...]:
+    """Solve EPnP, or iterative PnP, with all corners (n, 4, 2), ideal pixels, of markers with corners ``points_trf_m`` (n, 4, 3).
 
     Returns one pose, or none if it is not finite or behind the camera; its covariance is first-order, from its residuals.
     """
@@ -43,7 +46,8 @@ def solve(camera: Camera, points_trf_m: Array, corners_ideal_px: Array) -> tuple
         return ()
     points, pixels = points_trf_m.reshape(-1, 3), corners_ideal_px.reshape(-1, 2)
     try:
-        ok, rvec, tvec = cv2.solvePnP(points, pixels, camera.matrix(), None, flags=cv2.SOLVEPNP_EPNP)
+        method = cv2.SOLVEPNP_ITERATIVE if iterative else cv2.SOLVEPNP_EPNP
+        ok, rvec, tvec = cv2.solvePnP(points, pixels, camera.matrix(), None, flags=method)
     except cv2.error:  # degenerate corners
         return ()
     position = np.asarray(tvec, dtype=float).ravel()

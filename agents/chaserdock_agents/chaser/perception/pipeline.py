@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -19,7 +19,7 @@ from .pnp import TargetPose
 _ENOUGH = 6
 """Number of markers beyond which further ones hardly improve the pose."""
 
-Method = Literal["default", "paper"]
+Method = Literal["default", "paper", "paper_iterative"]
 
 
 @dataclass(frozen=True)
@@ -40,13 +40,13 @@ class PerceptionResult:
 class Perception:
     """Estimates the pose of one target model in the images of one camera.
 
-    Stateless: `estimate` depends on its arguments only. ``method``: "default", or "paper" for
-    the paper's baseline. Raises ValueError for another method, or for an unknown marker dictionary.
+    Stateless: `estimate` depends on its arguments only. ``method``: "default", or for the paper's baseline "paper" (EPnP) or
+    "paper_iterative". Raises ValueError for another method, or for an unknown marker dictionary.
     """
 
     def __init__(self, camera: Camera, model: TargetModel, method: Method = "default"):
-        if method not in ("default", "paper"):
-            raise ValueError(f"unknown perception method {method!r}; known: default, paper")
+        if method not in get_args(Method):
+            raise ValueError(f"unknown perception method {method!r}; known: {', '.join(get_args(Method))}")
         self.camera = camera
         self.model = model
         self.method: Method = method
@@ -70,7 +70,7 @@ class Perception:
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise ValueError(f"expected a uint8 image of {shape}, got {got}")
         image = np.ascontiguousarray(image)
-        if self.method == "paper":
+        if self.method != "default":
             return self._estimate_paper(image)
         region = None if predicted is None else detect.region_of(self.camera, self.model, *predicted)
         if region is not None:
@@ -115,7 +115,7 @@ class Perception:
         kept = np.array([int(i) in once for i in found.ids], dtype=bool)
         ids, px = found.ids[kept], found.corners_px[kept]
         rows = np.array([self._rows[int(i)] for i in ids], dtype=np.intp)
-        solutions = paper.solve(self.camera, self._table.corners[rows], px)
+        solutions = paper.solve(self.camera, self._table.corners[rows], px, iterative=self.method != "paper")
         if not solutions:
             ids, px = ids[:0], px[:0]
         return self._sighting(found.ids, solutions, ids, px)

@@ -70,24 +70,20 @@ def compare(
 def reproduce(
     quick: Annotated[
         bool,
-        typer.Option("--quick", help="shorter runs, few of them with images: tens of minutes, not hours"),
+        typer.Option("--quick", help="one short flight per row, no missions: minutes, not an hour"),
     ] = False,
-    out: Annotated[Path, typer.Option(help="folder for runs and page; a second call resumes there")] = Path(
-        "runs/reproduce"
-    ),
-    jobs: Annotated[int, typer.Option(min=1, max=64, help="concurrent missions")] = 2,
-    keep_logs: Annotated[
-        bool, typer.Option("--keep-logs", help="keep every mission.mcap (gigabytes)")
-    ] = False,
+    out: Annotated[
+        Path, typer.Option(help="folder for results and page; a second call resumes there")
+    ] = Path("runs/reproduce"),
 ) -> None:
     """Fly the paper's experiments and compare with its figures: writes OUT/reproduction.md and .html.
 
-    The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without them the page shows the
-    last recorded flights of that chain, and the status is 1.
+    The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without them the page lacks that
+    chain, and the status is 1.
     """
     from chaserdock.reproduce.main import reproduce as fly_all
 
-    raise typer.Exit(fly_all(quick, out, jobs, keep_logs))
+    raise typer.Exit(fly_all(quick, out))
 
 
 def study(

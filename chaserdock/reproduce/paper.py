@@ -48,3 +48,4 @@ ROWS = (
     PaperRow("alpha=60", 3.0, 0.1, 0.6, 1.75e-2, 4.25e-3),
     PaperRow("dt=1-30-alpha=30", 3.0, 1 / 30, 0.3, 1.59e-2, 4.02e-3),
 )
+BASELINE = ROWS[0]

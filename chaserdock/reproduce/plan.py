@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plan of a reproduction: missions with images, and studies of the controller on perfect knowledge."""
+"""Plan of a reproduction: single-chaser flights of the paper's table, flights that explain, missions of several chasers."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario.bodies import Target
+from msgspec import Struct
 
 from chaserdock.evaluation.study_cases import StudyCase
 
-from .paper import PAPER_S, ROWS
+from .paper import BASELINE, PAPER_S, ROWS, PaperRow
 
 QUICK_S = 40.0
 SCENARIO = "paper-single"
-"""The scenario of every single-chaser run: the paper's settings and its baseline row."""
+"""The scenario of every single-chaser flight: the paper's settings and its baseline row."""
 
 DRAWS = range(3)
 """The paper flew every row three times. Ours differ by their dispersed start; equal draws have equal starts in all rows."""
@@ -32,11 +33,12 @@ RATE_BOUND = 0.2
 vector; each component of the rotation vector of the target's initial attitude; each component of the target's velocity
 and angular velocity, as a share of its value."""
 
-CHAIN = "chain"
+OPEN = "controller.solver='open'"
+WRITTEN, CODE, DEFAULT = "as written", "as in the authors' code", "ours"
 COLUMNS: dict[str, tuple[str, ...]] = {
-    CHAIN: ("perception.name='paper'", "estimator.name='paper'", "controller.solver='open'"),
-    "paper": (),
-    "default": (
+    WRITTEN: ("perception.name='paper'", "estimator.name='paper'", OPEN),
+    CODE: ("perception.name='paper_iterative'", "estimator.name='paper'", OPEN),
+    DEFAULT: (
         "controller.integrator='rk4'",
         "controller.feed_forward=true",
         "time.rate_hz=15",
@@ -44,8 +46,8 @@ COLUMNS: dict[str, tuple[str, ...]] = {
         "time.latency_s=0.0333333333333333",
     ),
 }
-"""Overrides of ``paper-single``. ``chain``: the paper's settings and the paper's perception (EPnP), combiner and solver
-(OpEn). ``paper``: the paper's settings with our perception, estimator and solver. ``default``: all ours."""
+"""Overrides of ``paper-single``, whose controller has the paper's settings. The paper's chain: perception, combiner, and
+OpEn, with EPnP as the paper writes, or with the PnP of its authors' public code. Ours: the default settings."""
 
 
 def dispersed_start(draw: int) -> tuple[str, ...]:
@@ -63,200 +65,130 @@ def dispersed_start(draw: int) -> tuple[str, ...]:
         f"target.q_wxyz={attitude.tolist()}",
         f"target.velocity_m_s={velocity.tolist()}",
         f"target.omega_rad_s={omega.tolist()}",
+        f"seed={draw}",
     )
 
 
-@dataclass(frozen=True)
-class Mission:
-    """One run of ``chaserdock run``. The runs of one ``group`` are shown together."""
+class Mission(Struct, frozen=True):
+    """A shipped scenario of several chasers, flown with images in the settings of a column."""
 
-    name: str
-    group: str
     scenario: str
-    seed: int = 0
+    column: str
     overrides: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """A name that is unique in the plan."""
+        return f"{self.scenario}, {self.column}"
 
 
 @dataclass(frozen=True)
 class ReproductionPlan:
-    """All missions and studies. ``duration_s``: of each single-chaser run."""
+    """All flights. ``duration_s``: of each single-chaser flight."""
 
     quick: bool
     duration_s: float
+    cases: tuple[StudyCase, ...]
     missions: tuple[Mission, ...]
-    studies: tuple[StudyCase, ...]
 
 
 def needs_open(item: Mission | StudyCase) -> bool:
-    """Return whether a run uses OpEn, the paper's solver."""
-    return "controller.solver='open'" in item.overrides
+    """Return whether a flight uses OpEn, the paper's solver."""
+    return OPEN in item.overrides
 
 
-def table_group(column: str, row: str) -> str:
-    """Return the group of a table cell, for missions and studies; ``group/draw`` names a run."""
-    return f"table/{column}/{row}"
+def table_name(column: str, row: PaperRow, draw: int) -> str:
+    """Return the name of a flight of the table."""
+    return f"table/{column}/{row.name}/{draw}"
 
 
-_PAPER_SETTINGS = (
-    "navigation.grade='exact'",
-    "time.latency_s=0.0",
-    "controller.integrator='euler'",
-    "controller.feed_forward=false",
-)
-_PAPER_VIEW = ("camera.width_px=1280", "camera.height_px=720", "time.rate_hz=30", "time.image_hz=30")
-TRACKING = "two-chaser-tracking"
-AVOIDANCE = "collision-avoidance"
-MULTI_CHASER = (TRACKING, "four-chaser-docking", AVOIDANCE)
+def draws_of(quick: bool, column: str, row: PaperRow) -> range:
+    """Return the starts from which a row is flown; EPnP fails alike in all rows, so three times in the baseline only."""
+    return DRAWS[:1] if quick or (column == WRITTEN and row != BASELINE) else DRAWS
 
 
-def _draws_with_images(quick: bool, column: str, row: str) -> range:
-    """Return the draws of a table cell that are flown with images; a quick plan flies few of them."""
-    if not quick or (row == "baseline" and column != "default"):
-        return DRAWS
-    shown = row == "baseline" or (column == CHAIN and row in ("T=0.5", "T=10"))
-    return DRAWS[:1] if shown else DRAWS[:0]
+def floor_name(draw: int) -> str:
+    """Return the name of the flight whose lower bound belongs to a start."""
+    return f"floor/{draw}"
 
 
-def missions(quick: bool, duration_s: float) -> tuple[Mission, ...]:
-    """Return the flights with images; the table comes first."""
-    length = f"duration_s={duration_s}"
-    out: list[Mission] = []
+def _stage_weights(factor: float) -> tuple[str, ...]:
+    weights = (("position", 65.0), ("orientation", 35.0), ("force", 3.5), ("torque", 40.0))
+    return tuple(f"controller.weight_{name}={weight * factor!r}" for name, weight in weights)
 
-    def add(group: str, draws: range, *overrides: str) -> None:
-        for draw in draws:
-            sets = (*overrides, *dispersed_start(draw), length)
-            out.append(Mission(f"{group}/{draw}", group, SCENARIO, draw, sets))
 
+STAGE_WEIGHTS = {"dt=1-5": 2.0, "dt=1-30": 1.0 / 3.0}
+"""Factors of the stage weights that keep the sum of the stage costs when dt changes."""
+STARTS: dict[str, str] = {
+    "0.80 m away": "chasers.0.start_offset_m=[0.8, 0.0, 0.0]",
+    "0.90 m away": "chasers.0.start_offset_m=[0.9, 0.0, 0.0]",
+    "turned by 0.50 rad": "chasers.0.start_rotation_rad=[0.3652, 0.0, -0.3415]",
+    "turned by 0.65 rad": "chasers.0.start_rotation_rad=[0.4748, 0.0, -0.4439]",
+}
+"""Starts that differ from the nominal one in one respect."""
+DELAYS_S: dict[str, tuple[float, ...]] = {"T=0.5": (0.1, 0.3, 0.5, 1.0), "T=10": (0.1, 0.2, 0.3, 0.4, 0.5)}
+"""Delays of the command with which the rows with failed runs are flown."""
+
+
+def _table(quick: bool, scenario: str, length: str) -> list[StudyCase]:
+    """Return the flights of the paper's table, with images."""
+    out = []
     for column, settings in COLUMNS.items():
         for row in ROWS:
-            draws = _draws_with_images(quick, column, row.name)
-            add(table_group(column, row.name), draws, *row.overrides, *settings)
-    if not quick:
-        add("estimator/paper", DRAWS, "estimator.name='paper'")
-        add("target/servicer", DRAWS, "target.model='servicer'", *COLUMNS["default"])
-    view = () if quick else _PAPER_VIEW
-    for column, settings, scenarios in (
-        ("default", (), ("four-chaser-docking", AVOIDANCE) if quick else MULTI_CHASER),
-        ("paper", (*_PAPER_SETTINGS, *view), () if quick else MULTI_CHASER),
-        (CHAIN, (*_PAPER_SETTINGS, *view, *COLUMNS[CHAIN]), (TRACKING,) if quick else (TRACKING, AVOIDANCE)),
-    ):
-        for scenario in scenarios:
-            group = f"mission/{column}/{scenario}"
-            out.append(Mission(f"{group}/0", group, scenario, 0, settings))
-    return tuple(out)
+            for draw in draws_of(quick, column, row):
+                sets = (*row.overrides, *settings, *dispersed_start(draw), length)
+                name = table_name(column, row, draw)
+                out.append(StudyCase(name=name, scenario=scenario, overrides=sets, images=True))
+    return out
 
 
-_INGREDIENTS: dict[str, tuple[str, ...]] = {
-    "RK4 in place of Euler": ("controller.integrator='rk4'",),
-    "feed-forward in place of u_ref = 0": ("controller.feed_forward=true",),
-    "latency of 1/30 s, compensated": ("time.latency_s=0.0333333333333333",),
-    "control at 15 Hz": ("time.rate_hz=15", "time.image_hz=15"),
-    "control at 10 Hz": ("time.rate_hz=10", "time.image_hz=10"),
-    "force weight times 4": ("controller.weight_force=14.0",),
-    "force weight by 4": ("controller.weight_force=0.875",),
-    "final weights by 4": (
-        "controller.weight_final_position=812.5",
-        "controller.weight_final_orientation=437.5",
-    ),
-    "dt = 1/30 s": ("controller.dt_s=0.0333333333333333",),
-    "dt = 1/30 s, stage weights by 3": (
-        "controller.dt_s=0.0333333333333333",
-        *(
-            f"controller.weight_{name}={weight / 3}"
-            for name, weight in (("position", 65), ("orientation", 35), ("force", 3.5), ("torque", 40))
-        ),
-    ),
-    "dt = 1/5 s": ("controller.dt_s=0.2",),
-    "dt = 1/5 s, stage weights times 2": (
-        "controller.dt_s=0.2",
-        *(
-            f"controller.weight_{name}={weight * 2}"
-            for name, weight in (("position", 65), ("orientation", 35), ("force", 3.5), ("torque", 40))
-        ),
-    ),
-    "solved to convergence (ipopt)": ("controller.solver='ipopt'",),
-    "the paper's solver (OpEn)": ("controller.solver='open'",),
-}
-
-INFERRED = "inferred"
-_STARTS: dict[str, tuple[str, ...]] = {
-    INFERRED: (),
-    "closing, turned about X": ("chasers.0.start_rotation_rad=[0.575, 0.0, 0.0]",),
-    "receding, turned about X": (
-        "chasers.0.position_m=[-1.0, 0.0, 0.0]",
-        "chasers.0.q_wxyz=[1.0, 0.0, 0.0, 0.0]",
-        "chasers.0.start_offset_m=[-0.85, 0.0, 0.0]",
-        "chasers.0.start_rotation_rad=[0.575, 0.0, 0.0]",
-    ),
-    "turned the other way": ("chasers.0.start_rotation_rad=[-0.42, 0.0, 0.3927]",),
-    "turned about X, the other way": ("chasers.0.start_rotation_rad=[-0.575, 0.0, 0.0]",),
-    "turned about Y": ("chasers.0.start_rotation_rad=[0.0, 0.575, 0.0]",),
-    "turned about Z": ("chasers.0.start_rotation_rad=[0.0, 0.0, 0.575]",),
-    "turned about Z, the other way": ("chasers.0.start_rotation_rad=[0.0, 0.0, -0.575]",),
-    "turned by 0.50 rad": ("chasers.0.start_rotation_rad=[0.3652, 0.0, -0.3415]",),
-    "turned by 0.65 rad": ("chasers.0.start_rotation_rad=[0.4748, 0.0, -0.4439]",),
-    "moving with the target's centre": ("chasers.0.start_velocity_m_s=[0.015, 0.0075, 0.03]",),
-    "the target stands still": ("target.motion='static'",),
-    "to the side, -Y": ("chasers.0.start_offset_m=[0.0, -0.85, 0.0]",),
-    "to the side, +Y": ("chasers.0.start_offset_m=[0.0, 0.85, 0.0]",),
-    "oblique, (0.6, 0.64, 0.48)": ("chasers.0.start_offset_m=[0.51, 0.544, 0.408]",),
-    "0.75 m in place of 0.85 m": ("chasers.0.start_offset_m=[0.75, 0.0, 0.0]",),
-    "0.80 m in place of 0.85 m": ("chasers.0.start_offset_m=[0.8, 0.0, 0.0]",),
-    "0.90 m in place of 0.85 m": ("chasers.0.start_offset_m=[0.9, 0.0, 0.0]",),
-    "on the reference, at rest": (
-        "chasers.0.start_offset_m=[0.0, 0.0, 0.0]",
-        "chasers.0.start_rotation_rad=[0.0, 0.0, 0.0]",
-    ),
-}
-
-
-SOLVERS = ("rti", "ipopt", "open")
-"""Whose solve time is measured: ours, one that converges, and the paper's."""
-DELAYS_S = (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)
-DELAYED_HORIZONS_S = (0.5, 3.0, 10.0)
-TIMED_HORIZONS_S = (3.0, 10.0)
-
-
-def studies(quick: bool, scenario: str, duration_s: float) -> tuple[StudyCase, ...]:
-    """Return the flights of the scenario file ``scenario`` on perfect knowledge; a quick plan omits most of our default."""
-    length = f"duration_s={duration_s}"
-    out: list[StudyCase] = []
+def _explanations(scenario: str, length: str) -> list[StudyCase]:
+    """Return the flights of the paper's controller alone, on perfect knowledge from the nominal start, and lower bounds."""
+    out = []
 
     def add(name: str, *overrides: str, floor: bool = False, delay_s: float | None = None) -> None:
         sets = (*overrides, length)
         out.append(StudyCase(name=name, scenario=scenario, overrides=sets, floor=floor, delay_s=delay_s))
 
-    for column, settings in COLUMNS.items():
-        for row in ROWS:
-            if quick and column == "default" and row.name != "baseline":
-                continue
-            for draw in DRAWS:
-                # One lower bound per start: the row affects it only through the rotation of the chaser.
-                floor = row.name == "baseline" and column == "paper"
-                name = f"{table_group(column, row.name)}/{draw}"
-                add(name, *row.overrides, *settings, *dispersed_start(draw), floor=floor)
-    for name, changed in _STARTS.items():
-        add(f"start/{name}", *changed, floor=True)
-    for name, changed in _INGREDIENTS.items():
-        # Other solvers take ten to a hundred times as long: they fly the transient only.
-        short = ("duration_s=30.0",) if "controller.solver" in changed[0] else ()
-        case = StudyCase(name=f"ingredient/{name}", scenario=scenario, overrides=(*changed, length, *short))
-        out.append(case)
-    for horizon_s in DELAYED_HORIZONS_S:
-        for delay_s in DELAYS_S:
-            changed = f"controller.horizon_s={horizon_s}"
-            add(f"delay/{horizon_s:g}/{delay_s:g}", changed, delay_s=delay_s)
-    for horizon_s in TIMED_HORIZONS_S:
-        for solver in SOLVERS:
-            sets = (f"controller.horizon_s={horizon_s}", f"controller.solver='{solver}'", "duration_s=30.0")
-            name = f"measured/{horizon_s:g}/{solver}"
-            out.append(StudyCase(name=name, scenario=scenario, overrides=sets, delay_measured=True))
-    return tuple(out)
+    for draw in DRAWS:
+        add(floor_name(draw), *dispersed_start(draw), floor=True)
+    for row in ROWS:
+        add(f"alone/{row.name}", *row.overrides, OPEN, floor=row == BASELINE)
+        if row.name in STAGE_WEIGHTS:
+            add(f"weights/{row.name}", *row.overrides, *_stage_weights(STAGE_WEIGHTS[row.name]), OPEN)
+        for delay_s in DELAYS_S.get(row.name, ()):
+            add(f"delay/{row.name}/{delay_s:g}", *row.overrides, OPEN, delay_s=delay_s)
+    for name, start in STARTS.items():
+        add(f"start/{name}", start, OPEN)
+    return out
+
+
+TRACKING = "two-chaser-tracking"
+MISSIONS = (TRACKING, "four-chaser-docking", "collision-avoidance")
+_PAPER_SETTINGS = (
+    "navigation.grade='exact'",
+    "time.latency_s=0.0",
+    "time.rate_hz=30",
+    "time.image_hz=30",
+    "camera.width_px=1280",
+    "camera.height_px=720",
+    "controller.integrator='euler'",
+    "controller.feed_forward=false",
+)
+
+
+def _missions() -> list[Mission]:
+    """Return the paper's missions of several chasers: ours as shipped; EPnP only where the paper reports a spike."""
+    out = [Mission(TRACKING, WRITTEN, (*_PAPER_SETTINGS, *COLUMNS[WRITTEN]))]
+    for scenario in MISSIONS:
+        out.append(Mission(scenario, CODE, (*_PAPER_SETTINGS, *COLUMNS[CODE])))
+        out.append(Mission(scenario, DEFAULT))
+    return out
 
 
 def make_plan(quick: bool, scenario: str) -> ReproductionPlan:
-    """Return the whole plan; ``scenario`` is the path of ``paper-single``."""
+    """Return the whole plan; ``scenario`` is the path of ``paper-single``. A quick plan has one short flight per row."""
     duration_s = QUICK_S if quick else PAPER_S
-    return ReproductionPlan(
-        quick, duration_s, missions(quick, duration_s), studies(quick, scenario, duration_s)
-    )
+    length = f"duration_s={duration_s}"
+    cases = (*_explanations(scenario, length), *_table(quick, scenario, length))
+    return ReproductionPlan(quick, duration_s, cases, () if quick else tuple(_missions()))

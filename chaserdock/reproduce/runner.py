@@ -1,31 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Execution of a plan: missions as runs of a campaign, studies by ``chaserdock study``. Finished work is kept."""
+"""Execution of a plan: every flight in this process, one after the other. Each result is kept at once as a line of JSON."""
 
 from __future__ import annotations
 
 import hashlib
-import os
-import subprocess
-import sys
+import math
+import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
-from chaserdock_protocol.process import SINGLE_THREADED
-from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.shipped_scenarios import ScenarioNotFound, find_scenario
+import numpy as np
+from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.recording.scan import LOG_NAME
+from chaserdock_protocol.shipped_scenarios import find_scenario
+from msgspec import Struct
 
-from chaserdock.campaign.plan import Campaign, Run, make_run
-from chaserdock.campaign.scheduler import CampaignProgress
-from chaserdock.campaign.table import rows_of, write_table
-from chaserdock.campaign.worker import CampaignError, FinishedRun, fly_campaign, read_result, result_path
-from chaserdock.evaluation.study_cases import StudyCase, StudyResult, line_of, read_lines
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import estimate_errors, summary_of
+from chaserdock.evaluation.study import fly_case
+from chaserdock.evaluation.study_cases import StudyResult, line_of, read_lines
+from chaserdock.simulation.mission import simulate
 
-from .plan import SCENARIO, Mission, ReproductionPlan
+from .plan import Mission, ReproductionPlan
 
 _PACKAGES = (
     "chaserdock",
@@ -35,165 +36,142 @@ _PACKAGES = (
     "chaserdock_protocol",
     "chaserdock_world",
 )
-_POLL_S = 0.5
+
+
+class ReproductionError(ChaserdockError):
+    """A flight of the reproduction did not end."""
+
+
+class MissionResult(Struct, frozen=True, kw_only=True):
+    """Results of a mission, on ground truth. Steady RMS: of the worst chaser, None without a steady interval.
+
+    ``dock_time_s``, ``reached_time_s``: by chaser. ``estimate_rms_rad``, ``estimate_max_rad``, ``estimate_max_at_s``: attitude
+    error of the target estimate after settling, and the time of its maximum; None without an estimate.
+    """
+
+    mission: Mission
+    steady_position_rms_m: float | None
+    steady_orientation_rms_rad: float | None
+    min_distance_target_m: float
+    min_distance_chasers_m: float | None
+    dock_time_s: dict[str, float]
+    reached_time_s: dict[str, float]
+    estimate_rms_rad: float | None
+    estimate_max_rad: float | None
+    estimate_max_at_s: float | None
 
 
 @dataclass(frozen=True)
 class ReproductionResults:
-    """Summaries of missions by name, results of studies by name."""
+    """Results by name of the case or mission."""
 
-    missions: dict[str, dict[str, Any]]
-    studies: dict[str, StudyResult]
+    cases: dict[str, StudyResult]
+    missions: dict[str, MissionResult]
 
 
 @cache
 def code_digest() -> str:
-    """Return a digest of the code that flies, so that results of another version are not reused."""
+    """Return a digest of the code that flies and of its scenarios, so that results of another version are not reused."""
     digest = hashlib.sha256()
     own = Path(__file__).resolve().parent
     for package in _PACKAGES:
         spec = find_spec(package)
         if spec is None or spec.origin is None:
-            raise CampaignError(
+            raise ReproductionError(
                 f"{package} is not installed; a reproduction needs all packages on this machine"
             )
         folder = Path(spec.origin).resolve().parent
         for path in sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c", ".h")):
             if path.parent != own:
                 digest.update(path.read_bytes())
-    digest.update(scenario_path(SCENARIO).read_bytes())  # the scenario of the studies
+    for path in sorted(find_scenario("paper-single").parent.glob("*.toml")):
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
 
 
-def scenario_path(name: str) -> Path:
-    """Return the path of a shipped scenario. Raise CampaignError if there is none of that name."""
-    try:
-        return find_scenario(name)
-    except ScenarioNotFound as error:
-        raise CampaignError(str(error)) from None
+def fly(plan: ReproductionPlan, folder: Path, stop: threading.Event, report: Callable[[str], None]) -> None:
+    """Fly what has no result in ``folder`` yet, until ``stop``. Raise ReproductionError, StudyError or ScenarioError."""
+    results = results_of(plan, folder)
+    cases = [c for c in plan.cases if c.name not in results.cases]
+    missions = [m for m in plan.missions if m.name not in results.missions]
+    total = len(plan.cases) + len(plan.missions)
+    done = total - len(cases) - len(missions)
+    for item in (*cases, *missions):
+        if stop.is_set():
+            return
+        done += 1
+        report(f"{done} of {total}: {item.name}")
+        if isinstance(item, Mission):
+            _append(_missions_file(folder), fly_mission(item))
+        else:
+            _append(_cases_file(folder), fly_case(item))
 
 
-def mission_run(mission: Mission, index: int = 0) -> tuple[Run, Scenario]:
-    """Return a mission as a campaign run, named after code and scenario, with the resolved scenario."""
-    varied = {"group": mission.group}
-    return make_run(
-        index, scenario_path(mission.scenario), mission.seed, varied, mission.overrides, code_digest()
+def fly_mission(mission: Mission) -> MissionResult:
+    """Simulate a mission and evaluate its log. Raise ReproductionError if a process of it crashed."""
+    with tempfile.TemporaryDirectory(prefix="chaserdock-reproduce-") as place:
+        folder = Path(place) / "run"
+        flight = simulate(find_scenario(mission.scenario), folder, mission.overrides)
+        for name, error in flight.crashes.items():
+            raise ReproductionError(f"{mission.name}: {name} crashed: {error.strip().splitlines()[-1]}")
+        recorded = load_flight(folder / LOG_NAME)
+    summary, errors = summary_of(recorded), estimate_errors(recorded)
+    chasers = summary["chasers"]
+    late = errors["time_s"] >= recorded.scenario.settling_s
+    angle, time_s = errors["orientation_rad"][late], errors["time_s"][late]
+    return MissionResult(
+        mission=mission,
+        steady_position_rms_m=_worst(c["steady"]["position_mse_m2"] for c in chasers.values()),
+        steady_orientation_rms_rad=_worst(c["steady"]["orientation_mse_rad2"] for c in chasers.values()),
+        min_distance_target_m=min(c["min_distance_target_m"] for c in chasers.values()),
+        min_distance_chasers_m=summary["min_distance_chasers_m"],
+        dock_time_s={i: c["dock_time_s"] for i, c in chasers.items() if c["docked"]},
+        reached_time_s={
+            i: c["reached_time_s"] for i, c in chasers.items() if c["reached_time_s"] is not None
+        },
+        estimate_rms_rad=float(np.sqrt(np.mean(angle**2))) if len(angle) else None,
+        estimate_max_rad=float(angle.max()) if len(angle) else None,
+        estimate_max_at_s=float(time_s[angle.argmax()]) if len(angle) else None,
     )
 
 
-def fly_missions(
-    missions: tuple[Mission, ...], folder: Path, jobs: int, keep_logs: bool, stop: threading.Event
-) -> None:
-    """Fly the missions without a result; write all finished ones to ``results.parquet``.
-
-    Raise CampaignError when a mission ended without a summary; it is flown again by the next call.
-    """
-    runs = [mission_run(m, index) for index, m in enumerate(missions)]
-    # Longest first, so that no core idles at the end.
-    runs.sort(key=lambda run: -_effort(run[1]))
-    campaign = Campaign("reproduction", ("group",), tuple(run for run, _ in runs))
-    keep = "all" if keep_logs else "none"
-    finished = fly_campaign(campaign, folder, keep, jobs, None, CampaignProgress(), stop)
-    crashed = [(run, result) for run, result in finished if result.summary is None]
-    for run, _ in crashed:
-        result_path(folder, run).unlink()
-    if crashed:
-        raise CampaignError("\n".join(f"{run.varied['group']}: {r.last_words}" for run, r in crashed))
-    if finished:
-        write_table(rows_of(sorted(finished, key=_plan_order)), folder / "results.parquet")
-
-
-def _plan_order(item: tuple[Run, FinishedRun]) -> int:
-    return item[0].index
-
-
-def _effort(scenario: Scenario) -> float:
-    return scenario.duration_s * scenario.time.image_hz * len(scenario.chasers)
+def _worst(mean_squares: Iterator[float | None]) -> float | None:
+    """Return the largest root of mean squares; None if one is missing."""
+    known = [math.sqrt(math.inf if x is None else x) for x in mean_squares]
+    return None if math.inf in known else max(known)
 
 
 def results_of(plan: ReproductionPlan, folder: Path) -> ReproductionResults:
-    """Return what is finished of ``plan``, in the plan's order."""
-    missions = {}
-    for mission in plan.missions:
-        result = read_result(folder, mission_run(mission)[0])
-        if result is not None and result.summary is not None:
-            missions[mission.name] = result.summary
-    finished = _finished_studies(folder)
-    studies = {case.name: finished[case] for case in plan.studies if case in finished}
-    return ReproductionResults(missions, studies)
+    """Return what is finished of ``plan`` with this code; a result of the same name with other settings does not count."""
+    cases = {r.case: r for r in _read(_cases_file(folder), StudyResult)}
+    missions = {r.mission: r for r in _read(_missions_file(folder), MissionResult)}
+    return ReproductionResults(
+        {c.name: cases[c] for c in plan.cases if c in cases},
+        {m.name: missions[m] for m in plan.missions if m in missions},
+    )
 
 
-# -- studies ----------------------------------------------------------------------------------------------
+def _cases_file(folder: Path) -> Path:
+    return folder / f"flights-{code_digest()}.jsonl"
 
 
-def fly_studies(
-    cases: tuple[StudyCase, ...],
-    folder: Path,
-    jobs: int,
-    stop: threading.Event,
-    report: Callable[[str], None],
-) -> None:
-    """Fly the cases without a result in ``jobs`` processes. Raise CampaignError when one of them fails."""
-    remaining = open_cases(cases, folder)
-    if not remaining:
-        return
-    report(f"{len(remaining)} studies to fly, {len(cases) - len(remaining)} are finished")
-    place = _studies_folder(folder)
-    place.mkdir(parents=True, exist_ok=True)
-    processes = []
-    for k in range(min(jobs, len(remaining))):
-        path = place / f"cases-{k}.jsonl"
-        path.write_text("".join(map(line_of, remaining[k::jobs])), encoding="utf-8")
-        command = [sys.executable, "-m", "chaserdock", "study", str(path), "--out"]
-        processes.append(
-            subprocess.Popen(
-                [*command, str(place / f"{code_digest()}-{k}.jsonl")],
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                env={**os.environ, **SINGLE_THREADED},
-                start_new_session=True,
-            )
-        )
-    errors = [_output_of(process, stop) for process in processes]
-    missing = open_cases(cases, folder)
-    if missing and not stop.is_set():
-        raise CampaignError(f"studies: {missing[0].name} has no result: {'; '.join(filter(None, errors))}")
+def _missions_file(folder: Path) -> Path:
+    return folder / f"missions-{code_digest()}.jsonl"
 
 
-def _output_of(process: subprocess.Popen[str], stop: threading.Event) -> str:
-    """Wait for a process, or terminate it after ``stop``; return its last line on standard error."""
-    while True:
-        try:
-            _, errors = process.communicate(timeout=_POLL_S)
-        except subprocess.TimeoutExpired:
-            if stop.is_set():
-                process.terminate()
-            continue
-        return (errors.strip().splitlines() or [""])[-1]
+def _append(path: Path, result: StudyResult | MissionResult) -> None:
+    with path.open("a", encoding="utf-8") as file:
+        file.write(line_of(result))
 
 
-def open_cases(cases: tuple[StudyCase, ...], folder: Path) -> list[StudyCase]:
-    """Return the cases without a result of this code; a result of the same name with other overrides does not count."""
-    finished = _finished_studies(folder)
-    return [case for case in cases if case not in finished]
+_Kind = TypeVar("_Kind", bound=Struct)
 
 
-def _studies_folder(folder: Path) -> Path:
-    return folder / "studies"
-
-
-def _finished_studies(folder: Path) -> dict[StudyCase, StudyResult]:
-    """Return the results of this code. No study may be running."""
-    results: dict[StudyCase, StudyResult] = {}
-    for path in sorted(_studies_folder(folder).glob(f"{code_digest()}-*.jsonl")):
-        _drop_incomplete_line(path)
-        results |= {r.case: r for r in read_lines(path, StudyResult)}
-    return results
-
-
-def _drop_incomplete_line(path: Path) -> None:
-    """Remove the last line of an interrupted study, so that the file can be read and appended to."""
+def _read(path: Path, kind: type[_Kind]) -> list[_Kind]:
+    """Return the lines of a file, none if it does not exist. Drop the last line of an interrupted flight."""
+    if not path.exists():
+        return []
     text = path.read_text(encoding="utf-8")
     if text and not text.endswith("\n"):
         path.write_text(text[: text.rfind("\n") + 1], encoding="utf-8")
+    return read_lines(path, kind)

@@ -138,7 +138,6 @@ INVALID = [
     ("campaign nowhere.toml", "nowhere.toml"),
     ("campaign nowhere.toml --jobs 0", "--jobs"),
     ("campaign nowhere.toml --only 0 --jobs 2", "--only flies one run"),
-    ("reproduce --jobs 65", "--jobs"),
     ("study nowhere.jsonl --out {tmp}/results", "nowhere.jsonl: no such file"),
     ("check controller nowhere -- true", "nowhere"),
     ("check controller {golden} --timeout nan -- true", "--timeout"),

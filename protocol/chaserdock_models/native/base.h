@@ -5,6 +5,10 @@
  * (-ffp-contract=off, no fast-math), the source fixes the order of every sum, and vectors are four wide on every
  * processor. Only operations that IEEE 754 defines exactly are used: + - * / and the square root. Fused multiply-add
  * is exact as well, but it gained 15 % with hardware support and cost a factor of twenty without.
+ *
+ * Counts, indices and array sizes must be right; a floating-point argument may be anything. Whatever it is, a kernel stays
+ * within its arrays, converts no number to an integer that cannot hold it, and ends. NaN passes through arithmetic to the
+ * result; a kernel that decides counts it as a failure, and says so in its comment.
  */
 #ifndef CHASERDOCK_BASE_H
 #define CHASERDOCK_BASE_H
@@ -24,6 +28,15 @@ static inline v4 load(const double *a) { return *(const v4 *)a; }
 static inline void store(double *a, v4 v) { *(v4 *)a = v; }
 static inline v4 splat(double s) { return (v4){s, s, s, s}; }
 static inline v4 madd4(v4 a, v4 b, v4 c) { return a * b + c; }
+/* Larger element of each pair; of a number and NaN, the number. */
+#if defined(__clang__)
+static inline v4 max4(v4 a, v4 b) { return __builtin_elementwise_max(a, b); }
+#else /* GCC, for the sanitizers */
+static inline v4 max4(v4 a, v4 b) {
+    for (int i = 0; i < 4; i++) a[i] = a[i] < b[i] || a[i] != a[i] ? b[i] : a[i];
+    return a;
+}
+#endif
 static inline double madd(double a, double b, double c) { return a * b + c; }
 static inline double sqrt_of(double a) { return __builtin_sqrt(a); }
 static inline double min_of(double a, double b) { return a < b ? a : b; }
@@ -31,11 +44,19 @@ static inline double max_of(double a, double b) { return a > b ? a : b; }
 static inline double abs_of(double a) { return __builtin_fabs(a); }
 static inline int finite(double a) { return abs_of(a) <= 1.7976931348623157e308; }
 
+/* The larger value; NaN if either is. */
+static inline double max_or_nan(double a, double b) { return b <= a || a != a ? a : b; }
+
 static inline void zero(double *a, int64_t n) {
     for (int64_t i = 0; i < n; i++) a[i] = 0.0;
 }
 static inline void copy(const double *a, double *out, int64_t n) {
     for (int64_t i = 0; i < n; i++) out[i] = a[i];
+}
+static inline int all_finite(const double *a, int64_t n) {
+    for (int64_t i = 0; i < n; i++)
+        if (!finite(a[i])) return 0;
+    return 1;
 }
 
 /* Dot product of two rows (12). */

@@ -233,8 +233,8 @@ static double newton_step(const Qp *qp, Iterate *it) {
         v4 change_mul = -(madd4(mul, change, load(it->res + j))) * inverse;
         store(it->d_mul + j, change_mul);
         /* the padding has a multiplier of zero */
-        v4 of_mul = -change_mul / __builtin_elementwise_max(mul, splat(1e-300));
-        steepest = __builtin_elementwise_max(steepest, __builtin_elementwise_max(-change * inverse, of_mul));
+        v4 of_mul = -change_mul / max4(mul, splat(1e-300));
+        steepest = max4(steepest, max4(-change * inverse, of_mul));
     }
     return 1.0 / max_of(max_of(steepest[0], steepest[1]), max_of(steepest[2], steepest[3]));
 }
@@ -295,8 +295,8 @@ static void expand_multipliers(const Qp *qp, const Iterate *it, double *mul) {
 }
 
 /* |w_bar + dw| <= 1 always holds, for FREE within FREE_TOLERANCE. With CONVERGED and LIMIT the point
- * lies strictly within the box; with LIMIT it is the best of max_iterations. Working memory: `ipm_workspace`
- * doubles, and R more. */
+ * lies strictly within the box; with LIMIT it is the best of max_iterations. BROKEN: the solution would not be finite.
+ * Working memory: `ipm_workspace` doubles, and R more. */
 static int solve_one(const Qp *qp, Answer *answer, double *work) {
     const int64_t inputs = 6 * qp->stages;
     double *active = allocate(&work, qp->n_rows);

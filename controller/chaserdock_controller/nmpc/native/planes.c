@@ -165,7 +165,7 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
 }
 
 /* Write the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
- * at least D (N + 2). None at stage 0. */
+ * at least D (N + 2). None at stage 0, and none whose distance is NaN. */
 EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *rows) {
     for (int64_t i = 0; i < zones->n; i++) rows->n_rows[i] = 0;
     for (int64_t i = 0; i < zones->n; i++) {
@@ -177,7 +177,7 @@ EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *ro
 }
 
 /* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if none. All stages 0..D
- * count, without margin. */
+ * count, without margin; NaN if a position is. */
 EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *worst) {
     const int64_t nodes = zones->stages + 1;
     double r[3], n[3];
@@ -187,17 +187,17 @@ EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *wo
         for (int64_t k = 0; k < nodes; k++, at += 13) {
             const double *corridor = zones->corridors + 5 * (nodes * i + k);
             subtract3(at, zones->references + 7 * (nodes * i + k), r);
-            worst[i] = max_of(worst[i], sqrt_of(dot3(r, r)) - zones->outer);
+            worst[i] = max_or_nan(worst[i], sqrt_of(dot3(r, r)) - zones->outer);
             subtract3(at, zones->targets + 3 * k, r);
-            if (dot3(corridor, corridor) > 0.0) worst[i] = max_of(worst[i], -corridor_room(r, corridor, n));
-            worst[i] = max_of(worst[i], zones->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
+            if (dot3(corridor, corridor) > 0.0) worst[i] = max_or_nan(worst[i], -corridor_room(r, corridor, n));
+            worst[i] = max_or_nan(worst[i], zones->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
             for (int64_t j = i + 1; j < zones->n; j++) {
                 const double d = zones->between[i * zones->n + j];
                 subtract3(at, x + 13 * (nodes * j + k), r);
                 double square = dot3(r, r);
                 if (square >= d * d) continue;
-                worst[i] = max_of(worst[i], d - sqrt_of(square));
-                worst[j] = max_of(worst[j], d - sqrt_of(square));
+                worst[i] = max_or_nan(worst[i], d - sqrt_of(square));
+                worst[j] = max_or_nan(worst[j], d - sqrt_of(square));
             }
         }
     }

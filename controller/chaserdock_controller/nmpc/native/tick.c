@@ -6,7 +6,8 @@
 
 /* inputs (N, D, 6): initial plan, replaced by the solution; states (N, 13), limits (N, 6); reach (D+1,): displacement by
  * each stage for 1 N on each axis, m; w1 (N,): slack weights. `budget`: total iterations; each chaser may use an even
- * share of the remaining ones, at most MAX_ITERATIONS. code and iterations (N,) are outputs. */
+ * share of the remaining ones, at most MAX_ITERATIONS. code and iterations (N,) are outputs; a chaser whose inputs would
+ * not be finite keeps those given, with code BROKEN. */
 typedef struct {
     const Model *model;
     const Weights *weights;
@@ -59,7 +60,7 @@ EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
         tick->iterations[i] = answer.iterations;
         left -= answer.iterations;
         for (int64_t m = 0; m < 6 * d; m++)
-            if (!finite(answer.dw[m])) tick->code[i] = BROKEN;
+            if (!finite(answer.dw[m] * limits[m % 6])) tick->code[i] = BROKEN;
         if (tick->code[i] == BROKEN) continue;
         for (int64_t m = 0; m < 6 * d; m++) u[m] = min_of(max_of(w_bar[m] + answer.dw[m], -1.0), 1.0) * limits[m % 6];
     }

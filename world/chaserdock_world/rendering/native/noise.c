@@ -31,7 +31,7 @@ static inline uint8_t noisy(uint8_t level, float deviation, int16_t white) {
 /* out = image + noise, rounded and limited to 0..255. ``image`` and ``out`` (rows, columns) may be the same array; ``bank``:
  * white noise in fixed point with row stride ``stride``; ``sigma`` (256): standard deviation by grey level, in fixed point;
  * ``scale``: grey levels per unit of their product, a power of two with the noise's sign, so that the order of the products
- * does not change the result. */
+ * does not change the result; NaN gives any level. */
 EXPORT void NAME(add_noise)(const uint8_t *image, const int16_t *bank, int64_t stride, const int16_t *sigma, double scale,
                            int64_t rows, int64_t columns, uint8_t *out) {
     float by_level[256];

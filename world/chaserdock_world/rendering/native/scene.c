@@ -86,7 +86,7 @@ static int reaches(const Frustum *f, const double *centre, double radius) {
 
 /* Find the visible boxes and faces, in the order of boxes and sides; ``counts``: number of boxes and of faces. ``camera``
  * (7): position and attitude IRF to WRF; ``poses`` (bodies, 7): of the bodies, body to WRF; ``sides`` (6, 3, 3): right, up and
- * normal of a box's sides as columns. ``faces`` holds six faces per shape. */
+ * normal of a box's sides as columns. ``faces`` holds six faces per shape. A box at NaN is not visible. */
 EXPORT void NAME(visible_faces)(const Frustum *f, const double *camera, const double *poses, int64_t shapes, const Shape *shape,
                            const double *sides, VisibleBox *boxes, Face *faces, int64_t *counts) {
     double inverse[4] = {camera[3], -camera[4], -camera[5], -camera[6]}, to_irf[9];
@@ -192,7 +192,8 @@ static int apart(const VisibleBox *a, const VisibleBox *b) {
 }
 
 /* Determine the painting order: every box after those that it occludes. Boxes that occlude one another cyclically (long thin
- * ones can) have no such order; the farthest is painted first. ``occluded`` (n, n) is working memory. */
+ * ones can) have no such order; the farthest is painted first. Boxes at NaN come anywhere. ``occluded`` (n, n) is working
+ * memory. */
 EXPORT void NAME(paint_order)(int64_t n, const VisibleBox *boxes, uint8_t *occluded, int64_t *order) {
     for (int64_t i = 0; i < n * n; i++) occluded[i] = 0;
     for (int64_t i = 0; i < n; i++)
@@ -226,7 +227,7 @@ EXPORT void NAME(paint_order)(int64_t n, const VisibleBox *boxes, uint8_t *occlu
 }
 
 /* Place a face's texture on a patch of the canvas with ``samples`` per pixel from pixel ``x0``, ``y0`` on; return 0 if the
- * region is empty. Output: the region of the patch (low x, y, high x, y), how often the texture's width and height are halved,
+ * region is empty or the homography is not finite. Output: the region of the patch (low x, y, high x, y), how often the texture's width and height are halved,
  * so that a texel is about a sample at the centre of the outline, and the homography (3, 3) from a sample of the region to
  * texels. ``patch``: width, height; ``finest``: columns and rows of the finest texture, ``texel_m`` wide. */
 EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double samples, double x0, double y0,
@@ -286,17 +287,17 @@ EXPORT int64_t NAME(place_texture)(const Frustum *f, const Face *face, double sa
     cross3(m + 6, m, rows_of + 3);
     cross3(m, m + 3, rows_of + 6);
     det = dot3(m, rows_of);
-    if (!(abs_of(det) > 0.0)) return 0;
+    if (!(abs_of(det) > 0.0)) return 0; /* singular, or not a number */
     for (int i = 0; i < 9; i++) {
         matrix[i] = rows_of[i] / det;
         largest = max_of(largest, abs_of(matrix[i]));
     }
     for (int i = 0; i < 9; i++) matrix[i] /= largest;
-    return 1;
+    return all_finite(matrix, 9);
 }
 
 /* Draw stars in ``directions`` (count, 3) of IRF, each one pixel of its level, on a canvas (height, width), except those
- * within 0.1 of the camera's plane. ``lens``: fx, fy, cx, cy, the canvas' first pixel. */
+ * within 0.1 of the camera's plane or at NaN. ``lens``: fx, fy, cx, cy, the canvas' first pixel. */
 EXPORT void NAME(draw_stars)(const double *directions, const uint8_t *levels, int64_t count, const double *lens, int64_t width,
                             int64_t height, uint8_t *canvas) {
     for (int64_t i = 0; i < count; i++) {

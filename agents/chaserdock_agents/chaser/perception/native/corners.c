@@ -254,8 +254,8 @@ static double strip_shift(const Image *p, const Settings *set, const Side *side,
 }
 
 /* Refines corners (n, 4, 2), ideal pixels, in place. `good` (n): whether all four sides are usable; otherwise the corners
- * are unchanged. `sigma` (n): uncertainty relative to that of a large marker. `margin` (n): width of the white border over
- * the marker's side. `cells`: cells along a side, including the black border. */
+ * are unchanged, as for corners that are not finite. `sigma` (n): uncertainty relative to that of a large marker. `margin`
+ * (n): width of the white border over the marker's side. `cells`: cells along a side, including the black border. */
 EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width, const double *lens, int64_t distorted,
                                 const Settings *set, double cells, int64_t n, const double *margin, double *corners,
                                 uint8_t *good, double *sigma) {

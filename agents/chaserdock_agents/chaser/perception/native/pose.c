@@ -61,8 +61,8 @@ static void turned_by(const double *phi, const double *rotation, double *out) {
     }
 }
 
-/* Move ``pose`` (position (3), rotation (3, 3), TRF to IRF) to the nearest minimum; return 0 if there is none. ``lens``: fx, fy, cx, cy;
- * ``points`` (n, 3) TRF, ``pixels`` (n, 2) ideal, ``weight`` (n, 2). */
+/* Move ``pose`` (position (3), rotation (3, 3), TRF to IRF) to the nearest minimum; return 0 if there is none
+ * of finite numbers. ``lens``: fx, fy, cx, cy; ``points`` (n, 3) TRF, ``pixels`` (n, 2) ideal, ``weight`` (n, 2). */
 EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const double *pixels, const double *weight,
                                 int64_t n, double *pose) {
     Normal now, then;
@@ -82,7 +82,7 @@ EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const
         /* An undamped step whose predicted gain is negligible is the last one and needs no check. */
         if (damping < 1e-3 && predicted <= MIN_PREDICTED_GAIN * now.cost + 1e-12) {
             copy(trial, pose, 12);
-            return 1;
+            break;
         }
         if (normal_of(lens, points, pixels, weight, n, trial, &then) && then.cost <= now.cost) {
             double gain = now.cost - then.cost;
@@ -95,5 +95,5 @@ EXPORT int64_t NAME(refine_pose)(const double *lens, const double *points, const
             if (damping > 1e9) break;
         }
     }
-    return 1;
+    return all_finite(pose, 12);
 }

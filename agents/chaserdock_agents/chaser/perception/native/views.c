@@ -9,7 +9,8 @@ static inline int project(const double *lens, const double *at, double *px) {
     return 1;
 }
 
-/* Squared distance (n), pixels, of points ``at`` (n, 3) in IRF from ``pixels`` (n, 2), ideal; NaN for points behind the camera. */
+/* Squared distance (n), pixels, of points ``at`` (n, 3) in IRF from ``pixels`` (n, 2), ideal; NaN for points behind the
+ * camera or at NaN. */
 EXPORT void NAME(squared_errors)(const double *lens, const double *at, const double *pixels, int64_t n, double *square) {
     for (int64_t i = 0; i < n; i++) {
         double px[2];
@@ -21,7 +22,7 @@ EXPORT void NAME(squared_errors)(const double *lens, const double *at, const dou
 }
 
 /* Largest distance (n), pixels, of each marker's corners from ``pixels`` (n, 4, 2), ideal; infinite for a marker behind the
- * camera or facing away. ``at`` (n, 4, 3): corners in IRF, m; ``outwards`` (n, 3): normals in IRF. */
+ * camera, facing away or at NaN. ``at`` (n, 4, 3): corners in IRF, m; ``outwards`` (n, 3): normals in IRF. */
 EXPORT void NAME(marker_errors)(const double *lens, const double *at, const double *pixels, const double *outwards, int64_t n,
                                double *error) {
     for (int64_t m = 0; m < n; m++) {

@@ -1,0 +1,115 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Fuzz targets of agents/chaserdock_agents/chaser/perception/native. */
+#include "fuzz.h"
+#include "kernels.c"
+
+static double *lens_of_camera(void) {
+    double *lens = outputs(4);
+    for (int i = 0; i < 2; i++) lens[i] = value(50.0, 900.0), lens[2 + i] = value(0.0, 640.0);
+    return lens;
+}
+
+/* An image with a bright quadrilateral, or noise. */
+static uint8_t *image_of(int64_t height, int64_t width) {
+    uint8_t *image = bytes(height * width);
+    if (chance(0.3)) return image;
+    const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height), slope = uniform(-1.0, 1.0);
+    for (int64_t i = 0; i < height * width; i++) {
+        double column = (double)(i % width), row = (double)(i / width);
+        image[i] = column + slope * row > x && row - slope * column > y ? 230 : 20;
+    }
+    return image;
+}
+
+static Settings settings(void) {
+    Settings s = {0};
+    s.first = uniform(0.0, 0.4), s.last = uniform(0.6, 1.0);
+    s.reach_cells = uniform(0.1, 1.0), s.reach_least_px = uniform(0.5, 2.0);
+    s.min_contrast = uniform(0.0, 20.0), s.min_rows_share = uniform(0.0, 1.0), s.max_move_px = uniform(0.5, 8.0);
+    s.strip_px = uniform(0.0, 20.0), s.log_edge_sigma = uniform(-1.0, 1.0), s.edge_sigma_spread = uniform(0.05, 0.5);
+    s.strip_beyond_px = uniform(0.1, 2.0), s.uncertain_px = uniform(0.5, 4.0);
+    for (int pass = 0; pass < 2; pass++) {
+        s.rows[pass] = (double)whole(2, ROWS_MOST), s.taps[pass] = (double)whole(2, TAPS_MOST);
+        s.reach_px[pass] = uniform(1.0, 5.0), s.reweighted[pass] = (double)whole(0, 3);
+    }
+    s.strip_rows = (double)whole(2, ROWS_MOST), s.strip_taps = (double)whole(2, TAPS_MOST), s.strip_steps = (double)whole(0, 4);
+    return s;
+}
+
+static void refine_corners(void) {
+    static const double around[8] = {-1.0, -1.0, 1.0, -1.0, 1.0, 1.0, -1.0, 1.0};
+    const int64_t height = whole(2, 40), width = whole(2, 40), n = whole(0, 2);
+    const uint8_t *image = image_of(height, width);
+    double *lens = doubles(9, -0.2, 0.2), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n), *sigma = outputs(n);
+    uint8_t *good = bytes(n);
+    Settings set = settings();
+    for (int i = 0; i < 2; i++) lens[i] = value(20.0, 60.0), lens[2 + i] = value(0.0, 40.0);
+    for (int64_t m = 0; m < n; m++) {
+        const double x = uniform(0.0, (double)width), y = uniform(0.0, (double)height), half = uniform(1.0, 15.0);
+        for (int i = 0; i < 8; i++)
+            corners[8 * m + i] = chance(special_share) ? special() : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
+    }
+    double *given = copy_of(corners, 8 * n);
+    NAME(refine_corners)(image, height, width, lens, whole(0, 1), &set, (double)whole(3, 9), n, margin, corners, good, sigma);
+    for (int64_t m = 0; m < n; m++) {
+        CHECK(good[m] <= 1 && sigma[m] >= 1.0 && finite(sigma[m]));
+        if (good[m]) CHECK(all_finite(corners + 8 * m, 8) && all_finite(given + 8 * m, 8));
+        else CHECK(same_bits(corners + 8 * m, given + 8 * m, 8));
+    }
+}
+
+static void refine_pose(void) {
+    const int64_t n = whole(0, 8);
+    double *lens = lens_of_camera(), *points = doubles(3 * n, -0.3, 0.3), *pixels = doubles(2 * n, 0.0, 640.0);
+    double *weight = doubles(2 * n, 0.0, 2.0), *pose = doubles(12, -1.0, 1.0);
+    pose[2] = value(0.2, 3.0);
+    if (chance(0.5)) /* near a solution */
+        for (int64_t i = 0; i < n; i++) {
+            double at[3];
+            multiply3(pose + 3, points + 3 * i, at);
+            for (int k = 0; k < 2; k++)
+                pixels[2 * i + k] = lens[k] * (at[k] + pose[k]) / (at[2] + pose[2]) + lens[2 + k] + value(-1.0, 1.0);
+        }
+    int64_t found = NAME(refine_pose)(lens, points, pixels, weight, n, pose);
+    CHECK(found == 0 || found == 1);
+    if (found) CHECK(all_finite(pose, 12));
+}
+
+static void squared_errors(void) {
+    const int64_t n = whole(0, 9);
+    double *lens = lens_of_camera(), *at = doubles(3 * n, -1.0, 3.0), *pixels = doubles(2 * n, 0.0, 640.0), *square = outputs(n);
+    NAME(squared_errors)(lens, at, pixels, n, square);
+    for (int64_t i = 0; i < n; i++) {
+        CHECK(square[i] >= 0.0 || square[i] != square[i]);
+        if (!(at[3 * i + 2] > 0.0)) CHECK(square[i] != square[i]);
+    }
+}
+
+static void marker_errors(void) {
+    const int64_t n = whole(0, 5);
+    double *lens = lens_of_camera(), *at = doubles(12 * n, -1.0, 3.0), *pixels = doubles(8 * n, 0.0, 640.0);
+    double *outwards = doubles(3 * n, -1.0, 0.2), *error = outputs(n);
+    NAME(marker_errors)(lens, at, pixels, outwards, n, error);
+    for (int64_t i = 0; i < n; i++) {
+        CHECK(error[i] >= 0.0);
+        if (any_nan(at + 12 * i, 12) || any_nan(outwards + 3 * i, 3) || any_nan(pixels + 8 * i, 8)) CHECK(!finite(error[i]));
+    }
+}
+
+static void count_visible_markers(void) {
+    const int64_t markers = whole(1, 6), row = whole(0, markers - 1);
+    double *lens = lens_of_camera(), *frame = doubles(3, 0.0, 640.0), *surface = doubles(18 * markers, -1.0, 1.0);
+    double *position = doubles(3, -0.5, 3.0), *size = outputs(markers), *cosine = outputs(markers);
+    int64_t count = NAME(count_visible_markers)(lens, frame, surface, position, markers, row, size, cosine);
+    CHECK(0 <= count && count < markers);
+    if (size[row] != size[row]) CHECK(count == 0); /* it is behind the camera, or at NaN */
+}
+
+static const Target TARGETS[] = {
+    {"refine_corners", refine_corners},
+    {"refine_pose", refine_pose},
+    {"squared_errors", squared_errors},
+    {"marker_errors", marker_errors},
+    {"count_visible_markers", count_visible_markers},
+};
+FUZZ_MAIN(TARGETS)

@@ -31,9 +31,13 @@ class Deviation(msgspec.Struct):
 
 
 class RunComparison(msgspec.Struct):
-    """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target estimate`` is the fused one."""
+    """``summary``: keys whose values differ, both values. ``deviations``: by track; ``target estimate`` is the fused one.
+
+    ``blas``: the linear algebra library of each flight (recording.provenance.blas_in_use), empty in older logs.
+    """
 
     digests: tuple[str, str]
+    blas: tuple[str, str]
     first_difference: str | None
     summary: dict[str, tuple[Any, Any]]
     deviations: dict[str, Deviation]
@@ -61,6 +65,7 @@ def compare(first: Path, second: Path, tolerance: float = 0.0) -> RunComparison:
     topics = _messages(first, second, tolerance)
     return RunComparison(
         digests=(flights[0].digest, flights[1].digest),
+        blas=(flights[0].run.get("blas", ""), flights[1].run.get("blas", "")),
         first_difference=first_difference(topics),
         summary={k: (a.get(k), b.get(k)) for k in {**a, **b} if a.get(k) != b.get(k)},
         deviations=_deviations(*flights),
@@ -96,9 +101,13 @@ def _deviations(a: RecordedFlight, b: RecordedFlight) -> dict[str, Deviation]:
 
 def comparison_lines(result: RunComparison) -> list[str]:
     """Format the comparison as lines of text."""
+    one, other = result.blas
+    lines = []
+    if one and other and one != other:
+        lines = [f"different BLAS, whose results differ in the last bits: {one}; {other}"]
     if result.equal:
-        return [f"equal flights, digest {result.digests[0]}"]
-    lines = ["summary (first, second, second / first):"]
+        return [*lines, f"equal flights, digest {result.digests[0]}"]
+    lines += ["summary (first, second, second / first):"]
     for wall in (False, True):
         for key, (x, y) in sorted(result.summary.items()):
             if key.startswith(_WALL) != wall or not isinstance(x, int | float | None | bool | str):

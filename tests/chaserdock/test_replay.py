@@ -38,11 +38,11 @@ REPLAYS = [(GOLDEN, s) for s in STAGES] + [(FOLDER / "capture.mcap", s) for s in
 TOLERANCE = 1e-4
 
 
-def rewritten(source: Path, path: Path, change: Any = lambda record: record.message) -> Path:
+def rewritten(source: Path, path: Path, change: Any = lambda record: record.message, **run_data: str) -> Path:
     """A copy of a log, each message as ``change(record)`` has it; None leaves it out."""
     writer = LogWriter(path)
     scenario, run = read_scenario(source)
-    writer.describe(scenario, {k: v for k, v in run.items() if k in ("run_id", "mode")})
+    writer.describe(scenario, {k: v for k, v in run.items() if k in ("run_id", "mode")} | run_data)
     for record in read_log(source):
         message = change(record)
         if message is not None:
@@ -307,6 +307,17 @@ def test_equal_runs_compare_equal(tmp_path: Path) -> None:
     assert found.equal
     assert found.summary == {}
     assert comparison_lines(found) == [f"equal flights, digest {found.digests[0]}"]
+
+
+def test_compare_reports_different_blas_kernels(tmp_path: Path) -> None:
+    one, other = (rewritten(GOLDEN, tmp_path / name, blas=name) for name in ("a Haswell", "a SkylakeX"))
+    found = compare(one, other)
+    assert comparison_lines(found) == [
+        "different BLAS, whose results differ in the last bits: a Haswell; a SkylakeX",
+        f"equal flights, digest {found.digests[0]}",
+    ]
+    assert len(comparison_lines(compare(one, one))) == 1
+    assert len(comparison_lines(compare(one, GOLDEN))) == 1  # the golden log states none
 
 
 def test_compare_reports_deviations_of_bodies(tmp_path: Path) -> None:

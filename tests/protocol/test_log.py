@@ -6,6 +6,10 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import os
+import platform
+import re
+import subprocess
 import sys
 import time
 from importlib.metadata import version
@@ -16,7 +20,7 @@ import msgpack
 import pytest
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol import messages as m
-from chaserdock_protocol.recording import chunk_index, log
+from chaserdock_protocol.recording import chunk_index, log, provenance
 from chaserdock_protocol.recording.log import (
     LOCK_ATTACHMENT,
     SCENARIO_ATTACHMENT,
@@ -58,6 +62,18 @@ def test_what_is_written_is_read_in_order(tmp_path: Path) -> None:
     for r in records:
         assert r.topic.key_of(r.place) == r.key
         assert type(r.message) is r.topic.kind
+
+
+def test_a_log_states_the_blas_in_use(tmp_path: Path) -> None:
+    written(tmp_path / "a.mcap")
+    assert read_scenario(tmp_path / "a.mcap")[1]["blas"] == provenance.blas_in_use()
+    if not provenance.blas_in_use().startswith("openblas") or platform.machine() != "x86_64":
+        pytest.skip("only OpenBLAS on x86-64 has this processor type")
+    code = "from chaserdock_protocol.recording.provenance import blas_in_use; print(blas_in_use())"
+    environment = os.environ | {"OPENBLAS_CORETYPE": "Nehalem"}
+    command = [sys.executable, "-c", code]
+    stated = subprocess.run(command, env=environment, check=True, capture_output=True, text=True).stdout
+    assert re.fullmatch(r"openblas \d+\.\d+\.\S+ Nehalem\n", stated)
 
 
 def librarys_writer(stream: Any) -> Writer:

@@ -157,7 +157,7 @@ class LogWriter:
         return self._sink.size
 
     def describe(self, scenario_json: str, run: dict[str, str]) -> None:
-        """Write the resolved scenario, the run's data, the lock file and the package versions."""
+        """Write the resolved scenario, the run's data, the lock file, the package versions and the BLAS in use."""
         now = time.time_ns()
         attached = [
             (SCENARIO_ATTACHMENT, "application/json", scenario_json.encode()),
@@ -169,7 +169,9 @@ class LogWriter:
             for name, kind, data in attached:
                 if data is not None:
                     self._writer.add_attachment(now, now, name, kind, data)
-            self._writer.add_metadata(METADATA, with_checksum({**run, **versions}))
+            self._writer.add_metadata(
+                METADATA, with_checksum({"blas": provenance.blas_in_use(), **run, **versions})
+            )
 
     def note(self, name: str, data: dict[str, str]) -> None:
         """Write a metadata record."""

@@ -32,11 +32,11 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]], text: bool = False
 
     Cells are plain text or ``Markup``. ``text``: the other columns are text, which is left-aligned, instead of numbers.
     """
-    top = "".join(f'<th scope="col">{_html(cell)}</th>' for cell in head)
-    cell_start = '<td class="text">' if text else "<td>"
+    kind = ' class="text"' if text else ""
+    top = "".join(f'<th scope="col"{kind}>{_html(cell)}</th>' for cell in head)
     lines = []
     for first, *rest in rows:
-        cells = "".join(f"{cell_start}{_html(cell)}</td>" for cell in rest)
+        cells = "".join(f"<td{kind}>{_html(cell)}</td>" for cell in rest)
         lines.append(f'<tr><th scope="row">{_html(first)}</th>{cells}</tr>')
     return (
         f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'

@@ -57,7 +57,7 @@ def _sensitivities(campaign: Campaign, rows: list[RunRow]) -> str:
     out = []
     if numeric and len(rows) > 1:
         caption = "<figcaption>Dots: passed; crosses: failed.</figcaption>"
-        out.append(f"<figure>{caption}{_figure(numeric, rows)}</figure>")
+        out.append(f'<figure class="wide">{caption}{_figure(numeric, rows)}</figure>')
         out.append(_correlations(numeric, rows))
     for p in categorical:
         out.append(_by_value(p, rows))

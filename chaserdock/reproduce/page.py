@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
@@ -12,10 +13,11 @@ from chaserdock.html_page import html_page, table
 
 @dataclass(frozen=True)
 class Table:
-    """A table. The first column is text, the others are numbers. Raise ValueError for a row of another length."""
+    """A table. The first column is text; the others are numbers, or ``text``. Raise ValueError for a row of another length."""
 
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    text: bool = False
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -25,7 +27,7 @@ class Table:
 
 @dataclass(frozen=True)
 class PageSection:
-    """A heading, followed by paragraphs (plain text) and tables."""
+    """A heading, followed by paragraphs (text, with code in backticks) and tables."""
 
     title: str
     parts: tuple[str | Table, ...]
@@ -48,7 +50,7 @@ def _markdown_table(table: Table) -> list[str]:
     def line(cells: tuple[str, ...]) -> str:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
 
-    rule = "| --- |" + " ---: |" * (len(table.header) - 1)
+    rule = "| --- |" + (" --- |" if table.text else " ---: |") * (len(table.header) - 1)
     return [line(table.header), rule, *map(line, table.rows), ""]
 
 
@@ -58,6 +60,10 @@ def html(title: str, sections: Sequence[PageSection]) -> str:
     for section in sections:
         body.append(f"<h2>{escape(section.title)}</h2>")
         body += [
-            table(p.header, p.rows) if isinstance(p, Table) else f"<p>{escape(p)}</p>" for p in section.parts
+            table(p.header, p.rows, p.text) if isinstance(p, Table) else _paragraph(p) for p in section.parts
         ]
     return html_page(title, body)
+
+
+def _paragraph(text: str) -> str:
+    return "<p>" + re.sub("`([^`]+)`", r"<code>\1</code>", escape(text)) + "</p>"

@@ -13,8 +13,8 @@ from .tables import (
     changes,
     comes_out,
     errors_by_name,
+    errors_of,
     paper_change,
-    paper_value,
     spread,
 )
 
@@ -29,7 +29,9 @@ def trend_rows(results: ReproductionResults) -> list[tuple[str, ...]]:
         chains = [_chain_text(results, column, row) for column in (CODE, DEFAULT)]
         alone = [_alone_change(results, f"alone/{row.name}", q) for q in QUANTITIES]
         alone_text = NONE if None in alone else "; ".join(change_text(x) for x in alone if x is not None)
-        out.append((row.label, paper, *chains, alone_text, explanation(results, row)))
+        why = explanation(results, row)
+        same = next((label for label, *_, earlier in out if earlier == why), None)
+        out.append((row.label, paper, *chains, alone_text, why if same is None else f"As for {same}."))
     return out
 
 
@@ -66,29 +68,26 @@ def explanation(results: ReproductionResults, row: PaperRow) -> str:
     if row.name in STAGE_WEIGHTS:
         texts.append(_by_stage_weights(results, row))
     if row.falloff:
-        texts.append(_by_spread(results, row))
+        texts.append(_by_spread(results))
     return " ".join(filter(None, texts)) or "Unexplained."
 
 
 def _by_delay(results: ReproductionResults, row: PaperRow) -> str:
     """Find the delay of the command that brings the position error of the controller alone to the paper's."""
-    paper = paper_value(row, "position")
-    known = [
-        (d, e.position)
-        for d in (0.0, *DELAYS_S[row.name])
-        if (e := errors_by_name(results, f"delay/{row.name}/{d:g}" if d else f"alone/{row.name}")) is not None
-    ]
     solved = results.cases.get(f"alone/{row.name}")
-    if solved is None or len(known) < 2:
+    flown = [(d, errors_by_name(results, f"delay/{row.name}/{d:g}")) for d in DELAYS_S[row.name]]
+    known = [(d, e.position) for d, e in flown if e is not None]
+    if solved is None or not known:
         return ""
-    times = f"OpEn's median solve takes {solved.solve_p50_s * 1e3:.1f} ms here, the longest {solved.solve_max_s * 1e3:.0f} ms."
-    values = ", ".join(f"{v:.3g} m^2 at {d:g} s" for d, v in known)
-    measured = (
-        f"Controller alone, command delayed by the solve: {values}; the paper: {paper:.3g} m^2. {times}"
+    paper = row.position_mse_m2
+    reached = next((k for k, (_, value) in enumerate(known) if value >= paper), None)
+    shown = known[-1:] if reached is None else known[max(reached - 1, 0) : reached + 1]
+    delayed = ", ".join(f"{value:.3g} if {d:g} s late" for d, value in shown)
+    found = "Unexplained" if reached is None else "A late command would explain it"
+    return (
+        f"{found}: the controller alone has {errors_of(solved).position:.3g} m^2, {delayed}, the paper {paper:.3g}. OpEn took at "
+        f"most {solved.solve_max_s * 1e3:.0f} ms here (median {solved.solve_p50_s * 1e3:.1f} ms)."
     )
-    if max(v for _, v in known) < paper:
-        return f"Unexplained by delay. {measured}"
-    return f"A late plan gives as much; whether the paper's was late is not known. {measured}"
 
 
 def _by_stage_weights(results: ReproductionResults, row: PaperRow) -> str:
@@ -97,15 +96,15 @@ def _by_stage_weights(results: ReproductionResults, row: PaperRow) -> str:
     after = _alone_change(results, f"weights/{row.name}", "position")
     if before is None or after is None:
         return ""
-    text = (
-        f"Eq. 6 sums the stage costs, so dt changes the share of the final cost: position {change_text(before)} alone, "
-        f"{change_text(after)} with stage weights times {STAGE_WEIGHTS[row.name]:.2g}."
+    text = f"position {change_text(before)} alone, {change_text(after)} with stage weights times {STAGE_WEIGHTS[row.name]:.2g}"
+    if abs(after) >= 0.5 * abs(before):
+        return f"Unexplained: {text}."
+    return (
+        f"Ours is the weight of the final cost, which eq. 6 counts once: {text}. The paper's is unexplained."
     )
-    explained = abs(after) < 0.5 * abs(before)
-    return f"{text} The paper's change is unexplained." if explained else f"Unexplained: {text}"
 
 
-def _by_spread(results: ReproductionResults, row: PaperRow) -> str:
+def _by_spread(results: ReproductionResults) -> str:
     """Compare the paper's changes with the spread of the baseline over the dispersed starts."""
     runs = list(cell(results, CODE, BASELINE).values())
     if len(runs) < 2:
@@ -114,7 +113,4 @@ def _by_spread(results: ReproductionResults, row: PaperRow) -> str:
     for q in QUANTITIES:
         s = spread([e.of(q) for e in runs])
         parts.append(f"{100 * (s.greatest - s.least) / s.median:.0f} % ({q})")
-    return (
-        f"The baseline varies by {', '.join(parts)} over our starts. If the paper's three runs varied as much, its change is "
-        "not significant."
-    )
+    return f"Less than the start matters: over ours the baseline varies by {', '.join(parts)}. The paper states no spread."

@@ -197,6 +197,43 @@ def test_late_measurements_end_in_the_same_state(shuffle: random.Random) -> None
     assert (late.accepted, late.gated) == (in_time.accepted, in_time.gated)
 
 
+# A body that turns otherwise than the target alone, about another centre.
+LATCHED = (((1.0, 0.0, 0.0), (0.0, 2.0, 0.0), (0.0, 0.0, 2.5)), (0.3, -0.2, 0.1))
+
+
+def test_late_measurements_from_before_a_latch_are_propagated_without_it() -> None:
+    """Measurements that arrive a third of a second late end in the same state: those before the latch do not move as the composite."""
+    states = []
+    for delay in (0, 5):
+        rng, f = np.random.default_rng(3), Mekf(replace(MekfParameters(), motion_model="torque_free"))
+        sent = [see(rng, 0, ns(k)) for k in range(30)]
+        for k in range(30 + delay):
+            f.update(sent[max(0, k - delay) : k - delay + 1], ns(k))
+            if k == 15:
+                f.change_body(*LATCHED)
+        states.append(f.update([], ns(40)))
+        assert (f.accepted, f.late_dropped) == (30, 0)
+    assert same(*states)
+
+
+def test_prediction_changes_the_body_at_the_latch() -> None:
+    """Not at the last measurement before it, and with an exposure across the latch as without."""
+    rng, f = np.random.default_rng(3), Mekf(NO_BIAS)
+    for k in range(20):
+        f.update([see(rng, 0, ns(k))], ns(k))
+    e = f.update([], ns(25))
+    f.change_body(*LATCHED)
+    expected, _ = motion.propagate_target(
+        e.position_m, e.velocity_m_s, e.q_wxyz, e.omega_rad_s, (ns(40) - ns(25)) * 1e-9, f.target
+    )
+    unseen = Measurement(0, ns(40), (), 0, eye_of(0, ns(40)))
+    for found in (f.estimate_at(ns(40)), f.update([unseen], ns(40))):
+        for value, right in zip(
+            (found.position_m, found.velocity_m_s, found.q_wxyz, found.omega_rad_s), expected, strict=True
+        ):
+            np.testing.assert_allclose(value, right, atol=1e-12)
+
+
 def test_late_early_duplicate_and_unusable_measurements_are_counted_and_ignored() -> None:
     rng = np.random.default_rng(0)
     f = Mekf()

@@ -116,6 +116,7 @@ class MekfState(Struct, forbid_unknown_fields=True, tag=True):
     early_dropped: int
     invalid: int
     duplicates: int
+    _before: list[tuple[int, MekfParameters]]
     _buffer: ReplayBuffer[Exposure, FilterState]
     _was_lost: bool
 

@@ -50,6 +50,7 @@ def simulate(
             "--shrink/--no-shrink", help="reduce seeds that fail to the simplest scenario that fails"
         ),
     ] = True,
+    stop: Annotated[bool, typer.Option("--stop", help="end at the first seed that fails")] = False,
     out: Annotated[
         Path, typer.Option(help="folder for scenarios that fail, and for the log of a flight without --seeds")
     ] = Path("simulations"),
@@ -82,6 +83,8 @@ def simulate(
             case = shrink_result(result)
             path = write_case(case, fly_case(case, result.seed), out)
             print(f"seed {result.seed}: shrunk to {path}:\n\n{path.read_text()}", flush=True)
+        if stop:
+            break
     elapsed_s = time.monotonic() - begin_s
     failed = sum(bool(r.violations) for r in results)
     counts = ", ".join(f"{n} {name}" for name, n in outcomes.most_common())

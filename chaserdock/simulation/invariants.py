@@ -24,9 +24,11 @@ from chaserdock_protocol.messages import (
     Event,
     MissionEnd,
     Reference,
+    RelativeEstimate,
     TargetEstimate,
     Tick,
     WorldTruth,
+    WrenchCommand,
 )
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import RawSample
@@ -36,13 +38,20 @@ from chaserdock.analysis.criteria import nearest_allowed_m
 SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate"})
 """Phases in which a chaser keeps its distance, if their reason is in the log."""
 KEEP_OUT_SLACK_M = 0.02
+RETREAT_SLACK_M = 0.15
+"""A reference that moves inwards at up to 8 cm/s turns within this distance."""
 SETTLING_S = 15.0
 """Longest time (s) after the last warning or command until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
 _DOCKED = frozenset({"docked", "latched", "verified"})
 _POSE = (0, 1, 2, 6, 7, 8)
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
+_ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
 _CONSERVED_SHARE = 2e-3
+_DISPLACEMENT_FLOOR_M = 2e-5
+_ROUNDING = 1e-6
+FOLLOWING_S = 3.0
+"""Longest time (s) in which a chaser flies none of the commands that are published for it, unless a fault lasts."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +77,7 @@ class Invariants:
     scenario: Scenario
     violations: list[Violation] = field(default_factory=list)
     nees: list[float] = field(default_factory=list)
+    relative_nees: list[float] = field(default_factory=list)
     reasons: list[str] = field(default_factory=list)
     reason_s: float = 0.0
     end: MissionEnd | None = None
@@ -83,6 +93,10 @@ class Invariants:
     _first_flown: dict[int, int] = field(default_factory=dict)
     _touching: set[str] = field(default_factory=set)
     _begin: dict[str, float] = field(default_factory=dict)
+    _commanded: dict[int, int] = field(default_factory=dict)
+    _following: dict[int, int] = field(default_factory=dict)
+    _latched: set[int] = field(default_factory=set)
+    _retreats_from_m: dict[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lifetime_ticks = math.ceil(
@@ -91,12 +105,16 @@ class Invariants:
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
         }
+        s = self.scenario.simulation
+        self._faults_s = [(f.at_s, f.at_s + (f.duration_s or 0.0)) for f in self.scenario.fault]
+        self._faults_s += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
         self._handlers: dict[type, Callable[[Any], None]] = {
             Tick: self._on_tick,
             WorldTruth: self._on_world,
             DrawnTruth: self._on_drawn,
             BodyTruth: self._on_body,
             ActuatorCommand: self._on_command,
+            WrenchCommand: self._on_wrench,
             TargetEstimate: self._on_estimate,
             Reference: self._on_reference,
             Event: self._on_event,
@@ -141,6 +159,7 @@ class Invariants:
             # A chaser that no command reaches drifts: what it hits is nobody's doing.
             if not {a, b} & self.dead:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
+        self._latched = set(world.latched)
         self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in world.latched}
         self._touching |= {f"chaser/{t.chaser}" for t in world.touches}
         for body in self._bodies:
@@ -159,15 +178,47 @@ class Invariants:
         if body.body in self._touching or (body.body == "target" and self._touching):
             self._begin.clear()
             return
+        if before is None:
+            self._check_start(body)
         if before is None or body.tick != before.tick + 1:
             return
+        self._check_displacement(before, body)
         if body.body == "target":
             self._check_target(body)
         else:
             self._check_momentum(before, body)
 
+    def _check_start(self, body: BodyTruth) -> None:
+        """Compare the first pose of a body with that of the scenario."""
+        if body.tick != 0:
+            return
+        target = self.scenario.target
+        position, q = np.array(target.position_m), np.array(target.q_wxyz)
+        if body.body != "target":
+            position, q = self.scenario.start_pose(int(body.body.partition("/")[2]))
+        error_m = _distance(position, np.array(body.position_m))
+        error_rad = float(rotations.angle_between(q, np.array(body.q_wxyz)))
+        if max(error_m, error_rad) > _ROUNDING:
+            text = f"begins {error_m:.2e} m and {error_rad:.2e} rad from its pose in the scenario"
+            self.violate("initial state", body.body, text)
+
+    def _check_displacement(self, before: BodyTruth, after: BodyTruth) -> None:
+        """Compare the displacement of a body with its velocity: they differ by a changing force only."""
+        dt_s = 1.0 / self.scenario.time.rate_hz
+        mean = np.add(before.velocity_m_s, after.velocity_m_s) / 2.0
+        error_m = _distance(np.array(after.position_m), np.array(before.position_m) + mean * dt_s)
+        gained_m_s = _distance(np.array(before.velocity_m_s), np.array(after.velocity_m_s))
+        drawn = self._drawn.get(after.body)
+        pushed_m_s = after.absolute_impulse_N_s / drawn.mass_kg if drawn is not None else 0.0
+        off_m = 0.0 if drawn is None else float(np.linalg.norm(drawn.centre_of_mass_m))
+        turned_rad = float(np.linalg.norm(after.omega_rad_s) + np.linalg.norm(before.omega_rad_s)) * dt_s
+        allowed_m = _DISPLACEMENT_FLOOR_M + (gained_m_s + pushed_m_s) * dt_s + off_m * turned_rad
+        if error_m > allowed_m:
+            text = f"moved {error_m:.2e} m more than its velocity explains, {allowed_m:.2e} allowed"
+            self.violate("displacement", after.body, text)
+
     def _check_momentum(self, before: BodyTruth, after: BodyTruth) -> None:
-        """Compare the change of a chaser's momentum with the impulse of its actuators and disturbances."""
+        """Compare the changes of a chaser's momentum and angular momentum with what its actuators and disturbances give."""
         drawn = self._drawn.get(after.body)
         if drawn is None or np.any(
             drawn.centre_of_mass_m
@@ -184,6 +235,17 @@ class Invariants:
         )
         if error > allowed + 5.0 * truth.force_noise_N * dt_s:
             self.violate("momentum", after.body, f"{error:.2e} N s without a cause, {allowed:.2e} allowed")
+        inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
+        angular = np.array(after.angular_impulse_N_m_s) + np.array(drawn.torque_N_m) * dt_s
+        spun = rotations.rotate(after.q_wxyz, inertia @ after.omega_rad_s)
+        spun = spun - rotations.rotate(before.q_wxyz, inertia @ before.omega_rad_s)
+        error = float(np.linalg.norm(spun - rotations.rotate(halfway, angular)))
+        allowed = _ANGULAR_FLOOR_N_M_S + (_IMPULSE_SHARE + turned) * (
+            float(np.abs(angular).sum()) + _ARM_M * after.absolute_impulse_N_s
+        )
+        if error > allowed + 5.0 * truth.torque_noise_N_m * dt_s:
+            text = f"{error:.2e} N m s without a cause, {allowed:.2e} allowed"
+            self.violate("angular momentum", after.body, text)
 
     def _check_target(self, body: BodyTruth) -> None:
         """Compare the untouched target's motion with what its kind of motion conserves."""
@@ -225,9 +287,27 @@ class Invariants:
 
     # -- commands ------------------------------------------------------------------------------------------------
 
+    def _on_wrench(self, command: WrenchCommand) -> None:
+        """Note since when a chaser is commanded without a break."""
+        i = command.chaser
+        if command.mode == "none" or command.tick - self._commanded.get(i, -1) > 1:
+            self._following[i] = command.tick
+        self._commanded[i] = max(command.tick, self._commanded.get(i, -1))
+
+    def _check_following(self, command: ActuatorCommand) -> None:
+        """Check that a chaser without commands has a cause for it."""
+        i, rate_hz = command.chaser, self.scenario.time.rate_hz
+        since_s, now_s = self._following.get(i, self._tick) / rate_hz, self._tick / rate_hz
+        since_s = max([since_s, *(min(end_s, now_s) for at_s, end_s in self._faults_s if at_s <= now_s)])
+        if self._commanded.get(i, -1) >= self._tick - 1 and now_s - since_s > FOLLOWING_S:
+            text = f"has flown no command for {now_s - since_s:.1f} s, but commands are published"
+            self.violate("commands are flown", f"chaser/{i}", text)
+
     def _on_command(self, command: ActuatorCommand) -> None:
         if command.source != "command":
+            self._check_following(command)
             return
+        self._following[command.chaser] = self._tick
         name, before = f"chaser/{command.chaser}", self._flown.get(command.chaser)
         self._flown[command.chaser] = command
         age = self._tick - command.tick
@@ -261,9 +341,24 @@ class Invariants:
         )
         error = np.concatenate([np.array(truth.position_m) - np.array(estimate.position_m), turn])
         self.nees.append(float(error @ np.linalg.solve(covariance, error)))
+        for relative in estimate.relative:
+            own = self._states.get(f"chaser/{relative.chaser}")
+            if own is not None and own.body not in self._touching and own.sim_time_ns == estimate.sim_time_ns:
+                self.relative_nees.append(_relative_nees(relative, own, truth))
 
     def _on_reference(self, reference: Reference) -> None:
-        self.phases[reference.chaser] = reference.phase
+        """Note the phase, and check that a retreat leads away from the target."""
+        i, away_m = reference.chaser, math.hypot(*reference.offset_m)
+        if self.phases.get(i) != reference.phase:
+            nominal_m = self.scenario.chasers[i].position_m
+            near_m = min(away_m, math.hypot(*nominal_m)) - RETREAT_SLACK_M
+            # From the far side of the target the way back passes it.
+            self._retreats_from_m[i] = near_m if np.dot(reference.offset_m, nominal_m) > 0.0 else 0.0
+        self.phases[i] = reference.phase
+        if reference.phase in ("retreat", "abort") and away_m < self._retreats_from_m[i]:
+            self.violate(
+                "retreat leads away", f"chaser/{i}", f"its reference is {away_m:.2f} m from the target"
+            )
 
     def _on_event(self, event: Event) -> None:
         if event.level != "info" and not event.what.startswith("fault "):
@@ -288,15 +383,30 @@ class Invariants:
             return
         if not self.end.complete and not self.dead.issuperset(self._nearest_m):
             self.violate("liveness", "world", f"the mission ended early: {self.end.reason}")
+        if self.end.complete and self.end.tick != self.scenario.ticks:
+            text = f"complete after {self.end.tick} of {self.scenario.ticks} ticks"
+            self.violate("liveness", "world", text)
         success, commanded = self.scenario.success, {e.command for e in self.scenario.timeline}
         for chaser in (*success.docked, *success.latched):
             phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
+            if phase in ("latched", "verified") and chaser not in self._latched and name not in self.dead:
+                self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
             named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
             commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
             disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < SETTLING_S
             if phase in _DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
             self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+
+
+def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:
+    """Return the normalized squared error (6 on average if consistent) of the pose of a chaser relative to the target."""
+    q_target = np.array(target.q_wxyz)
+    place = rotations.rotate_inverse(q_target, np.subtract(own.position_m, target.position_m))
+    q = rotations.multiply(rotations.conjugate(q_target), np.array(own.q_wxyz))
+    turn = rotations.log(rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), q))
+    error = np.concatenate([place - np.array(estimate.position_m), turn])
+    return float(error @ np.linalg.solve(np.reshape(estimate.covariance, (6, 6)), error))
 
 
 def _distance(a: Array, b: Array) -> float:

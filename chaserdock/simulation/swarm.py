@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
+from chaserdock_protocol import topics
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.faults import FaultKind
@@ -216,9 +217,13 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationRes
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(toml_document(case), encoding="utf-8")
         checks, fingerprint = Invariants(load_scenario(path)), 0
+        published: Counter[str] = Counter()
 
         def tap(sender: str, raw: RawSample) -> None:
             nonlocal fingerprint
+            # The recorder listens from the first tick on, and is not asked for its own and for presence.
+            if (published or raw.key == topics.TICK.key) and sender != "recorder":
+                published[raw.key] += not raw.key.endswith("/presence")
             fingerprint = zlib.crc32(
                 raw.payload, zlib.crc32(f"{sender}{raw.key}{raw.sent_ns}".encode(), fingerprint)
             )
@@ -226,9 +231,11 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationRes
 
         flight = simulate(path, path.parent / "run", tap=tap)
         checks.check_end(flight.crashes, flight.stalled)
-        _check_recording(checks, flight)
+        _check_recording(checks, flight, published)
         _check_queues(checks, flight)
-    lies = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
+        honest = not _LIES & {f["kind"] for f in case.get("fault", [])} and "truth" not in case
+        if honest:
+            _check_consistency(checks)
     return SimulationResult(
         seed=seed,
         case=case,
@@ -236,9 +243,16 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationRes
         outcome=_outcome(checks),
         fingerprint=f"{fingerprint:08x}",
         nees=tuple(checks.nees),
-        honest=not lies & {f["kind"] for f in case.get("fault", [])} and "truth" not in case,
+        honest=honest,
         sim_time_s=checks.time_s,
     )
+
+
+def _check_consistency(checks: Invariants) -> None:
+    """Compare the errors of the estimates of one flight with their covariances."""
+    for name, nees in (("target", checks.nees), ("chasers relative to the target", checks.relative_nees)):
+        if len(nees) >= LEAST_ESTIMATES and (mean := sum(nees) / len(nees)) > FLIGHT_NEES:
+            checks.violate("covariance consistency", name, f"mean NEES {mean:.0f} in one flight")
 
 
 def _memory_folder() -> str | None:
@@ -256,8 +270,8 @@ def _outcome(checks: Invariants) -> str:
     )
 
 
-def _check_recording(checks: Invariants, flight: SimulatedFlight) -> None:
-    """Compare the log with what reached the recorder."""
+def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Counter[str]) -> None:
+    """Compare the log with what reached the recorder; in lock-step also with what was published."""
     if "recorder" in flight.stalled or flight.statuses.get("recorder") is None:
         return
     try:
@@ -272,7 +286,12 @@ def _check_recording(checks: Invariants, flight: SimulatedFlight) -> None:
     recorded: Counter[str] = Counter()
     for channel, number in index.statistics.channel_message_counts.items():
         recorded[index.channels[channel].topic] += number
-    for key, number in flight.traffic.recorded.items():
+    expected = Counter(flight.traffic.recorded)
+    s = checks.scenario
+    unreachable = s.simulation.partition or {"cut", "kill"} & {f.kind for f in s.fault}
+    if s.simulation.mode == "lockstep" and not unreachable:
+        expected |= published
+    for key, number in expected.items():
         if recorded.get(key, 0) != number:
             checks.violate(
                 "no recorded data lost", key, f"{recorded.get(key, 0)} of {number} messages are in the log"
@@ -289,5 +308,8 @@ def _check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
             checks.violate("bounded queues", name.split()[0], f"{items.most} messages waited")
 
 
-QUEUE_LIMIT = 2000
+LEAST_ESTIMATES, FLIGHT_NEES = 10, 40.0
+"""Largest mean normalized squared error (6 if consistent) of at least so many estimates of one flight without lying sensors."""
+_LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
+QUEUE_LIMIT = 400
 """Most messages that may wait for a reader which is neither slow nor flooded."""

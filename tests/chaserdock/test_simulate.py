@@ -57,6 +57,10 @@ def test_a_flight_without_seeds_keeps_its_log_once(good: Path, tmp_path: Path) -
 def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_path: Path) -> None:
     seed = next(s for s in range(1, 50) if fly_seed(Swarm(str(bad)), s).violations)
     result = fly_seed(Swarm(str(bad)), seed)
+    arguments = ("simulate", str(bad), "--seeds", f"{seed}:{seed + 5}", "--no-shrink", "--stop")
+    status, text = finished(*arguments)
+    assert status == 1
+    assert "\n1 seeds in" in text
     assert fly_seed(Swarm(str(bad)), seed).fingerprint == result.fingerprint
     case = shrink_result(result, attempts=60)
     path = write_case(case, fly_case(case, seed), tmp_path / "out")

@@ -20,6 +20,7 @@ from chaserdock_protocol.messages import (
     Reference,
     Tick,
     WorldTruth,
+    WrenchCommand,
     encoding_of,
 )
 from chaserdock_protocol.scenario import Scenario, load_scenario
@@ -136,7 +137,7 @@ def test_contact_is_a_violation_unless_a_chaser_is_lost(log: Log) -> None:
 def test_keep_out_zones_surround_target_and_chasers(log: Log) -> None:
     log.bodies(1, body("target", 0.0), body("chaser/0", 0.34), body("chaser/1", 0.70))
     assert log.found == []
-    log.bodies(2, body("target", 0.0), body("chaser/0", 0.32), body("chaser/1", 0.64))
+    log.bodies(3, body("target", 0.0), body("chaser/0", 0.32), body("chaser/1", 0.64))
     assert log.found == ["keep-out zone", "keep-out zone"]
 
 
@@ -144,18 +145,81 @@ def test_momentum_changes_by_impulses_only(log: Log) -> None:
     drawn = DrawnBody(body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0,) * 9)
     log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
     pushed = {"impulse_N_s": (0.1, 0.0, 0.0), "absolute_impulse_N_s": 0.1}
-    log.bodies(0, body("chaser/0", 2.0))
-    log.bodies(1, body("chaser/0", 2.0, 0.01, **pushed))
+    log.bodies(1, body("chaser/0", 2.0))
+    log.bodies(2, body("chaser/0", 2.0, 0.01, **pushed))
     assert log.found == []
-    log.bodies(2, body("chaser/0", 2.0, 0.02))
+    log.bodies(3, body("chaser/0", 2.0015, 0.02))
     assert log.found == ["momentum"]
+
+
+def test_angular_momentum_changes_by_angular_impulses_only(log: Log) -> None:
+    drawn = DrawnBody(body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
+    log.bodies(1, body("chaser/0", 2.0))
+    turned: dict[str, Any] = {"omega_rad_s": (0.0, 0.0, 0.2), "angular_impulse_N_m_s": (0.0, 0.0, 0.1)}
+    log.bodies(2, body("chaser/0", 2.0, **turned))
+    assert log.found == []
+    log.bodies(3, body("chaser/0", 2.0, omega_rad_s=(0.0, 0.0, 0.3)))
+    assert log.found == ["angular momentum"]
+
+
+def test_positions_follow_velocities(log: Log) -> None:
+    log.bodies(1, body("chaser/0", 2.0, 0.1))
+    log.bodies(2, body("chaser/0", 2.01, 0.1))
+    assert log.found == []
+    log.bodies(3, body("chaser/0", 2.019, 0.1))
+    assert log.found == ["displacement"]
+
+
+def test_bodies_begin_where_the_scenario_states(log: Log, scenario: Scenario) -> None:
+    position, q = scenario.start_pose(0)
+    there = {"position_m": tuple(position.tolist()), "q_wxyz": tuple(q.tolist())}
+    start = msgspec.structs.replace(body("chaser/0", 0.0), **there)
+    log.bodies(0, start)
+    assert log.found == []
+    other = Log(scenario)
+    other.bodies(0, msgspec.structs.replace(start, q_wxyz=(0.0, 1.0, 0.0, 0.0)))
+    assert other.found == ["initial state"]
+
+
+def test_published_commands_are_flown_unless_a_fault_lasts(scenario: Scenario, tmp_path: Path) -> None:
+    drop = {"kind": "drop", "process": "chaser/1", "topic": "wrench", "at_s": 1.0, "duration_s": 4.0}
+    (tmp_path / "case.toml").write_text(toml_document({"extends": "fault-drill", "fault": [drop]}))
+    log = Log(load_scenario(tmp_path / "case.toml"))
+    sample: Any = BY_TYPE[WrenchCommand]
+    for tick in range(82):
+        assert log.found == [], tick
+        log.tick(tick)
+        for chaser in (0, 1):
+            commanded = msgspec.structs.replace(sample, chaser=chaser, tick=tick, mode="nmpc")
+            log.publish(topics.WRENCH, commanded, chaser, "controller")
+        log.flies(0, tick)
+        log.flies(1, tick, source="command" if tick < 10 else "hold")
+    assert [str(v) for v in log.checks.violations] == [
+        "commands are flown at 8.10 s: chaser/1: has flown no command for 3.1 s, but commands are published"
+    ]
+
+
+def test_a_retreat_leads_away_from_the_target(log: Log) -> None:
+    sample: Any = msgspec.structs.replace(BY_TYPE[Reference], chaser=0)
+
+    def refers(phase: str, x_m: float) -> None:
+        reference = msgspec.structs.replace(sample, phase=phase, offset_m=(x_m, 0.0, 0.0))
+        log.publish(topics.REFERENCE, reference, 0)
+
+    for phase, x_m in (("approach", -0.5), ("retreat", -0.45), ("retreat", -0.42), ("hold", -0.1)):
+        refers(phase, x_m)
+    assert log.found == []
+    refers("abort", -0.5)
+    refers("abort", -0.3)
+    assert log.found == ["retreat leads away"]
 
 
 def test_an_untouched_target_conserves_its_energy(log: Log) -> None:
     drawn = DrawnBody(body="target", mass_kg=1.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
     log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
-    for tick, rate in enumerate((0.1, 0.1, 0.1, 0.11)):
-        log.bodies(tick, body("target", 0.0, 0.1, omega_rad_s=(0.0, 0.0, rate)))
+    for tick, rate in enumerate((0.1, 0.1, 0.1, 0.11), start=1):
+        log.bodies(tick, body("target", 0.01 * tick, 0.1, omega_rad_s=(0.0, 0.0, rate)))
     assert log.found == ["energy and momentum"]
 
 
@@ -163,7 +227,7 @@ def test_a_touched_target_may_change_its_energy(log: Log) -> None:
     drawn = DrawnBody(body="target", mass_kg=1.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
     log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
     for tick, rate in enumerate((0.1, 0.2, 0.2)):
-        turning = body("target", 0.0, 0.1, omega_rad_s=(0.0, 0.0, rate), tick=tick)
+        turning = body("target", 0.01 * tick, 0.1, omega_rad_s=(0.0, 0.0, rate), tick=tick)
         log.publish(topics.TRUTH_BODY, turning, "target")
         latched = (0,) if tick == 1 else ()
         log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched))
@@ -211,6 +275,15 @@ def at_end(log: Log, phase: str) -> None:
     for chaser in (0, 3):
         reference: Any = msgspec.structs.replace(BY_TYPE[Reference], chaser=chaser, phase=phase)
         log.publish(topics.REFERENCE, reference, chaser)
+
+
+def test_a_complete_mission_lasts_as_long_as_the_scenario(log: Log) -> None:
+    log.publish(topics.END, MissionEnd(tick=249, reason="completed", complete=True))
+    at_end(log, "docked")
+    log.checks.check_end({}, ())
+    assert [str(v) for v in log.checks.violations] == [
+        "liveness at 0.00 s: world: complete after 249 of 250 ticks"
+    ]
 
 
 def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, scenario: Scenario) -> None:

@@ -54,7 +54,7 @@ class Views:
     def __init__(self, target: str, width: int = 1280, height: int = 720):
         self.camera = Camera.from_hfov(width, height, HFOV)
         self.model = target_model(target)
-        self.renderer = Renderer(self.camera, self.model)
+        self.renderer = Renderer(self.camera, self.model, None, Effects().point_spread_px)
         self.effects = CameraEffects(width, height, Effects(), 7)
         self.count = 0
 

@@ -29,7 +29,7 @@ class Scene:
     def __init__(self, name, width=640, height=480, distortion=(), method: Method = "default"):
         self.camera = Camera.from_hfov(width, height, HFOV, distortion=distortion)
         self.model = target_model(name)
-        self.renderer = Renderer(self.camera, self.model)
+        self.renderer = Renderer(self.camera, self.model, None, Effects().point_spread_px)
         self.effects = CameraEffects(width, height, Effects(), 11)
         self.perception = Perception(self.camera, self.model, method)
 
@@ -116,7 +116,7 @@ def test_fitted_sides_beat_contours_and_narrow_borders_do_not_bias_them():
         assert 0 in found.ids
         k = found.ids.tolist().index(0)
         px = found.corners_px[k : k + 1]
-        refined = corners.refine(image, scene.camera, px, 7, table.margin_share[[0]])
+        refined = corners.refine(image, scene.camera, px, 7, table.margin_share[[0]], table.outlined[[0]])
         assert refined.good.all()
         truth = scene.camera.project(rotations.rotate(q, table.corners[0]) + position)
         outwards = truth - truth.mean(axis=0)
@@ -126,6 +126,44 @@ def test_fitted_sides_beat_contours_and_narrow_borders_do_not_bias_them():
     assert np.mean(raw) < -0.2
     assert abs(np.mean(fitted)) < 0.06
     assert np.abs(fitted).max() < 0.3
+
+
+@pytest.mark.parametrize("distortion", [(), LENS])
+def test_corners_do_not_depend_on_the_place_of_a_side_between_pixels(distortion):
+    """Face-on without noise, moved by tenths of a pixel: an edge interpolated between pixels is off by up to 0.03 px."""
+    scene = Scene("paper", 960, 540, distortion)
+    table, margin = pnp.MarkerTable.of(scene.model), 0.5
+    for tenths in range(0, 10, 3):
+        position = (
+            np.array([(margin + tenths / 10.0) * 0.7, (margin + tenths / 10.0) * 0.7, 0.0])
+            / scene.camera.fx_px
+        )
+        position[2] = 0.7
+        image = scene.renderer.render(EYE, AHEAD, position, FACING, (), Light((0.0, 0.0, -1.0)))
+        truth = scene.camera.project_ideal(rotations.rotate(FACING, table.corners[0]) + position)
+        found = corners.refine(
+            image, scene.camera, truth[None], 7, table.margin_share[[0]], table.outlined[[0]]
+        )
+        assert found.good.all()
+        assert np.abs(found.corners_px[0] - truth).max() < (0.02 if not distortion else 0.04)
+
+
+@pytest.mark.parametrize("turn_rad", [0.4, 0.5])
+def test_a_bright_face_beside_a_border_does_not_move_corners(turn_rad):
+    """Beyond the border's outer edge is the brighter border of the adjacent face's marker: no fall, but a second rise."""
+    scene = Scene("paper", 960, 540)
+    table = pnp.MarkerTable.of(scene.model)
+    q, position = rotations.multiply(FACING, rotations.exp([0.0, 0.0, turn_rad])), np.array([0.0, 0.0, 1.2])
+    seen = [k for k in range(6) if rotations.rotate(q, table.normals[k]) @ position < -0.2]
+    assert len(seen) == 2
+    for side in (-1.0, 1.0):  # the sun lights one face, then the other
+        image = scene.image(position, q, light=(side, 0.0, -0.35))
+        for k in seen:
+            truth = scene.camera.project(rotations.rotate(q, table.corners[k]) + position)
+            ends = table.outlined[[k]]
+            found = corners.refine(image, scene.camera, truth[None], 7, table.margin_share[[k]], ends)
+            assert found.good.all()
+            assert np.abs(found.corners_px[0] - truth).max() < 0.25
 
 
 def test_a_prediction_changes_where_is_looked_but_not_what_is_found():

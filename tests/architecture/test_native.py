@@ -73,17 +73,23 @@ def test_every_instruction_set_sees_the_same_bits(
         pytest.skip(f"this processor has no copy {number}")
     rng = np.random.default_rng(3)
     camera = Camera.from_hfov(320, 240, 1.0, distortion=distortion)
-    noise = rng.integers(0, 255, (240, 320), dtype=np.uint8)
-    image = np.asarray(cv2.GaussianBlur(noise, (7, 7), 1.5), dtype=np.uint8)
+    outlined = np.arange(12) % 2 == 0
+    image = rng.integers(0, 60, (240, 320), dtype=np.uint8)
     quads = np.array([[40, 40], [90, 45], [88, 95], [38, 90]]) + rng.uniform(0, 120, (12, 1, 2))
     margin = rng.uniform(0.02, 0.2, 12)
+    for quad, share in zip(quads, margin, strict=True):
+        middle = quad.mean(axis=0)
+        for scale, level in ((1.0 + 2.0 * share, 200), (1.0, 10)):
+            outline = np.rint(16.0 * camera.distort(middle + scale * (quad - middle))).astype(np.int32)
+            cv2.fillConvexPoly(image, outline, level, cv2.LINE_AA, 4)
+    image = np.asarray(cv2.GaussianBlur(image, (7, 7), 0.7), dtype=np.uint8)
     points = rng.uniform(-0.3, 0.3, (8, 3))
     truth = pose_at([0.1, -0.05, 1.5], [0.4, -2.0, 0.9])
     pixels = camera.project_ideal(points @ truth.rotation.T + truth.position) + rng.normal(0.0, 0.1, (8, 2))
     start = pose_at([0.0, 0.0, 1.2], [0.0, -1.6, 0.5])
 
     def seen() -> list[NDArray[Any]]:
-        found = corners.refine(image, camera, quads, 6, margin)
+        found = corners.refine(image, camera, quads, 6, margin, outlined)
         pose = refine.refine(camera.matrix(), points, pixels, np.ones(16), start)
         assert pose is not None
         np.testing.assert_allclose(pose.rotation, truth.rotation, atol=0.01)
@@ -123,11 +129,11 @@ def test_corners_that_lie_nowhere_are_not_good(corner: float) -> None:
     image = np.full((48, 64), 200, dtype=np.uint8)
     quads = np.array([[[10.0, 10.0], [30.0, 10.0], [30.0, 30.0], [10.0, 30.0]]])
     quads[0, 2, 0] = corner
-    found = corners.refine(image, Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
+    found = corners.refine(image, Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]), np.array([True]))
     assert not found.good.any()
     np.testing.assert_array_equal(found.corners_px, quads)
     with pytest.raises(ValueError, match="has no corners"):
-        corners.refine(image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]))
+        corners.refine(image[:1], Camera.from_hfov(64, 48, 1.0), quads, 6, np.array([0.1]), np.array([True]))
 
 
 def pose_at(position: list[float], rotation_vector: list[float]) -> refine.PoseInCamera:

@@ -26,13 +26,13 @@ static Settings settings(void) {
     s.first = uniform(0.0, 0.4), s.last = uniform(0.6, 1.0);
     s.reach_cells = uniform(0.1, 1.0), s.reach_least_px = uniform(0.5, 2.0);
     s.min_contrast = uniform(0.0, 20.0), s.min_rows_share = uniform(0.0, 1.0), s.max_move_px = uniform(0.5, 8.0);
-    s.strip_px = uniform(0.0, 20.0), s.log_edge_sigma = uniform(-1.0, 1.0), s.edge_sigma_spread = uniform(0.05, 0.5);
-    s.strip_beyond_px = uniform(0.1, 2.0), s.uncertain_px = uniform(0.5, 4.0);
-    for (int pass = 0; pass < 2; pass++) {
-        s.rows[pass] = (double)whole(2, ROWS_MOST), s.taps[pass] = (double)whole(2, TAPS_MOST);
-        s.reach_px[pass] = uniform(1.0, 5.0), s.reweighted[pass] = (double)whole(0, 3);
-    }
-    s.strip_rows = (double)whole(2, ROWS_MOST), s.strip_taps = (double)whole(2, TAPS_MOST), s.strip_steps = (double)whole(0, 4);
+    s.rows = (double)whole(2, ROWS_MOST), s.taps = (double)whole(2, TAPS_MOST), s.coarse_reach_px = uniform(1.0, 5.0);
+    s.border_share = uniform(0.1, 1.0), s.columns = (double)whole(1, COLUMNS_MOST), s.end_px = uniform(0.0, 5.0);
+    s.end_share = uniform(0.0, 0.4), s.reach_px = uniform(1.0, 5.0), s.clear_px = uniform(0.0, 2.0);
+    s.beyond_px = uniform(0.1, 2.0), s.strip_px = uniform(0.0, 20.0), s.least_fall = uniform(-1.0, 1.0);
+    s.agreement_px = uniform(0.0, 1.0), s.log_edge_sigma = uniform(-1.0, 1.0), s.edge_sigma_spread = uniform(0.05, 0.5);
+    s.rounds = (double)whole(0, 3), s.iterations = (double)whole(1, 4), s.strip_iterations = (double)whole(1, 5);
+    s.uncertain_px = uniform(0.5, 4.0), s.uncertain_level = uniform(0.0, 200.0);
     return s;
 }
 
@@ -41,7 +41,7 @@ static void refine_corners(void) {
     const int64_t height = whole(2, 40), width = whole(2, 40), n = whole(0, 2);
     const uint8_t *image = image_of(height, width);
     double *lens = doubles(9, -0.2, 0.2), *margin = doubles(n, 0.0, 0.3), *corners = outputs(8 * n), *sigma = outputs(n);
-    uint8_t *good = bytes(n);
+    uint8_t *good = bytes(n), *outlined = bytes(n);
     Settings set = settings();
     for (int i = 0; i < 2; i++) lens[i] = value(20.0, 60.0), lens[2 + i] = value(0.0, 40.0);
     for (int64_t m = 0; m < n; m++) {
@@ -50,7 +50,7 @@ static void refine_corners(void) {
             corners[8 * m + i] = chance(special_share) ? special() : (i % 2 ? y : x) + half * around[i] + uniform(-1.0, 1.0);
     }
     double *given = copy_of(corners, 8 * n);
-    NAME(refine_corners)(image, height, width, lens, whole(0, 1), &set, (double)whole(3, 9), n, margin, corners, good, sigma);
+    NAME(refine_corners)(image, height, width, lens, whole(0, 1), &set, (double)whole(3, 9), n, margin, outlined, corners, good, sigma);
     for (int64_t m = 0; m < n; m++) {
         CHECK(good[m] <= 1 && sigma[m] >= 1.0 && finite(sigma[m]));
         if (good[m]) CHECK(all_finite(corners + 8 * m, 8) && all_finite(given + 8 * m, 8));

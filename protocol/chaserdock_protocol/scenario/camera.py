@@ -21,7 +21,7 @@ class Effects(Section):
 
     gain: Positive = Field(default=1.0, description="Exposure: factor on the grey levels.")
     point_spread_px: NotNegative = Field(
-        default=0.6, description="Standard deviation of a Gaussian blur, pixels."
+        default=0.6, description="Standard deviation of the lens' Gaussian blur, pixels."
     )
     read_noise: NotNegative = Field(
         default=1.5, description="Standard deviation of the read noise, grey levels."

@@ -51,7 +51,7 @@ class Cameras:
         def renderer(camera: Camera) -> Renderer | TinyRenderer:
             try:
                 kind = Renderer if section.renderer == "exact" else TinyRenderer
-                return kind(camera, self._target, background)
+                return kind(camera, self._target, background, effects.point_spread_px)
             except ValueError as error:
                 raise ScenarioError(f"camera: {error}") from None
 

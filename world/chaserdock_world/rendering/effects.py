@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera effects on the rendered image: exposure, point spread, noise. Lens distortion is part of rendering (``lens``).
+"""Camera effects on the rendered image: exposure, noise. Point spread and distortion are part of rendering (``lens``).
 
 Deterministic: the noise of an image depends on the seed, the chaser and the image number only. It is added in C
 (native/noise.c): 1280 x 960 pixels take 0.3 ms, with NumPy 4 ms, with OpenCV 7 ms.
@@ -7,7 +7,6 @@ Deterministic: the noise of an image depends on the seed, the chaser and the ima
 
 from __future__ import annotations
 
-import math
 from ctypes import c_double, c_int64, c_void_p
 
 import cv2
@@ -25,7 +24,7 @@ _NOISE_STEPS = 4096.0
 
 
 class CameraEffects:
-    """Applies gain, point spread, read noise and shot noise of ``effects`` to images of one size; ``seed`` fixes all noise."""
+    """Applies gain, read noise and shot noise of ``effects`` to images of one size; ``seed`` fixes all noise."""
 
     def __init__(self, width_px: int, height_px: int, effects: Effects, seed: int):
         self.effects = effects
@@ -56,11 +55,6 @@ class CameraEffects:
         out = image
         if self.effects.gain != 1.0:
             out = np.asarray(cv2.convertScaleAbs(out, alpha=self.effects.gain), dtype=np.uint8)
-        sigma_px = self.effects.point_spread_px
-        if sigma_px > 0.0:
-            size = (2 * math.ceil(3.0 * sigma_px) + 1,) * 2
-            blurred = cv2.GaussianBlur(out, size, sigma_px, borderType=cv2.BORDER_REPLICATE)
-            out = np.asarray(blurred, dtype=np.uint8)
         if self._bank is not None:
             return self._add_noise(out, self._bank, chaser, number)
         return out.copy() if out is image else out

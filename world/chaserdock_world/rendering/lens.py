@@ -1,12 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lens distortion: the extent of the ideal image that a distorted image needs, and the mapping between them."""
+"""The lens: point spread, the extent of the ideal image that a distorted image needs, and the mapping between them."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
 from chaserdock_models.camera import Camera
 from numpy.typing import NDArray
+
+
+def spread_points(image: NDArray[np.uint8], sigma_px: float) -> NDArray[np.uint8]:
+    """Return an image (h, w) after the lens' point spread, a Gaussian with this standard deviation; itself if that is 0."""
+    if sigma_px == 0.0:
+        return image
+    size = (2 * math.ceil(3.0 * sigma_px) + 1,) * 2
+    blurred = cv2.GaussianBlur(image, size, sigma_px, borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(blurred, dtype=np.uint8)
 
 
 class Lens:

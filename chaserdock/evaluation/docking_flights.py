@@ -218,9 +218,8 @@ def cause_of(flight: InProcessMission, verified: bool) -> str:
     """Return the outcome in a few words."""
     if flight.contacts:
         return f"collision {sorted(flight.contacts)[0]}"
-    retreats = [text for _, _, text in flight.events if ": retreat (" in text]
-    reason = retreats[-1].partition(": retreat (")[2].rstrip(")").partition(": ")[2] if retreats else ""
-    kind = reason.partition(":")[0]
+    retreats = flight.retreats(0)
+    kind = retreats[-1].split(": ")[1] if retreats else ""
     if verified:
         return "verified at the first attempt" if not retreats else f"verified after a retreat: {kind}"
     return f"not verified, last retreat: {kind}" if retreats else f"not verified, phase {flight.phase(0)}"

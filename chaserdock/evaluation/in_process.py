@@ -106,6 +106,11 @@ class InProcessMission:
         self._odometry_sensor = OdometrySensor(scenario)
         self._validation = OdometryValidation(flight)
 
+    def retreats(self, chaser: int) -> list[str]:
+        """Return why a chaser retreated, in order: phase and reason."""
+        begin = f"chaser {chaser}: retreat ("
+        return [text.removeprefix(begin).rstrip(")") for _, _, text in self.events if text.startswith(begin)]
+
     def __enter__(self) -> Self:
         return self
 

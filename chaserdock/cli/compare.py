@@ -81,6 +81,9 @@ def reproduce(
     The paper's chain needs its solver, OpEn: the extra chaserdock[open] and Rust's cargo. Without them the page lacks that
     chain, and the status is 1.
     """
+    from chaserdock_protocol.process import SINGLE_THREADED
+
+    os.environ |= SINGLE_THREADED  # as in flight; must precede the import of NumPy
     from chaserdock.reproduce.main import reproduce as fly_all
 
     raise typer.Exit(fly_all(quick, out))

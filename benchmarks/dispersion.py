@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import msgspec
-from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario import load_scenario
 from common import (
     ROOT,
     Figures,
@@ -58,14 +58,14 @@ class DispersedFlight(NamedTuple):
     tracking_rad: float
 
 
-def scenario_of(name: str, grade: str, seed: int, images: bool) -> Scenario:
-    """Return a shipped scenario with other errors; under ``orbit`` its approaches follow a calibration of the cameras."""
+def overrides_of(name: str, grade: str, seed: int, images: bool) -> tuple[str, ...]:
+    """Return a shipped scenario's overrides for other errors; under ``orbit`` its captures follow a calibration of the cameras."""
     overrides = [f"seed={seed}", f'navigation.grade="{grade}"', 'truth.preset="mismatch"']
     if not images:
         overrides.append('perception.name="statistical"')
     nominal = load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
     if grade != "orbit" or not nominal.success.latched:
-        return nominal
+        return tuple(overrides)
     commands = [
         {"at_s": c.at_s + CALIBRATION_S, "command": c.command, "chasers": list(c.chasers)}
         for c in nominal.timeline
@@ -76,13 +76,13 @@ def scenario_of(name: str, grade: str, seed: int, images: bool) -> Scenario:
         "{" + ",".join(f"{key}={msgspec.json.encode(value).decode()}" for key, value in c.items()) + "}"
         for c in sorted(commands, key=lambda c: c["at_s"])
     )
-    overrides += [f"timeline=[{timeline}]", f"duration_s={nominal.duration_s + CALIBRATION_S}"]
-    return load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
+    return (*overrides, f"timeline=[{timeline}]", f"duration_s={nominal.duration_s + CALIBRATION_S}")
 
 
 def fly(name: str, grade: str, images: bool, seed: int) -> DispersedFlight:
     """Fly a mission to its end and judge it on the true motion."""
-    scenario = scenario_of(name, grade, seed, images)
+    overrides = overrides_of(name, grade, seed, images)
+    scenario = load_scenario(ROOT / "scenarios" / f"{name}.toml", overrides)
     end_s, success = scenario.duration_s, scenario.success
     approach = scenario.approach
     inside_since = dict.fromkeys(success.docked, math.inf)

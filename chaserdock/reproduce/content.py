@@ -85,8 +85,9 @@ def _result(plan: ReproductionPlan, results: ReproductionResults, about: Provena
     ]
     if missing:
         total = len(plan.cases) + len(plan.missions)
-        parts.append(
-            f"NOT COMPLETE: {len(missing)} of {total} flights have no result, the first is {missing[0]}."
+        parts.insert(
+            0,
+            f"NOT COMPLETE: {len(missing)} of {total} flights have no result (a dash); the same command resumes them.",
         )
     return PageSection("Result", tuple(parts))
 

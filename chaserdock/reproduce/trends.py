@@ -68,7 +68,7 @@ def explanation(results: ReproductionResults, row: PaperRow) -> str:
     if row.name in STAGE_WEIGHTS:
         texts.append(_by_stage_weights(results, row))
     if row.falloff:
-        texts.append(_by_spread(results))
+        texts.append(_by_spread(results, row))
     return " ".join(filter(None, texts)) or "Unexplained."
 
 
@@ -83,7 +83,7 @@ def _by_delay(results: ReproductionResults, row: PaperRow) -> str:
     reached = next((k for k, (_, value) in enumerate(known) if value >= paper), None)
     shown = known[-1:] if reached is None else known[max(reached - 1, 0) : reached + 1]
     delayed = ", ".join(f"{_error_text(value)} if {d:g} s late" for d, value in shown)
-    found = "Unexplained" if reached is None else "A late command would explain it"
+    found = "Unexplained" if reached is None else "A late command gives as much"
     return (
         f"{found}: the controller alone has {errors_of(solved).position:.3g} m^2, {delayed}, the paper {paper:.3g}. The "
         f"median solve of OpEn took {solved.solve_p50_s * 1e3:.1f} ms here."
@@ -103,18 +103,22 @@ def _by_stage_weights(results: ReproductionResults, row: PaperRow) -> str:
     text = f"position {change_text(before)} alone, {change_text(after)} with stage weights times {STAGE_WEIGHTS[row.name]:.2g}"
     if abs(after) >= 0.5 * abs(before):
         return f"Unexplained: {text}."
-    return (
-        f"Ours is the weight of the final cost, which eq. 6 counts once: {text}. The paper's is unexplained."
-    )
+    return f"Eq. 6 counts the final cost once for any dt, which explains ours: {text}. The paper's is unexplained."
 
 
-def _by_spread(results: ReproductionResults) -> str:
+def _by_spread(results: ReproductionResults, row: PaperRow) -> str:
     """Compare the paper's changes with the spread of the baseline over the dispersed starts."""
     runs = list(cell(results, CODE, BASELINE).values())
     if len(runs) < 2:
         return ""
-    parts = []
+    texts = []
     for q in QUANTITIES:
         s = spread([e.of(q) for e in runs])
-        parts.append(f"{100 * (s.greatest - s.least) / s.median:.0f} % ({q})")
-    return f"Less than the start matters: over ours the baseline varies by {', '.join(parts)}. The paper states no spread."
+        width = (s.greatest - s.least) / s.median
+        found = (
+            "unexplained by the start"
+            if width < abs(paper_change(row, q))
+            else "not separable from the start"
+        )
+        texts.append(f"{q} {found}, which changes the baseline by {100 * width:.0f} %")
+    return f"{'; '.join(texts).capitalize()}. The paper states no spread."

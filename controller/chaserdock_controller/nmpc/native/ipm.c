@@ -294,7 +294,7 @@ static void expand_multipliers(const Qp *qp, const Iterate *it, double *mul) {
     copy(it->mul + 2 * it->n, mul + 2 * qp->n_rows, 12 * qp->stages);
 }
 
-/* |w_bar + dw| <= 1 always holds, for FREE within FREE_TOLERANCE. With CONVERGED and LIMIT the point
+/* |w_bar + dw| <= 1 always holds up to rounding, for FREE within FREE_TOLERANCE. With CONVERGED and LIMIT the point
  * lies strictly within the box; with LIMIT it is the best of max_iterations. BROKEN: the solution would not be finite.
  * Working memory: `ipm_workspace` doubles, and R more. */
 static int solve_one(const Qp *qp, Answer *answer, double *work) {

@@ -308,7 +308,7 @@ def _check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
             checks.violate("bounded queues", name.split()[0], f"{items.most} messages waited")
 
 
-LEAST_ESTIMATES, FLIGHT_NEES = 10, 40.0
+LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
 """Largest mean normalized squared error (6 if consistent) of at least so many estimates of one flight without lying sensors."""
 _LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
 QUEUE_LIMIT = 400

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence that ``chaserdock simulate`` finds bugs: ``python benchmarks/planted_bugs.py [--only NAME ...] [--seeds 500]``.
+
+Each patch in tests/planted_bugs/ plants one bug in a copy of this checkout, in which random seeds are flown until one fails; the
+checkout itself must pass that seed. Prints a table: bug, seed, invariant. ``--check`` only applies all patches. The lines of a
+patch before its first ``---`` state the bug and, as ``Scenario: NAME``, what is flown (default: fault-drill).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+from common import ROOT, Figures, make_parser, write_json
+
+PATCHES = sorted((ROOT / "tests" / "planted_bugs").glob("*.patch"))
+SOURCES = ("agents", "chaserdock", "controller", "protocol", "world")
+COPIED = (*SOURCES, "scenarios", "tests/planted_bugs", "pyproject.toml", "build_hook.py")
+_BUILD = "protocol/chaserdock_models/native/build.py"
+_FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,]+?)(?: at [\d.]+ s)?: (.*)")
+
+
+@dataclass(frozen=True)
+class PlantedBug:
+    """A planted bug: its number and name, what is wrong, the scenario to fly, and the hunks: file, old text, new text."""
+
+    name: str
+    text: str
+    scenario: str
+    hunks: tuple[tuple[str, str, str], ...]
+
+
+@dataclass(frozen=True)
+class FailedSeed:
+    """The first seed that fails, the invariant that it violates, and what was found."""
+
+    seed: int
+    invariant: str
+    text: str
+
+
+def read_bug(path: Path) -> PlantedBug:
+    """Read a patch: a unified diff below a description. Raises ValueError for a line that is neither."""
+    head, file, scenario = [], "", "fault-drill"
+    hunks: list[tuple[str, list[str], list[str]]] = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        if line.startswith("+++ b/"):
+            file = line.removeprefix("+++ b/")
+        elif line.startswith("@@"):
+            hunks.append((file, [], []))
+        elif line.startswith("--- a/"):
+            file = ""
+        elif file and line[:1] in ("", " ", "-", "+"):
+            for mark, lines in (("-", hunks[-1][1]), ("+", hunks[-1][2])):
+                if line[:1] in ("", " ", mark):
+                    lines.append(line[1:])
+        elif found := re.fullmatch(r"Scenario: (\S+)", line):
+            scenario = found[1]
+        elif not file and not hunks:
+            head.append(line)
+        else:
+            raise ValueError(f"{path.name}: not a line of a unified diff: {line!r}")
+    texts = tuple((f, "\n".join(old) + "\n", "\n".join(new) + "\n") for f, old, new in hunks)
+    return PlantedBug(path.stem, " ".join(head), scenario, texts)
+
+
+def apply(bug: PlantedBug, folder: Path, write: bool = True) -> None:
+    """Apply a bug to the sources in ``folder``. Raises ValueError for a hunk whose old text is not there exactly once."""
+    for file, old, new in bug.hunks:
+        path = folder / file
+        source = path.read_text(encoding="utf-8") if path.is_file() else ""
+        if source.count(old) != 1:
+            raise ValueError(
+                f"{bug.name}: {file} contains the text to replace {source.count(old)} times:\n{old}"
+            )
+        if write:
+            path.write_text(source.replace(old, new), encoding="utf-8")
+
+
+def copy_checkout(folder: Path) -> None:
+    """Copy all that a simulation needs to ``folder``."""
+    for name in COPIED:
+        if (ROOT / name).is_dir():
+            shutil.copytree(
+                ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules")
+            )
+        else:
+            shutil.copy(ROOT / name, folder / name)
+
+
+def _run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    paths = [str(folder), *(str(folder / name) for name in SOURCES if name != "chaserdock")]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True)
+
+
+def simulate(folder: Path, scenario: str, first: int, last: int) -> FailedSeed | None:
+    """Fly seeds with the sources in ``folder`` until one fails. Raises RuntimeError if the program fails otherwise."""
+    seeds = f"{first}:{last}"
+    done = _run(folder, "-m", "chaserdock", "simulate", scenario, "--seeds", seeds, "--no-shrink", "--stop")
+    found = _FAILED.search(done.stdout) or _FAILED.search(done.stderr)
+    if done.returncode == 0:
+        return None
+    if found is None:
+        raise RuntimeError(f"simulate failed:\n{done.stdout}{done.stderr}")
+    return FailedSeed(int(found[1] or last), found[2], found[3])
+
+
+def hunt(bug: PlantedBug, seeds: int) -> FailedSeed | None:
+    """Return the first seed that finds a bug. Raises RuntimeError if the patched sources cannot be flown."""
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        copy_checkout(folder)
+        apply(bug, folder)
+        if any(file.endswith((".c", ".h")) for file, _, _ in bug.hunks):
+            built = _run(folder, _BUILD)
+            if built.returncode:
+                raise RuntimeError(f"{bug.name} does not compile:\n{built.stdout}{built.stderr}")
+        return simulate(folder, bug.scenario, 1, seeds)
+
+
+def main() -> int:
+    parser = make_parser(__doc__)
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="bugs whose name contains one of these")
+    parser.add_argument("--seeds", type=int, default=500, metavar="N", help="most seeds to fly for a bug")
+    parser.add_argument("--check", action="store_true", help="only check that the patches apply")
+    options = parser.parse_args()
+    bugs = [
+        bug
+        for path in PATCHES
+        if any(n in path.stem for n in options.only or [""])
+        for bug in [read_bug(path)]
+    ]
+    if not bugs:
+        parser.error(
+            f"no bug is named {' or '.join(options.only)}; there are: {', '.join(p.stem for p in PATCHES)}"
+        )
+    for bug in bugs:
+        apply(bug, ROOT, write=False)
+    if options.check:
+        print(f"{len(bugs)} patches apply")
+        return 0
+    figures: Figures = {}
+    flown: set[tuple[str, int]] = set()
+    print("| bug | scenario | seed | invariant |\n| --- | --- | --- | --- |", flush=True)
+    for bug in bugs:
+        try:
+            found = hunt(bug, min(options.seeds, 5) if options.quick else options.seeds)
+        except RuntimeError as error:  # the other bugs are hunted nevertheless
+            print(error, file=sys.stderr, flush=True)
+            found = None
+        figures[bug.name] = 0 if found is None else found.seed
+        seed, invariant = ("not found", "") if found is None else (found.seed, found.invariant)
+        print(f"| {bug.name}: {bug.text} | {bug.scenario} | {seed} | {invariant} |", flush=True)
+        if found is not None:
+            flown.add((bug.scenario, found.seed))
+            print(f"{bug.name}: {found.text}", file=sys.stderr, flush=True)
+    missed = [name for name, seed in figures.items() if not seed]
+    print(
+        f"{len(bugs) - len(missed)} of {len(bugs)} found" + (f"; not: {', '.join(missed)}" if missed else "")
+    )
+    write_json(options.json, figures)
+    wrong = [(*case, found) for case in sorted(flown) if (found := simulate(ROOT, case[0], case[1], case[1]))]
+    for scenario, seed, found in wrong:
+        print(f"seed {seed} of {scenario} fails without a planted bug: {found.invariant}: {found.text}")
+    if flown and not wrong:
+        print(f"all {len(flown)} seeds that found a bug pass without it")
+    return 1 if missed or wrong else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

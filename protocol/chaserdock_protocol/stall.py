@@ -18,7 +18,7 @@ class StallTimer:
         self.waited_s = 0.0
 
     def reset(self) -> None:
-        """Start anew: what the loop waits for has come."""
+        """Restart the count: what the loop waits for has come."""
         self.waited_s = 0.0
 
     def update(self) -> float:

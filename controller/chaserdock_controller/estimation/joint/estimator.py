@@ -300,7 +300,7 @@ def _reacquire(
     now: JointFilterState, seen: Mapping[int, Sighting], mounting: CameraMounting, p: JointParameters,
     events: list[EstimatorEvent],
 ) -> JointFilterState:  # fmt: skip
-    """Start the target anew from the status "lost", with its rates; unless it would be lost again."""
+    """Reinitialize the target from the status "lost", keeping its rates; unless it would be lost again."""
     new_events: list[EstimatorEvent] = []
     fresh = _start(now, seen, rates_of(now.hypotheses[0]), mounting, p, "reacquired", new_events)
     if all_lost(fresh, p.target):

@@ -4,7 +4,7 @@
 A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
 until it has fitted as often: a jump or a constant error then changes nothing. A velocity or rate that suddenly does not fit, by no
 more than the thrusters can cause within a tick, is followed. When most cameras are rejected together, the
-target has moved in an unexpected way: its rates are widened, and if that does not help its pose starts anew.
+target has moved in an unexpected way: its rates are widened, and if that does not help its pose is reinitialized.
 """
 
 from __future__ import annotations

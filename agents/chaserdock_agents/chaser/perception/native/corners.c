@@ -252,6 +252,12 @@ typedef struct {
     double inside[COLUMNS_MOST], offset[PIXELS_MOST], along[PIXELS_MOST], border[PIXELS_MOST], level[PIXELS_MOST];
 } Band;
 
+/* How far outwards, pixels, the pixels at `at` pixels along a side are used: up to beyond the border's outer edge, or not as far. */
+static double outward_limit(const Settings *set, const Border *border, int outer, double at) {
+    double edge = border->at + border->rise * at;
+    return outer ? edge + set->beyond_px : min_of(set->reach_px, edge - set->clear_px);
+}
+
 /* Collects the pixels from `inner` pixels inside the side's line to those before the border's outer edge, or about both. */
 static void collect(const Image *p, const Settings *set, const Side *s, const Border *border, int outer, double inner,
                     Band *band) {
@@ -266,7 +272,7 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
         for (int j = 0; j < 2; j++) seen[j] = ideal[j] = s->start[j] + at / length * s->vector[j];
         if (p->distorted) distort(p, seen, seen + 1);
         for (int j = 0; j < 2; j++) shift[j] = seen[j] - ideal[j];
-        double edge = border->at + border->rise * at, most = outer ? edge + set->beyond_px : min_of(reach, edge - set->clear_px);
+        double most = outward_limit(set, border, outer, at);
         double low = seen[o] - inner / s->normal[o], high = seen[o] + most / s->normal[o];
         double from = min_of(low, high), to = max_of(low, high), line = __builtin_floor(seen[k] + 0.5);
         band->inside[c] = line >= 0.0 && line < (double)sizes[k] && from >= 0.0 && to <= (double)(sizes[o] - 1) ? 1.0 : 0.0;
@@ -283,7 +289,7 @@ static void collect(const Image *p, const Settings *set, const Side *s, const Bo
             double x = q[0] - s->start[0], y = q[1] - s->start[1];
             double offset = x * s->normal[0] + y * s->normal[1], along = (x * s->vector[0] + y * s->vector[1]) / length;
             double width = border->at + border->rise * along;
-            if (!(offset >= -inner && offset <= (outer ? width + set->beyond_px : min_of(reach, width - set->clear_px)))) continue;
+            if (!(offset >= -inner && offset <= outward_limit(set, border, outer, along))) continue;
             if (offset > reach && offset < width - reach) continue;
             int n = band->count++;
             band->offset[n] = offset;

@@ -170,7 +170,7 @@ def grades(options: argparse.Namespace) -> Figures:
             overrides = ('navigation.grade="lab"', *truth)
             scenario = scenario_of("harsh-light", estimator, seed, duration_s, *overrides)
             flights.append(Flight(f"harsh_light_lab_2_{estimator}", scenario, settled_s, True))
-    return fly_all(flights, options.jobs)
+    return fly_all([f for f in flights if f.label.startswith(tuple(options.rows))], options.jobs)
 
 
 def sources(options: argparse.Namespace) -> Figures:
@@ -300,6 +300,13 @@ def main() -> None:
     parser.add_argument("--nominal", action="store_true", help="without plant mismatch in grades")
     parser.add_argument(
         "--estimators", nargs="+", choices=ESTIMATORS, default=ESTIMATORS, help="estimators (default: both)"
+    )
+    parser.add_argument(
+        "--rows",
+        nargs="+",
+        default=("",),
+        metavar="TEXT",
+        help="of grades, rows whose name begins so, such as orbit_calibrated_4 (default: all)",
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)")
     options = parser.parse_args()

@@ -35,6 +35,7 @@ from .state import (
 )
 
 _EYE3 = np.eye(3)
+_ODOMETRY_ROWS = np.arange(12)
 
 
 class CameraMounting(NamedTuple):
@@ -90,9 +91,10 @@ def odometry_noise(odometry: Odometry, p: JointParameters) -> Array:
         odometry.attitude_covariance_rad2,
         odometry.omega_covariance_rad2_s2,
     )
-    for k, (floor, covariance) in enumerate(zip(floors, stated, strict=True)):
+    for k, covariance in enumerate(stated):
         part = slice(3 * k, 3 * k + 3)
-        noise[part, part] = np.reshape(covariance, (3, 3)) + floor**2 * _EYE3
+        noise[part, part] = np.reshape(covariance, (3, 3))
+    noise[_ODOMETRY_ROWS, _ODOMETRY_ROWS] += np.repeat([floor**2 for floor in floors], 3)
     return noise
 
 

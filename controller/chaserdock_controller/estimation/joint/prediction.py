@@ -9,7 +9,7 @@ origin of CRF is at -c from the centre of mass. Its sensor errors are Gauss-Mark
 from __future__ import annotations
 
 import math
-from collections.abc import Set
+from collections.abc import Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -74,11 +74,13 @@ def predict(
     rows = np.concatenate(
         [state.positions_m, state.velocities_m_s, state.attitudes_wxyz, state.omegas_rad_s], axis=1
     )
-    for i in range(n):
-        u = at_origin(wrenches[i], centres[i], state.omegas_rad_s[i], p).tolist()
-        rows[i] = rk4_step(lambda y, u=u: newton_euler(y, u, p.body.mass_kg, p.inertia), rows[i], dt)
+    totals = [at_origin(wrenches[i], centres[i], state.omegas_rad_s[i], p) for i in range(n)]
+    mass, inertia = p.body.mass_kg, p.inertia
+    for i, total in enumerate(totals):
+        u = total.tolist()
+        rows[i] = rk4_step(lambda y, u=u: newton_euler(y, u, mass, inertia), rows[i], dt)
     fade = _fading(state, dt, p)
-    motion = _motion_transitions(state, wrenches, centres, dt, p)
+    motion = _motion_transitions(state, wrenches, totals, centres, dt, p)
     covariance = _transform(target_transition, motion, fade, state.covariance)
     _add_noise(covariance, state, impulses, dt, p, latched, fade, max(0.0, dt - nominal_s))
     return replace(
@@ -154,15 +156,23 @@ def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) ->
 
 
 def _motion_transitions(
-    state: JointState, wrenches: Array, centres_m: Array, dt: float, p: JointParameters
+    state: JointState,
+    wrenches: Array,
+    totals: Sequence[Array],
+    centres_m: Array,
+    dt: float,
+    p: JointParameters,
 ) -> Array:
-    """Return the transition matrices (N, MOTION, MOTION) of the errors of motion and disturbance, to second order in ``dt``."""
+    """Return the transition matrices (N, MOTION, MOTION) of the errors of motion and disturbance, to second order in ``dt``.
+
+    ``totals``: the wrenches (6,) ``at_origin``.
+    """
     n, inertia = state.chasers, np.array(p.inertia)
     a = np.zeros((n, MOTION, MOTION))
     for i in range(n):
         c, w = so3.to_matrix(state.attitudes_wxyz[i]), state.omegas_rad_s[i]
         centre, turning = so3.skew(centres_m[i]), so3.skew(w)
-        total = at_origin(wrenches[i], centres_m[i], w, p)
+        total = totals[i]
         alpha = _angular_acceleration(total[3:], w, p)
         a[i, ATTITUDE, ATTITUDE] = -turning
         a[i, RATE, RATE] = (so3.skew(inertia * w) - turning * inertia) / inertia[:, None]
@@ -193,7 +203,9 @@ def _transform(target: Array, motion: Array, fade: Array, covariance: Array) -> 
         return out
 
     result = left(np.ascontiguousarray(left(covariance).T))
-    return 0.5 * (result + result.T)
+    result = result + result.T
+    result *= 0.5
+    return result
 
 
 def _add_noise(

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plumes of thrusters: the angle to a box is the smallest of all its points, and does not depend on the frame."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from chaserdock_models import rotations
+from chaserdock_models.plume import angle_to_box, angle_to_point, plume_hits
+from chaserdock_models.targets import Box
+from hypothesis import given
+from hypothesis import strategies as st
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def random_case(seed: int) -> tuple[np.ndarray, np.ndarray, Box]:
+    rng = np.random.default_rng(seed)
+    q = rotations.normalize(rng.normal(size=4)).tolist()
+    box = Box(tuple(rng.uniform(0.1, 1.0, 3)), tuple(rng.uniform(-0.5, 0.5, 3)), tuple(q))
+    axis = rng.normal(size=3)
+    return rng.uniform(-1.5, 1.5, 3), axis / np.linalg.norm(axis), box
+
+
+@given(SEEDS)
+def test_no_point_of_a_box_is_at_a_smaller_angle_than_the_one_returned(seed: int) -> None:
+    nozzle, axis, box = random_case(seed)
+    smallest = angle_to_box(nozzle, axis, box)
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 25)] * 3), axis=-1).reshape(-1, 3)
+    points = rotations.rotate(box.q_wxyz, grid * box.size_m) + box.position_m - nozzle
+    cosines = points @ axis / np.linalg.norm(points, axis=1)
+    sampled = math.acos(min(1.0, float(cosines.max())))
+    assert smallest <= sampled + 1e-7
+    # The nearest point of the grid is at most half a cell away.
+    cell_m = np.linalg.norm(box.size_m) / 48.0
+    distance_m = float(np.linalg.norm(points, axis=1).min())
+    if distance_m > 4.0 * cell_m:
+        assert sampled - smallest <= 2.0 * cell_m / (distance_m - cell_m)
+
+
+@given(SEEDS)
+def test_the_angle_is_the_same_in_every_frame(seed: int) -> None:
+    nozzle, axis, box = random_case(seed)
+    rng = np.random.default_rng([seed, 1])
+    q, shift = rotations.normalize(rng.normal(size=4)), rng.normal(size=3)
+    moved = Box(
+        box.size_m,
+        tuple((rotations.rotate(q, box.position_m) + shift).tolist()),
+        tuple(rotations.multiply(q, box.q_wxyz).tolist()),
+    )
+    there = angle_to_box(rotations.rotate(q, nozzle) + shift, rotations.rotate(q, axis), moved)
+    assert there == pytest.approx(angle_to_box(nozzle, axis, box), abs=1e-7)
+
+
+@pytest.mark.parametrize(
+    ("nozzle", "axis", "angle"),
+    [
+        ((2.0, 0.0, 0.0), (-1.0, 0.0, 0.0), 0.0),
+        ((0.1, 0.0, 0.0), (1.0, 0.0, 0.0), 0.0),  # inside
+        ((2.0, 0.0, 0.0), (0.0, 0.0, 1.0), math.atan2(1.5, 0.5)),  # an edge
+        ((2.0, 0.0, 0.0), (1.0, 0.0, 0.0), math.pi - math.atan2(math.hypot(0.5, 0.5), 1.5)),  # behind it
+        ((2.0, 0.0, 2.0), (-1.0, 0.0, 0.0), math.atan2(1.5, 2.5)),
+    ],
+)
+def test_angles_to_a_unit_cube(nozzle: tuple, axis: tuple, angle: float) -> None:
+    box = Box((1.0, 1.0, 1.0))
+    assert angle_to_box(np.array(nozzle), np.array(axis), box) == pytest.approx(angle, abs=1e-9)
+
+
+def test_a_plume_is_opposite_to_the_force() -> None:
+    nozzle, half = np.array([2.0, 0.0, 0.0]), math.radians(20.0)
+    assert plume_hits(nozzle, np.array([1.0, 0.0, 0.0]), half, [Box((1.0, 1.0, 1.0))])
+    assert not plume_hits(nozzle, np.array([-1.0, 0.0, 0.0]), half, [Box((1.0, 1.0, 1.0))])
+    assert plume_hits(nozzle, np.array([-1.0, 0.0, 0.0]), half, [], [np.array([3.0, 0.3, 0.0])])
+    assert not plume_hits(nozzle, np.array([-1.0, 0.0, 0.0]), half, [], [np.array([3.0, 0.4, 0.0])])
+    assert angle_to_point(nozzle, np.array([1.0, 0.0, 0.0]), nozzle) == 0.0

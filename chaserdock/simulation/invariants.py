@@ -23,23 +23,31 @@ from chaserdock_protocol.messages import (
     DrawnTruth,
     Event,
     MissionEnd,
+    Plan,
     Reference,
     RelativeEstimate,
+    Sighting,
     TargetEstimate,
+    ThrusterReport,
     Tick,
     WorldTruth,
     WrenchCommand,
 )
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.faults import Fault
 from chaserdock_protocol.transport import RawSample
 
 from chaserdock.analysis.criteria import nearest_allowed_m
+
+from .message_checks import defects_of
 
 SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate"})
 """Phases in which a chaser keeps its distance, if their reason is in the log."""
 KEEP_OUT_SLACK_M = 0.02
 RETREAT_SLACK_M = 0.15
 """A reference that moves inwards at up to 8 cm/s turns within this distance."""
+TURNING_S, HOMING_SLACK_M = 5.0, 0.03
+"""Time (s) after which a retreat leads to the nominal place, and the noise of its reference."""
 SETTLING_S = 15.0
 """Longest time (s) after the last warning or command until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
@@ -52,6 +60,15 @@ _DISPLACEMENT_FLOOR_M = 2e-5
 _ROUNDING = 1e-6
 FOLLOWING_S = 3.0
 """Longest time (s) in which a chaser flies none of the commands that are published for it, unless a fault lasts."""
+_GAP_S = 1.1
+"""Commands that pause for longer, at a hand-over, are published anew."""
+_HARMLESS = frozenset({"camera_off", "lying_sensor", "odometry_lie", "duplicate"})
+"""Kinds of faults after which a chaser flies commands nevertheless."""
+_LIES = frozenset({"odometry_lie", "clock_jump", "corrupt"})
+ACCURACY_M, SEEN_S = 0.02, 0.5
+"""Largest error (m) of the target's position beside drift, while two honest chasers see it, or saw it so long (s) ago."""
+_THRUSTER_FLOOR_N_S, _THRUSTER_SHARE = 0.01, 0.15
+_PLAN_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -97,6 +114,11 @@ class Invariants:
     _following: dict[int, int] = field(default_factory=dict)
     _latched: set[int] = field(default_factory=set)
     _retreats_from_m: dict[int, float] = field(default_factory=dict)
+    _homing_m: dict[int, float] = field(default_factory=dict)
+    _planned: dict[int, Plan] = field(default_factory=dict)
+    _seen_s: dict[int, float] = field(default_factory=dict)
+    _unexplained: dict[int, Array] = field(default_factory=dict)
+    _given_N_s: dict[int, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lifetime_ticks = math.ceil(
@@ -105,9 +127,7 @@ class Invariants:
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
         }
-        s = self.scenario.simulation
-        self._faults_s = [(f.at_s, f.at_s + (f.duration_s or 0.0)) for f in self.scenario.fault]
-        self._faults_s += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
+        self._liars = {f.process for f in self.scenario.fault if f.kind == "lying_sensor"}
         self._handlers: dict[type, Callable[[Any], None]] = {
             Tick: self._on_tick,
             WorldTruth: self._on_world,
@@ -117,6 +137,9 @@ class Invariants:
             WrenchCommand: self._on_wrench,
             TargetEstimate: self._on_estimate,
             Reference: self._on_reference,
+            Sighting: self._on_sighting,
+            Plan: self._on_plan,
+            ThrusterReport: self._on_thrusters,
             Event: self._on_event,
             MissionEnd: self._on_end,
         }
@@ -142,6 +165,8 @@ class Invariants:
         except Rejected as refusal:
             self.violate("valid messages", sender, f"{raw.key}: {refusal}")
             return
+        for text in defects_of(message, self.scenario):
+            self.violate("valid messages", raw.key, text)
         handle = self._handlers.get(type(message))
         if handle is not None:
             handle(message)
@@ -159,8 +184,9 @@ class Invariants:
             # A chaser that no command reaches drifts: what it hits is nobody's doing.
             if not {a, b} & self.dead:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
+        held = self._latched | set(world.latched)  # also until a release within this tick
         self._latched = set(world.latched)
-        self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in world.latched}
+        self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in held}
         self._touching |= {f"chaser/{t.chaser}" for t in world.touches}
         for body in self._bodies:
             self._check_body(body)
@@ -289,19 +315,45 @@ class Invariants:
 
     def _on_wrench(self, command: WrenchCommand) -> None:
         """Note since when a chaser is commanded without a break."""
-        i = command.chaser
-        if command.mode == "none" or command.tick - self._commanded.get(i, -1) > 1:
+        i, gap = command.chaser, math.ceil(_GAP_S * self.scenario.time.rate_hz)
+        if command.mode == "none" or command.tick - self._commanded.get(i, -gap) > gap:
             self._following[i] = command.tick
         self._commanded[i] = max(command.tick, self._commanded.get(i, -1))
+        plan = self._planned.get(i)
+        if command.mode == "nmpc" and plan is not None and plan.tick == command.tick:
+            self._check_plan(plan, command)
+
+    def _on_plan(self, plan: Plan) -> None:
+        self._planned[plan.chaser] = plan
+
+    def _check_plan(self, plan: Plan, command: WrenchCommand) -> None:
+        """Check that a command is the input of its plan at the time from which it acts."""
+        stage = int((command.effective_time_ns - plan.sim_time_ns) / 1e9 / plan.step_s + 1e-9)
+        planned = np.reshape(plan.inputs, (-1, 6))
+        if not 0 <= stage < len(planned):
+            return
+        limits = self.scenario.chaser.wrench_max
+        error = np.abs(np.array([*command.force_N, *command.torque_N_m]) - planned[stage]) / limits
+        if float(error.max()) > _PLAN_SHARE:
+            text = f"differs from its plan by {error.max():.2e} of the limits"
+            self.violate("plan is flown", f"chaser/{command.chaser}", text)
 
     def _check_following(self, command: ActuatorCommand) -> None:
         """Check that a chaser without commands has a cause for it."""
         i, rate_hz = command.chaser, self.scenario.time.rate_hz
         since_s, now_s = self._following.get(i, self._tick) / rate_hz, self._tick / rate_hz
-        since_s = max([since_s, *(min(end_s, now_s) for at_s, end_s in self._faults_s if at_s <= now_s)])
-        if self._commanded.get(i, -1) >= self._tick - 1 and now_s - since_s > FOLLOWING_S:
+        since_s = max(since_s, self._disturbed_until_s(f"chaser/{i}", now_s))
+        recent = self._commanded.get(i, -1) >= self._tick - math.ceil(_GAP_S * rate_hz)
+        if recent and now_s - since_s > FOLLOWING_S:
             text = f"has flown no command for {now_s - since_s:.1f} s, but commands are published"
             self.violate("commands are flown", f"chaser/{i}", text)
+
+    def _disturbed_until_s(self, name: str, now_s: float) -> float:
+        """Return until when faults or the network have kept commands from a chaser, at most ``now_s``; 0 if never."""
+        s = self.scenario.simulation
+        spans = [(f.at_s, f.at_s + (f.duration_s or 0.0)) for f in self.scenario.fault if _concerns(f, name)]
+        spans += [(w.at_s, w.at_s + w.duration_s) for w in (*s.partition, *s.slow)]
+        return max([0.0, *(min(end_s, now_s) for at_s, end_s in spans if at_s <= now_s)])
 
     def _on_command(self, command: ActuatorCommand) -> None:
         if command.source != "command":
@@ -329,11 +381,57 @@ class Invariants:
 
     # -- the rest ------------------------------------------------------------------------------------------------
 
+    def _on_sighting(self, sighting: Sighting) -> None:
+        name = f"chaser/{sighting.chaser}"
+        if sighting.status == "seen" and name not in self._liars:
+            self._seen_s[sighting.chaser] = self.time_s
+
+    def _check_accuracy(self, estimate: TargetEstimate, truth: BodyTruth) -> None:
+        """Check that one lying sensor does not mislead the estimate while two honest chasers see the target."""
+        if len(self._liars) > 1 or any(f.kind in _LIES for f in self.scenario.fault):
+            return
+        if sum(self.time_s - seen_s <= SEEN_S for seen_s in self._seen_s.values()) < 2:
+            return
+        error_m = _distance(np.array(estimate.position_m), np.array(truth.position_m))
+        allowed_m = ACCURACY_M + 4.0 * self.scenario.navigation.errors().position_drift_m
+        if error_m > allowed_m:
+            text = f"estimated {error_m:.3f} m from its position, {allowed_m:g} allowed"
+            self.violate("accurate estimate", "target", text)
+
+    def _on_thrusters(self, report: ThrusterReport) -> None:
+        """Compare the impulse that a chaser expects of its thrusters with the true one, summed since the last fault."""
+        i, name = report.chaser, f"chaser/{report.chaser}"
+        body, now_s = self._states.get(name), report.tick / self.scenario.time.rate_hz
+        s = self.scenario
+        lossy = s.simulation.mode == "realtime" and (s.simulation.loss or s.simulation.reorder)
+        if body is None or body.tick != report.tick or lossy or s.thruster_failure or name in self._touching:
+            self._unexplained.pop(i, None)
+            return
+        if any(f.at_s <= now_s <= f.at_s + (f.duration_s or 0.0) + 2.0 for f in s.fault):
+            self._unexplained.pop(i, None)
+            return
+        true = [*body.impulse_N_s, *np.divide(body.angular_impulse_N_m_s, _ARM_M)]
+        expected = [*report.given_impulse_N_s, *np.divide(report.given_angular_impulse_N_m_s, _ARM_M)]
+        if i not in self._unexplained:
+            self._unexplained[i], self._given_N_s[i] = np.zeros(6), 0.0
+            return
+        self._unexplained[i] = self._unexplained[i] + np.subtract(expected, true)
+        self._given_N_s[i] += sum(body.thruster_impulse_N_s)
+        error = float(np.linalg.norm(self._unexplained[i]))
+        if error > _THRUSTER_FLOOR_N_S + _THRUSTER_SHARE * self._given_N_s[i]:
+            text = (
+                f"expects {error:.2e} N s more of its thrusters than they gave, of {self._given_N_s[i]:.2e}"
+            )
+            self.violate("thrusters as expected", name, text)
+
     def _on_estimate(self, estimate: TargetEstimate) -> None:
         truth = self._states.get("target")
-        if estimate.tick % self.scenario.time.rate_hz or estimate.status not in ("tracking", "predicting"):
+        if estimate.status not in ("tracking", "predicting"):
             return
         if truth is None or truth.sim_time_ns != estimate.sim_time_ns:
+            return
+        self._check_accuracy(estimate, truth)
+        if estimate.tick % self.scenario.time.rate_hz:
             return
         covariance = np.array(estimate.covariance).reshape(12, 12)[np.ix_(_POSE, _POSE)]
         turn = rotations.log(
@@ -354,20 +452,38 @@ class Invariants:
             near_m = min(away_m, math.hypot(*nominal_m)) - RETREAT_SLACK_M
             # From the far side of the target the way back passes it.
             self._retreats_from_m[i] = near_m if np.dot(reference.offset_m, nominal_m) > 0.0 else 0.0
+            self._homing_m.pop(i, None)
         self.phases[i] = reference.phase
+        if reference.phase in ("retreat", "abort") and reference.phase_time_s > TURNING_S:
+            self._check_homing(i, reference)
         if reference.phase in ("retreat", "abort") and away_m < self._retreats_from_m[i]:
             self.violate(
                 "retreat leads away", f"chaser/{i}", f"its reference is {away_m:.2f} m from the target"
             )
 
+    def _check_homing(self, i: int, reference: Reference) -> None:
+        """Check that a retreat leads to the chaser's nominal place."""
+        left_m = math.dist(reference.offset_m, self.scenario.chasers[i].position_m)
+        least_m = self._homing_m[i] = min(left_m, self._homing_m.get(i, left_m))
+        if left_m > least_m + HOMING_SLACK_M:
+            text = f"its reference is {left_m:.2f} m from its nominal place, after {least_m:.2f} m"
+            self.violate("retreat leads away", f"chaser/{i}", text)
+
     def _on_event(self, event: Event) -> None:
         if event.level != "info" and not event.what.startswith("fault "):
             self.reasons.append(f"{event.process}: {event.what} {event.detail}".strip())
             self.reason_s = self.time_s
-        if event.process == "world" and event.what == "process lost":
-            self.dead.add(event.detail)
-        if event.process == "world" and event.what == "actuators stopped":
-            self.dead.add(event.detail.partition(":")[0])
+        if event.process == "world" and event.what in ("process lost", "actuators stopped"):
+            lost = event.detail.partition(":")[0]
+            self.dead.add(lost)
+            if not self._may_lose():
+                self.violate("no loss without a cause", lost, event.what)
+
+    def _may_lose(self) -> bool:
+        """Return whether a fault or the network explains that a process is lost."""
+        s = self.scenario.simulation
+        lossy = s.mode == "realtime" and (s.loss or s.reorder)
+        return bool(lossy or s.slow or s.partition) or any(f.at_s <= self.time_s for f in self.scenario.fault)
 
     def _on_end(self, end: MissionEnd) -> None:
         self.end = end
@@ -392,11 +508,27 @@ class Invariants:
             if phase in ("latched", "verified") and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
             named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
+            if phase not in _DOCKED and not self._disturbed():
+                self.violate(
+                    "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
+                )
             commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
             disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < SETTLING_S
             if phase in _DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
             self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
+
+    def _disturbed(self) -> bool:
+        """Return whether anything may keep the chasers from docking: faults, the network, commands, or another plant."""
+        s = self.scenario
+        network = s.simulation.model_dump(exclude={"mode", "latency_s", "jitter_s", "duplicate"})
+        commands = {e.command for e in s.timeline} - {"approach"}
+        return bool(s.fault or commands or any(network.values()) or "truth" in s.model_fields_set)
+
+
+def _concerns(fault: Fault, name: str) -> bool:
+    """Return whether a fault may keep commands from a chaser, or make it refuse them."""
+    return fault.kind not in _HARMLESS and fault.process in (name, "world", "controller", "standby")
 
 
 def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:

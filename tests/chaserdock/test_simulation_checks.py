@@ -17,7 +17,12 @@ from chaserdock_protocol.messages import (
     DrawnTruth,
     Event,
     MissionEnd,
+    Plan,
     Reference,
+    Sighting,
+    TargetEstimate,
+    ThrusterPulse,
+    ThrusterReport,
     Tick,
     WorldTruth,
     WrenchCommand,
@@ -31,16 +36,33 @@ from message_samples import BY_TYPE
 
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
+from chaserdock.simulation.message_checks import covariance_defect, defects_of
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import KINDS, Case, SimulationResult, draw_case
 from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
+WEAK: dict[str, Any] = {"force_N": (0.25, -1.5, 1.0), "torque_N_m": (0.01, 0.0, -0.02)}
+WRENCH: Any = msgspec.structs.replace(BY_TYPE[WrenchCommand], expires_ns=1_300_000_000, **WEAK)
+ACTUATORS: Any = msgspec.structs.replace(BY_TYPE[ActuatorCommand], pulses=(), isolated=(), **WEAK)
+EYE3 = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
     return load_scenario(DRILL)
+
+
+def variant(folder: Path, **keys: Any) -> Scenario:
+    """Return fault-drill with other values of ``keys``."""
+    (folder / "case.toml").write_text(toml_document({"extends": "fault-drill", **keys}))
+    return load_scenario(folder / "case.toml")
+
+
+@pytest.fixture
+def killed(tmp_path: Path) -> Scenario:
+    """Scenario in which chaser 1 is killed."""
+    return variant(tmp_path, fault=[{"kind": "kill", "process": "chaser/1", "at_s": 0.1}])
 
 
 # -- cases ------------------------------------------------------------------------------------------------------
@@ -98,8 +120,7 @@ class Log:
         self.tick(tick)
 
     def flies(self, chaser: int, tick: int, term: int = 1, source: str = "command") -> None:
-        sample: Any = BY_TYPE[ActuatorCommand]
-        command = msgspec.structs.replace(sample, chaser=chaser, tick=tick, term=term, source=source)
+        command = msgspec.structs.replace(ACTUATORS, chaser=chaser, tick=tick, term=term, source=source)
         self.publish(topics.ACTUATORS, command, chaser, f"chaser/{chaser}")
 
     def event(self, what: str, detail: str, process: str = "world", level: Any = "warning") -> None:
@@ -124,7 +145,9 @@ def body(name: str, x_m: float, speed_m_s: float = 0.0, **values: Any) -> BodyTr
     return BodyTruth(body=name, position_m=(x_m, 0.0, 0.0), **{**state, **values})
 
 
-def test_contact_is_a_violation_unless_a_chaser_is_lost(log: Log) -> None:
+def test_contact_is_a_violation_unless_a_chaser_is_lost(killed: Scenario) -> None:
+    log = Log(killed)
+    log.tick(1)
     log.event("process lost", "chaser/1")
     log.bodies(1, contacts=(("chaser/1", "target"),))
     assert log.found == []
@@ -182,16 +205,24 @@ def test_bodies_begin_where_the_scenario_states(log: Log, scenario: Scenario) ->
     assert other.found == ["initial state"]
 
 
-def test_published_commands_are_flown_unless_a_fault_lasts(scenario: Scenario, tmp_path: Path) -> None:
+def test_a_chaser_is_lost_for_a_cause_only(killed: Scenario, scenario: Scenario) -> None:
+    with_cause, without = Log(killed), Log(scenario)
+    for log in (with_cause, without):
+        log.tick(2)
+        log.event("actuators stopped", "chaser/1: no command for 0.5 s")
+    assert with_cause.found == []
+    assert without.found == ["no loss without a cause"]
+
+
+def test_published_commands_are_flown_unless_a_fault_lasts(tmp_path: Path) -> None:
     drop = {"kind": "drop", "process": "chaser/1", "topic": "wrench", "at_s": 1.0, "duration_s": 4.0}
-    (tmp_path / "case.toml").write_text(toml_document({"extends": "fault-drill", "fault": [drop]}))
-    log = Log(load_scenario(tmp_path / "case.toml"))
-    sample: Any = BY_TYPE[WrenchCommand]
+    blind = {"kind": "camera_off", "process": "chaser/1", "at_s": 1.0, "duration_s": 6.0}
+    log = Log(variant(tmp_path, fault=[drop, blind, {**drop, "process": "chaser/2", "duration_s": 6.0}]))
     for tick in range(82):
         assert log.found == [], tick
         log.tick(tick)
         for chaser in (0, 1):
-            commanded = msgspec.structs.replace(sample, chaser=chaser, tick=tick, mode="nmpc")
+            commanded = msgspec.structs.replace(WRENCH, chaser=chaser, tick=tick, mode="nmpc")
             log.publish(topics.WRENCH, commanded, chaser, "controller")
         log.flies(0, tick)
         log.flies(1, tick, source="command" if tick < 10 else "hold")
@@ -213,6 +244,72 @@ def test_a_retreat_leads_away_from_the_target(log: Log) -> None:
     refers("abort", -0.5)
     refers("abort", -0.3)
     assert log.found == ["retreat leads away"]
+
+
+def test_a_retreat_leads_to_the_nominal_place_when_it_has_turned(log: Log) -> None:
+    sample: Any = msgspec.structs.replace(BY_TYPE[Reference], chaser=0, phase="retreat")
+    for time_s, x_m in ((1.0, -0.50), (4.0, -0.44), (6.0, -0.48), (7.0, -0.50), (8.0, -0.48)):
+        reference = msgspec.structs.replace(sample, phase_time_s=time_s, offset_m=(x_m, 0.0, 0.0))
+        log.publish(topics.REFERENCE, reference, 0)
+    assert log.found == []
+    log.publish(
+        topics.REFERENCE, msgspec.structs.replace(sample, phase_time_s=9.0, offset_m=(-0.46, 0, 0)), 0
+    )
+    assert log.found == ["retreat leads away"]
+
+
+def test_commands_are_the_inputs_of_their_plans(log: Log) -> None:
+    inputs = (*WRENCH.force_N, *WRENCH.torque_N_m, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    sample: Any = BY_TYPE[Plan]
+    plan = msgspec.structs.replace(
+        sample, positions_m=(0.0,) * 9, quaternions_wxyz=(1.0, 0, 0, 0) * 3, inputs=inputs
+    )
+    log.publish(topics.PLAN, plan, 0)
+    acting = msgspec.structs.replace(WRENCH, effective_time_ns=plan.sim_time_ns + 50_000_000)
+    log.publish(topics.WRENCH, acting, 0)
+    log.publish(topics.WRENCH, msgspec.structs.replace(acting, mode="track", force_N=(0.0, 0.0, 0.0)), 0)
+    assert log.found == []
+    late = msgspec.structs.replace(acting, effective_time_ns=plan.sim_time_ns + 150_000_000)
+    log.publish(topics.WRENCH, late, 0)
+    assert log.found == ["plan is flown"]
+
+
+def test_a_lying_sensor_does_not_mislead_the_estimate_of_two_others(tmp_path: Path) -> None:
+    lie = {"kind": "lying_sensor", "at_s": 1.0, "duration_s": 9.0, "offset_m": [0.2, 0.0, 0.0]}
+    logs = [
+        Log(variant(tmp_path, fault=[{**lie, "process": f"chaser/{i}"} for i in liars]))
+        for liars in ((2,), (1, 2))
+    ]
+    sample: Any = BY_TYPE[TargetEstimate]
+    for log in logs:
+        log.bodies(9, body("target", 0.0))
+        for chaser in range(3):
+            sighting: Any = msgspec.structs.replace(BY_TYPE[Sighting], chaser=chaser)
+            log.publish(topics.SIGHTING, sighting, chaser)
+        for x_m in (0.01, 0.03):
+            estimate = msgspec.structs.replace(
+                sample, tick=9, sim_time_ns=900_000_000, position_m=(x_m, 0.0, 0.0)
+            )
+            log.publish(topics.TARGET, estimate)
+    assert [log.found for log in logs] == [["accurate estimate"], []]
+
+
+def test_thrusters_give_what_the_chaser_expects() -> None:
+    log = Log(load_scenario(ROOT / "scenarios" / "docking-contact.toml"))
+    sample: Any = BY_TYPE[ThrusterReport]
+    report = msgspec.structs.replace(
+        sample,
+        force_max_N=(0.5,) * 3,
+        torque_max_N_m=(0.01,) * 3,
+        thrusters=("healthy",) * 12,
+        given_impulse_N_s=(0.1, 0.0, 0.0),
+    )
+    for tick in range(1, 12):
+        fired: dict[str, Any] = {"impulse_N_s": (0.1 if tick < 10 else -0.1, 0.0, 0.0)}
+        log.bodies(tick, body("chaser/0", 2.0, **fired, thruster_impulse_N_s=(0.1,)))
+        at = {"tick": tick, "sim_time_ns": tick * 100_000_000}
+        log.publish(topics.THRUSTERS, msgspec.structs.replace(report, **at), 0)
+        assert log.found == ([] if tick < 10 else ["thrusters as expected"]), tick
 
 
 def test_an_untouched_target_conserves_its_energy(log: Log) -> None:
@@ -264,6 +361,50 @@ def test_invalid_messages_are_noticed(log: Log) -> None:
     assert log.found == ["valid messages"]
 
 
+WRONG = [
+    (msgspec.structs.replace(WRENCH, expires_ns=900_000_000), "a lifetime of 0.1 s, 0.5 stated"),
+    (msgspec.structs.replace(WRENCH, force_N=(0.0, 2.1, 0.0)), "wrench of 1.050 of the body's limits"),
+    (msgspec.structs.replace(ACTUATORS, torque_N_m=(0.0, 0.0, -0.06)), "wrench of 1.200"),
+    (
+        msgspec.structs.replace(ACTUATORS, pulses=(ThrusterPulse(thruster=0, open_ns=9, close_ns=19),)),
+        "pulse of thruster 0 from 9",
+    ),
+    (body("target", 0.0, q_wxyz=(1.0, 0.0, 0.0, 0.01)), "quaternion of length 1.00005"),
+    (msgspec.structs.replace(BY_TYPE[Sighting], solutions=()), "status seen with 0 solutions"),
+    (msgspec.structs.replace(BY_TYPE[TargetEstimate], rejected=(0,)), "both accepted and rejected"),
+    (msgspec.structs.replace(BY_TYPE[Reference], offset_m=(30.0, 0.0, 0.0)), "30.0 m from the target"),
+    (msgspec.structs.replace(BY_TYPE[Plan], positions_m=()), "plan of 1 stages with (0, 8, 6) numbers"),
+]
+
+
+@pytest.mark.parametrize(("message", "text"), WRONG, ids=lambda x: type(x).__name__)
+def test_messages_with_impossible_values_are_found(message: Any, text: str, scenario: Scenario) -> None:
+    assert text in " ".join(defects_of(message, scenario))
+
+
+@pytest.mark.parametrize("kind", [WrenchCommand, ActuatorCommand, Sighting, TargetEstimate, Reference])
+def test_correct_messages_have_no_defects(kind: type, scenario: Scenario) -> None:
+    message = {WrenchCommand: WRENCH, ActuatorCommand: ACTUATORS}.get(kind, BY_TYPE.get(kind))
+    assert defects_of(message, scenario) == []
+
+
+def test_covariances_are_symmetric_and_positive_semidefinite() -> None:
+    assert covariance_defect(EYE3) == covariance_defect((0.0,) * 9) == ""
+    assert "not symmetric" in covariance_defect((1.0, 0.1, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+    assert "eigenvalue -1" in covariance_defect((1.0, 2.0, 0.0, 2.0, 1.0, 0.0, 0.0, 0.0, 1.0))
+
+
+def test_pulses_of_a_thruster_do_not_overlap() -> None:
+    capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    pulses = tuple(ThrusterPulse(thruster=j, open_ns=9 + 5 * j, close_ns=19) for j in (0, 1))
+    fired = msgspec.structs.replace(ACTUATORS, force_N=(0.0,) * 3, torque_N_m=(0.0,) * 3, pulses=pulses)
+    assert defects_of(fired, capture) == []
+    again = (*pulses, ThrusterPulse(thruster=1, open_ns=18, close_ns=25))
+    assert defects_of(msgspec.structs.replace(fired, pulses=again), capture) == [
+        "overlapping pulses of thruster 1"
+    ]
+
+
 def ended(log: Log, complete: bool = True) -> Log:
     log.publish(
         topics.END, MissionEnd(tick=250, reason="completed" if complete else "no chaser", complete=complete)
@@ -286,19 +427,28 @@ def test_a_complete_mission_lasts_as_long_as_the_scenario(log: Log) -> None:
     ]
 
 
-def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, scenario: Scenario) -> None:
+def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -> None:
     at_end(log, "docked")
     ended(log).checks.check_end({}, ())
     assert log.found == []
-    without = Log(scenario)
+    without = Log(killed)
     at_end(without, "hold")
     ended(without).checks.check_end({}, ())
     assert without.found == ["liveness", "liveness"]
-    with_reason = Log(scenario)
+    with_reason = Log(killed)
     at_end(with_reason, "hold")
     with_reason.event("no command", "for 2 s", "chaser/0")
     ended(with_reason).checks.check_end({}, ())
     assert with_reason.found == []
+
+
+def test_an_undisturbed_mission_docks(log: Log) -> None:
+    at_end(log, "hold")
+    log.event("no command", "for 2 s", "chaser/0")
+    ended(log).checks.check_end({}, ())
+    assert [str(v) for v in log.checks.violations] == [
+        f"liveness at 0.00 s: chaser/{i}: ends in phase hold, although nothing disturbed it" for i in (0, 3)
+    ]
 
 
 def test_crashes_stalls_and_early_ends_are_violations(scenario: Scenario) -> None:

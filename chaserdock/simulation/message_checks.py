@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What must hold for each published message by itself, beyond what the decoder checks. Pure functions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    BodyTruth,
+    Odometry,
+    Plan,
+    Reference,
+    Sighting,
+    TargetEstimate,
+    ThrusterReport,
+    WrenchCommand,
+)
+from chaserdock_protocol.scenario import Scenario
+
+_UNIT = 1e-6
+_LIMIT_SHARE = 1.01
+"""Share of a limit up to which chasers accept commands."""
+_SYMMETRY = 1e-9
+"""Largest asymmetry and largest negative eigenvalue of a covariance, as a share of its largest variance."""
+
+
+def defects_of(message: Any, scenario: Scenario) -> list[str]:
+    """Return what is wrong with a message, given its scenario; empty if nothing is."""
+    check = _CHECKS.get(type(message))
+    return [] if check is None else list(check(message, scenario))
+
+
+def covariance_defect(values: Sequence[float]) -> str:
+    """Return why a row-major matrix is no covariance, or an empty string."""
+    size = math.isqrt(len(values))
+    matrix = np.reshape(np.asarray(values), (size, size))
+    scale = float(np.abs(matrix).max())
+    asymmetry = float(np.abs(matrix - matrix.T).max())
+    if asymmetry > _SYMMETRY * scale:
+        return f"covariance is not symmetric: {asymmetry:.2e} of {scale:.2e}"
+    least = float(np.linalg.eigvalsh(matrix)[0])
+    if least < -_SYMMETRY * scale:
+        return f"covariance is not positive semidefinite: eigenvalue {least:.2e}"
+    return ""
+
+
+def _quaternions(values: Iterable[Sequence[float]], tolerance: float = _UNIT) -> Iterator[str]:
+    for q in values:
+        if abs(math.hypot(*q) - 1.0) > tolerance:
+            yield f"quaternion of length {math.hypot(*q):.9g}"
+
+
+def _covariances(values: Iterable[Sequence[float]]) -> Iterator[str]:
+    yield from filter(None, map(covariance_defect, values))
+
+
+def _body(body: BodyTruth, scenario: Scenario) -> Iterator[str]:
+    yield from _quaternions([body.q_wxyz])
+
+
+def _odometry(odometry: Odometry, scenario: Scenario) -> Iterator[str]:
+    yield from _quaternions([odometry.q_wxyz])
+    yield from _covariances(
+        [
+            odometry.position_covariance_m2,
+            odometry.velocity_covariance_m2_s2,
+            odometry.attitude_covariance_rad2,
+            odometry.omega_covariance_rad2_s2,
+        ]
+    )
+
+
+def _sighting(sighting: Sighting, scenario: Scenario) -> Iterator[str]:
+    yield from _quaternions(s.q_wxyz for s in sighting.solutions)
+    yield from _covariances(s.covariance for s in sighting.solutions)
+    if (sighting.status == "seen") != bool(sighting.solutions):
+        yield f"status {sighting.status} with {len(sighting.solutions)} solutions"
+
+
+def _estimate(estimate: TargetEstimate, scenario: Scenario) -> Iterator[str]:
+    if estimate.status == "none":
+        return
+    yield from _quaternions([estimate.q_wxyz, *(r.q_wxyz for r in estimate.relative)])
+    yield from _covariances([estimate.covariance, *(r.covariance for r in estimate.relative)])
+    if both := set(estimate.accepted) & set(estimate.rejected):
+        yield f"sightings of chasers {sorted(both)} are both accepted and rejected"
+
+
+def _reference(reference: Reference, scenario: Scenario) -> Iterator[str]:
+    yield from _quaternions([reference.q_wxyz])
+    away_m, most_m = math.hypot(*reference.offset_m), scenario.limits.max_reference_distance_m
+    if away_m > most_m * _LIMIT_SHARE:
+        yield f"reference {away_m:.1f} m from the target, at most {most_m:g} allowed"
+
+
+def _plan(plan: Plan, scenario: Scenario) -> Iterator[str]:
+    stages = len(plan.inputs) // 6
+    lengths = len(plan.positions_m), len(plan.quaternions_wxyz), len(plan.inputs)
+    if lengths != (3 * (stages + 1), 4 * (stages + 1), 6 * stages):
+        yield f"plan of {stages} stages with {lengths} numbers"
+        return
+    yield from _within_limits(np.reshape(plan.inputs, (stages, 6)), scenario)
+
+
+def _within_limits(wrenches: Any, scenario: Scenario) -> Iterator[str]:
+    limits = scenario.chaser.wrench_max
+    share = float(np.max(np.abs(wrenches) / limits, initial=0.0))
+    if share > _LIMIT_SHARE:
+        yield f"wrench of {share:.3f} of the body's limits"
+
+
+def _wrench(command: WrenchCommand, scenario: Scenario) -> Iterator[str]:
+    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario)
+    if command.mode == "none":
+        return
+    lifetime_s = (command.expires_ns - command.sim_time_ns) * 1e-9
+    stated_s = scenario.controller.command_lifetime_s
+    if command.sim_time_ns and abs(lifetime_s - stated_s) > 1e-6:  # stamps of a wrong clock end at 0
+        yield f"command with a lifetime of {lifetime_s:g} s, {stated_s:g} stated"
+
+
+def _actuators(command: ActuatorCommand, scenario: Scenario) -> Iterator[str]:
+    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario)
+    count, closed = len(scenario.chaser.thrusters), {}
+    for pulse in sorted(command.pulses, key=lambda p: (p.thruster, p.open_ns)):
+        if pulse.thruster >= count or pulse.open_ns >= pulse.close_ns:
+            yield f"pulse of thruster {pulse.thruster} from {pulse.open_ns} to {pulse.close_ns} ns"
+        if pulse.open_ns < closed.get(pulse.thruster, 0):
+            yield f"overlapping pulses of thruster {pulse.thruster}"
+        closed[pulse.thruster] = pulse.close_ns
+
+
+def _report(report: ThrusterReport, scenario: Scenario) -> Iterator[str]:
+    yield from _within_limits([*report.force_max_N, *report.torque_max_N_m], scenario)
+    if len(report.thrusters) != len(scenario.chaser.thrusters):
+        yield f"states of {len(report.thrusters)} thrusters, the body has {len(scenario.chaser.thrusters)}"
+
+
+_CHECKS: dict[type, Callable[[Any, Scenario], Iterator[str]]] = {
+    BodyTruth: _body,
+    Odometry: _odometry,
+    Sighting: _sighting,
+    TargetEstimate: _estimate,
+    Reference: _reference,
+    Plan: _plan,
+    WrenchCommand: _wrench,
+    ActuatorCommand: _actuators,
+    ThrusterReport: _report,
+}

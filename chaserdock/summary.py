@@ -17,6 +17,18 @@ class SteadyErrors(Struct, frozen=True, kw_only=True):
     orientation_mse_rad2: float | None
 
 
+class PortLoadPeaks(Struct, frozen=True, kw_only=True):
+    """Largest loads at a chaser's port, over all physics steps; ``closing_impulse_N_s``: largest in a tick, where a latch
+    closed."""
+
+    peak_force_N: float
+    peak_torque_N_m: float
+    peak_axial_N: float
+    peak_shear_N: float
+    peak_bending_N_m: float
+    closing_impulse_N_s: float
+
+
 class Capture(Struct, frozen=True, kw_only=True):
     """Docking by contact of one chaser; the figures at contact are None without a latch."""
 
@@ -29,6 +41,7 @@ class Capture(Struct, frozen=True, kw_only=True):
     contact_lateral_speed_m_s: float | None
     probe_touches: int
     refused: list[str]
+    port_load: PortLoadPeaks | None = None
 
 
 class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):

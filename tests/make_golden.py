@@ -12,7 +12,7 @@ import tempfile
 from pathlib import Path
 
 from chaserdock_protocol import codec
-from chaserdock_protocol.messages import BodyTruth, Image, WorldTruth, encoding_of
+from chaserdock_protocol.messages import BodyTruth, Image, PortLoad, WorldTruth, encoding_of
 from chaserdock_protocol.recording.log import LogWriter, read_log, read_scenario
 from harness import ROOT, run
 
@@ -45,7 +45,7 @@ def for_the_controller(log: Path, out: Path) -> None:
     writer = LogWriter(out)
     writer.describe(scenario, {k: v for k, v in run.items() if k in ("run_id", "mode")})
     for record in read_log(log):
-        if not isinstance(record.message, Image | BodyTruth | WorldTruth):
+        if not isinstance(record.message, Image | BodyTruth | WorldTruth | PortLoad):
             payload = codec.encode(record.message)
             writer.write(record.key, encoding_of(type(record.message)), payload, record.sent_ns)
     writer.close()

@@ -36,6 +36,18 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         bodies=(m.DrawnBody(body="chaser/0", mass_kg=12.5, inertia_kg_m2=(0.25,) * 9, centre_of_mass_m=V),),
     ),
     m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
+    m.PortLoad(
+        **HEAD,
+        chaser=1,
+        force_N=V,
+        torque_N_m=V,
+        peak_force_N=4.0,
+        peak_torque_N_m=4.5,
+        peak_axial_N=0.25,
+        peak_shear_N=3.5,
+        peak_bending_N_m=3.25,
+        closing_impulse_N_s=0.125,
+    ),
     m.Sighting(
         **HEAD,
         chaser=1,

@@ -25,7 +25,7 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
     touches = [t for t in flight.world.touches if t.chaser == chaser]
     latching = [t for t in touches if t.latched]
     last = latching[-1] if latching else None
-    reference = flight.references.get(chaser)
+    reference, loads = flight.references.get(chaser), flight.loads.get(chaser)
     return {
         "latched": chaser in flight.world.latched,
         "verified": reference is not None and reference.phases[-1][1] == "verified",
@@ -36,6 +36,7 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
         "contact_lateral_speed_m_s": None if last is None else last.lateral_speed_m_s,
         "probe_touches": len(touches),
         "refused": [t.refused for t in touches if not t.latched],
+        "port_load": None if loads is None else loads.peaks(),
     }
 
 

@@ -215,6 +215,32 @@ def docking(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure(
+    "Loads at the ports",
+    "Largest force and torque that each latched chaser exerts on its port, over the physics steps of each tick; thin: the part "
+    "of the force across the port's axis. The steps in which a latch closes are left out.",
+)
+def loads(flight: RecordedFlight, _: Traces) -> Figure:
+    if not any(history.of("peak_force_N").any() for history in flight.loads.values()):
+        raise MissingData("no chaser has loaded a port")
+    figure, (top, bottom) = new_figure(2, sharex=True)
+    for i, history in flight.loads.items():
+        d = decimated(len(history.time_s))
+        time_s, style = history.time_s[d], dashes(i)
+        top.plot(time_s, history.of("peak_force_N")[d], color=colour(i), linestyle=style, label=f"chaser {i}")
+        top.plot(
+            time_s, history.of("peak_shear_N")[d], color=colour(i), linestyle=style, linewidth=0.5, alpha=0.7
+        )
+        bottom.plot(time_s, history.of("peak_torque_N_m")[d], color=colour(i), linestyle=style)
+    end_s = max(float(history.time_s[-1]) for history in flight.loads.values())
+    top.set(ylabel="force / N", ylim=(0.0, None))
+    bottom.set(ylabel="torque / N m", xlabel="time / s", xlim=(0.0, max(end_s, 1e-3)), ylim=(0.0, None))
+    for axes in (top, bottom):
+        _mark_phases(axes, flight, axes is top)
+    legend_above(top)
+    return figure
+
+
 @_figure("Separation of the chasers", "Distance between the centres of each pair of chasers.")
 def separation(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)

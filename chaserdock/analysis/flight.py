@@ -21,6 +21,7 @@ from chaserdock_protocol.messages import (
     DrawnTruth,
     Event,
     Health,
+    PortLoad,
     ProbeTouch,
     Reference,
     Sighting,
@@ -37,6 +38,14 @@ from .columns import Columns
 
 # Messages whose number or content depends on the wall clock.
 NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK, topics.STATE)
+LOAD_QUANTITIES = (
+    "peak_force_N",
+    "peak_torque_N_m",
+    "peak_axial_N",
+    "peak_shear_N",
+    "peak_bending_N_m",
+    "closing_impulse_N_s",
+)
 _POSE = (0, 1, 2, 6, 7, 8)
 _UPPER = np.triu_indices(6)
 _KEPT = np.array([12 * _POSE[i] + _POSE[j] for i, j in zip(*_UPPER, strict=True)])
@@ -128,6 +137,22 @@ class WorldHistory:
 
 
 @dataclass
+class LoadHistory:
+    """Loads at a port: times (K,) s, and what ``LOAD_QUANTITIES`` names since the tick before, (K, 6)."""
+
+    time_s: Array
+    values: Array
+
+    def of(self, quantity: str) -> Array:
+        """Return the values (K,) of a quantity."""
+        return self.values[:, LOAD_QUANTITIES.index(quantity)]
+
+    def peaks(self) -> dict[str, float]:
+        """Return the largest value of each quantity."""
+        return dict(zip(LOAD_QUANTITIES, self.values.max(axis=0).tolist(), strict=True))
+
+
+@dataclass
 class RecordedFlight:
     """Content of a log without the images. Mappings by body name or chaser.
 
@@ -146,6 +171,7 @@ class RecordedFlight:
     covariances: Columns
     references: dict[int, ReferenceHistory]
     sightings: dict[int, SightingHistory]
+    loads: dict[int, LoadHistory]
     solves: SolverHistory
     world: WorldHistory
     drawn: tuple[DrawnBody, ...]
@@ -224,6 +250,7 @@ class _Collector:
         default_factory=lambda: defaultdict(_ReferenceCollector)
     )
     sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
+    loads: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(7)))
     solves: Columns = field(default_factory=lambda: Columns(3))
     statuses: Counter[str] = field(default_factory=Counter)
     solver: str | None = None
@@ -262,15 +289,24 @@ class _Collector:
                 self._add_estimate(message)
             case Reference():
                 self.references[message.chaser].add(message)
-            case Sighting():
-                seen = message.status == "seen"
-                self.sightings[message.chaser].add((message.sim_time_ns / 1e9, seen, len(message.marker_ids)))
             case SolverStatus():
                 self._add_solve(message)
             case WorldTruth():
                 self.world.add(message)
+            case Sighting() | PortLoad():
+                self._add_of_chaser(message)
             case Event() | CommandReply() | Health() | DrawnTruth():
                 self._add_report(message)
+
+    def _add_of_chaser(self, message: Sighting | PortLoad) -> None:
+        time_s = message.sim_time_ns / 1e9
+        match message:
+            case Sighting():
+                seen = message.status == "seen"
+                self.sightings[message.chaser].add((time_s, seen, len(message.marker_ids)))
+            case PortLoad():
+                values = (getattr(message, name) for name in LOAD_QUANTITIES)
+                self.loads[message.chaser].add((time_s,), values)
 
     def _add_report(self, message: Event | CommandReply | Health | DrawnTruth) -> None:
         match message:
@@ -331,6 +367,11 @@ def _sighting_history(columns: Columns) -> SightingHistory:
     return SightingHistory(t[:, 0].copy(), t[:, 1] > 0.0, t[:, 2].astype(np.intp))
 
 
+def _load_history(columns: Columns) -> LoadHistory:
+    t = columns.table()
+    return LoadHistory(t[:, 0].copy(), t[:, 1:])
+
+
 def load_flight(log: LogSource) -> RecordedFlight:
     """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by chaserdock."""
     scenario, run = logged_scenario(log)
@@ -356,6 +397,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         covariances=c.covariance,
         references={i: collector.finish() for i, collector in c.references.items()},
         sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
+        loads={i: _load_history(columns) for i, columns in c.loads.items()},
         solves=SolverHistory(
             c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses
         ),

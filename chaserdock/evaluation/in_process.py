@@ -28,6 +28,7 @@ from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_world.actuators.ideal import ActuatorOutput, fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
+from chaserdock_world.physics.port_loads import IntervalLoads
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.sensors.errors import OdometrySensor
@@ -42,7 +43,7 @@ class TickRecord:
     """One tick: true states at its begin, what was sensed, decided and commanded, and what the actuators delivered.
 
     ``outputs`` is None while a delayed controller is busy. ``tracking_errors``: distance (m) and angle (rad) of each chaser
-    from its reference pose on the true target.
+    from its reference pose on the true target. ``loads``: at each port, since the tick before.
     """
 
     tick: int
@@ -54,6 +55,7 @@ class TickRecord:
     commands: dict[int, ActuatorCommand]
     tracking_errors: dict[int, tuple[float, float]]
     delivered: dict[int, ActuatorOutput]
+    loads: dict[int, IntervalLoads]
 
     @property
     def time_s(self) -> float:
@@ -145,6 +147,7 @@ class InProcessMission:
         docking = {x.chaser: docking_status(x, self.tick, time_ns) for x in self.physics.latches.values()}
         for latch in self.physics.latches.values():
             self.touches += latch.take_touches()
+        loads = {x.chaser: self.physics.port_loads[name].take() for name, x in self.physics.latches.items()}
         odometry = {i: self.measure(i, time_ns, states) for i in self.chasers}
         reports = {}
         for i, thrusters in self.thrusters.items():
@@ -163,7 +166,16 @@ class InProcessMission:
         errors = {i: self.tracking_error(i, states, outputs) for i in self.chasers}
         actuator_commands, delivered = self._act(outputs, time_ns)
         record = TickRecord(
-            self.tick, time_ns, states, odometry, sightings, outputs, actuator_commands, errors, delivered
+            self.tick,
+            time_ns,
+            states,
+            odometry,
+            sightings,
+            outputs,
+            actuator_commands,
+            errors,
+            delivered,
+            loads,
         )
         self.tick += 1
         return record

@@ -22,6 +22,7 @@ from chaserdock_protocol.messages import (
     Level,
     MissionEnd,
     Odometry,
+    PortLoad,
     Reference,
     SolverStatus,
     TargetEstimate,
@@ -41,6 +42,7 @@ ChartQuantity = Literal[
     "solve_ms",
     "estimate_error_mm",
     "estimate_error_deg",
+    "port_load_N",
 ]
 
 
@@ -147,6 +149,10 @@ class History:
                 self._add_estimation_error(message)
             case BodyTruth() if message.body == TARGET:
                 keep_newest(self._truth, message.sim_time_ns, message)
+            case PortLoad():
+                self.series["port_load_N", message.chaser].add(
+                    message.sim_time_ns / 1e9, message.peak_force_N
+                )
             case SolverStatus():
                 self.series["solve_ms", None].add(message.sim_time_ns / 1e9, message.wall_solve_s * 1e3)
             case Health():

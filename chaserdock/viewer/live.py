@@ -118,6 +118,9 @@ class _Feed:
         if truth:
             bodies = ["target", *(f"chaser/{i}" for i in range(chasers))]
             feed.subscriptions += [node.subscribe_newest(topics.TRUTH_BODY, _STATES, body) for body in bodies]
+            feed.subscriptions += [
+                node.subscribe_newest(topics.TRUTH_LOAD, _STATES, i) for i in range(chasers)
+            ]
         for topic in OF_CHASERS:
             depth = 1 if topic is topics.IMAGE else _STATES
             feed.subscriptions += [node.subscribe_newest(topic, depth, i) for i in range(chasers)]

@@ -40,6 +40,7 @@ _DECODED = (
     topics.TARGET,
     topics.SOLVER,
     topics.TRUTH_BODY,
+    topics.TRUTH_LOAD,
     topics.ACTUATORS,
     topics.TICK,
     *_EVENT_TOPICS,

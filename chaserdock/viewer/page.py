@@ -180,7 +180,8 @@ class Page:
             self._images = gui.add_image(self._mosaic, format="jpeg", jpeg_quality=70)
         plots.dock_below(images)
         with plots.add_tab("Plots"):
-            for plot in plots_of(len(scenario.chasers), truth):
+            ports = [i for i in range(number) if scenario.docking.port_of(i) is not None]
+            for plot in plots_of(number, truth, ports):
                 self._plots.append((plot, self._chart(plot)))
 
     def _chart(self, plot: Plot) -> Any:

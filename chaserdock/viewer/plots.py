@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,11 +48,12 @@ class Plot:
     curves: tuple[Curve, ...]
 
 
-def plots_of(chasers: int, truth: bool) -> tuple[Plot, ...]:
-    """Return the plots of the page; the estimation error only with ground truth."""
+def plots_of(chasers: int, truth: bool, ports: Sequence[int] = ()) -> tuple[Plot, ...]:
+    """Return the plots of the page; the estimation error and the loads at the ports of the chasers ``ports`` only with ground
+    truth."""
 
-    def each(quantity: ChartQuantity) -> tuple[Curve, ...]:
-        return tuple((str(i), COLOURS[i % len(COLOURS)], quantity, i) for i in range(chasers))
+    def each(quantity: ChartQuantity, numbers: Iterable[int] = range(chasers)) -> tuple[Curve, ...]:
+        return tuple((str(i), COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
 
     estimate: tuple[Curve, ...] = (
         ("position, mm", ESTIMATE_COLOUR, "estimate_error_mm", None),
@@ -62,6 +64,7 @@ def plots_of(chasers: int, truth: bool) -> tuple[Plot, ...]:
         Plot("position error, mm", each("position_error_mm")),
         Plot("orientation error, deg", each("orientation_error_deg")),
         *((Plot("error of the target estimate", estimate),) if truth else ()),
+        *((Plot("load at the port, N", each("port_load_N", ports)),) if truth and ports else ()),
         Plot("solve time, ms", (("controller", COLOURS[0], "solve_ms", None),)),
         Plot("image to command, ms wall time", each("latency_ms")),
     )

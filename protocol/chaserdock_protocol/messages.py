@@ -242,6 +242,27 @@ class WorldTruth(Message, frozen=True, kw_only=True):
     latched: ChaserIds = ()
 
 
+class PortLoad(Message, frozen=True, kw_only=True):
+    """Ground truth of the load at a chaser's port: what the latched chaser exerts on it, torque about the tip. Zero without
+    a latch.
+
+    Axes of the port: x outward, z as that of the docked chaser's CRF. ``force_N``, ``torque_N_m``: in the last physics step.
+    ``peak_*``: largest magnitudes in the physics steps since the last tick: of force and torque, of the force along the
+    axis (``axial``) and across it (``shear``), and of the torque across it (``bending``). ``closing_impulse_N_s``: of the
+    steps in which a latch closed, which are not in the peaks.
+    """
+
+    chaser: ChaserId
+    force_N: Vector3
+    torque_N_m: Vector3
+    peak_force_N: float
+    peak_torque_N_m: float
+    peak_axial_N: float
+    peak_shear_N: float
+    peak_bending_N_m: float
+    closing_impulse_N_s: float = 0.0
+
+
 class DrawnBody(Struct, frozen=True, kw_only=True):
     """What the scenario drew for one body (``target`` or ``chaser/0``), body axes unless stated otherwise.
 
@@ -558,6 +579,7 @@ VERSION: dict[type[Struct], int] = {
     DockingStatus: 1,
     BodyTruth: 2,
     WorldTruth: 1,
+    PortLoad: 1,
     DrawnTruth: 1,
     Sighting: 2,
     TargetEstimate: 1,

@@ -34,7 +34,13 @@ from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
 from chaserdock_world.sensors.errors import OdometrySensor
-from chaserdock_world.sensors.publish import drawn_truth, publish_docking, publish_odometry, publish_truth
+from chaserdock_world.sensors.publish import (
+    drawn_truth,
+    publish_docking,
+    publish_odometry,
+    publish_port_loads,
+    publish_truth,
+)
 
 _REALTIME_SLICES_HZ = 240
 
@@ -119,6 +125,7 @@ class World:
             node.advertise(topics.ODOMETRY, i)
             if f"chaser/{i}" in self._physics.latches:
                 node.advertise(topics.DOCKING, i)
+                node.advertise(topics.TRUTH_LOAD, i)
             node.advertise(topics.IMAGE, i)
         heartbeat = Heartbeat(node, membership.instance)
         node.declare_liveliness()
@@ -175,6 +182,7 @@ class World:
         states = {name: physics.state(name) for name in physics.bodies}
         publish_docking(node, physics.latches, tick, timing)  # first, as the ground truth takes the touches
         publish_truth(node, states, tick, timing, self._actuators, self._contacts, physics.latches)
+        publish_port_loads(node, physics, tick, timing)
         publish_odometry(node, states, tick, timing, self._odometry)
         return states
 

@@ -24,6 +24,7 @@ from chaserdock_world.random_draws import GaussMarkov, Stream
 from .bullet import connect, pybullet
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch
+from .port_loads import PortLoadRecorder, port_attitude
 
 TARGET = "target"
 PROBE_RADIUS_M = 0.006
@@ -62,7 +63,12 @@ class Physics:
         hz, docking = scenario.time.physics_hz, scenario.docking
         ports = docking.ports if docking.kind == "capture" else ()
         self.latches = {f"chaser/{p.chaser}": ProbeLatch(p.chaser, p, docking.tolerances, hz) for p in ports}
+        self.port_loads = {name: self._load_recorder(name, p.chaser) for name, p in self.latches.items()}
+        if self.latches:
+            # Else the solver stops early, and joint reactions lag behind changes of thrust by a few steps.
+            self._bullet.setPhysicsEngineParameter(solverResidualThreshold=0.0)
         self._joints: dict[str, int] = {}
+        self._closing = False  # a latch closed in the last step: its joint acts first in the next one
         # Pose and rates of every free body at the beginning of the last step, in Bullet's conventions.
         self._before: dict[int, tuple[Any, Any]] = {}
 
@@ -70,6 +76,13 @@ class Physics:
     def bodies(self) -> tuple[str, ...]:
         """Names of all bodies: ``target``, ``chaser/0``, ..."""
         return tuple(self._bodies)
+
+    def _load_recorder(self, name: str, chaser: int) -> PortLoadRecorder:
+        q_port = port_attitude(np.asarray(self._scenario.chasers[chaser].q_wxyz))
+        frame = self.plants[TARGET].frame
+        if frame is not None:
+            q_port = rotations.multiply(rotations.conjugate(frame.q_wxyz), q_port)
+        return PortLoadRecorder(q_port, 1.0 / self._scenario.time.physics_hz)
 
     def _add(self, shape: int, plant: Plant, mass_kg: float, body_state: BodyState) -> int:
         state = body_state if plant.frame is None else plant.frame.from_body(body_state)
@@ -208,6 +221,8 @@ class Physics:
                 torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
             pybullet.stepSimulation(client)
             self.step_count += 1
+            if self._joints:
+                self._record_loads()
             # A bounce may last a single step, so contacts are checked after each.
             if pybullet.getContactPoints(physicsClientId=client):
                 pairs, tips = self._find_contacts()
@@ -216,6 +231,15 @@ class Physics:
             if moves and self.step_count % self._steps_per_target_update == 0:
                 self.place(TARGET, self.state(TARGET))
         return touched
+
+    def _record_loads(self) -> None:
+        """Record the loads at all ports in the last step."""
+        target_xyzw = self._before[self._bodies[TARGET]][0][1]
+        for name, joint in self._joints.items():
+            reaction = pybullet.getConstraintState(joint, self._client)
+            chaser_xyzw = self._before[self._bodies[name]][0][1]
+            self.port_loads[name].add(reaction, target_xyzw, chaser_xyzw, self._closing)
+        self._closing = False
 
     def contacts(self) -> tuple[tuple[str, str], ...]:
         """Return the pairs of bodies in contact after the last step, sorted, without probe tips on the target."""
@@ -260,6 +284,9 @@ class Physics:
             view = view_of(latch.port, reach_m, q_off, chaser, target)
             if latch.touch(self.step_count - 1, view):
                 self._add_joint(name)
+                self._closing = True
+        if self._closing:
+            self._before.clear()  # the joints change the rates abruptly
 
     def _add_joint(self, name: str) -> None:
         """Fix a chaser's probe tip to the target in their current relative pose."""
@@ -287,7 +314,6 @@ class Physics:
         )
         # The contact spring would work against the joint.
         self._bullet.setCollisionFilterPair(a, b, -1, -1, 0)
-        self._before.clear()  # the joint changes the rates abruptly
 
     def _remove_joint(self, name: str) -> None:
         self._bullet.removeConstraint(self._joints.pop(name))

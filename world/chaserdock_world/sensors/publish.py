@@ -9,13 +9,22 @@ from typing import Any
 from chaserdock_models.clock import Timing
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import BodyTruth, DockingStatus, DrawnBody, DrawnTruth, Odometry, WorldTruth
+from chaserdock_protocol.messages import (
+    BodyTruth,
+    DockingStatus,
+    DrawnBody,
+    DrawnTruth,
+    Odometry,
+    PortLoad,
+    WorldTruth,
+)
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.transport import Node
 
 from chaserdock_world.actuators.ideal import Actuators
 from chaserdock_world.physics.latch import ProbeLatch
-from chaserdock_world.physics.simulation import BodyState
+from chaserdock_world.physics.port_loads import IntervalLoads
+from chaserdock_world.physics.simulation import BodyState, Physics
 from chaserdock_world.plant import Plant, actuation_errors, chaser_plant, target_plant, true_target
 
 from .errors import OdometrySensor, camera_errors
@@ -99,6 +108,31 @@ def publish_truth(
         touches=tuple(touch for latch in latches.values() for touch in latch.take_touches()),
     )
     node.publish(topics.TRUTH_WORLD, world)
+
+
+def publish_port_loads(node: Node, physics: Physics, tick: int, timing: Timing) -> None:
+    """Publish the loads at all ports since the last tick, which this takes."""
+    for name, recorder in physics.port_loads.items():
+        chaser = physics.latches[name].chaser
+        message = port_load(recorder.take(), chaser, tick, timing.tick_time_ns(tick))
+        node.publish(topics.TRUTH_LOAD, message, chaser)
+
+
+def port_load(loads: IntervalLoads, chaser: int, tick: int, time_ns: int) -> PortLoad:
+    """Return the message of the loads at a chaser's port."""
+    return PortLoad(
+        tick=tick,
+        sim_time_ns=time_ns,
+        chaser=chaser,
+        force_N=vector(loads.force_N),
+        torque_N_m=vector(loads.torque_N_m),
+        peak_force_N=loads.peak_force_N,
+        peak_torque_N_m=loads.peak_torque_N_m,
+        peak_axial_N=loads.peak_axial_N,
+        peak_shear_N=loads.peak_shear_N,
+        peak_bending_N_m=loads.peak_bending_N_m,
+        closing_impulse_N_s=loads.closing_impulse_N_s,
+    )
 
 
 def drawn_truth(scenario: Scenario, sensor: OdometrySensor) -> DrawnTruth:

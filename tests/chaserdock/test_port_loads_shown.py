@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads at the ports in a log: summary, figure and viewer."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_protocol import messages as m
+from chaserdock_protocol import topics
+from chaserdock_protocol.codec import encode
+from chaserdock_protocol.recording.log import LogWriter
+from docking_cases import scenario
+
+from chaserdock.analysis.figures import loads
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.plots import MissingData
+from chaserdock.analysis.summary import summarize
+from chaserdock.analysis.time_series import Traces
+from chaserdock.summary import Summary
+from chaserdock.viewer import plots
+from chaserdock.viewer.history import History
+from chaserdock.viewer.logged import LoggedMission
+
+TICK_NS = 1_000_000_000 // 15
+FORCES_N = (0.0, 0.0, 3.5, 0.5)
+
+
+def load_at(k: int, force_N: float) -> m.PortLoad:
+    return m.PortLoad(
+        seq=k,
+        tick=k,
+        sim_time_ns=k * TICK_NS,
+        chaser=0,
+        force_N=(0.1, 0.0, 0.0),
+        torque_N_m=(0.0, 0.0, 0.0),
+        peak_force_N=force_N,
+        peak_torque_N_m=0.2 * force_N,
+        peak_axial_N=0.6 * force_N,
+        peak_shear_N=0.8 * force_N,
+        peak_bending_N_m=0.1 * force_N,
+        closing_impulse_N_s=0.12 if k == 2 else 0.0,
+    )
+
+
+def made_log(path: Path, forces_N: tuple[float, ...], **changes: Any) -> Path:
+    """A log of one chaser at rest with these peak forces, one a tick."""
+    writer = LogWriter(path)
+    writer.describe(scenario(**changes).model_dump_json(), {"mode": "lockstep"})
+
+    def put(topic: topics.Topic, place: Any, message: Any) -> None:
+        writer.write(
+            topic.key_of(place), m.encoding_of(type(message)), encode(message), 10**18 + message.sim_time_ns
+        )
+
+    for k, force_N in enumerate(forces_N):
+        head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * TICK_NS}
+        rest: dict[str, Any] = {"velocity_m_s": (0, 0, 0), "q_wxyz": (1, 0, 0, 0), "omega_rad_s": (0, 0, 0)}
+        put(topics.TICK, None, m.Tick(**head, images=False, chasers=(0,), controller=True))
+        for name, x in (("target", 0.0), ("chaser/0", -1.0)):
+            put(
+                topics.TRUTH_BODY,
+                name,
+                m.BodyTruth(**head, **rest, body=name, position_m=(x, 0.0, 0.0)),
+            )
+        put(topics.TRUTH_WORLD, None, m.WorldTruth(**head, contacts=(), saturated=(), latched=(0,)))
+        put(topics.TRUTH_LOAD, 0, load_at(k, force_N))
+    writer.close()
+    return path
+
+
+def test_summary_has_the_peaks(tmp_path: Path) -> None:
+    result = summarize(made_log(tmp_path / "a.mcap", FORCES_N))
+    assert result["chasers"]["0"]["capture"]["port_load"] == pytest.approx(
+        {
+            "peak_force_N": 3.5,
+            "peak_torque_N_m": 0.7,
+            "peak_axial_N": 2.1,
+            "peak_shear_N": 2.8,
+            "peak_bending_N_m": 0.35,
+            "closing_impulse_N_s": 0.12,
+        }
+    )
+    capture = Summary.from_dict(result).chasers[0].capture
+    assert capture is not None
+    assert capture.port_load is not None
+    assert capture.port_load.peak_force_N == 3.5
+
+
+def test_figure_draws_each_port_and_needs_a_load(tmp_path: Path) -> None:
+    figure = loads(load_flight(made_log(tmp_path / "a.mcap", FORCES_N)), Traces({}, {}, {}))
+    top, bottom = figure.axes
+    force, shear = top.get_lines()[:2]
+    assert np.asarray(force.get_ydata()).tolist() == list(FORCES_N)
+    assert np.asarray(shear.get_ydata()).tolist() == pytest.approx([0.8 * f for f in FORCES_N])
+    assert np.asarray(bottom.get_lines()[0].get_ydata()).tolist() == pytest.approx(
+        [0.2 * f for f in FORCES_N]
+    )
+    nothing = load_flight(made_log(tmp_path / "b.mcap", (0.0, 0.0)))
+    with pytest.raises(MissingData, match="no chaser has loaded a port"):
+        loads(nothing, Traces({}, {}, {}))
+
+
+def test_viewer_plots_loads_of_chasers_with_a_port_only_with_truth(tmp_path: Path) -> None:
+    mission = LoggedMission(made_log(tmp_path / "a.mcap", FORCES_N))
+    (plot,) = (p for p in plots.plots_of(2, True, [0]) if p.curves[0][2] == "port_load_N")
+    assert [chaser for *_, chaser in plot.curves] == [0]
+    _, values = plots.points_of(plot, mission.history, 0.0, mission.end_s)
+    assert values.max() == 3.5
+    for shown in (plots.plots_of(2, False, [0]), plots.plots_of(2, True)):
+        assert not any(p.curves[0][2] == "port_load_N" for p in shown)
+    assert not History(1).series["port_load_N", 0].until(1.0)[0].size

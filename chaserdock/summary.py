@@ -19,7 +19,7 @@ class SteadyErrors(Struct, frozen=True, kw_only=True):
 
 class PortLoadPeaks(Struct, frozen=True, kw_only=True):
     """Largest loads at a chaser's port, over all physics steps; ``closing_impulse_N_s``: largest in a tick, where a latch
-    closed."""
+    closed. ``limit_exceeded_s``: end of the first tick with a load beyond the port's limits, or None."""
 
     peak_force_N: float
     peak_torque_N_m: float
@@ -27,6 +27,7 @@ class PortLoadPeaks(Struct, frozen=True, kw_only=True):
     peak_shear_N: float
     peak_bending_N_m: float
     closing_impulse_N_s: float
+    limit_exceeded_s: float | None = None
 
 
 class Capture(Struct, frozen=True, kw_only=True):

@@ -10,7 +10,7 @@ from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_protocol.scenario import Scenario
 
-from .flight import RecordedFlight
+from .flight import LoadHistory, RecordedFlight
 
 _CONTACT_SLACK_M = 0.02
 
@@ -36,8 +36,47 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
         "contact_lateral_speed_m_s": None if last is None else last.lateral_speed_m_s,
         "probe_touches": len(touches),
         "refused": [t.refused for t in touches if not t.latched],
-        "port_load": None if loads is None else loads.peaks(),
+        "port_load": None if loads is None else port_load_of(loads, flight.scenario, chaser),
     }
+
+
+def port_load_of(loads: LoadHistory, s: Scenario, chaser: int) -> dict[str, float | None]:
+    """Return the largest loads at a chaser's port as plain values for JSON, and when a limit was first exceeded."""
+    beyond = np.zeros(len(loads.time_s), dtype=bool)
+    for quantity, limit, _ in _load_limits(s, chaser):
+        beyond |= loads.of(quantity) > limit
+    first = np.flatnonzero(beyond)
+    return {**loads.peaks(), "limit_exceeded_s": float(loads.time_s[first[0]]) if len(first) else None}
+
+
+def _load_limits(s: Scenario, chaser: int) -> list[tuple[str, float, str]]:
+    """Return quantity, limit and unit of the load limits of a chaser's port."""
+    port = s.docking.port_of(chaser)
+    if port is None:
+        return []
+    limits = (
+        ("peak_force_N", port.force_limit_N, "N"),
+        ("peak_torque_N_m", port.torque_limit_N_m, "N m"),
+    )
+    return [(quantity, limit, unit) for quantity, limit, unit in limits if limit is not None]
+
+
+def overloads(result: dict[str, Any], s: Scenario) -> list[str]:
+    """Return a message for each load limit that was exceeded, or cannot be judged."""
+    out = []
+    for i, c in result["chasers"].items() if s.success.keep_load_limits else ():
+        for quantity, limit, unit in _load_limits(s, int(i)):
+            load, what = c["capture"]["port_load"], quantity.split("_")[1]
+            if load is None:
+                out.append(
+                    f"chaser {i}: largest {what} on its port: unknown, at most {limit:g} {unit} allowed"
+                )
+            elif load[quantity] > limit:
+                out.append(
+                    f"chaser {i}: largest {what} on its port: {load[quantity]:.4g} {unit}, at most {limit:g} {unit} allowed; "
+                    f"exceeded from {load['limit_exceeded_s']:.2f} s on"
+                )
+    return out
 
 
 def nearest_allowed_m(s: Scenario, chaser: int) -> float:

@@ -235,8 +235,14 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
     end_s = max(float(history.time_s[-1]) for history in flight.loads.values())
     top.set(ylabel="force / N", ylim=(0.0, None))
     bottom.set(ylabel="torque / N m", xlabel="time / s", xlim=(0.0, max(end_s, 1e-3)), ylim=(0.0, None))
-    for axes in (top, bottom):
+    ports = [port for i in flight.loads if (port := flight.scenario.docking.port_of(i)) is not None]
+    for axes, limits, unit in (
+        (top, {port.force_limit_N for port in ports}, "N"),
+        (bottom, {port.torque_limit_N_m for port in ports}, "N m"),
+    ):
         _mark_phases(axes, flight, axes is top)
+        for limit in sorted(x for x in limits if x is not None):
+            limit_line(axes, limit, f"limit {limit:g} {unit}")
     legend_above(top)
     return figure
 

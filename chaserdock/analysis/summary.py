@@ -26,6 +26,7 @@ from .criteria import (
     judged_criteria,
     nearest_allowed_m,
     not_reached,
+    overloads,
     reached_time,
 )
 from .flight import RecordedFlight, Track, load_flight
@@ -281,6 +282,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
             f"{what} orientation RMS", _degrees(_root(angle)), s.success.steady_orientation_rms_deg, "deg"
         )
     out += capture_failures(result, s)
+    out += overloads(result, s)
     estimate = result["target_estimate"]
     position, angle = estimate["max_position_error_m"], _degrees(estimate["max_orientation_error_rad"])
     what = "error of the estimate"

@@ -12,7 +12,8 @@ from chaserdock_protocol import messages as m
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import encode
 from chaserdock_protocol.recording.log import LogWriter
-from docking_cases import scenario
+from chaserdock_protocol.scenario import ScenarioError
+from docking_cases import PORTS, scenario
 
 from chaserdock.analysis.figures import loads
 from chaserdock.analysis.flight import load_flight
@@ -45,7 +46,7 @@ def load_at(k: int, force_N: float) -> m.PortLoad:
     )
 
 
-def made_log(path: Path, forces_N: tuple[float, ...], **changes: Any) -> Path:
+def made_log(path: Path, forces_N: tuple[float, ...], measured: bool = True, **changes: Any) -> Path:
     """A log of one chaser at rest with these peak forces, one a tick."""
     writer = LogWriter(path)
     writer.describe(scenario(**changes).model_dump_json(), {"mode": "lockstep"})
@@ -66,7 +67,8 @@ def made_log(path: Path, forces_N: tuple[float, ...], **changes: Any) -> Path:
                 m.BodyTruth(**head, **rest, body=name, position_m=(x, 0.0, 0.0)),
             )
         put(topics.TRUTH_WORLD, None, m.WorldTruth(**head, contacts=(), saturated=(), latched=(0,)))
-        put(topics.TRUTH_LOAD, 0, load_at(k, force_N))
+        if measured:
+            put(topics.TRUTH_LOAD, 0, load_at(k, force_N))
     writer.close()
     return path
 
@@ -81,12 +83,76 @@ def test_summary_has_the_peaks(tmp_path: Path) -> None:
             "peak_shear_N": 2.8,
             "peak_bending_N_m": 0.35,
             "closing_impulse_N_s": 0.12,
+            "limit_exceeded_s": None,
         }
     )
     capture = Summary.from_dict(result).chasers[0].capture
     assert capture is not None
     assert capture.port_load is not None
     assert capture.port_load.peak_force_N == 3.5
+
+
+def limited(**limits: float) -> dict[str, Any]:
+    return {"docking": {"ports": [PORTS[0] | limits]}}
+
+
+@pytest.mark.parametrize(
+    ("limits", "failures"),
+    [
+        ({"force_limit_N": 3.6, "torque_limit_N_m": 0.71}, []),
+        (
+            {"force_limit_N": 3.4},
+            [
+                "chaser 0: largest force on its port: 3.5 N, at most 3.4 N allowed; exceeded from 0.13 s on",
+            ],
+        ),
+        (
+            {"torque_limit_N_m": 0.05},
+            [
+                "chaser 0: largest torque on its port: 0.7 N m, at most 0.05 N m allowed; exceeded from 0.13 s on",
+            ],
+        ),
+    ],
+)
+def test_exceeded_limits_are_failures(tmp_path: Path, limits: dict[str, float], failures: list[str]) -> None:
+    result = summarize(made_log(tmp_path / "a.mcap", FORCES_N, **limited(**limits)))
+    assert [x for x in result["failures"] if "port" in x] == failures
+    peaks = result["chasers"]["0"]["capture"]["port_load"]
+    assert peaks["limit_exceeded_s"] == (pytest.approx(2 / 15, abs=1e-6) if failures else None)
+    unjudged = {**limited(**limits), "success": {"keep_load_limits": False}}
+    result = summarize(made_log(tmp_path / "b.mcap", FORCES_N, **unjudged))
+    assert not any("port" in x for x in result["failures"])
+
+
+def test_limits_without_loads_in_the_log_are_not_met(tmp_path: Path) -> None:
+    log = made_log(tmp_path / "a.mcap", FORCES_N, measured=False, **limited(force_limit_N=5.0))
+    result = summarize(log)
+    assert result["chasers"]["0"]["capture"]["port_load"] is None
+    assert "chaser 0: largest force on its port: unknown, at most 5 N allowed" in result["failures"]
+
+
+@pytest.mark.parametrize(
+    ("limits", "message"),
+    [
+        (
+            {"force_limit_N": 0.01},
+            "docking.ports.0.force_limit_N: 0.01 N is less than the 0.0194 N that the tumble of 3.22 degrees/s alone "
+            "exerts on the port of chaser 0",
+        ),
+        (
+            {"torque_limit_N_m": 1e-4},
+            "docking.ports.0.torque_limit_N_m: 0.0001 N m is less than the 0.000",
+        ),
+        ({"force_limit_N": 0.0}, "docking.ports.0.force_limit_N"),
+        ({"torque_limit_N_m": float("inf")}, "docking.ports.0.torque_limit_N_m"),
+    ],
+)
+def test_limit_below_the_tumble_is_one_line(limits: dict[str, float], message: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        scenario(**limited(**limits))
+    assert message in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+    scenario(**limited(force_limit_N=0.02, torque_limit_N_m=1e-3))
 
 
 def test_figure_draws_each_port_and_needs_a_load(tmp_path: Path) -> None:

@@ -10,10 +10,19 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.port_load import CarriedBody, tumble_load
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_world.physics.port_loads import PortLoadRecorder, port_attitude
 from chaserdock_world.physics.simulation import TARGET, Physics
-from docking_cases import REACH_M, scenario, world
+from docking_cases import (
+    CHASER_INERTIA,
+    CHASER_KG,
+    REACH_M,
+    TARGET_INERTIA,
+    TARGET_KG,
+    scenario,
+    world,
+)
 
 HZ = 960
 FIRING = np.array([0.3, 0.5, -0.2, 0.05, 0.1, 0.02])
@@ -98,6 +107,25 @@ def test_a_tumbling_chaser_pulls_outward(worlds: Any) -> None:
     expected_N = 17.8 * 0.1**2 * (0.2 + REACH_M - centre_m)
     assert loads.force_N[0] == pytest.approx(expected_N, rel=0.02)
     assert loads.peak_axial_N == pytest.approx(expected_N, rel=0.02)
+
+
+def test_tumble_load_of_the_scenario_checks_is_that_of_the_physics(worlds: Any) -> None:
+    omega = (0.045, 0.135, 0.09)
+    physics = worlds(gap_m=0.0002, omega_rad_s=omega)
+    latch(physics)
+    physics.advance(20, {})
+    physics.port_loads["chaser/0"].take()
+    physics.advance(1, {})
+    loads = physics.port_loads["chaser/0"].take()
+    target = CarriedBody(TARGET_KG, np.diag(TARGET_INERTIA), np.zeros(3))
+    chaser = CarriedBody(CHASER_KG, np.diag(CHASER_INERTIA), np.array([-0.2 - REACH_M, 0.0, -0.05]))
+    port = np.array([-0.2, 0.0, -0.05])
+    force, torque = tumble_load(target, chaser, port, physics.state(TARGET).omega_rad_s)
+    q_port = port_attitude(np.array([1.0, 0.0, 0.0, 0.0]))
+    assert np.linalg.norm(force) > 0.1
+    assert np.linalg.norm(torque) > 1e-3
+    assert loads.force_N == pytest.approx(rotations.rotate_inverse(q_port, force), rel=0.02, abs=2e-3)
+    assert loads.torque_N_m == pytest.approx(rotations.rotate_inverse(q_port, torque), rel=0.02, abs=5e-5)
 
 
 def test_a_pull_shows_as_tension_in_the_port(worlds: Any) -> None:

@@ -8,8 +8,11 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
+from chaserdock_models.port_load import CarriedBody, tumble_load
 
+from .bodies import cuboid_inertia
 from .faults import check_faults
 from .thrusters import check_pulses
 
@@ -35,6 +38,7 @@ def check_consistent(scenario: Scenario) -> None:
     _check_reached(scenario)
     _check_thruster_failures(scenario)
     _check_latched(scenario)
+    _check_load_limits(scenario)
     check_faults(scenario.fault, scenario)
     _check_truth(scenario)
 
@@ -155,6 +159,30 @@ def _check_latched(scenario: Scenario) -> None:
             raise ValueError(
                 f"success.latched: chaser {i} has no port; see docking.kind and [[docking.ports]]"
             )
+
+
+def _check_load_limits(scenario: Scenario) -> None:
+    """Check that the ports carry what the tumble at the start exerts once their chaser is latched, with nominal masses."""
+    if scenario.docking.kind != "capture":
+        return
+    target, body = scenario.target, scenario.chaser
+    moments = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
+    alone = CarriedBody(target.mass_kg, np.diag(moments), np.zeros(3))
+    rate_deg_s = math.degrees(math.hypot(*target.omega_rad_s))
+    for k, port in enumerate(scenario.docking.ports):
+        turn = rotations.to_matrix(scenario.chasers[port.chaser].q_wxyz)
+        inertia = turn @ np.diag(body.inertia) @ turn.T
+        chaser = CarriedBody(body.mass_kg, inertia, centre_offset(port, body.probe_reach_m, 0.0))
+        force, torque = tumble_load(alone, chaser, np.array(port.position_m), np.array(target.omega_rad_s))
+        for key, limit, load, unit in (
+            ("force_limit_N", port.force_limit_N, force, "N"),
+            ("torque_limit_N_m", port.torque_limit_N_m, torque, "N m"),
+        ):
+            if limit is not None and (exerted := float(np.linalg.norm(load))) > limit:
+                raise ValueError(
+                    f"docking.ports.{k}.{key}: {limit:g} {unit} is less than the {exerted:.3g} {unit} that the tumble of "
+                    f"{rate_deg_s:.3g} degrees/s alone exerts on the port of chaser {port.chaser}"
+                )
 
 
 def _check_capture(scenario: FlightScenario) -> None:

@@ -16,6 +16,12 @@ class Port(Section):
     chaser: Index = Field(description="Number of the chaser, from 0. At most one port per chaser.")
     position_m: Vector = Field(description="Where the probe's tip latches (TRF), m.")
     axis: UnitVector = Field(description="Outward axis of the port (TRF), unit vector.")
+    force_limit_N: Positive | None = Field(
+        default=None, description="Largest force that the latched chaser may exert on the port, N."
+    )
+    torque_limit_N_m: Positive | None = Field(
+        default=None, description="Largest torque about the tip that it may exert on the port, N m."
+    )
 
 
 class Corridor(Section):

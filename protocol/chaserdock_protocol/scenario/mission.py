@@ -48,6 +48,10 @@ class Success(Section):
     keep_distances: bool = Field(
         default=True, description="Whether the distances of `[limits]` must be kept."
     )
+    keep_load_limits: bool = Field(
+        default=True,
+        description="Whether `force_limit_N` and `torque_limit_N_m` of `[[docking.ports]]` must be kept in every physics step.",
+    )
     steady_position_rms_m: Positive | None = Field(
         default=None, description="Largest RMS of each chaser's position error in the steady interval, m."
     )

@@ -34,7 +34,7 @@ class SightingNoise(NamedTuple):
     view_time_s: float
 
 
-SINGLE_MARKER = SightingNoise(white_ratio=1.2, view_ratio=0.22, view_time_s=40.0)
+SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
 
 

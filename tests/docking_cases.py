@@ -16,6 +16,7 @@ from chaserdock_world.physics.simulation import TARGET, BodyState, Physics
 TARGET_KG, CHASER_KG = 40.0, 17.8
 TARGET_INERTIA, CHASER_INERTIA = (0.683, 0.875, 0.9), (0.3, 0.31, 0.33)
 REACH_M = 0.35
+HZ = 960
 PORTS = (
     {"chaser": 0, "position_m": [-0.2, 0.0, -0.05], "axis": [-1.0, 0.0, 0.0]},
     {"chaser": 1, "position_m": [0.2, 0.0, -0.05], "axis": [1.0, 0.0, 0.0]},
@@ -86,6 +87,44 @@ def world(
     )
     physics.place("chaser/0", state)
     return physics
+
+
+def latch(physics: Physics) -> None:
+    """Let chaser 0 drift into its port and latch."""
+    physics.command_latch(0, "arm", 0)
+    for _ in range(HZ):
+        if physics.latches["chaser/0"].latched:
+            return
+        physics.advance(1, {})
+    raise AssertionError("it does not latch")
+
+
+def momenta(physics: Physics, name: str) -> tuple[Array, Array]:
+    """Momentum (3,) and angular momentum (3,) of a body about WRF's origin, WRF."""
+    plant, s = physics.plants[name], physics.state(name)
+    arm = rotations.rotate(s.q_wxyz, plant.centre_of_mass_m)
+    velocity = s.velocity_m_s + rotations.cross(rotations.rotate(s.q_wxyz, s.omega_rad_s), arm)
+    spin = rotations.rotate(s.q_wxyz, plant.inertia_kg_m2 @ s.omega_rad_s)
+    return plant.mass_kg * velocity, spin + rotations.cross(s.position_m + arm, plant.mass_kg * velocity)
+
+
+def tip_of(state: BodyState) -> Array:
+    return state.position_m + rotations.rotate(state.q_wxyz, np.array([REACH_M, 0.0, 0.0]))
+
+
+def balance(physics: Physics, wrench: Array) -> tuple[Array, Array]:
+    """Make one step; return force and torque about the tip (3,) that the chaser's motion demands of the port, WRF."""
+    before, (p, h) = physics.state("chaser/0"), momenta(physics, "chaser/0")
+    physics.advance(1, {"chaser/0": wrench})
+    p_after, h_after = momenta(physics, "chaser/0")
+    plant = physics.plants["chaser/0"]
+    force, torque = (
+        rotations.rotate(before.q_wxyz, wrench[:3] + plant.disturbance[:3]),
+        rotations.rotate(before.q_wxyz, wrench[3:] + plant.disturbance[3:]),
+    )
+    on_chaser = (p_after - p) * HZ - force
+    torque_on_chaser = (h_after - h) * HZ - torque - rotations.cross(before.position_m, force)
+    return -on_chaser, -(torque_on_chaser - rotations.cross(tip_of(before), on_chaser))
 
 
 def senses(offset_m: Any, **changes: Any) -> DockingObservation:

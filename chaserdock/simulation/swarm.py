@@ -12,6 +12,7 @@ import random
 import tempfile
 import zlib
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -19,7 +20,7 @@ from typing import Any, get_args
 from chaserdock_protocol import topics
 from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
-from chaserdock_protocol.scenario.faults import FaultKind
+from chaserdock_protocol.scenario.faults import LATCH_FAULTS, FaultKind
 from chaserdock_protocol.transport import RawSample
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
@@ -29,7 +30,9 @@ from chaserdock.toml_text import toml_document
 from .invariants import Invariants, Violation
 from .mission import SimulatedFlight, simulate
 
-KINDS: tuple[str, ...] = get_args(FaultKind)
+KINDS: tuple[str, ...] = tuple(kind for kind in get_args(FaultKind) if kind not in LATCH_FAULTS)
+LATCH_KINDS: tuple[str, ...] = tuple(sorted(LATCH_FAULTS))
+"""Kinds of faults of any scenario, and those that need a port."""
 RECEIVED = {
     "world": ["actuators"],
     "controller": ["odometry", "sighting"],
@@ -58,8 +61,13 @@ class SimulationResult:
     sim_time_s: float
 
 
-def draw_fault(kind: str, draw: random.Random, chasers: int, latest_s: float = 20.0) -> dict[str, Any]:
-    """Return a random fault of a kind, as in a scenario file, that begins before ``latest_s``."""
+def draw_fault(
+    kind: str, draw: random.Random, chasers: int, latest_s: float = 20.0, ports: Sequence[int] = ()
+) -> dict[str, Any]:
+    """Return a random fault of a kind, as in a scenario file, that begins before ``latest_s``.
+
+    ``ports``: chasers that have one; a fault of a latch needs one.
+    """
     names = [f"chaser/{i}" for i in range(chasers)]
     fault: dict[str, Any] = {"kind": kind, "at_s": round(draw.uniform(0.5, latest_s), 2)}
     duration_s = round(draw.choice([0.3, 1.0, 3.0, 8.0]) * draw.uniform(0.5, 1.5), 2)
@@ -74,6 +82,8 @@ def draw_fault(kind: str, draw: random.Random, chasers: int, latest_s: float = 2
         fault["process"] = draw.choice(names)
         if draw.random() < 0.5:
             fault["peer"] = "controller"
+    elif kind in LATCH_FAULTS:
+        fault["process"] = f"chaser/{draw.choice(ports)}"
     elif kind in ("camera_off", "lying_sensor", "odometry_lie"):
         fault["process"] = draw.choice(names)
     elif kind == "clock_jump":
@@ -92,6 +102,8 @@ def _draw_severity(kind: str, draw: random.Random) -> dict[str, Any]:
         return {"share": draw.choice([0.1, 0.5, 1.0])}
     if kind == "delay":
         return {"delay_s": round(draw.uniform(0.1, 1.0), 2)}
+    if kind == "latch_slip":
+        return {"force_N": draw.choice([0.05, 0.3]), "torque_N_m": draw.choice([0.01, 0.1])}
     if kind == "flood":
         return {"copies": draw.choice([5, 50, 200])}
     if kind in ("lying_sensor", "odometry_lie"):
@@ -113,8 +125,10 @@ def draw_case(
     standby = scenario.controller.standby or draw.random() < 0.5
     case["controller"] = {"standby": standby}
     kinds = [kind for kind in KINDS if draw.random() < 0.25]
+    ports = [i for i in range(chasers) if scenario.docking.port_of(i) is not None]
+    kinds += [kind for kind in LATCH_KINDS if ports and draw.random() < 0.25]
     faults = [
-        draw_fault(draw.choice(kinds), draw, chasers, 0.8 * end_s)
+        draw_fault(draw.choice(kinds), draw, chasers, 0.8 * end_s, ports)
         for _ in range(draw.choice([0, 1, 1, 2, 3, 4]) if kinds else 0)
     ]
     for fault in faults:

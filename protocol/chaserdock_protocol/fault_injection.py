@@ -12,7 +12,6 @@ on which the reader stops waiting. Real-time readers do not wait, and get none.
 
 from __future__ import annotations
 
-import math
 import random
 from dataclasses import dataclass, field
 from typing import Any
@@ -78,19 +77,14 @@ class FaultLayer:
 
     def active(self, fault: Fault, tick: int) -> bool:
         """Return whether a fault affects the messages of a tick."""
-        begin, end = self._ticks(fault)
+        begin, end = fault.ticks(self.timing.rate_hz)
         return begin <= tick < end
-
-    def _ticks(self, fault: Fault) -> tuple[int, int]:
-        """Return the first tick of a fault and the first tick after it. A fault lasts at least one tick."""
-        begin = max(1, math.ceil(fault.at_s * self.timing.rate_hz - 1e-9))
-        return begin, begin + max(1, round((fault.duration_s or 0.0) * self.timing.rate_hz))
 
     def transitions_at(self, tick: int) -> list[tuple[str, str]]:
         """Return the faults that begin or end at a tick, as event texts: (what, detail)."""
         transitions = []
         for fault in self.faults:
-            begin, end = self._ticks(fault)
+            begin, end = fault.ticks(self.timing.rate_hz)
             if tick == begin:
                 transitions.append(("fault begins", fault.text()))
             elif tick == end and fault.duration_s is not None:
@@ -109,7 +103,7 @@ class FaultLayer:
         for k, fault in self._own:
             if fault.kind not in ("kill", "freeze") or k in self._applied:
                 continue
-            begin, _ = self._ticks(fault)
+            begin, _ = fault.ticks(self.timing.rate_hz)
             if tick < begin:
                 continue
             self._applied.add(k)

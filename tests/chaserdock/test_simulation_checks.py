@@ -38,7 +38,7 @@ from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, Case, SimulationResult, draw_case
+from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, draw_case
 from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
@@ -85,6 +85,21 @@ def test_seeds_draw_valid_scenarios_with_all_kinds_of_faults(scenario: Scenario,
     assert kinds == set(KINDS)
     assert modes == {"lockstep", "realtime"}
     assert sections >= {"truth", "timeline", "partition", "slow", "clock", "loss", "duplicate", "reorder"}
+
+
+def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> None:
+    base = load_scenario(ROOT / "scenarios" / "four-chaser-capture.toml")
+    kinds, chasers = set(), set()
+    for seed in range(60):
+        case = draw_case("four-chaser-capture", seed, base)
+        path = tmp_path / "case.toml"
+        path.write_text(toml_document(case))
+        faults = [f for f in load_scenario(path).fault if f.kind in LATCH_KINDS]
+        kinds |= {f.kind for f in faults}
+        chasers |= {f.process for f in faults}
+    assert kinds == set(LATCH_KINDS)
+    assert chasers <= {f"chaser/{port.chaser}" for port in base.docking.ports}
+    assert len(chasers) > 1
 
 
 def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> None:

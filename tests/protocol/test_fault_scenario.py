@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.scenario.errors import ScenarioError
+from chaserdock_protocol.scenario.faults import faults_of
 
 ROOT = Path(__file__).resolve().parents[2]
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
+CAPTURE = ROOT / "scenarios" / "four-chaser-capture.toml"
 
 GOOD = [
     'kind = "kill", process = "controller"',
@@ -67,6 +69,57 @@ BAD = [
     ('kind = "camera_off", process = "chaser/0", duration_s = -1', "fault.0.duration_s"),
     ('kind = "camera_off", process = "chaser/0", duration_s = 1, colour = "red"', "fault.0.colour"),
 ]
+
+
+LATCHES = [
+    'kind = "latch_slip", process = "chaser/0", duration_s = 2.0, force_N = 0.3',
+    'kind = "latch_slip", process = "chaser/3", duration_s = 2.0, force_N = 0.3, torque_N_m = 0.1',
+    'kind = "latch_open", process = "chaser/1", duration_s = 0.1',
+    'kind = "latch_stuck", process = "chaser/0", duration_s = 20.0',
+]
+BAD_LATCHES = [
+    (
+        'kind = "latch_open", process = "chaser/2", duration_s = 1',
+        "fault.0: latch_open cannot happen to chaser/2, which has no port; see docking.kind and [[docking.ports]]",
+    ),
+    ('kind = "latch_slip", process = "chaser/0", duration_s = 1', "latch_slip needs force_N or torque_N_m"),
+    ('kind = "latch_slip", process = "chaser/0", duration_s = 1, force_N = 0', "fault.0.force_N"),
+    ('kind = "latch_stuck", process = "chaser/0"', "latch_stuck needs duration_s"),
+    (
+        'kind = "latch_stuck", process = "chaser/0", duration_s = 1, force_N = 1',
+        "force_N does not go with latch_stuck",
+    ),
+    ('kind = "latch_open", process = "controller", duration_s = 1', "latch_open cannot happen to controller"),
+    ('kind = "latch_open", process = "chaser/9", duration_s = 1', "there is no chaser/9"),
+]
+
+
+@pytest.mark.parametrize("fault", LATCHES)
+def test_faults_of_latches_stay_with_the_world(fault: str) -> None:
+    scenario = load_scenario(CAPTURE, (f"fault=[{{{fault}, at_s = 1.0}}]",))
+    assert type(scenario).model_validate_json(scenario.model_dump_json()) == scenario
+    assert faults_of(scenario, "world").faults == scenario.fault
+    assert faults_of(scenario, scenario.fault[0].process).faults == ()
+
+
+@pytest.mark.parametrize(("fault", "words"), BAD_LATCHES)
+def test_invalid_faults_of_latches_are_one_line(fault: str, words: str) -> None:
+    with pytest.raises(ScenarioError) as error:
+        load_scenario(CAPTURE, (f"fault=[{{{fault}, at_s = 1.0}}]",))
+    assert words in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_latches_need_ports() -> None:
+    with pytest.raises(ScenarioError, match="latch_stuck cannot happen to chaser/0, which has no port"):
+        load_scenario(DRILL, ('fault=[{kind="latch_stuck",process="chaser/0",at_s=1.0,duration_s=1.0}]',))
+    with pytest.raises(
+        ScenarioError, match=r'truth.latch.strength_N: latches exist only with docking.kind = "'
+    ):
+        load_scenario(DRILL, ("truth.latch.strength_N=3.0",))
+    for bad in ("strength_N=0.0", "strength_N_m=-1.0", "play_m=0.02", "play_deg=6.0"):
+        with pytest.raises(ScenarioError, match=rf"truth.latch.{bad.partition('=')[0]}: "):
+            load_scenario(CAPTURE, (f"truth.latch.{bad}",))
 
 
 @pytest.mark.parametrize("fault", GOOD)

@@ -20,6 +20,9 @@ from docking_cases import (
     REACH_M,
     TARGET_INERTIA,
     TARGET_KG,
+    balance,
+    latch,
+    momenta,
     scenario,
     world,
 )
@@ -40,40 +43,6 @@ def worlds() -> Iterator[Any]:
     yield make
     for physics in opened:
         physics.close()
-
-
-def latch(physics: Physics) -> None:
-    physics.command_latch(0, "arm", 0)
-    while not physics.latches["chaser/0"].latched:
-        physics.advance(1, {})
-
-
-def momenta(physics: Physics, name: str) -> tuple[Array, Array]:
-    """Momentum (3,) and angular momentum (3,) of a body about WRF's origin, WRF."""
-    plant, s = physics.plants[name], physics.state(name)
-    arm = rotations.rotate(s.q_wxyz, plant.centre_of_mass_m)
-    velocity = s.velocity_m_s + rotations.cross(rotations.rotate(s.q_wxyz, s.omega_rad_s), arm)
-    spin = rotations.rotate(s.q_wxyz, plant.inertia_kg_m2 @ s.omega_rad_s)
-    return plant.mass_kg * velocity, spin + rotations.cross(s.position_m + arm, plant.mass_kg * velocity)
-
-
-def tip_of(state: BodyState) -> Array:
-    return state.position_m + rotations.rotate(state.q_wxyz, np.array([REACH_M, 0.0, 0.0]))
-
-
-def balance(physics: Physics, wrench: Array) -> tuple[Array, Array]:
-    """Make one step; return force and torque about the tip (3,) that the chaser's motion demands of the port, WRF."""
-    before, (p, h) = physics.state("chaser/0"), momenta(physics, "chaser/0")
-    physics.advance(1, {"chaser/0": wrench})
-    p_after, h_after = momenta(physics, "chaser/0")
-    plant = physics.plants["chaser/0"]
-    force, torque = (
-        rotations.rotate(before.q_wxyz, wrench[:3] + plant.disturbance[:3]),
-        rotations.rotate(before.q_wxyz, wrench[3:] + plant.disturbance[3:]),
-    )
-    on_chaser = (p_after - p) * HZ - force
-    torque_on_chaser = (h_after - h) * HZ - torque - rotations.cross(before.position_m, force)
-    return -on_chaser, -(torque_on_chaser - rotations.cross(tip_of(before), on_chaser))
 
 
 @pytest.mark.parametrize("changes", [{}, MISMATCH], ids=["nominal", "mismatch"])

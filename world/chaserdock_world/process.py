@@ -190,6 +190,8 @@ class World:
         self._barrier.open_tick(tick, self._timing.has_images(tick))
         for what, detail in self._faults.apply_pending(tick, self._timing):
             self._barrier.publish_warning(what, detail)
+        for chaser, reason in self._physics.take_openings():
+            self._barrier.publish_warning("latch opened", f"chaser {chaser}: {reason}")
 
     def _expose_images(self, tick: int, states: States) -> None:
         """Render and publish the images of a tick.

@@ -136,6 +136,10 @@ def _check_truth(scenario: Scenario) -> None:
         key := next((k for k in sorted(given) if getattr(scenario.truth.target, k)), None)
     ):
         raise ValueError(f'truth.target.{key}: needs target.motion = "torque_free"')
+    latches = scenario.truth.latch
+    key = next((k for k in sorted(latches.model_fields_set) if getattr(latches, k)), None)
+    if key and scenario.docking.kind != "capture":
+        raise ValueError(f'truth.latch.{key}: latches exist only with docking.kind = "capture"')
     named: set[int | None] = set()
     for k, values in enumerate(scenario.truth.values):
         path, name = f"truth.values.{k}", "the target" if values.target else f"chaser {values.chaser}"

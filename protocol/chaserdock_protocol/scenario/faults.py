@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from pydantic import AfterValidator, Field, ValidationError, model_validator
@@ -32,6 +33,9 @@ FaultKind = Literal[
     "camera_off",
     "lying_sensor",
     "odometry_lie",
+    "latch_slip",
+    "latch_open",
+    "latch_stuck",
 ]
 TopicName = Literal["image", "odometry", "docking", "sighting", "thrusters", "wrench", "actuators"]
 
@@ -50,6 +54,11 @@ ON_RECEIPT: frozenset[str] = frozenset(
     {"cut", "drop", "delay", "duplicate", "reorder", "corrupt", "camera_off"}
 )
 ON_PUBLISHING: frozenset[str] = frozenset({"flood", "clock_jump", "lying_sensor", "odometry_lie"})
+
+
+LATCH_FAULTS: frozenset[str] = frozenset({"latch_slip", "latch_open", "latch_stuck"})
+_BY_WORLD: frozenset[str] = LATCH_FAULTS | {"odometry_lie"}
+"""Faults that happen to chasers, but in the world's process."""
 
 
 class _Signature(NamedTuple):
@@ -79,6 +88,9 @@ _SIGNATURES: dict[str, _Signature] = {
     "camera_off": _signature("duration_s", "", "chaser"),
     "lying_sensor": _signature("duration_s", "offset_m rotation_deg", "chaser"),
     "odometry_lie": _signature("duration_s", "offset_m rotation_deg", "chaser"),
+    "latch_slip": _signature("duration_s", "force_N torque_N_m", "chaser"),
+    "latch_open": _signature("duration_s", "", "chaser"),
+    "latch_stuck": _signature("duration_s", "", "chaser"),
 }
 _COMMON = frozenset({"kind", "at_s", "process"})
 
@@ -110,7 +122,8 @@ class Fault(Section):
     )
     process: Process = Field(
         description="Process that is affected: `world`, `controller`, `standby`, `chaser/NUMBER` or `recorder`. Faults of "
-        "messages affect what it receives; `flood`, `clock_jump`, `lying_sensor` and `odometry_lie` what it publishes."
+        "messages affect what it receives; `flood`, `clock_jump`, `lying_sensor` and `odometry_lie` what it publishes; "
+        "`latch_slip`, `latch_open` and `latch_stuck` its latch."
     )
     peer: Process | None = Field(default=None, description="Limits the fault to messages from this process.")
     topic: TopicName | None = Field(default=None, description="Kind of message that is affected.")
@@ -134,6 +147,13 @@ class Fault(Section):
         description="Error of the attitude, rotation vector, degrees: of sightings in IRF, of odometry in CRF.",
     )
 
+    force_N: Positive | None = Field(
+        default=None, description="Largest force that a slipping latch transmits, N. Without it: any."
+    )
+    torque_N_m: Positive | None = Field(
+        default=None, description="Largest torque that a slipping latch transmits, N m. Without it: any."
+    )
+
     @model_validator(mode="after")
     def _check_keys(self) -> Fault:
         signature = _SIGNATURES[self.kind]
@@ -142,8 +162,12 @@ class Fault(Section):
             raise ValueError(f"{self.kind} needs {name}")
         for name in sorted(present - signature.required - signature.optional):
             raise ValueError(f"{name} does not go with {self.kind}")
-        if self.kind in ("lying_sensor", "odometry_lie") and not present & {"offset_m", "rotation_deg"}:
-            raise ValueError(f"{self.kind} needs offset_m or rotation_deg")
+        for kinds, (one, other) in (
+            (("lying_sensor", "odometry_lie"), ("offset_m", "rotation_deg")),
+            (("latch_slip",), ("force_N", "torque_N_m")),
+        ):
+            if self.kind in kinds and not present & {one, other}:
+                raise ValueError(f"{self.kind} needs {one} or {other}")
         return self
 
     @model_validator(mode="after")
@@ -163,6 +187,11 @@ class Fault(Section):
         if self.peer is not None and (self.peer == self.process or role_of(self.peer) == "recorder"):
             raise ValueError(f"peer: {self.process} receives no message that can be faulty from {self.peer}")
         return self
+
+    def ticks(self, rate_hz: int) -> tuple[int, int]:
+        """Return the first tick of the fault and the first tick after it. A fault lasts at least one tick."""
+        begin = max(1, math.ceil(self.at_s * rate_hz - 1e-9))
+        return begin, begin + max(1, round((self.duration_s or 0.0) * rate_hz))
 
     def text(self) -> str:
         """Return the fault as one line for the log."""
@@ -201,7 +230,7 @@ def faults_of(scenario: Scenario, process: str) -> ProcessFaults:
 def _concerns(fault: Fault, process: str) -> bool:
     if fault.kind == "cut" and fault.process != process:
         return fault.peer in (None, process)
-    return fault.process == process and fault.kind != "odometry_lie"  # which the world publishes
+    return fault.process == process and fault.kind not in _BY_WORLD
 
 
 def process_faults_from_json(text: str) -> ProcessFaults:
@@ -228,3 +257,11 @@ def check_faults(faults: tuple[Fault, ...], scenario: Scenario) -> None:
             raise ValueError(f'fault.{k}.topic: thrusters exist only with chaser.actuation = "thrusters"')
         if fault.topic == "docking" and scenario.docking.kind != "capture":
             raise ValueError(f'fault.{k}.topic: docking sensors exist only with docking.kind = "capture"')
+        if (
+            fault.kind in LATCH_FAULTS
+            and scenario.docking.port_of(int(fault.process.partition("/")[2])) is None
+        ):
+            raise ValueError(
+                f"fault.{k}: {fault.kind} cannot happen to {fault.process}, which has no port; see docking.kind and "
+                "[[docking.ports]]"
+            )

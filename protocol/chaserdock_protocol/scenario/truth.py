@@ -125,6 +125,23 @@ class SensorTruth(Section):
     )
 
 
+class LatchTruth(Section):
+    """Imperfections of the latches: strength and play. By default a closed latch is rigid and holds any load."""
+
+    strength_N: Positive | None = Field(
+        default=None, description="Force on the port beyond which a closed latch opens, N."
+    )
+    strength_N_m: Positive | None = Field(
+        default=None, description="Torque about the tip beyond which it opens, N m."
+    )
+    play_m: Annotated[float, Field(ge=0, le=0.01, allow_inf_nan=False)] = Field(
+        default=0.0, description="Free travel of the tip in a closed latch, in any direction, m."
+    )
+    play_deg: Annotated[float, Field(ge=0, le=5, allow_inf_nan=False)] = Field(
+        default=0.0, description="Free rotation of the chaser in a closed latch, about any axis, degrees."
+    )
+
+
 class TruthValues(Section):
     """True values of one body, in place of drawn ones."""
 
@@ -227,6 +244,7 @@ class TruthSection(Section):
     target: TargetTruth = TargetTruth()
     camera: CameraTruth = CameraTruth()
     sensors: SensorTruth = SensorTruth()
+    latch: LatchTruth = LatchTruth()
     values: tuple[TruthValues, ...] = ()
 
     def mismatch(self, body: Literal["chaser", "target"]) -> Mismatch:

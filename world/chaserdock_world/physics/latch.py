@@ -1,17 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""State machine of a probe's latch: due commands, and whether a touch closes it. Contains no physics."""
+"""State machine of a probe's latch: due commands, faults, and whether a touch closes it. Contains no physics."""
 
 from __future__ import annotations
 
 import heapq
+import math
 from dataclasses import dataclass, field
 
 from chaserdock_models.docking_geometry import PortView
 from chaserdock_protocol.messages import Latch, ProbeTouch
+from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.docking import Port, Tolerances
+from chaserdock_protocol.scenario.faults import LATCH_FAULTS
+
+from .compliant_latch import Grip
 
 _NEW_TOUCH_AFTER_S = 0.02
 """Contact after at least this time without contact is a new touch."""
+
+
+@dataclass(frozen=True)
+class LatchFault:
+    """A fault of a latch from physics step ``begin`` to before ``end``. ``grip``: of a latch that slips."""
+
+    kind: str
+    begin: int
+    end: int
+    grip: Grip = field(default_factory=Grip)
+
+
+def latch_faults(scenario: Scenario, chaser: int) -> tuple[LatchFault, ...]:
+    """Return the faults of a chaser's latch."""
+    timing, faults = scenario.timing, []
+    for fault in scenario.fault:
+        if fault.kind in LATCH_FAULTS and fault.process == f"chaser/{chaser}":
+            begin, end = (timing.step_of_tick(tick) for tick in fault.ticks(timing.rate_hz))
+            limits = (x if x is not None else math.inf for x in (fault.force_N, fault.torque_N_m))
+            faults.append(LatchFault(fault.kind, begin, end, Grip(*limits)))
+    return tuple(faults)
 
 
 @dataclass
@@ -25,6 +51,7 @@ class ProbeLatch:
     port: Port
     tolerances: Tolerances
     physics_hz: int
+    faults: tuple[LatchFault, ...] = ()
     armed: bool = False
     latched: bool = False
     touched: bool = False
@@ -39,16 +66,23 @@ class ProbeLatch:
             self._received += 1
             heapq.heappush(self._queue, (effective_step, self._received, latch))
 
+    def fault_at(self, kind: str, step: int) -> LatchFault | None:
+        """Return the fault of this kind that acts at ``step``, or None."""
+        return next((f for f in self.faults if f.kind == kind and f.begin <= step < f.end), None)
+
     def apply_due_commands(self, step: int) -> bool:
-        """Apply the commands due at ``step``; return whether the latch opens."""
-        opens = False
+        """Apply the commands due at ``step``; return whether the latch opens. A stuck one opens when it is free again."""
         while self._queue and self._queue[0][0] <= step:
             self.armed = heapq.heappop(self._queue)[2] == "arm"
-            opens = self.latched and not self.armed
+        opens = self.latched and not self.armed and self.fault_at("latch_stuck", step) is None
         if opens:
-            self.latched = False
-            self._last_touch_step = step  # the probe is still in contact
+            self.open(step)
         return opens
+
+    def open(self, step: int) -> None:
+        """Open the latch, which must be armed again before it can close."""
+        self.latched = self.armed = False
+        self._last_touch_step = step  # the probe is still in contact
 
     def touch(self, step: int, before: PortView) -> bool:
         """Handle contact of the tip during ``step``; return whether the latch closes.
@@ -62,6 +96,7 @@ class ProbeLatch:
             return False
         refused = "" if self.armed else "not armed"
         refused = refused or before.fault(self.tolerances, self.tolerances.closing_m_s)
+        refused = refused or ("latch stuck" if self.fault_at("latch_stuck", step) else "")
         self.latched = not refused
         self.touches.append(
             ProbeTouch(

@@ -7,6 +7,8 @@ with body rates. There is no gravity, damping or sleeping.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -22,8 +24,9 @@ from chaserdock_world.plant import Plant, chaser_plant, target_plant
 from chaserdock_world.random_draws import GaussMarkov, Stream
 
 from .bullet import connect, pybullet
+from .compliant_latch import ENGAGED_M, CompliantLatch, Grip
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
-from .latch import ProbeLatch
+from .latch import ProbeLatch, latch_faults
 from .port_loads import PortLoadRecorder, port_attitude
 
 TARGET = "target"
@@ -62,12 +65,19 @@ class Physics:
         self._names = {number: name for name, number in self._bodies.items()}
         hz, docking = scenario.time.physics_hz, scenario.docking
         ports = docking.ports if docking.kind == "capture" else ()
-        self.latches = {f"chaser/{p.chaser}": ProbeLatch(p.chaser, p, docking.tolerances, hz) for p in ports}
+        self.latches = {
+            f"chaser/{p.chaser}": ProbeLatch(
+                p.chaser, p, docking.tolerances, hz, latch_faults(scenario, p.chaser)
+            )
+            for p in ports
+        }
         self.port_loads = {name: self._load_recorder(name, p.chaser) for name, p in self.latches.items()}
         if self.latches:
             # Else the solver stops early, and joint reactions lag behind changes of thrust by a few steps.
             self._bullet.setPhysicsEngineParameter(solverResidualThreshold=0.0)
         self._joints: dict[str, int] = {}
+        self._compliant: dict[str, CompliantLatch] = {}
+        self._openings: list[tuple[int, str]] = []
         self._closing = False  # a latch closed in the last step: its joint acts first in the next one
         # Pose and rates of every free body at the beginning of the last step, in Bullet's conventions.
         self._before: dict[int, tuple[Any, Any]] = {}
@@ -206,8 +216,11 @@ class Physics:
         for _ in range(steps):
             for name, latch in self.latches.items():
                 if latch.apply_due_commands(self.step_count):
-                    self._remove_joint(name)
-            jointed = {self._bodies[name] for name in (*self._joints, TARGET)} if self._joints else ()
+                    self._detach(name)
+                if latch.faults and latch.latched:
+                    self._apply_latch_faults(name, latch)
+            attached = (*self._joints, *self._compliant)
+            jointed = {self._bodies[name] for name in (*attached, TARGET)} if attached else ()
             # Bullet clears external forces after every step.
             for body, inertia, force, torque in loads:
                 pose, rates = pose_of(body, client), rates_of(body, client)
@@ -219,6 +232,8 @@ class Physics:
                 before[body] = pose, rates
                 force_on(body, -1, force, (0, 0, 0), frame, client)
                 torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
+            if self._compliant:
+                self._apply_compliant_latches()
             pybullet.stepSimulation(client)
             self.step_count += 1
             if self._joints:
@@ -233,13 +248,56 @@ class Physics:
         return touched
 
     def _record_loads(self) -> None:
-        """Record the loads at all ports in the last step."""
-        target_xyzw = self._before[self._bodies[TARGET]][0][1]
-        for name, joint in self._joints.items():
-            reaction = pybullet.getConstraintState(joint, self._client)
-            chaser_xyzw = self._before[self._bodies[name]][0][1]
-            self.port_loads[name].add(reaction, target_xyzw, chaser_xyzw, self._closing)
-        self._closing = False
+        """Record the loads at the ports with rigid joints in the last step; open latches that they are too large for."""
+        closing, self._closing = self._closing, False
+        for name, joint in tuple(self._joints.items()):
+            self._record_load(name, pybullet.getConstraintState(joint, self._client), closing)
+
+    def _record_load(self, name: str, reaction: Sequence[float], closing: bool = False) -> None:
+        target_xyzw, chaser_xyzw = (self._before[self._bodies[n]][0][1] for n in (TARGET, name))
+        self.port_loads[name].add(reaction, target_xyzw, chaser_xyzw, closing)
+        strength = self._scenario.truth.latch
+        for load, limit, unit in (
+            (math.hypot(*reaction[:3]), strength.strength_N, "N"),
+            (math.hypot(*reaction[3:]), strength.strength_N_m, "N m"),
+        ):
+            if limit is not None and load > limit and not closing and self.latches[name].latched:
+                self._open(name, f"{load:.3g} {unit} on the port, strength {limit:g} {unit}")
+
+    def _apply_latch_faults(self, name: str, latch: ProbeLatch) -> None:
+        """Open a closed latch, or let it slip, where a fault says so."""
+        if latch.fault_at("latch_open", self.step_count) is not None:
+            self._open(name, "fault latch_open")
+        elif name in self._joints and latch.fault_at("latch_slip", self.step_count) is not None:
+            self._remove_joint(name)
+            self._compliant[name] = self._compliant_latch(name)
+
+    def _apply_compliant_latches(self) -> None:
+        """Apply the loads of latches with play, and of those that slip, to target and chasers for one step."""
+        force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
+        reach_m, target = self._scenario.chaser.probe_reach_m, self.state(TARGET)
+        for name, compliant in tuple(self._compliant.items()):
+            slip = self.latches[name].fault_at("latch_slip", self.step_count)
+            grip = Grip() if slip is None else slip.grip
+            force, torque, tip = compliant.load(target, self.state(name), reach_m, grip)
+            for body, sign in ((self._bodies[TARGET], 1.0), (self._bodies[name], -1.0)):
+                force_on(body, -1, (sign * force).tolist(), tip.tolist(), pybullet.WORLD_FRAME, self._client)
+                torque_on(body, -1, (sign * torque).tolist(), pybullet.WORLD_FRAME, self._client)
+            x, y, z, w = self._before[self._bodies[name]][0][1]
+            self._record_load(name, [*force, *rotations.rotate_inverse([w, x, y, z], torque)])
+            if name in self._compliant and compliant.slipped_m > ENGAGED_M:
+                self._open(name, f"slipped {compliant.slipped_m * 1e3:.0f} mm, out of its port")
+
+    def _open(self, name: str, reason: str) -> None:
+        """Open a latch that no command opens."""
+        self._openings.append((self.latches[name].chaser, reason))
+        self.latches[name].open(self.step_count)
+        self._detach(name)
+
+    def take_openings(self) -> list[tuple[int, str]]:
+        """Return the latches that have opened without a command since the last call: chaser and reason."""
+        openings, self._openings = self._openings, []
+        return openings
 
     def contacts(self) -> tuple[tuple[str, str], ...]:
         """Return the pairs of bodies in contact after the last step, sorted, without probe tips on the target."""
@@ -283,10 +341,38 @@ class Physics:
             reach_m = self._scenario.chaser.probe_reach_m
             view = view_of(latch.port, reach_m, q_off, chaser, target)
             if latch.touch(self.step_count - 1, view):
-                self._add_joint(name)
-                self._closing = True
+                self._attach(name)
         if self._closing:
             self._before.clear()  # the joints change the rates abruptly
+
+    def _attach(self, name: str) -> None:
+        """Hold a chaser's probe in its port in their current relative pose."""
+        play = self._scenario.truth.latch
+        if play.play_m or play.play_deg:
+            self._compliant[name] = self._compliant_latch(name)
+        else:
+            self._add_joint(name)
+            self._closing = True
+        # The contact spring would work against the latch.
+        self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 0)
+
+    def _detach(self, name: str) -> None:
+        if name in self._joints:
+            self._remove_joint(name)
+        self._compliant.pop(name, None)
+        self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 1)
+
+    def _compliant_latch(self, name: str) -> CompliantLatch:
+        """Return a latch that holds a chaser where it is."""
+        target, chaser, play = self.state(TARGET), self.state(name), self._scenario.truth.latch
+        tip = np.array([self._scenario.chaser.probe_reach_m, 0.0, 0.0])
+        place = chaser.position_m + rotations.rotate(chaser.q_wxyz, tip) - target.position_m
+        return CompliantLatch(
+            rotations.rotate_inverse(target.q_wxyz, place),
+            rotations.multiply(rotations.conjugate(target.q_wxyz), chaser.q_wxyz),
+            play.play_m,
+            math.radians(play.play_deg),
+        )
 
     def _add_joint(self, name: str) -> None:
         """Fix a chaser's probe tip to the target in their current relative pose."""
@@ -312,12 +398,9 @@ class Physics:
             parentFrameOrientation=_xyzw(relative),
             childFrameOrientation=[0.0, 0.0, 0.0, 1.0],
         )
-        # The contact spring would work against the joint.
-        self._bullet.setCollisionFilterPair(a, b, -1, -1, 0)
 
     def _remove_joint(self, name: str) -> None:
         self._bullet.removeConstraint(self._joints.pop(name))
-        self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 1)
 
     def close(self) -> None:
         """Disconnect the PyBullet client."""

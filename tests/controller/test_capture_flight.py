@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import ScenarioError, parse_scenario
+from chaserdock_world.physics.latch import LatchFault
 from chaserdock_world.physics.simulation import TARGET
 from docking_cases import PORTS, values
 
@@ -46,6 +47,41 @@ def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
     assert flight.angular_error is not None
     assert max(flight.linear_error, flight.angular_error) <= 1e-4
     assert not flight.physics.latches["chaser/0"].latched
+
+
+def test_a_slipping_latch_is_not_verified_and_a_stuck_one_is_not_pulled_at() -> None:
+    """The pull moves the chaser; it is to retreat, but the latch opens only 5 s later. It backs out without a touch."""
+    fault = "fault=[{kind='latch_slip',at_s=1.0,duration_s=200.0,force_N=0.2,process='chaser/0'}]"
+    scenario = docking_scenario(1, changes=(fault, "docking.entry_m=0.25", "docking.final_m=0.06"))
+    flight = InProcessMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1)))
+    latch = flight.physics.latches["chaser/0"]
+    while flight.time_s < 2.0:
+        flight.step()
+    flight.step((OperatorCommand(command="approach", chaser=0),))
+    while flight.phase(0) != "retreat":
+        assert flight.time_s < 60.0, flight.events
+        flight.step()
+    begun, begin_s = flight.physics.step_count, flight.time_s
+    latch.faults += (LatchFault("latch_stuck", begun, begun + 5 * 960),)
+    modes = set()
+    while flight.time_s - begin_s < 12.0:
+        out = flight.step().outputs
+        assert out is not None
+        if 1.5 < flight.time_s - begin_s < 5.0:
+            assert latch.latched
+            modes.add(out.wrenches[0].mode)
+    states = flight.states()
+    away_m = np.linalg.norm(states["chaser/0"].position_m - states[TARGET].position_m)
+    flight.close()
+    assert modes == {"coast"}
+    failed, stuck, opened = flight.retreats(0)
+    assert failed.startswith("from latched: moved ")
+    assert failed.endswith("under the pull")
+    assert (stuck, opened) == ("the latch does not open", "the latch opened")
+    assert not latch.latched
+    assert away_m > 0.6
+    assert flight.contacts == set()
+    assert flight.phase(0) == "retreat"
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -166,6 +167,40 @@ def test_a_latch_that_slips_under_the_pull_is_not_verified() -> None:
     pilot.guidance.update_docking(0, pilot.now_s, senses(slipped, latched=True))
     assert pilot.phase() == "retreat"
     assert "moved 6.00 mm" in drain(pilot.guidance)[-1][2]
+
+
+def test_a_chaser_whose_latch_does_not_open_waits_at_its_port() -> None:
+    """For a second it takes the latch for slow; then it stays, and its way out begins when the latch opens."""
+    pilot = Pilot()
+    pilot.ask("approach")
+    pilot.fly_to("verified")
+    machine = pilot.guidance
+    place = at(machine.chasers[0].move, pilot.now_s)[0]
+    pilot.ask("retreat")
+    drain(machine)
+
+    def observe(seconds: float, latched: bool, sensed: bool = True) -> list[str]:
+        for _ in range(round(seconds / DT_S)):
+            pilot.now_s += DT_S
+            machine.update_tracking(0, pilot.now_s, 0.0, 0.0)
+            machine.update_docking(0, pilot.now_s, replace(senses(place, latched=latched), sensed=sensed))
+        return [event[2] for event in drain(machine)]
+
+    assert observe(0.8, latched=True) == []
+    assert observe(2.0, latched=True, sensed=False) == []  # nothing is known of the latch
+    assert not machine.chasers[0].stuck
+    assert observe(20.0, latched=True) == ["the latch does not open"]
+    assert pilot.phase() == "retreat"
+    assert machine.chasers[0].stuck
+    assert machine.latch(0) == "release"
+    assert machine.min_distance_target_m(0) == 0.0
+    np.testing.assert_allclose(at(machine.chasers[0].move, pilot.now_s)[0], place, atol=1e-9)
+    assert observe(DT_S, latched=True, sensed=False) == []
+    assert machine.chasers[0].stuck
+    assert observe(DT_S, latched=False) == ["the latch opened"]
+    assert not machine.chasers[0].stuck
+    pilot.observed[0] = {}
+    pilot.fly_to("hold")
 
 
 def test_the_pull_gives_back_the_impulse_that_it_takes() -> None:

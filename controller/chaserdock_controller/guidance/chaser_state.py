@@ -27,7 +27,7 @@ class ChaserGuidance:
 
     ``inside_since_s``: since when the chaser is within its tolerances. ``attempt``: number of the docking attempt, from 1.
     ``held``: position (3,) and attitude (4,) in TRF when the pull test began. ``faces``: the reference attitude turns
-    with the offset so that the chaser faces the target.
+    with the offset so that the chaser faces the target. ``stuck``: it is to back out, but its latch does not open.
     """
 
     phase: Phase
@@ -38,6 +38,7 @@ class ChaserGuidance:
     attempt: int = 1
     held: tuple[Array, Array] | None = None
     faces: bool = False
+    stuck: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ class CommandResult:
 
 @dataclass(frozen=True)
 class PhaseChange:
-    """A chaser entered ``phase``; ``detail`` names the phase before and the reason."""
+    """A chaser entered ``phase``; ``detail`` names the phase before and the reason, or what has happened in the phase."""
 
     chaser: int
     phase: Phase

@@ -75,7 +75,8 @@ def why_not_approach(dock: Dock, offset_m: Array) -> str:
 class DockingObservation:
     """Estimated geometry of a chaser at its port, and the state of its docking sensor.
 
-    ``offset_m`` (3,) and ``q_wxyz`` (4,): estimated pose of its centre and body in TRF.
+    ``offset_m`` (3,) and ``q_wxyz`` (4,): estimated pose of its centre and body in TRF. ``sensed``: the sensor has reported in
+    this tick; otherwise ``latched`` is its last report.
     """
 
     view: PortView
@@ -83,6 +84,7 @@ class DockingObservation:
     latched: bool
     offset_m: Array
     q_wxyz: Array
+    sensed: bool = True
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from . import command_validation as validation
 from .approach_cone import Cone, cone_of
 from .chaser_state import ChaserGuidance, CommandResult, NextMove, PhaseChange
 from .docking import (
+    Dock,
     DockingObservation,
     PhaseProgress,
     corridors_apart,
@@ -49,6 +50,8 @@ _SIGHT_LOSS_S = 3.0
 """An approach stops when no chaser has seen the target for this long."""
 _HELD_MARGIN_M = 0.03
 """A chaser that docks at a distance may be planned this much nearer than that distance."""
+_RELEASE_S = 1.0
+"""A latch that is closed for this long after the command to release it does not open."""
 _OUTSIDE_M = 0.02
 """A chaser this far outside of its cone is planned without it."""
 
@@ -272,6 +275,9 @@ class PhaseMachine:
         c, dock = self.chasers[i], self._docks[i]
         if dock is None:
             return
+        if c.phase in (Phase.RETREAT, Phase.ABORT):
+            self._update_stuck(i, dock, now_s)
+            return
         if c.phase is Phase.WAIT:
             if not self._why_corridor_occupied(i):
                 self._align(i, Trigger.CORRIDOR_FREE, now_s, 1)
@@ -294,6 +300,20 @@ class PhaseMachine:
         outcome = docking_trigger(docking, progress, observed)
         if outcome is not None:
             self._apply_docking_trigger(i, now_s, *outcome)
+
+    def _update_stuck(self, i: int, dock: Dock, now_s: float) -> None:
+        """Begin the way out of a chaser anew, in every tick, for as long as its latch does not open."""
+        c, observed = self.chasers[i], self._observed[i]
+        sensed = observed.sensed or c.stuck
+        stuck = observed.latched and sensed and now_s - c.since_s >= _RELEASE_S
+        if stuck:
+            entry, speed = dock.offset(dock.docking.entry_m), self._back_out_speed(c.phase)
+            c = replace(c, move=move_to(stay(observed.offset_m, now_s), entry, now_s, speed))
+        if stuck and not c.stuck:
+            self._changes.append(PhaseChange(i, c.phase, "the latch does not open", "warning"))
+        elif c.stuck and not stuck:
+            self._changes.append(PhaseChange(i, c.phase, "the latch opened"))
+        self.chasers[i] = replace(c, stuck=stuck)
 
     def _apply_docking_trigger(self, i: int, now_s: float, trigger: Trigger, reason: str) -> None:
         c, dock = self.chasers[i], self._docks[i]
@@ -343,6 +363,10 @@ class PhaseMachine:
         at_port = c.phase in (Phase.APPROACH, Phase.FINAL, Phase.CONTACT, *ATTACHED)
         return at_port or dock.inside(self._observed[i].offset_m)
 
+    def _is_held(self, i: int) -> bool:
+        """Return whether the latch of a chaser holds the target, by its phase, or because it does not open."""
+        return self.chasers[i].phase in ATTACHED or self.chasers[i].stuck
+
     def set_position(self, i: int, offset_m: Array) -> None:
         """Set a chaser's estimated centre (3,), TRF."""
         self._positions[i] = offset_m
@@ -354,7 +378,7 @@ class PhaseMachine:
         distance that every chaser keeps.
         """
         position, dock = self._positions.get(i), self._docks[i]
-        if position is None or self.chasers[i].phase in ATTACHED:
+        if position is None or self._is_held(i):
             return None
         if dock is None:
             near = float(np.linalg.norm(position)) < self._scenario.limits.min_distance_target_m
@@ -371,7 +395,7 @@ class PhaseMachine:
             return min(limit, docked_m) if self.corridor(i) is not None else limit
         if not self.in_corridor(i):
             return limit
-        return 0.0 if self.chasers[i].phase in ATTACHED else min(limit, dock.keep_out_m())
+        return 0.0 if self._is_held(i) else min(limit, dock.keep_out_m())
 
     def latch(self, i: int) -> Latch:
         """Return the latch command: armed from the final approach on, open before and when backing out."""

@@ -149,13 +149,16 @@ class GuidanceStage:
         view = view_of(port, s.chaser.probe_reach_m, np.asarray(s.chasers[i].q_wxyz), chaser, moving)
         status = observation.docking.get(i)
         contact = status is not None and status.contact
-        return DockingObservation(view, contact, i in estimation.latched, *pose_in_target(target, odometry))
+        pose = pose_in_target(target, odometry)
+        return DockingObservation(view, contact, i in estimation.latched, *pose, sensed=status is not None)
 
     def _attached(self, observation: Observation, estimation: TargetEstimation) -> frozenset[int]:
-        """Return the latched chasers that are to stay; their actuators are off but for the latch test."""
+        """Return the latched chasers that are to stay, or cannot leave; their actuators are off but for the latch test."""
         backing_out = (Phase.RETREAT, Phase.ABORT)
         latched = estimation.latched & observation.odometry.keys()
-        return frozenset(i for i in latched if self.chasers[i].phase not in backing_out)
+        return frozenset(
+            i for i in latched if self.chasers[i].phase not in backing_out or self.chasers[i].stuck
+        )
 
     def _direct_command(
         self, i: int, observation: Observation, estimation: TargetEstimation, attached: bool

@@ -51,7 +51,8 @@ TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 SETTLING_S = 15.0
 """Longest time (s) after the last warning or command until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
-_DOCKED = frozenset({"docked", "latched", "verified"})
+ATTACHED = frozenset({"latched", "verified"})
+_DOCKED = ATTACHED | {"docked"}
 _POSE = (0, 1, 2, 6, 7, 8)
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
 _ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
@@ -184,6 +185,9 @@ class Invariants:
             # A chaser that no command reaches drifts: what it hits is nobody's doing.
             if not {a, b} & self.dead:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
+        for i in self._latched - set(world.latched):
+            if self.phases.get(i) in ATTACHED:
+                self.violate("latch holds", f"chaser/{i}", f"its latch opens in phase {self.phases[i]}")
         held = self._latched | set(world.latched)  # also until a release within this tick
         self._latched = set(world.latched)
         self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in held}
@@ -505,7 +509,7 @@ class Invariants:
         success, commanded = self.scenario.success, {e.command for e in self.scenario.timeline}
         for chaser in (*success.docked, *success.latched):
             phase, name = self.phases.get(chaser, ""), f"chaser/{chaser}"
-            if phase in ("latched", "verified") and chaser not in self._latched and name not in self.dead:
+            if phase in ATTACHED and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
             named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
             if phase not in _DOCKED and not self._disturbed():
@@ -523,7 +527,8 @@ class Invariants:
         s = self.scenario
         network = s.simulation.model_dump(exclude={"mode", "latency_s", "jitter_s", "duplicate"})
         commands = {e.command for e in s.timeline} - {"approach"}
-        return bool(s.fault or commands or any(network.values()) or "truth" in s.model_fields_set)
+        plant = s.thruster_failure or "truth" in s.model_fields_set
+        return bool(s.fault or commands or plant or any(network.values()))
 
 
 def _concerns(fault: Fault, name: str) -> bool:

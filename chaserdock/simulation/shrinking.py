@@ -18,6 +18,7 @@ Fails = Callable[[Case], bool]
 _LISTS = (
     ("fault",),
     ("timeline",),
+    ("thruster_failure",),
     ("simulation", "partition"),
     ("simulation", "slow"),
     ("simulation", "clock"),
@@ -95,7 +96,7 @@ def _shorter(case: Case, violated_s: float) -> Iterator[Case]:
         end_s = math.ceil(2.0 * (violated_s + extra_s)) / 2.0
         if end_s < case.get("duration_s", math.inf):
             shorter = {**copy.deepcopy(case), "duration_s": end_s}
-            for path in (("fault",), ("timeline",)):
+            for path in (("fault",), ("timeline",), ("thruster_failure",)):
                 kept = [row for row in _at(case, path) if row["at_s"] < end_s]
                 if path[0] in case:
                     shorter[path[0]] = kept

@@ -142,7 +142,47 @@ def draw_case(
         case["truth"] = truth
     if commands := _draw_commands(draw, scenario):
         case["timeline"] = commands
+    devices = random.Random(f"devices {seed}")
+    faults += _draw_device_faults(devices, scenario)
+    if failures := _draw_thruster_failures(devices, scenario):
+        case["thruster_failure"] = failures
     return case
+
+
+def _draw_device_faults(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
+    """Return at most one fault of the messages of thrusters or docking sensors, where a scenario has them."""
+    readers = [("controller", "thrusters")] if scenario.chaser.actuation == "thrusters" else []
+    if scenario.docking.kind == "capture":
+        readers.append(("controller", "docking"))
+        readers += [(f"chaser/{p.chaser}", "docking") for p in scenario.docking.ports]
+    if not readers or draw.random() > 0.3:
+        return []
+    kind = draw.choice(["drop", "delay", "duplicate", "reorder", "corrupt"])
+    fault = draw_fault(kind, draw, len(scenario.chasers), 0.8 * scenario.duration_s)
+    fault["process"], fault["topic"] = draw.choice(readers)
+    return [fault]
+
+
+def _draw_thruster_failures(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:
+    """Return the scenario's thruster failures and one more; mostly, and without thrusters, none."""
+    if scenario.chaser.actuation != "thrusters" or draw.random() > 0.3:
+        return []
+    failures = [f.model_dump(exclude_none=True) for f in scenario.thruster_failure]
+    failed = {(f["chaser"], f["thruster"]) for f in failures}
+    healthy = [
+        (i, j)
+        for i in range(len(scenario.chasers))
+        for j in range(len(scenario.chaser.thrusters))
+        if (i, j) not in failed
+    ]
+    chaser, thruster = draw.choice(healthy)
+    failure: dict[str, Any] = {"chaser": chaser, "thruster": thruster}
+    failure["at_s"] = round(draw.uniform(0.5, 0.8 * scenario.duration_s), 2)
+    failure["kind"] = draw.choice(["stuck_off", "stuck_on", "weak"])
+    if failure["kind"] == "weak":
+        failure["factor"] = draw.choice([0.2, 0.5, 0.8])
+    failure["reported"] = draw.random() < 0.3
+    return [*failures, failure]
 
 
 def _draw_network(draw: random.Random, chasers: int, end_s: float, standby: bool) -> dict[str, Any]:

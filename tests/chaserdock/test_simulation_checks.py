@@ -102,6 +102,20 @@ def test_seeds_draw_faults_of_latches_where_there_are_ports(tmp_path: Path) -> N
     assert len(chasers) > 1
 
 
+def test_seeds_draw_thruster_failures_and_lost_device_messages_where_there_are_any(tmp_path: Path) -> None:
+    capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    kinds, topics_of = set(), set()
+    for seed in range(60):
+        case = draw_case("docking-contact", seed, capture)
+        path = tmp_path / "case.toml"
+        path.write_text(toml_document(case))
+        loaded = load_scenario(path)
+        kinds |= {f.kind for f in loaded.thruster_failure}
+        topics_of |= {(f.process, f.topic) for f in loaded.fault if f.topic in ("docking", "thrusters")}
+    assert kinds == {"stuck_off", "stuck_on", "weak"}
+    assert topics_of == {("controller", "thrusters"), ("controller", "docking"), ("chaser/0", "docking")}
+
+
 def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> None:
     path = tmp_path / "case.toml"
     path.write_text(toml_document({"extends": "fault-drill", "timeline": [], "success": {"docked": []}}))
@@ -325,6 +339,15 @@ def test_thrusters_give_what_the_chaser_expects() -> None:
         at = {"tick": tick, "sim_time_ns": tick * 100_000_000}
         log.publish(topics.THRUSTERS, msgspec.structs.replace(report, **at), 0)
         assert log.found == ([] if tick < 10 else ["thrusters as expected"]), tick
+
+
+@pytest.mark.parametrize(("phase", "found"), [("verified", ["latch holds"]), ("retreat", [])])
+def test_a_latch_opens_for_a_retreat_only(log: Log, phase: str, found: list[str]) -> None:
+    for tick, latched in ((1, (0,)), (2, ())):
+        reference: Any = msgspec.structs.replace(BY_TYPE[Reference], phase=phase)
+        log.publish(topics.REFERENCE, reference, 0)
+        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched))
+    assert log.found == found
 
 
 def test_an_untouched_target_conserves_its_energy(log: Log) -> None:

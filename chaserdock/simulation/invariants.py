@@ -422,11 +422,20 @@ class Invariants:
         self._unexplained[i] = self._unexplained[i] + np.subtract(expected, true)
         self._given_N_s[i] += sum(body.thruster_impulse_N_s)
         error = float(np.linalg.norm(self._unexplained[i]))
-        if error > _THRUSTER_FLOOR_N_S + _THRUSTER_SHARE * self._given_N_s[i]:
+        if error > self._thruster_error_N_s(name, self._given_N_s[i]):
             text = (
                 f"expects {error:.2e} N s more of its thrusters than they gave, of {self._given_N_s[i]:.2e}"
             )
             self.violate("thrusters as expected", name, text)
+
+    def _thruster_error_N_s(self, name: str, given_N_s: float) -> float:
+        """Return by how much the impulse that thrusters have given may differ from the expected one."""
+        truth, drawn = self.scenario.truth.mismatch("chaser"), self._drawn.get(name)
+        late_s = truth.delay_s + 3.0 * truth.delay_jitter_s
+        late_s += 0.0 if drawn is None else abs(drawn.clock_offset_s)
+        # A thruster's force acts on position and, by its arm, on attitude.
+        shifted_N_s = 2.0 * late_s * sum(t.thrust_N for t in self.scenario.chaser.thrusters)
+        return _THRUSTER_FLOOR_N_S + shifted_N_s + (_THRUSTER_SHARE + 3.0 * truth.thrust_share) * given_N_s
 
     def _on_estimate(self, estimate: TargetEstimate) -> None:
         truth = self._states.get("target")

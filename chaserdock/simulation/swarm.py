@@ -287,7 +287,8 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationRes
         checks.check_end(flight.crashes, flight.stalled)
         _check_recording(checks, flight, published)
         _check_queues(checks, flight)
-        honest = not _LIES & {f["kind"] for f in case.get("fault", [])} and "truth" not in case
+        lies = _LIES & {f["kind"] for f in case.get("fault", [])}
+        honest = not (lies or "truth" in case or "thruster_failure" in case)
         if honest:
             _check_consistency(checks)
     return SimulationResult(

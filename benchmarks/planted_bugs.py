@@ -2,8 +2,9 @@
 """Evidence that ``chaserdock simulate`` finds bugs: ``python benchmarks/planted_bugs.py [--only NAME ...] [--seeds 500]``.
 
 Each patch in tests/planted_bugs/ plants one bug in a copy of this checkout, in which random seeds are flown until one fails; the
-checkout itself must pass that seed. Prints a table: bug, seed, invariant. ``--check`` only applies all patches. The lines of a
-patch before its first ``---`` state the bug and, as ``Scenario: NAME``, what is flown (default: fault-drill).
+checkout itself must pass that seed. Prints a table: bug, scenario, seed, invariant. ``--check`` only applies all patches. The
+lines of a patch before its first ``---`` state the bug and, as ``Scenario: NAME``, what is flown (default: fault-drill), and as
+``Seed: NUMBER`` one that finds it (default: 1), the only one flown with ``--known``.
 """
 
 from __future__ import annotations
@@ -28,11 +29,13 @@ _FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,
 
 @dataclass(frozen=True)
 class PlantedBug:
-    """A planted bug: its number and name, what is wrong, the scenario to fly, and the hunks: file, old text, new text."""
+    """A planted bug: its number and name, what is wrong, the scenario to fly, a seed that finds it, and the hunks: file, old
+    text, new text."""
 
     name: str
     text: str
     scenario: str
+    known_seed: int
     hunks: tuple[tuple[str, str, str], ...]
 
 
@@ -47,7 +50,7 @@ class FailedSeed:
 
 def read_bug(path: Path) -> PlantedBug:
     """Read a patch: a unified diff below a description. Raises ValueError for a line that is neither."""
-    head, file, scenario = [], "", "fault-drill"
+    head, file, stated = [], "", {"Scenario": "fault-drill", "Seed": "1"}
     hunks: list[tuple[str, list[str], list[str]]] = []
     for line in path.read_text(encoding="utf-8").splitlines():
         if line.startswith("+++ b/"):
@@ -60,14 +63,14 @@ def read_bug(path: Path) -> PlantedBug:
             for mark, lines in (("-", hunks[-1][1]), ("+", hunks[-1][2])):
                 if line[:1] in ("", " ", mark):
                     lines.append(line[1:])
-        elif found := re.fullmatch(r"Scenario: (\S+)", line):
-            scenario = found[1]
+        elif found := re.fullmatch(r"(Scenario|Seed): (\S+)", line):
+            stated[found[1]] = found[2]
         elif not file and not hunks:
             head.append(line)
         else:
             raise ValueError(f"{path.name}: not a line of a unified diff: {line!r}")
     texts = tuple((f, "\n".join(old) + "\n", "\n".join(new) + "\n") for f, old, new in hunks)
-    return PlantedBug(path.stem, " ".join(head), scenario, texts)
+    return PlantedBug(path.stem, " ".join(head), stated["Scenario"], int(stated["Seed"]), texts)
 
 
 def apply(bug: PlantedBug, folder: Path, write: bool = True) -> None:
@@ -112,8 +115,8 @@ def simulate(folder: Path, scenario: str, first: int, last: int) -> FailedSeed |
     return FailedSeed(int(found[1] or last), found[2], found[3])
 
 
-def hunt(bug: PlantedBug, seeds: int) -> FailedSeed | None:
-    """Return the first seed that finds a bug. Raises RuntimeError if the patched sources cannot be flown."""
+def hunt(bug: PlantedBug, first: int, last: int) -> FailedSeed | None:
+    """Return the first of the seeds that finds a bug. Raises RuntimeError if the patched sources cannot be flown."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         copy_checkout(folder)
@@ -122,13 +125,14 @@ def hunt(bug: PlantedBug, seeds: int) -> FailedSeed | None:
             built = _run(folder, _BUILD)
             if built.returncode:
                 raise RuntimeError(f"{bug.name} does not compile:\n{built.stdout}{built.stderr}")
-        return simulate(folder, bug.scenario, 1, seeds)
+        return simulate(folder, bug.scenario, first, last)
 
 
 def main() -> int:
     parser = make_parser(__doc__)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="bugs whose name contains one of these")
     parser.add_argument("--seeds", type=int, default=500, metavar="N", help="most seeds to fly for a bug")
+    parser.add_argument("--known", action="store_true", help="fly only the seed that each patch states")
     parser.add_argument("--check", action="store_true", help="only check that the patches apply")
     options = parser.parse_args()
     bugs = [
@@ -151,13 +155,15 @@ def main() -> int:
     print("| bug | scenario | seed | invariant |\n| --- | --- | --- | --- |", flush=True)
     for bug in bugs:
         try:
-            found = hunt(bug, min(options.seeds, 5) if options.quick else options.seeds)
+            seeds = (1, min(options.seeds, 5) if options.quick else options.seeds)
+            found = hunt(bug, *((bug.known_seed,) * 2 if options.known else seeds))
         except RuntimeError as error:  # the other bugs are hunted nevertheless
             print(error, file=sys.stderr, flush=True)
             found = None
         figures[bug.name] = 0 if found is None else found.seed
         seed, invariant = ("not found", "") if found is None else (found.seed, found.invariant)
         print(f"| {bug.name}: {bug.text} | {bug.scenario} | {seed} | {invariant} |", flush=True)
+        write_json(options.json, figures)
         if found is not None:
             flown.add((bug.scenario, found.seed))
             print(f"{bug.name}: {found.text}", file=sys.stderr, flush=True)
@@ -165,7 +171,6 @@ def main() -> int:
     print(
         f"{len(bugs) - len(missed)} of {len(bugs)} found" + (f"; not: {', '.join(missed)}" if missed else "")
     )
-    write_json(options.json, figures)
     wrong = [(*case, found) for case in sorted(flown) if (found := simulate(ROOT, case[0], case[1], case[1]))]
     for scenario, seed, found in wrong:
         print(f"seed {seed} of {scenario} fails without a planted bug: {found.invariant}: {found.text}")

@@ -50,7 +50,9 @@ def simulate(
             "--shrink/--no-shrink", help="reduce seeds that fail to the simplest scenario that fails"
         ),
     ] = True,
-    stop: Annotated[bool, typer.Option("--stop", help="end at the first seed that fails")] = False,
+    stop: Annotated[
+        bool, typer.Option("--stop", help="end at the first violation of the first seed that fails")
+    ] = False,
     out: Annotated[
         Path, typer.Option(help="folder for scenarios that fail, and for the log of a flight without --seeds")
     ] = Path("simulations"),
@@ -71,7 +73,7 @@ def simulate(
     begin_s = time.monotonic()
     results: list[SimulationResult] = []
     outcomes: Counter[str] = Counter()
-    swarm = Swarm(scenario, images, None if mode is None else mode.value)
+    swarm = Swarm(scenario, images, None if mode is None else mode.value, to_violation=stop)
     for result in fly_seeds(swarm, _seed_range(seeds), jobs):
         results.append(result)
         outcomes[result.outcome] += 1

@@ -28,11 +28,12 @@ LEAST_NEES_FLIGHTS = 20
 
 @dataclass(frozen=True)
 class Swarm:
-    """What to fly: a scenario by name or path; with rendered images; in one mode only."""
+    """What to fly: a scenario by name or path; with rendered images; in one mode only; until a violation only."""
 
     scenario: str
     images: bool = False
     mode: str | None = None
+    to_violation: bool = False
 
 
 def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
@@ -40,7 +41,7 @@ def fly_seed(swarm: Swarm, seed: int) -> SimulationResult:
     path = find_scenario(swarm.scenario)
     name = str(path.resolve()) if path == Path(swarm.scenario) else path.stem
     case = draw_case(name, seed, load_scenario(path), images=swarm.images, mode=swarm.mode)
-    return fly_case(case, seed)
+    return fly_case(case, seed, to_violation=swarm.to_violation)
 
 
 def _fly(job: tuple[Swarm, int]) -> SimulationResult:

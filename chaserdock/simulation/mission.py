@@ -45,11 +45,16 @@ class SimulatedFlight:
 
 
 def simulate(
-    path: Path, folder: Path, overrides: tuple[str, ...] = (), tap: Tap | None = None
+    path: Path,
+    folder: Path,
+    overrides: tuple[str, ...] = (),
+    tap: Tap | None = None,
+    over: Callable[[], bool] = lambda: False,
 ) -> SimulatedFlight:
     """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes to ``folder``.
 
-    ``tap`` sees every message when it is published: the sender's name, the sample. Raises ScenarioError.
+    ``tap`` sees every message when it is published: the sender's name, the sample. The flight is broken off when ``over``
+    holds. Raises ScenarioError.
     """
     scenario = load_scenario(path, overrides)
     scheduler = Scheduler(scenario.seed)
@@ -74,7 +79,7 @@ def simulate(
         with contextlib.redirect_stderr(printed):
             tasks = _spawn(scheduler, scenario, options)
             limit_s = _START_S + 3.0 * scenario.duration_s + _END_S
-            scheduler.run(limit_s)
+            scheduler.run(limit_s, over)
             stalled = tuple(t.name for t in tasks if not t.done)
             scheduler.end()
     finally:

@@ -82,11 +82,11 @@ class Scheduler:
         self.call_at(self.now_s, lambda: self._continue(task, 0))
         return task
 
-    def run(self, limit_s: float) -> bool:
-        """Run until all tasks have ended; return False if they have not by ``limit_s``."""
+    def run(self, limit_s: float, over: Callable[[], bool] = lambda: False) -> bool:
+        """Run until all tasks have ended; return False if they have not by ``limit_s``, or when ``over`` holds."""
         self._hub = getcurrent()
         while self._alive:
-            if not self._events or self._events[0][0] > limit_s:
+            if over() or not self._events or self._events[0][0] > limit_s:
                 return False
             self.now_s, _, _, call = heapq.heappop(self._events)
             call()

@@ -263,8 +263,13 @@ def _draw_commands(draw: random.Random, scenario: Scenario) -> list[dict[str, An
     return sorted(timeline, key=lambda e: e["at_s"])
 
 
-def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationResult:
-    """Simulate a case and check the invariants; the log stays in ``folder`` if one is given. Raises ScenarioError."""
+def fly_case(
+    case: Case, seed: int, folder: Path | None = None, *, to_violation: bool = False
+) -> SimulationResult:
+    """Simulate a case and check the invariants, with ``to_violation`` only until one is violated.
+
+    The log stays in ``folder`` if one is given. Raises ScenarioError.
+    """
     with contextlib.ExitStack() as stack:
         scratch = Path(stack.enter_context(tempfile.TemporaryDirectory(dir=_memory_folder())))
         path = (folder or scratch) / "scenario.toml"
@@ -283,14 +288,18 @@ def fly_case(case: Case, seed: int, folder: Path | None = None) -> SimulationRes
             )
             checks.observe(sender, raw)
 
-        flight = simulate(path, path.parent / "run", tap=tap)
-        checks.check_end(flight.crashes, flight.stalled)
-        _check_recording(checks, flight, published)
-        _check_queues(checks, flight)
+        def over() -> bool:
+            return to_violation and bool(checks.violations)
+
+        flight = simulate(path, path.parent / "run", tap=tap, over=over)
         lies = _LIES & {f["kind"] for f in case.get("fault", [])}
         honest = not (lies or "truth" in case or "thruster_failure" in case)
-        if honest:
-            _check_consistency(checks)
+        if not over():
+            checks.check_end(flight.crashes, flight.stalled)
+            _check_recording(checks, flight, published)
+            _check_queues(checks, flight)
+            if honest:
+                _check_consistency(checks)
     return SimulationResult(
         seed=seed,
         case=case,

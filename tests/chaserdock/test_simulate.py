@@ -6,10 +6,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from chaserdock_protocol.messages import Tick
 from chaserdock_protocol.scenario import load_scenario
 from harness import ROOT, finished
 
 from chaserdock.simulation.campaign import Swarm, fly_seed, shrink_result, write_case
+from chaserdock.simulation.invariants import Invariants
 from chaserdock.simulation.swarm import fly_case
 
 SHORT = """
@@ -67,10 +69,24 @@ def test_a_failing_seed_becomes_a_minimal_scenario_that_fails(bad: Path, tmp_pat
     assert not case["fault"]
     assert case.keys() <= {"extends", "name", "seed", "perception", "fault", "duration_s"}
     assert path.read_text().startswith(
-        "# liveness at 1.00 s: chaser/0: ends in phase hold without a named reason"
+        "# liveness at 1.00 s: chaser/0: ends in phase hold, although nothing disturbed it"
     )
     assert load_scenario(path).duration_s == 1.0
     assert [v.invariant for v in fly_case({"extends": str(path)}, seed).violations] == ["liveness"]
+
+
+def test_a_flight_may_end_at_the_first_violation(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(checks: Invariants, tick: Tick) -> None:
+        checks._tick = tick.tick
+        if tick.tick == 3:
+            checks.violate("no contact", "test", "third tick")
+
+    monkeypatch.setattr(Invariants, "_on_tick", fail)
+    rate_hz = load_scenario(good).time.rate_hz
+    for to_violation, end_s in ((True, 3 / rate_hz), (False, 1.0)):
+        result = fly_case({"extends": str(good)}, 0, to_violation=to_violation)
+        assert [v.text for v in result.violations] == ["test: third tick"]
+        assert result.sim_time_s == pytest.approx(end_s)
 
 
 def test_regressions_are_scenarios_that_run_accepts() -> None:

@@ -34,7 +34,7 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.faults import Fault
+from chaserdock_protocol.scenario.faults import LATCH_FAULTS, Fault
 from chaserdock_protocol.transport import RawSample
 
 from chaserdock.analysis.criteria import nearest_allowed_m
@@ -186,7 +186,7 @@ class Invariants:
             if not {a, b} & self.dead:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
         for i in self._latched - set(world.latched):
-            if self.phases.get(i) in ATTACHED:
+            if self.phases.get(i) in ATTACHED and not self._latch_may_open(i):
                 self.violate("latch holds", f"chaser/{i}", f"its latch opens in phase {self.phases[i]}")
         held = self._latched | set(world.latched)  # also until a release within this tick
         self._latched = set(world.latched)
@@ -491,6 +491,12 @@ class Invariants:
             self.dead.add(lost)
             if not self._may_lose():
                 self.violate("no loss without a cause", lost, event.what)
+
+    def _latch_may_open(self, i: int) -> bool:
+        """Return whether a fault or a limited strength explains that a closed latch opens."""
+        faults = (f for f in self.scenario.fault if f.kind in LATCH_FAULTS and f.process == f"chaser/{i}")
+        lasting = any(f.at_s <= self.time_s <= f.at_s + (f.duration_s or 0.0) + 1.0 for f in faults)
+        return lasting or "latch" in self.scenario.truth.model_fields_set
 
     def _may_lose(self) -> bool:
         """Return whether a fault or the network explains that a process is lost."""

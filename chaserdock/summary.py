@@ -73,6 +73,14 @@ class TargetEstimateErrors(Struct, frozen=True, kw_only=True):
     nees_mean: float | None
 
 
+class StackRest(Struct, frozen=True, kw_only=True):
+    """Rates at the end of the target with the chasers latched to it, and since when they are within ``success.detumbled``."""
+
+    speed_m_s: float
+    rate_rad_s: float
+    since_s: float | None
+
+
 class Latency(Struct, frozen=True, kw_only=True):
     """Wall time from the publication of an image to the actuator command of the same tick."""
 
@@ -139,6 +147,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     peak_memory_bytes: int | None = None
     cpu_s: dict[str, float] | None = None
     drawn: list[DrawnBody] = []
+    stack: StackRest | None = None
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Summary:

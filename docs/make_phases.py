@@ -35,6 +35,8 @@ MEANING = {
     Phase.CONTACT: "touches the port",
     Phase.LATCHED: "is latched, and tests the latch by a pull",
     Phase.VERIFIED: "is latched, and the latch has passed the test",
+    Phase.DETUMBLE: "is latched, and stops the target together with the others that were commanded to",
+    Phase.STACK_HOLD: "is latched to the stopped target, and keeps it at rest",
 }
 
 

@@ -13,6 +13,8 @@ from chaserdock_protocol.scenario import Scenario
 from .flight import LoadHistory, RecordedFlight
 
 _CONTACT_SLACK_M = 0.02
+_VERIFIED = ("verified", "detumble", "stack_hold")
+"""Phases of a chaser whose latch has passed the test."""
 
 
 def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
@@ -28,7 +30,7 @@ def capture_of(flight: RecordedFlight, chaser: int) -> dict[str, Any] | None:
     reference, loads = flight.references.get(chaser), flight.loads.get(chaser)
     return {
         "latched": chaser in flight.world.latched,
-        "verified": reference is not None and reference.phases[-1][1] == "verified",
+        "verified": reference is not None and reference.phases[-1][1] in _VERIFIED,
         "latch_time_s": None if last is None else last.sim_time_ns / 1e9,
         "contact_lateral_m": None if last is None else last.lateral_m,
         "contact_angle_rad": None if last is None else last.angle_rad,
@@ -115,6 +117,47 @@ def capture_text(capture: dict[str, Any]) -> str:
     )
 
 
+def stack_rest(flight: RecordedFlight) -> dict[str, float | None] | None:
+    """Return the rates at the end of the target with the chasers latched then; None where nothing is judged.
+
+    ``since_s``: simulated time from which on both were within ``success.detumbled``; None if they are not at the end.
+    """
+    limits = flight.scenario.success.detumbled
+    if limits is None or "target" not in flight.truth:
+        return None
+    names = ["target", *(f"chaser/{i}" for i in flight.world.latched)]
+    tracks, drawn = {name: flight.truth[name] for name in names}, {body.body: body for body in flight.drawn}
+    n = min(len(track.time_s) for track in tracks.values())
+    momentum, mass = np.zeros((n, 3)), 0.0
+    for name, track in tracks.items():
+        own = drawn[name]
+        turning = np.cross(track.omega_rad_s[:n], own.centre_of_mass_m)
+        momentum += own.mass_kg * (track.velocity_m_s[:n] + rotations.rotate(track.q_wxyz[:n], turning))
+        mass += own.mass_kg
+    speed = np.linalg.norm(momentum, axis=1) / mass
+    rate = np.linalg.norm(tracks["target"].omega_rad_s[:n], axis=1)
+    outside = np.flatnonzero((speed > limits.speed_m_s) | (rate > np.radians(limits.rate_deg_s)))
+    first = int(outside[-1]) + 1 if len(outside) else 0
+    return {
+        "speed_m_s": float(speed[-1]),
+        "rate_rad_s": float(rate[-1]),
+        "since_s": float(tracks["target"].time_s[first]) if first < n else None,
+    }
+
+
+def rest_failures(result: dict[str, Any], s: Scenario) -> list[str]:
+    """Return the violations of ``success.detumbled``."""
+    limits, stack = s.success.detumbled, result.get("stack")
+    if limits is None or (stack is not None and stack["since_s"] is not None):
+        return []
+    if stack is None:
+        return ["the log has no truth to judge success.detumbled"]
+    return [
+        f"the stack moves at {stack['speed_m_s'] * 1e3:.2f} mm/s and {np.degrees(stack['rate_rad_s']):.3f} degrees/s; at most "
+        f"{limits.speed_m_s * 1e3:g} mm/s and {limits.rate_deg_s:g} degrees/s allowed"
+    ]
+
+
 def reached_time(flight: RecordedFlight, chaser: int) -> float | None:
     """Return the simulated time (s) from which on a chaser stays at the goal of its last ``goto``; None if it does not.
 
@@ -153,7 +196,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
 
     A scenario that is shortened by an override can end before the part of the flight that a criterion is about: before
     ``settling_s`` (tracking and estimation errors), or before the time line commands the approach or the ``goto`` of a
-    chaser (``docked``, ``latched``, ``reached``). Such criteria are neither met nor violated.
+    chaser (``docked``, ``latched``, ``reached``) or the first ``detumble``. Such criteria are neither met nor violated.
     """
     success, changes, skipped = scenario.success, {}, []
     end_s = min(scenario.steady_until_s or scenario.duration_s, scenario.duration_s)
@@ -180,6 +223,12 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
                 f"its {command} is at {first_s:g} s"
                 for i, first_s in late.items()
             ]
+    first_s = min((e.at_s for e in scenario.timeline if e.command == "detumble"), default=None)
+    if success.detumbled is not None and first_s is not None and first_s >= scenario.duration_s:
+        changes["detumbled"] = None
+        skipped.append(
+            f"success.detumbled: the flight ends at {scenario.duration_s:g} s, detumble is at {first_s:g} s"
+        )
     return scenario.model_copy(update={"success": success.model_copy(update=changes)}), skipped
 
 

@@ -28,6 +28,8 @@ from .criteria import (
     not_reached,
     overloads,
     reached_time,
+    rest_failures,
+    stack_rest,
 )
 from .flight import RecordedFlight, Track, load_flight
 
@@ -232,6 +234,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "rejected": flight.rejected,
         "digest": flight.digest,
     }
+    if (stack := stack_rest(flight)) is not None:
+        result["stack"] = stack
     judged, result["not_judged"] = judged_criteria(s)
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
@@ -283,6 +287,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
         )
     out += capture_failures(result, s)
     out += overloads(result, s)
+    out += rest_failures(result, s)
     estimate = result["target_estimate"]
     position, angle = estimate["max_position_error_m"], _degrees(estimate["max_orientation_error_rad"])
     what = "error of the estimate"

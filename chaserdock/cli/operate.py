@@ -34,6 +34,7 @@ class CommandName(StrEnum):
     abort = "abort"
     goto = "goto"
     calibrate = "calibrate"
+    detumble = "detumble"
     isolate = "isolate"
     restore = "restore"
 

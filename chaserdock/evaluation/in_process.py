@@ -220,7 +220,8 @@ class InProcessMission:
             command = passed_on(wrench)
             if i in self.thrusters:
                 self.thrusters[i].apply_command(wrench)
-                command = self.thrusters[i].add_pulses(command)
+                thrusts_N = np.array(wrench.thrusts_N) if wrench.thrusts_N else None
+                command = self.thrusters[i].add_pulses(command, thrusts_N)
             if self._gain != 1.0:
                 command = msgspec.structs.replace(
                     command,

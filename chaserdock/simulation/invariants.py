@@ -51,8 +51,8 @@ TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 SETTLING_S = 15.0
 """Longest time (s) after the last warning or command until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
-ATTACHED = frozenset({"latched", "verified"})
-_DOCKED = ATTACHED | {"docked"}
+ATTACHED = frozenset({"latched", "verified", "detumble", "stack_hold"})
+DOCKED = ATTACHED | {"docked"}
 _POSE = (0, 1, 2, 6, 7, 8)
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
 _ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
@@ -527,13 +527,13 @@ class Invariants:
             if phase in ATTACHED and chaser not in self._latched and name not in self.dead:
                 self.violate("liveness", name, f"is in phase {phase}, but its latch is open")
             named = bool(self.reasons) or bool(commanded & set(_NAMED_IN))
-            if phase not in _DOCKED and not self._disturbed():
+            if phase not in DOCKED and not self._disturbed():
                 self.violate(
                     "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
                 )
             commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
             disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < SETTLING_S
-            if phase in _DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
+            if phase in DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
             self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")
 

@@ -27,7 +27,7 @@ from mcap.reader import make_reader
 
 from chaserdock.toml_text import toml_document
 
-from .invariants import Invariants, Violation
+from .invariants import DOCKED, Invariants, Violation
 from .mission import SimulatedFlight, simulate
 
 KINDS: tuple[str, ...] = tuple(kind for kind in get_args(FaultKind) if kind not in LATCH_FAULTS)
@@ -329,9 +329,7 @@ def _outcome(checks: Invariants) -> str:
         return checks.violations[0].invariant
     success = checks.scenario.success
     wanted = {*success.docked, *success.latched}
-    return (
-        "docked" if all(checks.phases.get(i) in ("docked", "latched", "verified") for i in wanted) else "safe"
-    )
+    return "docked" if all(checks.phases.get(i) in DOCKED for i in wanted) else "safe"
 
 
 def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Counter[str]) -> None:

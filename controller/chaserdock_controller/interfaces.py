@@ -34,7 +34,7 @@ from .nmpc.types import NmpcPlan
 
 LogEntry = tuple[Level, str]
 """Level and text of an event."""
-ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search"]
+ControlMode = Literal["nmpc", "track", "brake", "coast", "pull", "search", "detumble"]
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ class Observation:
     ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states; ``invalid``: why a state is not.
     ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
     ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
+    ``isolated``: thrusters that chasers report as closed.
     """
 
     tick: int
@@ -91,6 +92,7 @@ class Observation:
     impulses: Mapping[int, AppliedImpulse]
     ahead: Mapping[int, tuple[tuple[float, Array], ...]]
     input_limits: Mapping[int, Array]
+    isolated: Mapping[int, tuple[int, ...]]
     events: tuple[LogEntry, ...]
 
     @property
@@ -140,10 +142,12 @@ class ReferencePose:
 
 @dataclass(frozen=True)
 class DirectCommand:
-    """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC."""
+    """Force and torque (6,), body axes, of a chaser that is not flown by the NMPC; ``thrusts_N`` (n,), if not None: those of
+    its thrusters, which give that wrench."""
 
     mode: ControlMode
     wrench: Array
+    thrusts_N: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,6 @@ from typing import Any
 
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import ESTIMATORS, FlightScenario
-from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from chaserdock_protocol.scenario.schema import Controller, Limits
 
 from chaserdock_controller.estimation.parameters import MekfParameters
@@ -49,10 +48,11 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
     if name == "paper":
         return make_estimator(name)
     target, errors = scenario.target, scenario.navigation.errors()
-    ix, iy, iz = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
+    xx, xy, xz, _, yy, yz, _, _, zz = target.inertia_tensor.reshape(-1).tolist()
     parameters = MekfParameters(
         motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
-        inertia_ratios=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
+        inertia_ratios=((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)),
+        centre_of_mass_trf_m=target.centre_of_mass_m,
         bias_position_m=errors.camera_shift_m,
         bias_attitude_rad=errors.camera_turn_rad,
         bias_focal_share=errors.camera_focal_share,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -115,7 +115,7 @@ def _paper() -> TargetModel:
     return TargetModel("paper", (Box(size, shade=0.6),), markers, "DICT_5X5_50", size, 0.005)
 
 
-# Edge length, and right and up coordinate of the centre, of the twelve markers on a face of the servicer.
+# Edge length, and right and up coordinate of the centre, of the twelve markers on a face of the servicer and the client.
 _SERVICER_LAYOUT: tuple[Vector3, ...] = (
     (0.108, -0.086, 0.086),
     (0.108, 0.086, 0.086),
@@ -132,17 +132,21 @@ _SERVICER_LAYOUT: tuple[Vector3, ...] = (
 )
 
 
-def _servicer() -> TargetModel:
-    size = (0.40, 0.32, 0.32)
+def _with_clusters(name: str, size: Vector3) -> TargetModel:
+    """Return a cuboid with the cluster of twelve markers in the middle of each face."""
     markers = tuple(
         Marker(12 * face + k, side, *_on_face(size, face, right, up))
         for face in range(6)
         for k, (side, right, up) in enumerate(_SERVICER_LAYOUT)
     )
-    return TargetModel("servicer", (Box(size, shade=0.6),), markers, "DICT_4X4_100", size, 0.032)
+    return TargetModel(name, (Box(size, shade=0.6),), markers, "DICT_4X4_100", size, 0.032)
 
 
-_MODELS: dict[str, Callable[[], TargetModel]] = {"paper": _paper, "servicer": _servicer}
+_MODELS: dict[str, Callable[[], TargetModel]] = {
+    "paper": _paper,
+    "servicer": partial(_with_clusters, "servicer", (0.40, 0.32, 0.32)),
+    "client": partial(_with_clusters, "client", (1.0, 0.9, 0.8)),
+}
 
 
 def target_names() -> tuple[str, ...]:

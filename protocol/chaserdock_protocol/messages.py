@@ -34,7 +34,7 @@ ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
 Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
 Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
 OperatorCommandName = Literal[
-    "approach", "hold", "retreat", "abort", "goto", "calibrate", "isolate", "restore"
+    "approach", "hold", "retreat", "abort", "goto", "calibrate", "detumble", "isolate", "restore"
 ]
 Level = Literal["info", "warning", "error"]
 Square3 = Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)]
@@ -58,6 +58,8 @@ PhaseName = Literal[
     "contact",
     "latched",
     "verified",
+    "detumble",
+    "stack_hold",
 ]
 """Phase of a chaser. Those from ``wait`` on occur only if docking ends by capture."""
 Latch = Literal["keep", "arm", "release"]
@@ -354,7 +356,9 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
 
     ``tick`` is that of the odometry that it is based on. ``mode`` is its origin: the NMPC's plan, a safe command
     (``track`` the reference without a plan, ``brake`` to rest, ``coast`` without force), the ``search`` for a target
-    that no chaser sees, the ``pull`` that verifies a latch, or ``none``: no command, as the chaser's state is unknown.
+    that no chaser sees, the ``pull`` that verifies a latch, the ``detumble`` of a stack, or ``none``: no command, as the
+    chaser's state is unknown. ``thrusts_N``, with ``detumble`` only: thrust of every thruster, in place of an allocation by
+    the chaser; force and torque are then those of the thrusts.
     ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
     healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
     thruster faults. ``term``, ``commander`` and ``instance`` are those of the ``Tick`` that put the sender in command.
@@ -363,9 +367,10 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "track", "brake", "coast", "pull", "search", "none"]
+    mode: Literal["nmpc", "track", "brake", "coast", "pull", "search", "detumble", "none"]
     force_N: Vector3
     torque_N_m: Vector3
+    thrusts_N: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
     isolated: Thrusters = ()
     trusted: Thrusters = ()
     free: bool = True
@@ -470,6 +475,7 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     at which it was accepted or rejected, so that the log holds all inputs.
 
     ``calibrate`` rotates the chaser while it observes the target, which makes its camera mounting observable.
+    ``detumble`` stops the tumble of the target with the thrusters of the latched chasers that it is sent to.
     ``isolate`` closes the shut-off valve of ``thruster``; ``restore`` opens it and declares the thruster healthy.
     """
 

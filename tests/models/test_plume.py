@@ -10,7 +10,7 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_models.plume import angle_to_box, angle_to_point, plume_hits
 from chaserdock_models.targets import Box
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -24,6 +24,7 @@ def random_case(seed: int) -> tuple[np.ndarray, np.ndarray, Box]:
     return rng.uniform(-1.5, 1.5, 3), axis / np.linalg.norm(axis), box
 
 
+@settings(deadline=None)
 @given(SEEDS)
 def test_no_point_of_a_box_is_at_a_smaller_angle_than_the_one_returned(seed: int) -> None:
     nozzle, axis, box = random_case(seed)
@@ -40,6 +41,7 @@ def test_no_point_of_a_box_is_at_a_smaller_angle_than_the_one_returned(seed: int
         assert sampled - smallest <= 2.0 * cell_m / (distance_m - cell_m)
 
 
+@settings(deadline=None)
 @given(SEEDS)
 def test_the_angle_is_the_same_in_every_frame(seed: int) -> None:
     nozzle, axis, box = random_case(seed)

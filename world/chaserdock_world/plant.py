@@ -14,7 +14,6 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.targets import Marker, TargetModel
 from chaserdock_protocol.scenario import Scenario
-from chaserdock_protocol.scenario.bodies import cuboid_inertia
 from chaserdock_protocol.scenario.truth import Mismatch, TruthValues
 
 from .random_draws import TARGET_KEY, Stream, generator
@@ -145,22 +144,39 @@ def draw_moments(nominal: Moments, share: float, rng: np.random.Generator) -> Mo
     return nominal
 
 
+def _principal(inertia: Array) -> tuple[Moments, Array]:
+    """Return the principal moments of an inertia tensor (3, 3), and the rotation (4,) from principal to body axes."""
+    values, axes = np.linalg.eigh(inertia)
+    axes[:, 2] *= np.sign(np.linalg.det(axes))
+    a, b, c = values.tolist()
+    return (a, b, c), rotations.from_matrix(axes)
+
+
 def _plant(
-    seed: int, key: int, mass_kg: float, moments: Moments, sigma: Mismatch, explicit: TruthValues | None
+    seed: int,
+    key: int,
+    mass_kg: float,
+    moments: Moments,
+    sigma: Mismatch,
+    explicit: TruthValues | None,
+    axes_wxyz: Array | None = None,
+    centre_m: Array | None = None,
 ) -> Plant:
+    """Return a body with errors. ``axes_wxyz`` (4,): stated principal axes to body axes; ``centre_m`` (3,): stated centre of mass."""
     draw = _normal(seed, Stream.PLANT, key, 13)
     mass = mass_kg * (1.0 + sigma.mass_share * float(draw[0]))
     offset, turn = sigma.centre_of_mass_m * draw[1:4], sigma.inertia_turn_rad * draw[4:7]
     disturbance = np.concatenate([sigma.force_N * draw[7:10], sigma.torque_N_m * draw[10:13]])
     moments = draw_moments(moments, sigma.inertia_share, generator(seed, Stream.INERTIA, key))
     q = rotations.exp(turn)
+    if axes_wxyz is not None:
+        q = rotations.multiply(q, axes_wxyz)
+    if centre_m is not None:
+        offset = offset + centre_m
     if explicit is not None:
         mass = explicit.mass_kg or mass
         if explicit.inertia is not None:
-            values, axes = np.linalg.eigh(explicit.inertia)
-            axes[:, 2] *= np.sign(np.linalg.det(axes))
-            ia, ib, ic = values.tolist()
-            moments, q = (ia, ib, ic), rotations.from_matrix(axes)
+            moments, q = _principal(explicit.inertia)
         if explicit.centre_of_mass_m is not None:
             offset = np.array(explicit.centre_of_mass_m)
         if explicit.force_N is not None:
@@ -181,11 +197,14 @@ def chaser_plant(scenario: Scenario, chaser: int) -> Plant:
 def target_plant(scenario: Scenario) -> Plant:
     """Return the true body of the target. A prescribed motion needs none: then it is the stated one."""
     target = scenario.target
-    stated = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
     if target.motion != "torque_free":
-        return Plant(target.mass_kg, stated)
+        return Plant(target.mass_kg, target.moments)
     sigma, explicit = scenario.truth.mismatch("target"), scenario.truth.values_of(None)
-    return _plant(scenario.seed, TARGET_KEY, target.mass_kg, stated, sigma, explicit)
+    moments, axes = target.moments, None
+    if any(target.inertia_products_kg_m2):
+        moments, axes = _principal(target.inertia_tensor)
+    place = np.array(target.centre_of_mass_m)
+    return _plant(scenario.seed, TARGET_KEY, target.mass_kg, moments, sigma, explicit, axes, place)
 
 
 def actuation_errors(scenario: Scenario, chaser: int) -> ActuationErrors:

@@ -24,6 +24,8 @@ def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now
         return f"for tick {command.tick}, but a command for tick {last_tick} was already executed"
     if command.expires_ns <= now_ns:
         return f"expired at {command.expires_ns / 1e9:.3f} s, now {now_ns / 1e9:.3f} s"
+    if command.thrusts_N:
+        return _thrusts_refusal(command.thrusts_N, body)
     # The margin covers rounding.
     largest_N = max(map(abs, command.force_N))
     if largest_N > body.force_max_N * 1.01:
@@ -31,6 +33,17 @@ def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now
     largest_N_m = max(map(abs, command.torque_N_m))
     if largest_N_m > body.torque_max_N_m * 1.01:
         return f"torque of {largest_N_m:.3g} N m exceeds the body's {body.torque_max_N_m:.3g} N m"
+    return None
+
+
+def _thrusts_refusal(thrusts_N: tuple[float, ...], body: Body) -> str | None:
+    """Return why commanded thrusts cannot be given, or None."""
+    count = len(body.thrusters) if body.actuation == "thrusters" else 0
+    if len(thrusts_N) != count:
+        return f"thrusts of {len(thrusts_N)} thrusters, but the body has {count}"
+    for k, (thrust_N, thruster) in enumerate(zip(thrusts_N, body.thrusters, strict=True)):
+        if not 0.0 <= thrust_N <= thruster.thrust_N * 1.01:
+            return f"thrust of {thrust_N:.3g} N exceeds thruster {k}'s {thruster.thrust_N:.3g} N"
     return None
 
 

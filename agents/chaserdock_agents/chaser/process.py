@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 import cv2
 import msgspec
+import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
@@ -308,7 +310,7 @@ class ChaserProcess:
         self._remember(command)
         if self._thrusters is not None:
             self._thrusters.apply_command(command)
-        self._reply(passed_on(command))
+        self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
 
     def _remember(self, command: WrenchCommand) -> None:
         """Store the plan and target estimate of a command for the fallback, and end the fallback."""
@@ -378,14 +380,14 @@ class ChaserProcess:
 
     # -- publishing ------------------------------------------------------------------------------------------
 
-    def _reply(self, command: ActuatorCommand) -> None:
+    def _reply(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
         """Publish the actuator command that is the reply to its tick."""
         self.executed_tick = command.tick
-        self._actuate(command)
+        self._actuate(command, thrusts_N)
 
-    def _actuate(self, command: ActuatorCommand) -> None:
+    def _actuate(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> None:
         if self._thrusters is not None:
-            command = self._thrusters.add_pulses(command)
+            command = self._thrusters.add_pulses(command, thrusts_N)
         self.node.publish(topics.ACTUATORS, command, self.number)
 
     def _publish_warning(self, what: str, detail: str, tick: int, time_ns: int) -> None:

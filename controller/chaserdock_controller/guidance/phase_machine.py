@@ -34,6 +34,7 @@ from .docking import (
 from .phases import (
     APPROACHING,
     ATTACHED,
+    DETUMBLING,
     Phase,
     Trigger,
     next_phase,
@@ -46,6 +47,8 @@ from .trajectories import Motion, glide, move_to, stay, stop
 _ABORT_SPEED_FACTOR = 2.0
 _GOTO_SPEED_FACTOR = 2.0
 _SEARCH_AFTER_S = 1.0
+_REST_S = 0.5
+"""Time for which a stack must be below its limits to count as stopped, or above them to count as moving."""
 _SIGHT_LOSS_S = 3.0
 """An approach stops when no chaser has seen the target for this long."""
 _HELD_MARGIN_M = 0.03
@@ -73,6 +76,7 @@ class PhaseMachine:
         self._seen_s: float | None = None
         self._interrupted: set[int] = set()
         self._planning_failures: dict[int, PlanningFailure] = {}
+        self._detumble_refusal = ""
 
     # -- the target's estimate -------------------------------------------------------------------------------
 
@@ -189,6 +193,8 @@ class PhaseMachine:
         match trigger:
             case Trigger.COMMAND_RETREAT | Trigger.COMMAND_ABORT:
                 self._back_out(i, trigger, now_s)
+            case Trigger.COMMAND_DETUMBLE:
+                self._transition(i, trigger, now_s, c.move)
             case Trigger.COMMAND_HOLD if self.in_corridor(i):
                 self._transition(i, trigger, now_s, stay(self._observed[i].offset_m, now_s))
             case Trigger.COMMAND_HOLD:
@@ -219,6 +225,8 @@ class PhaseMachine:
             return validation.why_not_calibrate(self._scenario, c.phase, c.move.over_at(now_s))
         if next_phase(c.phase, trigger_of(command.command), by_capture) is None:
             return f"in phase {c.phase} permitted: {', '.join(permitted_commands(c.phase, by_capture))}"
+        if command.command == "detumble":
+            return self._detumble_refusal
         if command.command == "approach":
             offset_m = c.move.at(np.array([now_s]))[0][0]
             return (
@@ -236,6 +244,40 @@ class PhaseMachine:
             }
             return validation.why_not_goto(self._scenario, command.offset_m, goals)
         return ""
+
+    # -- the stack of the target and latched chasers ---------------------------------------------------------------
+
+    def may_detumble(self, i: int) -> bool:
+        """Return whether a chaser stops the stack already, or may be commanded to."""
+        return self.chasers[i].phase in DETUMBLING or self._permits(i, Trigger.COMMAND_DETUMBLE)
+
+    def detumbling(self) -> frozenset[int]:
+        """Return the chasers that stop the stack or keep it at rest."""
+        return frozenset(i for i, c in enumerate(self.chasers) if c.phase in DETUMBLING)
+
+    def set_detumble_refusal(self, reason: str) -> None:
+        """Set why this tick's commands to detumble are refused; empty if they are accepted."""
+        self._detumble_refusal = reason
+
+    def update_stack(self, now_s: float, stopped: bool, moving: bool) -> None:
+        """Advance the phases of detumbling chasers by the motion of the stack, which is neither stopped nor moving in between."""
+        timeout_s = self._scenario.detumble.timeout_s
+        for i in sorted(self.detumbling()):
+            c = self.chasers[i]
+            holds = c.phase is Phase.STACK_HOLD
+            since = self._inside_since(i, moving if holds else stopped, now_s)
+            self.chasers[i] = replace(c, inside_since_s=since)
+            if since is not None and now_s - since >= _REST_S:
+                trigger = Trigger.STACK_MOVED if holds else Trigger.STACK_STOPPED
+                self._transition(i, trigger, now_s, c.move)
+            elif not holds and now_s - c.since_s > timeout_s:
+                reason = f"not stopped within {timeout_s:g} s"
+                self._transition(i, Trigger.DETUMBLE_FAILED, now_s, c.move, reason)
+
+    def detumble_failed(self, now_s: float, reason: str) -> None:
+        """Close the thrusters of all detumbling chasers."""
+        for i in self.detumbling():
+            self._transition(i, Trigger.DETUMBLE_FAILED, now_s, self.chasers[i].move, reason)
 
     # -- progress --------------------------------------------------------------------------------------------
 
@@ -443,7 +485,7 @@ class PhaseMachine:
         self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
         if phase is not before.phase:
             detail = f"from {before.phase}" + (f": {reason}" if reason else "")
-            level = "warning" if trigger is Trigger.PLANNING_FAILED else "info"
+            level = "warning" if trigger in (Trigger.PLANNING_FAILED, Trigger.DETUMBLE_FAILED) else "info"
             complete = trigger is Trigger.CALIBRATION_COMPLETE
             self._changes.append(PhaseChange(i, phase, detail, level, complete))
 

@@ -28,6 +28,8 @@ class Phase(StrEnum):
     CONTACT = "contact"
     LATCHED = "latched"
     VERIFIED = "verified"
+    DETUMBLE = "detumble"
+    STACK_HOLD = "stack_hold"
 
 
 class Trigger(StrEnum):
@@ -46,6 +48,7 @@ class Trigger(StrEnum):
     COMMAND_GOTO = "command goto"
     COMMAND_RETREAT = "command retreat"
     COMMAND_ABORT = "command abort"
+    COMMAND_DETUMBLE = "command detumble"
     CALIBRATION_COMPLETE = "calibration complete"
     MOVE_COMPLETE = "move complete"
     NEXT_ATTEMPT = "move complete, attempts left"
@@ -57,6 +60,9 @@ class Trigger(StrEnum):
     TIP_CONTACT = "tip in contact"
     LATCH_CLOSED = "latch closed"
     PULL_WITHSTOOD = "pull test passed"
+    STACK_STOPPED = "stack at rest"
+    STACK_MOVED = "stack moves again"
+    DETUMBLE_FAILED = "stack cannot be stopped"
     ATTEMPT_FAILED = "limit violated or time-out"
     PLANNING_FAILED = "planning failed"
 
@@ -74,7 +80,9 @@ class Transition:
 _P, _T = Phase, Trigger
 CORRIDOR = (_P.ALIGN, _P.APPROACH, _P.FINAL, _P.CONTACT)
 """Phases of an approach to a port before the latch has closed."""
-ATTACHED = (_P.LATCHED, _P.VERIFIED)
+DETUMBLING = (_P.DETUMBLE, _P.STACK_HOLD)
+"""Phases in which the controller commands the thrusters of a latched chaser one by one."""
+ATTACHED = (_P.LATCHED, _P.VERIFIED, *DETUMBLING)
 """Phases of a chaser whose latch holds the target."""
 APPROACHING = (_P.WAIT, *CORRIDOR, *ATTACHED, _P.DOCKED)
 """Phases that an ``approach`` command leads through."""
@@ -117,6 +125,11 @@ TRANSITIONS = (
     Transition((_P.FINAL,), _T.TIP_CONTACT, _P.CONTACT, by_capture=True),
     Transition(CORRIDOR, _T.LATCH_CLOSED, _P.LATCHED, by_capture=True),
     Transition((_P.LATCHED,), _T.PULL_WITHSTOOD, _P.VERIFIED, by_capture=True),
+    Transition((_P.VERIFIED,), _T.COMMAND_DETUMBLE, _P.DETUMBLE, by_capture=True),
+    Transition((_P.DETUMBLE,), _T.STACK_STOPPED, _P.STACK_HOLD, by_capture=True),
+    Transition((_P.STACK_HOLD,), _T.STACK_MOVED, _P.DETUMBLE, by_capture=True),
+    Transition(DETUMBLING, _T.COMMAND_HOLD, _P.VERIFIED, by_capture=True),
+    Transition(DETUMBLING, _T.DETUMBLE_FAILED, _P.VERIFIED, by_capture=True),
     Transition((*CORRIDOR, *ATTACHED), _T.ATTEMPT_FAILED, _P.RETREAT, by_capture=True),
     Transition((_P.RETREAT,), _T.NEXT_ATTEMPT, _P.ALIGN, by_capture=True),
     Transition((_P.HOLD, _P.CALIBRATE, _P.GOTO), _T.PLANNING_FAILED, _P.RETREAT),
@@ -138,6 +151,7 @@ _COMMANDS = {
     "goto": Trigger.COMMAND_GOTO,
     "retreat": Trigger.COMMAND_RETREAT,
     "abort": Trigger.COMMAND_ABORT,
+    "detumble": Trigger.COMMAND_DETUMBLE,
 }
 
 

@@ -3,13 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import view_of
 from chaserdock_models.rigid_body import BodyState
-from chaserdock_protocol.messages import CameraCalibration, CommandReply, Odometry
+from chaserdock_protocol.messages import CameraCalibration, CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.composite_body import pose_in_target
@@ -25,6 +25,7 @@ from chaserdock_controller.interfaces import (
 from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from .chaser_state import ChaserGuidance
+from .detumble.control import DetumbleControl, StackState
 from .docking import DockingObservation
 from .horizon import ReferenceBuilder
 from .phase_machine import PhaseMachine
@@ -41,6 +42,7 @@ class GuidanceStage:
         self.machine = PhaseMachine(scenario)
         self.thrusters = ThrusterCommandHandler(scenario)
         self.search = TargetSearch(scenario.chaser, scenario.camera_model())
+        self.detumble = DetumbleControl(scenario)
         self.references = ReferenceBuilder(scenario, self.machine)
 
     @property
@@ -57,11 +59,14 @@ class GuidanceStage:
         """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed."""
         self._follow_estimate(observation, estimation)
         self.machine.update_planning(observation.time_s, failures)
-        replies = self._apply_commands(observation)
+        stack = self.detumble.state(observation, estimation)
+        replies = self._apply_commands(observation, stack)
         references: dict[int, ReferencePose] = {}
         if estimation.known:
             for i in sorted(observation.odometry):
                 references[i] = self._update_chaser(i, observation, estimation)
+        self._update_stack(observation, stack)
+        commands = self._detumble_commands(observation, stack)
         ids, attached = sorted(observation.odometry), self._attached(observation, estimation)
         planned = tuple(i for i in ids if self.chasers[i].phase is not Phase.SEARCHING)
         horizon = None
@@ -80,7 +85,7 @@ class GuidanceStage:
                 isolated=self.thrusters.isolated(i),
                 trusted=self.thrusters.trusted(i),
                 reference=references.get(i),
-                direct=self._direct_command(i, observation, estimation, i in attached),
+                direct=commands.get(i) or self._direct_command(i, observation, estimation, i in attached),
             )
         return GuidanceResult(directives, horizon, tuple(replies), tuple(self._events(estimation)))
 
@@ -97,10 +102,11 @@ class GuidanceStage:
             for i, odometry in estimation.own.items():
                 self.machine.target_settled(i, now_s, pose_in_target(target, odometry)[0])
 
-    def _apply_commands(self, observation: Observation) -> list[CommandReply]:
+    def _apply_commands(self, observation: Observation, stack: StackState | None) -> list[CommandReply]:
         now_s = observation.time_s
         commands = (*self.machine.due_commands(now_s), *observation.commands)
         self.machine.set_pending_goals(commands)
+        self.machine.set_detumble_refusal(self._why_not_detumble(commands, observation, stack))
         replies = []
         for command in commands:
             handler = self.thrusters if command.command in THRUSTER_COMMANDS else self.machine
@@ -117,6 +123,38 @@ class GuidanceStage:
                 )
             )
         return replies
+
+    def _why_not_detumble(
+        self, commands: Sequence[OperatorCommand], observation: Observation, stack: StackState | None
+    ) -> str:
+        """Return why the chasers that one tick's commands name cannot stop the stack together with those that do already."""
+        named = {c.chaser for c in commands if c.command == "detumble" and c.chaser < len(self.chasers)}
+        able = {i for i in named if self.machine.may_detumble(i)}
+        if not able:
+            return ""
+        return self.detumble.why_not(stack, able | self.machine.detumbling(), observation.isolated)
+
+    def _detumble_commands(
+        self, observation: Observation, stack: StackState | None
+    ) -> Mapping[int, DirectCommand]:
+        """Return the commands of detumbling chasers, by chaser. While the stack is at rest no thruster fires."""
+        active = self.machine.detumbling() & observation.odometry.keys()
+        if stack is None or not active:
+            return {}
+        hold = all(self.chasers[i].phase is Phase.STACK_HOLD for i in active)
+        return self.detumble.commands(stack, active, observation.isolated, hold)
+
+    def _update_stack(self, observation: Observation, stack: StackState | None) -> None:
+        """Advance the phases of detumbling chasers; close their thrusters if those that are left cannot stop the stack."""
+        active = self.machine.detumbling()
+        if not active or stack is None:
+            return
+        present = active & stack.chasers.keys()
+        if present and (reason := self.detumble.why_not(stack, present, observation.isolated)):
+            self.machine.detumble_failed(observation.time_s, reason)
+            return
+        stopped, share = self.detumble.is_stopped(stack), self.detumble.share_of_limits(stack)
+        self.machine.update_stack(observation.time_s, stopped, share > 1.0)
 
     def _update_chaser(self, i: int, observation: Observation, estimation: TargetEstimation) -> ReferencePose:
         """Advance a chaser's phase by its errors and its docking sensor; return its reference at the start of the tick."""

@@ -47,6 +47,7 @@ class IngestStage:
             impulses=self._impulses(odometry, inputs, history),
             ahead={i: self._ahead(i, inputs, effective_ns, history) for i in odometry},
             input_limits={i: self.thrusters.limits(i) for i in inputs.odometry},
+            isolated=self.thrusters.isolated(),
             events=tuple(events),
         )
 

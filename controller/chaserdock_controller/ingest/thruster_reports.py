@@ -36,6 +36,10 @@ class ThrusterReports:
             return None
         return np.array([*report.coming_impulse_N_s, *report.coming_angular_impulse_N_m_s])
 
+    def isolated(self) -> dict[int, tuple[int, ...]]:
+        """Return the thrusters that every chaser reports as closed."""
+        return {i: report.isolated for i, report in self._reports.items() if report.isolated}
+
     def given(self, tick: int) -> dict[int, Array]:
         """Return the impulses (6,), body axes, that thrusters gave between the tick before and ``tick``, as reported."""
         return {

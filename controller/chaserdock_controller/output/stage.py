@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
@@ -31,7 +32,7 @@ from .message_builders import (
     solver_message,
     target_message,
 )
-from .quantization import in_steps
+from .quantization import COMMAND_STEP, in_steps
 
 
 class OutputStage:
@@ -112,7 +113,10 @@ class OutputStage:
     def _send(
         self, i: int, observation: Observation, guidance: GuidanceResult, command: DirectCommand
     ) -> WrenchCommand:
-        wrench = in_steps(command.wrench, observation.input_limits[i])
+        thrusts = command.thrusts_N
+        # The limits hold on all axes at once; commanded thrusters need none but their own.
+        limits = observation.input_limits[i] if thrusts is None else np.abs(command.wrench) + COMMAND_STEP
+        wrench = in_steps(command.wrench, limits)
         self.history.add(i, observation.effective_ns, wrench)
         directive = guidance.directives[i]
         lifetime_ns = round(self._scenario.controller.command_lifetime_s * 1e9)
@@ -125,6 +129,7 @@ class OutputStage:
             mode=command.mode,
             force_N=vector(wrench[:3]),
             torque_N_m=vector(wrench[3:]),
+            thrusts_N=() if thrusts is None else vector(np.rint(thrusts / COMMAND_STEP[0]) * COMMAND_STEP[0]),
             latch=directive.latch,
             isolated=directive.isolated,
             trusted=directive.trusted,

@@ -21,7 +21,7 @@ class FlightTarget(Section):
 
     model: Name = Field(
         default="paper",
-        description="Name of a known target (`paper`, `servicer`), or, in a file, the path of a target file (`….toml`) "
+        description="Name of a known target (`paper`, `servicer`, `client`), or, in a file, the path of a target file (`….toml`) "
         "relative to it. With `geometry`: the name of that geometry.",
     )
     geometry: Geometry | None = Field(
@@ -35,8 +35,15 @@ class FlightTarget(Section):
     mass_kg: Positive = Field(default=1.25, description="Mass, kg. Used by `torque_free` only.")
     inertia_kg_m2: PositiveVector | None = Field(
         default=None,
-        description="Principal moments of inertia about the axes of TRF, kg m². Used by `torque_free` only. Without it: "
-        "those of a homogeneous cuboid of the model's size.",
+        description="Moments of inertia about the axes of TRF through the centre of mass, kg m². Used by `torque_free` only. "
+        "Without it: those of a homogeneous cuboid of the model's size.",
+    )
+    inertia_products_kg_m2: Vector = Field(
+        default=(0.0, 0.0, 0.0),
+        description="Elements xy, xz, yz of the inertia tensor (TRF), kg m². Used by `torque_free` only.",
+    )
+    centre_of_mass_m: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="Centre of mass (TRF), m. Used by `torque_free` only."
     )
 
     @model_validator(mode="after")
@@ -48,8 +55,26 @@ class FlightTarget(Section):
                 f"model: {self.model!r} is the name of a known target; choose another one for this geometry"
             )
         if self.inertia_kg_m2 is not None:
-            _check_inertia(self.inertia_kg_m2)
+            a, b, c = np.linalg.eigvalsh(self.inertia_tensor).tolist()
+            if a <= 0.0:
+                raise ValueError(
+                    f"inertia_products_kg_m2 {self.inertia_products_kg_m2}: too large for a body's inertia"
+                )
+            _check_inertia((a, b, c) if any(self.inertia_products_kg_m2) else self.inertia_kg_m2)
+        elif any(self.inertia_products_kg_m2):
+            raise ValueError("inertia_products_kg_m2: needs inertia_kg_m2")
         return self
+
+    @property
+    def moments(self) -> tuple[float, float, float]:
+        """Moments of inertia about the axes of TRF through the centre of mass, kg m^2."""
+        return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.shape().size_m)
+
+    @property
+    def inertia_tensor(self) -> Array:
+        """Inertia tensor (3, 3) about the centre of mass, TRF axes, kg m^2."""
+        xy, xz, yz = self.inertia_products_kg_m2
+        return np.diag(self.moments) + np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
 
     def shape(self) -> TargetModel:
         """Return geometry and markers."""

@@ -12,7 +12,6 @@ from chaserdock_models import rotations
 from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.port_load import CarriedBody, tumble_load
 
-from .bodies import cuboid_inertia
 from .faults import check_faults
 from .thrusters import check_pulses
 
@@ -28,6 +27,7 @@ def check_flight(scenario: FlightScenario) -> None:
         check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
     if scenario.docking.kind == "capture":
         _check_capture(scenario)
+    _check_detumble(scenario)
 
 
 def check_consistent(scenario: Scenario) -> None:
@@ -170,8 +170,7 @@ def _check_load_limits(scenario: Scenario) -> None:
     if scenario.docking.kind != "capture":
         return
     target, body = scenario.target, scenario.chaser
-    moments = target.inertia_kg_m2 or cuboid_inertia(target.mass_kg, scenario.target_model().size_m)
-    alone = CarriedBody(target.mass_kg, np.diag(moments), np.zeros(3))
+    alone = CarriedBody(target.mass_kg, target.inertia_tensor, np.array(target.centre_of_mass_m))
     rate_deg_s = math.degrees(math.hypot(*target.omega_rad_s))
     for k, port in enumerate(scenario.docking.ports):
         turn = rotations.to_matrix(scenario.chasers[port.chaser].q_wxyz)
@@ -187,6 +186,17 @@ def _check_load_limits(scenario: Scenario) -> None:
                     f"docking.ports.{k}.{key}: {limit:g} {unit} is less than the {exerted:.3g} {unit} that the tumble of "
                     f"{rate_deg_s:.3g} degrees/s alone exerts on the port of chaser {port.chaser}"
                 )
+
+
+def _check_detumble(scenario: FlightScenario) -> None:
+    for k, entry in enumerate(scenario.timeline):
+        if entry.command != "detumble":
+            continue
+        for i in entry.chasers:
+            if scenario.docking.port_of(i) is None:
+                raise ValueError(f"timeline.{k}: chaser {i} has no port and cannot be latched to the target")
+        if scenario.chaser.actuation != "thrusters":
+            raise ValueError(f'timeline.{k}: detumble needs chaser.actuation = "thrusters"')
 
 
 def _check_capture(scenario: FlightScenario) -> None:

@@ -17,6 +17,7 @@ from pydantic import Field, TypeAdapter, ValidationError, model_validator
 from .bodies import Body, FlightTarget
 from .camera import FlightCamera
 from .checks import check_flight
+from .detumble import Detumble
 from .docking import Docking
 from .errors import invalid
 from .fields import Name, Section
@@ -60,6 +61,7 @@ class FlightScenario(Section):
     limits: Limits = Limits()
     approach: Approach = Approach()
     docking: Docking = Docking()
+    detumble: Detumble = Detumble()
     chasers: tuple[FlightChaser, ...] = Field(min_length=1, max_length=16)
     timeline: tuple[TimelineEntry, ...] = ()
 

@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from .bodies import Target
 from .camera import CameraSection
 from .checks import check_consistent
+from .detumble import RestLimits
 from .faults import Fault
 from .fields import Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
@@ -44,6 +45,10 @@ class Success(Section):
         default=None, description="Longest time from that `goto` until a chaser is there to stay, s."
     )
     latched: tuple[Index, ...] = Field(default=(), description="Chasers that must be latched at the end.")
+    detumbled: RestLimits | None = Field(
+        default=None,
+        description="Rates that the stack of target and latched chasers must not exceed at the end.",
+    )
     max_collisions: int = Field(default=0, ge=0, description="Largest number of collisions.")
     keep_distances: bool = Field(
         default=True, description="Whether the distances of `[limits]` must be kept."

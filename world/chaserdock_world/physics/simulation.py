@@ -332,6 +332,12 @@ class Physics:
         if latch is not None:
             latch.command(command, effective_step)
 
+    def close_latch(self, chaser: int) -> None:
+        """Latch a chaser to the target in their present relative pose, without contact: the start of a flight as a stack."""
+        latch = self.latches[f"chaser/{chaser}"]
+        latch.armed = latch.latched = True
+        self._attach(f"chaser/{chaser}")
+
     def _update_latches(self, tips: set[str]) -> None:
         """Pass the contacts of the last step to the latches of these chasers."""
         for name in sorted(tips):

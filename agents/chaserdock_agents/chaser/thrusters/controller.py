@@ -206,15 +206,15 @@ class ThrusterController:
         elif self._free_since_ns is None:
             self._free_since_ns = command.sim_time_ns
 
-    def add_pulses(self, command: ActuatorCommand) -> ActuatorCommand:
-        """Return the command with the pulses of the carrier periods that begin while it acts."""
+    def add_pulses(self, command: ActuatorCommand, thrusts_N: Array | None = None) -> ActuatorCommand:
+        """Return the command with the pulses of the carrier periods that begin while it acts.
+
+        ``thrusts_N`` (n,): thrust of every thruster, in place of an allocation of the command's force and torque.
+        """
         available_N = self._available_N()
-        wrench = np.array([*command.force_N, *command.torque_N_m])
-        try:
-            thrusts = self._allocator.allocate(wrench, available_N).thrusts_N
-        except RuntimeError as error:  # the next command may be solvable
-            self.events.append(("error", "thruster allocation failed", str(error)))
-            thrusts = np.zeros(len(available_N))
+        thrusts = (
+            self._allocate(command, available_N) if thrusts_N is None else np.minimum(thrusts_N, available_N)
+        )
         begin_ns, isolated = command.effective_time_ns, self.isolated
         end_ns = self._timing.effective_ns(command.tick + 1)
         test = None
@@ -228,6 +228,14 @@ class ThrusterController:
             self._valves.pulse(p.thruster, p.open_ns, p.close_ns)
         self._valves.set_shut(isolated, begin_ns)
         return msgspec.structs.replace(command, pulses=tuple(pulses), isolated=isolated)
+
+    def _allocate(self, command: ActuatorCommand, available_N: Array) -> Array:
+        wrench = np.array([*command.force_N, *command.torque_N_m])
+        try:
+            return self._allocator.allocate(wrench, available_N).thrusts_N
+        except RuntimeError as error:  # the next command may be solvable
+            self.events.append(("error", "thruster allocation failed", str(error)))
+            return np.zeros(len(available_N))
 
     def drain_events(self) -> list[tuple[Level, str, str]]:
         """Return the events since the last call."""

@@ -17,7 +17,7 @@ from chaserdock_models.arrays import Array
 
 _REGULARIZATION = 1e-2
 _SCALE_FIRST = 1e3
-"""Weight of the scale over that of the thrusts: larger than any change of the sum of thrusts that a gain in scale costs."""
+"""Weight of the scale over that of the thrusts. A gain in scale that costs more thrust than this is not taken (below 1e-3)."""
 _EQUALITY = 5  # daqp's codes for an equality constraint and for success
 _SOLVED = 1
 _NOTHING = 1e-12

@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Seeded detumbling flights that begin with latched chasers, and what a frozen attitude would need at the least."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_controller.estimation.composite_body import nominal_mounting
+from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.guidance.chaser_state import ChaserGuidance
+from chaserdock_controller.guidance.detumble.allocation import MinimumTime, minimum_time
+from chaserdock_controller.guidance.detumble.stack import (
+    MountedChaser,
+    StackMotion,
+    plume_free,
+    stack_motion,
+    thruster_wrenches,
+)
+from chaserdock_controller.guidance.phases import Phase
+from chaserdock_controller.guidance.trajectories import stay
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.detumble import RestLimits
+from chaserdock_protocol.scenario.mission import Success
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+from chaserdock_world.physics.simulation import TARGET
+from chaserdock_world.rendering.cameras import States
+
+from .in_process import InProcessMission, TickRecord
+from .perception import PerceptionModel
+from .transfers import load_shipped
+
+COMMAND_AT_S = 5.0
+"""Until then the estimator settles."""
+_PORT_ERROR_M, _PORT_ERROR_RAD = 0.002, math.radians(0.3)
+
+
+def stack_scenario(seed: int, chasers: Sequence[int], changes: Sequence[str] = ()) -> Scenario:
+    """Return ``detumble`` with these of its chasers, renumbered, and a tumble of 5 to 10 degrees/s drawn from the seed.
+
+    ``changes`` as of ``run --set``.
+    """
+    scenario = load_shipped(
+        "detumble", f"seed={seed}", "timeline=[]", "perception.name=statistical", *changes
+    )
+    rng = np.random.default_rng([seed, 0xDE7])
+    ports = [
+        scenario.docking.port_of(old).model_copy(update={"chaser": new})  # type: ignore[union-attr]
+        for new, old in enumerate(chasers)
+    ]
+    target = scenario.target.model_copy(
+        update={
+            "q_wxyz": tuple(rotations.normalize(rng.normal(size=4)).tolist()),
+            "omega_rad_s": tuple(_random_vector(rng, math.radians(rng.uniform(5.0, 10.0)))),
+            "velocity_m_s": tuple(_random_vector(rng, 0.034)),
+        }
+    )
+    return scenario.model_copy(
+        update={
+            "target": target,
+            "docking": scenario.docking.model_copy(update={"ports": tuple(ports)}),
+            "chasers": tuple(scenario.chasers[i] for i in chasers),
+            "success": Success(),
+        }
+    )
+
+
+def _random_vector(rng: np.random.Generator, length: float) -> list[float]:
+    direction = rng.normal(size=3)
+    return (length * direction / np.linalg.norm(direction)).tolist()
+
+
+class StackMission(InProcessMission):
+    """A mission that begins with all chasers latched, with seeded errors at their ports, and verified."""
+
+    def __init__(self, scenario: Scenario, perception: PerceptionModel) -> None:
+        super().__init__(scenario, perception)
+        rng = np.random.default_rng([scenario.seed, 0x57A])
+        target = self.physics.state(TARGET)
+        for i in self.chasers:
+            place, q = nominal_mounting(scenario, i)
+            place = place + rng.uniform(-_PORT_ERROR_M, _PORT_ERROR_M, 3)
+            turn = rotations.exp(rng.uniform(-_PORT_ERROR_RAD, _PORT_ERROR_RAD, 3))
+            self.physics.place(f"chaser/{i}", moving_with(target, place, rotations.multiply(q, turn)))
+            self.physics.close_latch(i)
+            verified = ChaserGuidance(Phase.VERIFIED, 0.0, stay(place, 0.0))
+            self.controller.guidance.machine.chasers[i] = verified
+
+    def truth(self, states: States) -> tuple[TargetBody, dict[int, MountedChaser], StackMotion]:
+        """Return the true stack, where its chasers are, and its momentum in TRF axes."""
+        target = states[TARGET]
+        mounted = {}
+        for i in self.chasers:
+            own = states[f"chaser/{i}"]
+            place = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
+            q = rotations.multiply(rotations.conjugate(target.q_wxyz), own.q_wxyz)
+            mounted[i] = MountedChaser(place, q)
+        body = self.true_body(mounted)
+        return body, mounted, stack_motion(body, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+
+    def true_body(self, mounted: dict[int, MountedChaser]) -> TargetBody:
+        """Return the true mass properties of the target with the mounted chasers."""
+        plants, parts = self.physics.plants, []
+        for i, chaser in mounted.items():
+            plant, q = plants[f"chaser/{i}"], chaser.q_wxyz
+            centre = chaser.position_m + rotations.rotate(q, plant.centre_of_mass_m)
+            axes = q if plant.frame is None else rotations.multiply(q, plant.frame.q_wxyz)
+            parts.append((plant.mass_kg, np.array(plant.moments_kg_m2), centre, axes))
+        alone = plants[TARGET]
+        return attach_bodies(TargetBody(alone.mass_kg, alone.inertia_kg_m2, alone.centre_of_mass_m), parts)
+
+
+def moving_with(target: BodyState, place_m: Array, q_wxyz: Array) -> BodyState:
+    """Return the state of a body fixed to the target at a place (3,) and attitude (4,) in TRF."""
+    arm = rotations.rotate(target.q_wxyz, place_m)
+    omega_world = rotations.rotate(target.q_wxyz, target.omega_rad_s)
+    return BodyState(
+        target.position_m + arm,
+        target.velocity_m_s + np.cross(omega_world, arm),
+        rotations.multiply(target.q_wxyz, q_wxyz),
+        rotations.rotate_inverse(q_wxyz, target.omega_rad_s),
+    )
+
+
+def _impulse(record: TickRecord) -> float:
+    """Return the impulse of all thrusters in a tick, N s."""
+    return sum(sum(output.thruster_impulse_N_s) for output in record.delivered.values())
+
+
+def least_time(
+    scenario: Scenario, body: TargetBody, mounted: dict[int, MountedChaser], motion: StackMotion
+) -> MinimumTime | None:
+    """Return the shortest time in which the plume-free thrusters stop a stack whose attitude is frozen, and its impulse."""
+    thrusters = scenario.chaser.thrusters
+    free = plume_free(
+        mounted,
+        thrusters,
+        math.radians(scenario.detumble.plume_deg),
+        scenario.target_model().boxes,
+        [np.array(port.position_m) for port in scenario.docking.ports],
+        scenario.chaser.size_m,
+    )
+    limits = np.where(free, np.tile(thrusts_max(thrusters), len(mounted)), 0.0)
+    return minimum_time(thruster_wrenches(body, mounted, thrusters), motion.momentum, limits)
+
+
+@dataclass(frozen=True)
+class DetumbleOutcome:
+    """One flight. ``time_s`` from the command until the stack stays below the limits, None if it does not; ``impulse_N_s`` of
+    all thrusters until then, and ``held_N_s`` from then to the end, ``held_s`` long. ``least``: at the command."""
+
+    seed: int
+    chasers: int
+    rate_deg_s: float
+    refused: str
+    time_s: float | None
+    impulse_N_s: float
+    held_N_s: float
+    held_s: float
+    least: MinimumTime | None
+    final_rate_deg_s: float
+    final_speed_m_s: float
+
+
+def fly_stack(
+    scenario: Scenario,
+    perception_of: Callable[[Scenario], PerceptionModel],
+    duration_s: float = 30.0,
+    limits: RestLimits | None = None,
+) -> DetumbleOutcome:
+    """Fly a stack from ``COMMAND_AT_S`` on for ``duration_s``; ``limits``: of rest, without any the scenario's."""
+    limits = limits or scenario.detumble
+    with StackMission(scenario, perception_of(scenario)) as mission:
+        while mission.time_s < COMMAND_AT_S:
+            mission.step()
+        states = mission.states()
+        body, mounted, motion = mission.truth(states)
+        least = least_time(scenario, body, mounted, motion)
+        rate_deg_s = math.degrees(motion.rates(body)[1])
+        commands = tuple(OperatorCommand(command="detumble", chaser=i) for i in mission.chasers)
+        first = mission.step(commands)
+        replies = [] if first.outputs is None else first.outputs.replies
+        refused = next((reply.reason for reply in replies if not reply.accepted), "")
+        impulses, inside = [_impulse(first)], [False]
+        while not refused and mission.time_s < COMMAND_AT_S + duration_s:
+            record = mission.step()
+            impulses.append(_impulse(record))
+            speed, rate = mission.truth(record.states)[2].rates(body)
+            inside.append(speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s)
+        speed, rate = mission.truth(mission.states())[2].rates(body)
+    since = len(inside) - next((k for k, x in enumerate(reversed(inside)) if not x), len(inside))
+    stopped, period_s = since < len(inside), 1.0 / scenario.time.rate_hz
+    return DetumbleOutcome(
+        seed=scenario.seed,
+        chasers=len(scenario.chasers),
+        rate_deg_s=rate_deg_s,
+        refused=refused,
+        time_s=since * period_s if stopped else None,
+        impulse_N_s=float(sum(impulses[:since])),
+        held_N_s=float(sum(impulses[since:])),
+        held_s=(len(inside) - since) * period_s,
+        least=least,
+        final_rate_deg_s=math.degrees(rate),
+        final_speed_m_s=speed,
+    )

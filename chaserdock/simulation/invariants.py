@@ -20,6 +20,7 @@ from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
+    DockingStatus,
     DrawnTruth,
     Event,
     MissionEnd,
@@ -114,6 +115,7 @@ class Invariants:
     _commanded: dict[int, int] = field(default_factory=dict)
     _following: dict[int, int] = field(default_factory=dict)
     _latched: set[int] = field(default_factory=set)
+    _probing: set[str] = field(default_factory=set)
     _retreats_from_m: dict[int, float] = field(default_factory=dict)
     _homing_m: dict[int, float] = field(default_factory=dict)
     _planned: dict[int, Plan] = field(default_factory=dict)
@@ -131,6 +133,7 @@ class Invariants:
         self._liars = {f.process for f in self.scenario.fault if f.kind == "lying_sensor"}
         self._handlers: dict[type, Callable[[Any], None]] = {
             Tick: self._on_tick,
+            DockingStatus: self._on_docking,
             WorldTruth: self._on_world,
             DrawnTruth: self._on_drawn,
             BodyTruth: self._on_body,
@@ -191,10 +194,16 @@ class Invariants:
         held = self._latched | set(world.latched)  # also until a release within this tick
         self._latched = set(world.latched)
         self._touching = {n for pair in world.contacts for n in pair} | {f"chaser/{i}" for i in held}
-        self._touching |= {f"chaser/{t.chaser}" for t in world.touches}
+        self._touching |= {f"chaser/{t.chaser}" for t in world.touches} | self._probing
+        self._probing.clear()
         for body in self._bodies:
             self._check_body(body)
         self._bodies.clear()
+
+    def _on_docking(self, status: DockingStatus) -> None:
+        """Note a probe in contact, also one whose latch has opened: the world publishes it before the bodies of the tick."""
+        if status.contact:
+            self._probing.add(f"chaser/{status.chaser}")
 
     def _on_drawn(self, drawn: DrawnTruth) -> None:
         self._drawn = {body.body: body for body in drawn.bodies}
@@ -507,6 +516,17 @@ class Invariants:
     def _on_end(self, end: MissionEnd) -> None:
         self.end = end
 
+    def _attempt_s(self, chaser: int) -> float:
+        """Return how long a chaser with a port takes to back out and to try again; 0 without a port."""
+        d = self.scenario.docking
+        if d.port_of(chaser) is None:
+            return 0.0
+        out_s = d.entry_m / self.scenario.approach.max_speed_m_s
+        in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (
+            d.final_m + d.overdrive_m
+        ) / d.contact_speed_m_s
+        return out_s + in_s + d.settle_s + 2.0 * d.pull_s
+
     def check_end(self, crashes: dict[str, str], stalled: tuple[str, ...]) -> None:
         """Check what must hold when a flight is over: it ended, all processes did, and each mission is docked or safe."""
         for name, trace in crashes.items():
@@ -532,7 +552,8 @@ class Invariants:
                     "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
                 )
             commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
-            disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < SETTLING_S
+            allowed_s = SETTLING_S + self._attempt_s(chaser)
+            disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < allowed_s
             if phase in DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue
             self.violate("liveness", name, f"ends in phase {phase or 'none'} without a named reason")

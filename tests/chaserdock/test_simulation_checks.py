@@ -13,6 +13,7 @@ from chaserdock_protocol import codec, topics
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
+    DockingStatus,
     DrawnBody,
     DrawnTruth,
     Event,
@@ -221,6 +222,18 @@ def test_positions_follow_velocities(log: Log) -> None:
     assert log.found == []
     log.bodies(3, body("chaser/0", 2.019, 0.1))
     assert log.found == ["displacement"]
+
+
+def test_a_probe_in_contact_may_change_the_momentum(log: Log) -> None:
+    """Also without a new touch, as after a latch has opened: the docking sensor reports it in the same tick."""
+    drawn = DrawnBody(body="chaser/0", mass_kg=10.0, inertia_kg_m2=(1.0,) * 9)
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=(drawn,)))
+    log.bodies(1, body("chaser/0", 2.0))
+    for tick, contact in ((2, True), (3, False)):
+        status = DockingStatus(tick=tick, chaser=0, contact=contact, armed=False, latched=False)
+        log.publish(topics.DOCKING, status, 0)
+        log.bodies(tick, body("chaser/0", 2.0, 0.01 * (tick - 1)))
+        assert ("momentum" in log.found) != contact
 
 
 def test_bodies_begin_where_the_scenario_states(log: Log, scenario: Scenario) -> None:

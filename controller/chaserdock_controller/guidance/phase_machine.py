@@ -485,7 +485,8 @@ class PhaseMachine:
         self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
         if phase is not before.phase:
             detail = f"from {before.phase}" + (f": {reason}" if reason else "")
-            level = "warning" if trigger in (Trigger.PLANNING_FAILED, Trigger.DETUMBLE_FAILED) else "info"
+            failed = (Trigger.PLANNING_FAILED, Trigger.DETUMBLE_FAILED, Trigger.ATTEMPT_FAILED)
+            level = "warning" if trigger in failed else "info"
             complete = trigger is Trigger.CALIBRATION_COMPLETE
             self._changes.append(PhaseChange(i, phase, detail, level, complete))
 

@@ -103,3 +103,22 @@ def test_braking_in_body_axes_pushes_against_the_motion_in_the_world() -> None:
     force = brake_command(o, BODY, 0).force_N
     assert force[0] == pytest.approx(-0.3)  # world y is the body's x; 30 kg and three seconds
     np.testing.assert_allclose(force[1:], 0.0, atol=1e-12)
+
+
+def test_commanded_thrusts_must_fit_the_thrusters() -> None:
+    body = Body(body="tetra12", actuation="thrusters")
+    # The wrench of single thrusters may exceed what is available on all axes at once.
+    base = msgspec.structs.replace(COMMAND, mode="detumble", force_N=(5.0, 0.0, 0.0))
+
+    def why(thrusts_N: tuple[float, ...], of: Body = body) -> str | None:
+        command = msgspec.structs.replace(base, thrusts_N=thrusts_N)
+        return refusal(command, 1, of, 4, 300_000_000)
+
+    assert why((1.5,) * 12) is None
+    assert why((1.5,) * 11) == "thrusts of 11 thrusters, but the body has 12"
+    assert why((1.5,) * 12, BODY) == "thrusts of 12 thrusters, but the body has 0"
+    for wrong in (1.6, -0.1, math.nan):
+        reason = why((*(0.0,) * 3, wrong, *(0.0,) * 8))
+        assert reason is not None
+        assert "thruster 3" in reason
+    assert "exceeds the body's" in str(why(()))

@@ -234,3 +234,19 @@ def test_stuck_thruster_is_isolated_within_half_a_second(thruster: int) -> None:
     assert record.position_error_m[late, 0].max() < 0.05
     assert record.rms(16.0)[0] < 0.01
     assert math.degrees(record.rms(16.0)[1]) < 2.0
+
+
+def test_commanded_thrusts_replace_the_allocation_except_of_isolated_thrusters() -> None:
+    s = mission(
+        thruster_failure=[{"chaser": 0, "thruster": 4, "at_s": 0.0, "kind": "stuck_off", "reported": True}]
+    )
+    thrusters, observe = reporting(s)
+    observe(at_rest(s, 0))
+    observe(at_rest(s, 1))
+    thrusts = np.zeros(12)
+    thrusts[[1, 4]] = 0.75
+    fired: set[int] = set()
+    for tick in range(1, 7):
+        command = passed_on(wrench(s, tick))
+        fired |= {p.thruster for p in thrusters.add_pulses(command, thrusts).pulses}
+    assert fired == {1}

@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
+from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
@@ -20,6 +21,7 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.thrusters import thrusts_max
 
 _UNIT = 1e-6
 _LIMIT_SHARE = 1.01
@@ -106,15 +108,18 @@ def _plan(plan: Plan, scenario: Scenario) -> Iterator[str]:
     yield from _within_limits(np.reshape(plan.inputs, (stages, 6)), scenario)
 
 
-def _within_limits(wrenches: Any, scenario: Scenario) -> Iterator[str]:
-    limits = scenario.chaser.wrench_max
+def _within_limits(wrenches: Any, scenario: Scenario, single: bool = False) -> Iterator[str]:
+    """Check wrenches (..., 6). ``single``: thrusters may be commanded one by one, up to all in the same direction."""
+    limits, thrusters = scenario.chaser.wrench_max, scenario.chaser.thrusters
+    if single:
+        limits = np.maximum(limits, np.abs(wrench_matrix(thrusters)) @ thrusts_max(thrusters))
     share = float(np.max(np.abs(wrenches) / limits, initial=0.0))
     if share > _LIMIT_SHARE:
         yield f"wrench of {share:.3f} of the body's limits"
 
 
 def _wrench(command: WrenchCommand, scenario: Scenario) -> Iterator[str]:
-    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario)
+    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario, bool(command.thrusts_N))
     if command.mode == "none":
         return
     lifetime_s = (command.expires_ns - command.sim_time_ns) * 1e-9
@@ -124,7 +129,8 @@ def _wrench(command: WrenchCommand, scenario: Scenario) -> Iterator[str]:
 
 
 def _actuators(command: ActuatorCommand, scenario: Scenario) -> Iterator[str]:
-    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario)
+    detumbles = scenario.docking.kind == "capture" and scenario.chaser.actuation == "thrusters"
+    yield from _within_limits([*command.force_N, *command.torque_N_m], scenario, detumbles)
     count, closed = len(scenario.chaser.thrusters), {}
     for pulse in sorted(command.pulses, key=lambda p: (p.thruster, p.open_ns)):
         if pulse.thruster >= count or pulse.open_ns >= pulse.close_ns:

@@ -24,7 +24,7 @@ PATCHES = sorted((ROOT / "tests" / "planted_bugs").glob("*.patch"))
 SOURCES = ("agents", "chaserdock", "controller", "protocol", "world")
 COPIED = (*SOURCES, "scenarios", "tests/planted_bugs", "pyproject.toml", "build_hook.py")
 _BUILD = "protocol/chaserdock_models/native/build.py"
-_FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,]+?)(?: at [\d.]+ s)?: (.*)")
+_FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,-]+?)(?: at [\d.]+ s)?: (.*)")
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ _GAP_S = 1.1
 _HARMLESS = frozenset({"camera_off", "lying_sensor", "odometry_lie", "duplicate"})
 """Kinds of faults after which a chaser flies commands nevertheless."""
 _LIES = frozenset({"odometry_lie", "clock_jump", "corrupt"})
-ACCURACY_M, SEEN_S = 0.02, 0.5
+ACCURACY_M, SEEN_S = 0.01, 0.5
 """Largest error (m) of the target's position beside drift, while two honest chasers see it, or saw it so long (s) ago."""
 _THRUSTER_FLOOR_N_S, _THRUSTER_SHARE = 0.01, 0.15
 _PLAN_SHARE = 1e-3

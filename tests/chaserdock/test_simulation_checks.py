@@ -328,7 +328,7 @@ def test_a_lying_sensor_does_not_mislead_the_estimate_of_two_others(tmp_path: Pa
         for chaser in range(3):
             sighting: Any = msgspec.structs.replace(BY_TYPE[Sighting], chaser=chaser)
             log.publish(topics.SIGHTING, sighting, chaser)
-        for x_m in (0.01, 0.03):
+        for x_m in (0.005, 0.015):
             estimate = msgspec.structs.replace(
                 sample, tick=9, sim_time_ns=900_000_000, position_m=(x_m, 0.0, 0.0)
             )

@@ -84,30 +84,34 @@ class Proxy:
 
 @dataclass
 class TakeoverObserver:
-    """Sending time of the first command of each term (wall clock, ns), and progress of the flight."""
+    """Sending time of the first command of each controller (wall clock, ns), and progress of the flight."""
 
-    first_command_ns: dict[int, int] = field(default_factory=dict)
+    first_command_ns: dict[str, int] = field(default_factory=dict)
     time_s: float = 0.0
     commander: str = ""
-    term: int = 0
     ended: bool = False
+
+    def first_of_another(self, commander: str) -> int | None:
+        """Return when the first command of another controller was sent since ``first_command_ns`` was cleared."""
+        return min((at for name, at in self.first_command_ns.items() if name != commander), default=None)
 
     def receive(self, raw: RawSample) -> None:
         """Note a message; called on a thread of Zenoh."""
         found = topics.topic_of_key(raw.key)
         message = codec.decode(found[0].kind, raw.payload) if found is not None else None
         if isinstance(message, WrenchCommand):
-            self.first_command_ns.setdefault(message.term, raw.sent_ns)
+            if message.mode not in ("wait", "yield"):
+                self.first_command_ns.setdefault(message.commander, raw.sent_ns)
+                self.commander = message.commander
         elif isinstance(message, Tick):
             self.time_s = message.sim_time_ns / 1e9
-            self.commander, self.term = message.commander, message.term
         elif isinstance(message, MissionEnd):
             self.ended = True
 
 
 @dataclass(frozen=True)
 class Takeover:
-    """Outcome of one flight. ``takeover_s``: from the fault to the first command of the next term; infinite if none."""
+    """Outcome of one flight. ``takeover_s``: from the fault to the first command of another controller; infinite if none."""
 
     takeover_s: float
     docked: bool
@@ -168,7 +172,8 @@ def fly(fault: InjectedFault, at_s: float) -> Takeover:
             for topic in (topics.WRENCH, topics.TICK, topics.END):
                 node.subscribe_raw(topic.key.format(chaser="*"), observer.receive)
             wait(lambda: observer.time_s >= at_s, fleet, 120.0)
-            commander, term = observer.commander, observer.term
+            commander = observer.commander
+            observer.first_command_ns.clear()
             pid = next(c.process.pid for c in fleet.children if c.name == commander)
             fault_ns = time.time_ns()
             fault(psutil.Process(pid), proxies[commander])
@@ -179,7 +184,7 @@ def fly(fault: InjectedFault, at_s: float) -> Takeover:
             for proxy in proxies.values():
                 proxy.close()
             node.close()
-        return evaluate(folder / "mission.mcap", observer.first_command_ns.get(term + 1), fault_ns)
+        return evaluate(folder / "mission.mcap", observer.first_of_another(commander), fault_ns)
 
 
 def wait(done: Callable[[], bool], fleet: Fleet, timeout_s: float) -> None:

@@ -77,21 +77,30 @@ the world and the controllers.
    any order.
 2. A chaser replies to its image with a `Sighting`, also if it detects nothing. With thrusters it replies to its
    odometry with a `ThrusterReport`.
-3. When for each chaser in `chasers` odometry, and the other messages of the tick, have arrived, the controller replies with one
-   `WrenchCommand` each, a `TargetEstimate`, and last a `SolverStatus`. All carry the tick's `tick` and
-   `sim_time_ns`. `effective_time_ns` is when the command acts: physics step `tick * physics_hz / rate_hz +
+3. At each `Tick` a chaser in `chasers` states its lease (`Lease`).
+4. When for each chaser in `chasers` odometry, lease, and the other messages of the tick, have arrived, the commanding
+   controller replies with one `WrenchCommand` each, a `TargetEstimate`, and last a `SolverStatus`. All carry the tick's
+   `tick` and `sim_time_ns`. `effective_time_ns` is when the command acts: physics step `tick * physics_hz / rate_hz +
    latency_steps`, as a time rounded down, with `latency_steps = round(time.latency_s * physics_hz)`.
-4. A chaser replies to its wrench with an `ActuatorCommand` of the same tick and `effective_time_ns`. When
-   `Tick.controller` is false, it replies with a safe command of its own.
-5. The world advances when every chaser in `chasers` has replied. A `Tick` with a higher `revision` reports that
-   a process was lost: it replaces the earlier one.
+5. A chaser replies to its wrench with an `ActuatorCommand` of the same tick and `effective_time_ns`. When no
+   controller in `controllers` holds its lease, it replies with a safe command of its own.
+6. The world advances when every chaser in `chasers` has replied. A `Tick` with a higher `revision` reports that
+   a process was lost: it replaces the earlier one, and each chaser states its lease again.
 
-## Change of command
-There may be two controllers, `controller` and `standby`; both publish on `controller/…`, one at a time. `Tick` names
-the one in command (`commander`, `instance`) and its `term`. It copies the three into each `WrenchCommand`; the other
-publishes none. A chaser copies `term` into the `ActuatorCommand` that forwards a command. Chasers and world reject
-commands of another term (`stale term` among the rejected). A higher `revision` of a tick may name another commander,
-which then replies to that tick. Rules of succession: [redundancy.md](redundancy.md).
+## Command authority
+There may be two controllers, `controller` and `standby`; both publish on `controller/…`, one at a time. Who commands is
+decided by the chasers, each of which grants a lease of some ticks to one controller ([redundancy.md](redundancy.md)). A
+controller commands a tick when more than half of the chasers in `chasers` (of an even number, half with the first)
+state that their lease
+
+- is that of its name (`holder`) and `instance`, and it is in `controllers` with that instance;
+- includes the tick: `from_tick` and `from_revision` are not after it, `until_tick` not before;
+- was stated (`tick`) no earlier than `since` says for the chaser and for the controller.
+
+Its `WrenchCommand` carries its name (`commander`), its `instance`, and as `term` the smallest number of its own that no
+stated `term` exceeds: odd for `controller`, even for `standby`. A chaser refuses commands of another sender than its
+holder, or of a lower term (`stale term` among the rejected), and copies `term` into its `ActuatorCommand`. In lock-step a
+controller that holds leases, but no majority, lets their chasers `wait`.
 
 In real time the world does not wait; a late reply acts late. Messages that a reader does not receive in time are
 dropped for that reader only, and show as gaps in `seq`.

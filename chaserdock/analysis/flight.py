@@ -264,7 +264,7 @@ class _Collector:
     counts: Counter[str] = field(default_factory=Counter)
     last_seq: dict[str, int] = field(default_factory=dict)
     lost: Counter[str] = field(default_factory=Counter)
-    hashes: dict[str, Any] = field(default_factory=dict)
+    hashes: dict[str, int] = field(default_factory=dict)
     wall: list[int] = field(default_factory=list)
     expected: int = 0
     tick: int = -1
@@ -328,7 +328,9 @@ class _Collector:
         self.last_seq[record.key] = message.seq
         if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
-            self.hashes.setdefault(record.key, hashlib.sha256()).update(content)
+            # A sum, as two controllers publish on the same keys, and their messages arrive in any order.
+            number = int.from_bytes(hashlib.sha256(content).digest(), "big")
+            self.hashes[record.key] = (self.hashes.get(record.key, 0) + number) % 2**256
 
     def _add_tick(self, message: Tick, sent_ns: int) -> None:
         # A later revision of the same tick replaces the number of commands that it expects.
@@ -380,7 +382,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         c.add(record)
     digest = hashlib.sha256()
     for key in sorted(c.hashes):
-        digest.update(f"{key} {c.hashes[key].hexdigest()}\n".encode())
+        digest.update(f"{key} {c.hashes[key]:064x}\n".encode())
     rejected: Counter[str] = Counter()
     for health in c.health.values():
         rejected.update(health.rejected)

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from chaserdock_agents.chaser.command_gate import refusal
+from chaserdock_controller.redundancy.lease_holder import LeaseHolder
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
-from chaserdock_protocol.messages import ActuatorCommand, Farewell, Message, Presence, WrenchCommand
+from chaserdock_protocol.messages import ActuatorCommand, Farewell, Lease, Message, Presence, WrenchCommand
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.topics import Role, Topic
 from chaserdock_protocol.transport import RawSample
@@ -45,6 +46,7 @@ def duties_of(role: Role, chaser: int | None, turn: RecordedTick, thrusters: boo
         wrenches = {topics.WRENCH.key_of(i): topics.WRENCH for i in tick.chasers}
         return {**wrenches, topics.TARGET.key_of(): topics.TARGET, topics.SOLVER.key_of(): topics.SOLVER}
     own = [
+        topics.LEASE,
         topics.ACTUATORS,
         *([topics.SIGHTING] if tick.images else []),
         *([topics.THRUSTERS] if thrusters else []),
@@ -190,12 +192,25 @@ class Ledger:
                     key, "wrong effective_time_ns", f"{message.effective_time_ns}, not {effective_ns}"
                 )
         if isinstance(message, WrenchCommand):
-            actual, expected = ((m.term, m.commander, m.instance) for m in (message, turn.tick))
-            if actual != expected:
-                self.report(key, "not the tick's term, commander and instance", f"{actual}, not {expected}")
+            self._check_authority(key, message, turn)
             reason = refusal(message, message.chaser, self.scenario.chaser, message.tick - 1, time_ns)
             if reason is not None:
                 self.report(key, "a command that the chaser rejects", reason)
+
+    def _check_authority(self, key: str, message: WrenchCommand, turn: RecordedTick) -> None:
+        """Check that a command names its sender, and the term that the leases of the tick give it."""
+        leases = LeaseHolder(self.process, turn.tick.controllers.get(self.process, ""))
+        for raw in turn.answers:
+            found = topics.topic_of_key(raw.key)
+            if found is not None and found[0] is topics.LEASE:
+                leases.add(codec.decode(Lease, raw.payload))
+        if not leases.claim(turn.tick):
+            self.report(key, "commands a tick without a majority of leases")
+        actual = (message.term, message.commander, message.instance)
+        expected = (leases.term, leases.name, leases.instance)
+        if actual != expected:
+            detail = f"{actual}, not {expected}"
+            self.report(key, "not the term of its leases, its name and its instance", detail)
 
     def miss(self, patience_s: float) -> None:
         """Report the missing answers of the present tick."""

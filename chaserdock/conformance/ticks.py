@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.errors import ChaserdockError
-from chaserdock_protocol.messages import Image, Tick, encoding_of
+from chaserdock_protocol.messages import Image, Lease, Tick, encoding_of
 from chaserdock_protocol.recording.log import LogSource, logged_scenario, read_log
 from chaserdock_protocol.scenario import Scenario, flight_scenario_json
 from chaserdock_protocol.topics import Role, Topic
@@ -36,16 +36,25 @@ class RecordedTick:
 
 
 def with_instance(turn: RecordedTick, process: str, instance: str) -> RecordedTick:
-    """Return the tick with ``instance`` as the commander's instance, if ``process`` is the commander."""
-    if turn.tick.commander != process:
+    """Return the tick with ``instance`` as the instance of controller ``process``, also in the leases that it holds."""
+
+    def renamed(raw: RawSample) -> RawSample:
+        found = topics.topic_of_key(raw.key)
+        if found is None or found[0] not in (topics.TICK, topics.LEASE):
+            return raw
+        message = codec.decode(found[0].kind, raw.payload)
+        match message:
+            case Tick(controllers=controllers) if process in controllers:
+                message = msgspec.structs.replace(message, controllers={**controllers, process: instance})
+            case Lease(holder=holder) if holder == process:
+                message = msgspec.structs.replace(message, instance=instance)
+        return msgspec.structs.replace(raw, payload=codec.encode(message))
+
+    if process not in turn.tick.controllers:
         return turn
-    tick = msgspec.structs.replace(turn.tick, instance=instance)
-    payload = codec.encode(tick)
-    opening = [
-        msgspec.structs.replace(raw, payload=payload) if raw.key == topics.TICK.key else raw
-        for raw in turn.opening
-    ]
-    return replace(turn, tick=tick, opening=opening)
+    tick = msgspec.structs.replace(turn.tick, controllers={**turn.tick.controllers, process: instance})
+    opening, answers = ([renamed(raw) for raw in raws] for raws in (turn.opening, turn.answers))
+    return replace(turn, tick=tick, opening=opening, answers=answers)
 
 
 @dataclass(frozen=True)
@@ -131,4 +140,4 @@ def _places(number: int | None, chasers: int) -> range | tuple[int]:
 
 
 def _expected(tick: Tick, number: int | None) -> bool:
-    return tick.controller if number is None else number in tick.chasers
+    return "controller" in tick.controllers if number is None else number in tick.chasers

@@ -83,7 +83,7 @@ def expected(name: str, tick: Tick | None) -> bool | None:
     if tick is None:
         return None
     if name in topics.CONTROLLERS:
-        return tick.controller and name == (tick.commander or "controller")
+        return name in tick.controllers
     head, _, number = name.partition("/")
     return int(number) in tick.chasers if head == "chaser" else None
 

@@ -17,6 +17,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.leases import commander_of
 from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
@@ -109,7 +110,8 @@ class Invariants:
     _states: dict[str, BodyTruth] = field(default_factory=dict)
     _drawn: dict[str, Any] = field(default_factory=dict)
     _flown: dict[int, ActuatorCommand] = field(default_factory=dict)
-    _first_flown: dict[int, int] = field(default_factory=dict)
+    _commanders: dict[int, str] = field(default_factory=dict)
+    _repeated: set[int] = field(default_factory=set)
     _touching: set[str] = field(default_factory=set)
     _begin: dict[str, float] = field(default_factory=dict)
     _commanded: dict[int, int] = field(default_factory=dict)
@@ -178,6 +180,8 @@ class Invariants:
     # -- bodies --------------------------------------------------------------------------------------------------
 
     def _on_tick(self, tick: Tick) -> None:
+        if tick.revision:
+            self._repeated.add(tick.tick)
         if tick.tick > self._tick:
             self._tick = tick.tick
             self._check_distances()
@@ -328,6 +332,8 @@ class Invariants:
 
     def _on_wrench(self, command: WrenchCommand) -> None:
         """Note since when a chaser is commanded without a break."""
+        if command.mode in ("wait", "yield"):
+            return  # of a controller that does not command
         i, gap = command.chaser, math.ceil(_GAP_S * self.scenario.time.rate_hz)
         if command.mode == "none" or command.tick - self._commanded.get(i, -gap) > gap:
             self._following[i] = command.tick
@@ -382,15 +388,12 @@ class Invariants:
             self.violate("no stale command", name, f"flies tick {command.tick} after {before.tick}")
         if before is not None and command.term < before.term:
             self.violate("no superseded command", name, f"flies term {command.term} after {before.term}")
-        first = self._first_flown.setdefault(command.term, command.tick)
-        for term, since in self._first_flown.items():
-            if term > command.term and command.tick > since + 1:
-                self.violate(
-                    "one commander",
-                    name,
-                    f"flies term {command.term} at tick {command.tick}; term {term} is flown since {since}",
-                )
-        self._first_flown[command.term] = min(first, command.tick)
+        sender = commander_of(command.term)
+        other = self._commanders.setdefault(command.tick, sender)
+        # A tick is repeated when the commander is lost in it: chasers may have executed its command before.
+        if other != sender and command.tick not in self._repeated:
+            text = f"flies a command of {sender} for tick {command.tick}, in which {other} commands"
+            self.violate("one commander", name, text)
 
     # -- the rest ------------------------------------------------------------------------------------------------
 

@@ -120,7 +120,7 @@ def _within_limits(wrenches: Any, scenario: Scenario, single: bool = False) -> I
 
 def _wrench(command: WrenchCommand, scenario: Scenario) -> Iterator[str]:
     yield from _within_limits([*command.force_N, *command.torque_N_m], scenario, bool(command.thrusts_N))
-    if command.mode == "none":
+    if command.mode in ("none", "wait", "yield"):
         return
     lifetime_s = (command.expires_ns - command.sim_time_ns) * 1e-9
     stated_s = scenario.controller.command_lifetime_s

@@ -74,7 +74,7 @@ def faults(state: MissionState, history: History, lost: set[str]) -> str:
         if i not in expected:
             out.append(f"chaser {i} does not participate")
         out += _chaser_faults(i, chaser)
-    if state.tick is not None and not state.tick.controller:
+    if state.tick is not None and not state.tick.controllers:
         out.append("the controller does not participate")
     if state.solver is not None:
         statuses = zip(state.solver.chasers, state.solver.status, strict=False)

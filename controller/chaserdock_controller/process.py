@@ -16,6 +16,7 @@ from chaserdock_protocol.messages import (
     DockingStatus,
     Event,
     JoinReply,
+    Lease,
     Level,
     MissionEnd,
     Odometry,
@@ -24,6 +25,7 @@ from chaserdock_protocol.messages import (
     Sighting,
     ThrusterReport,
     Tick,
+    WrenchCommand,
 )
 from chaserdock_protocol.process import ProcessOptions, StopSignal
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
@@ -96,6 +98,7 @@ class ControllerProcess:
         self.requests = OperatorRequests()
         self.standby = HotStandby(self.name, realtime, replaying)
         self.checkpoint = Checkpoint(core, self.inputs.odometry_validation)
+        self._left_at = (-1, -1)
         self._last_result: tuple[Tick, TickOutputs, float] | None = None
         self._idle_receives = 0
         self._on_network = False
@@ -105,14 +108,15 @@ class ControllerProcess:
     def open(self, instance: str, stall_s: float = DEFAULT_STALL_S) -> None:
         """Advertise and subscribe the topics, then start the heartbeat."""
         node = self.node
-        self.standby.instance, self._on_network = instance, True
+        self.standby.join(instance)
+        self._on_network = True
         for topic in (topics.TARGET, topics.SOLVER, topics.COMMAND, topics.OPERATED, topics.STATE):
             node.advertise(topic)
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
         inputs = (topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.THRUSTERS)
-        for topic in (topics.TICK, topics.END, *inputs, topics.STATE):
+        for topic in (topics.TICK, topics.END, *inputs, topics.LEASE, topics.STATE):
             node.subscribe(topic)
         self.heartbeat = Heartbeat(node, instance, stall_s)
 
@@ -135,7 +139,7 @@ class ControllerProcess:
             self.heartbeat.report_waiting(received, self._missing_keys)
         if released is not None:
             self._dispatch(released)
-        elif received is not None and not self._dispatch_leadership(received.message):
+        elif received is not None and not self._dispatch_leadership(received):
             if self.standby.hold_back(received, self.done_tick):
                 return
             self._dispatch(received)
@@ -148,7 +152,8 @@ class ControllerProcess:
         tick = self.tick
         if tick is None or tick.tick <= self.done_tick:
             return (topics.TICK.key_of(),)
-        return self.inputs.missing_keys(tick) or (topics.STATE.key_of(),)
+        leases = tuple(topics.LEASE.key_of(i) for i in self.standby.leases.missing(tick))
+        return self.inputs.missing_keys(tick) + leases or (topics.STATE.key_of(),)
 
     def _open_tick(self) -> Tick | None:
         """Return the tick that waits for its deadline, in real time."""
@@ -162,7 +167,7 @@ class ControllerProcess:
         return min(_RECEIVE_TIMEOUT_S, max(0.0, self._deadline_s - self.now_s()))
 
     def _is_ready(self, tick: Tick) -> bool:
-        if not self.standby.may_process():
+        if not self.standby.may_process() or not self.standby.is_decided(tick):
             return False
         if self.inputs.is_complete(tick) and self.standby.has_leader_commands(tick.tick):
             return True
@@ -204,6 +209,8 @@ class ControllerProcess:
 
     def _process(self, tick: Tick) -> None:
         start_s = self.now_s()
+        if self.realtime:
+            self._decide(tick)
         leads = self.standby.leads_at(tick.tick)
         requests = self.requests.take()
         commands = tuple(c for c, _ in requests) if leads else self.standby.take_leader_commands(tick.tick)
@@ -231,16 +238,15 @@ class ControllerProcess:
     def _publish(
         self, tick: Tick, out: TickOutputs, wall_s: float, operated: tuple[OperatorCommand, ...]
     ) -> None:
-        node, newest = self.node, self.standby.newest or tick
-        if newest.standing_by and not self.replaying:
+        node = self.node
+        if self.standby.others:
             # Before the wrenches: once a tick is answered, the standby knows the commands that it was answered with.
             self._publish_state(tick, operated=operated)
         node.publish(topics.TARGET, out.target)
-        head = {"term": newest.term, "commander": newest.commander, "instance": newest.instance}
         for i, wrench in out.wrenches.items():
             if i in out.plans:
                 node.publish(topics.PLAN, out.plans[i], i)
-            node.publish(topics.WRENCH, msgspec.structs.replace(wrench, **head), i)
+            self._publish_wrench(wrench)
         for i, reference in out.references.items():
             node.publish(topics.REFERENCE, reference, i)
         for reply in out.replies:
@@ -256,9 +262,13 @@ class ControllerProcess:
             except CheckpointError as error:
                 self._publish_event("warning", f"the state cannot be serialized: {error}", tick)
 
+    def _publish_wrench(self, wrench: WrenchCommand) -> None:
+        sender = self.standby.authority
+        head = {"term": sender.term, "commander": sender.name, "instance": sender.instance}
+        self.node.publish(topics.WRENCH, msgspec.structs.replace(wrench, **head), wrench.chaser)
+
     def _publish_state(self, tick: Tick, **fields: Any) -> None:
-        newest = self.standby.newest or tick
-        state = ControllerState(process=self.name, term=newest.term, **fields)
+        state = ControllerState(process=self.name, term=self.standby.authority.term, **fields)
         stamp = {"tick": tick.tick, "sim_time_ns": tick.sim_time_ns}
         self.node.publish(topics.STATE, msgspec.structs.replace(state, **stamp))
 
@@ -268,31 +278,67 @@ class ControllerProcess:
 
     # -- leader and standby ----------------------------------------------------------------------------------
 
-    def _dispatch_leadership(self, message: Any) -> bool:
+    def _dispatch_leadership(self, received: ReceivedMessage) -> bool:
         """Apply what a message says about the leader, ahead of held messages; return whether that is all it says."""
-        if isinstance(message, ControllerState):
-            if message.process != self.name:
-                self._apply_leader_state(message)
-            return True
-        if isinstance(message, Tick):
-            led = self.standby.leads
-            if self.standby.update(message):
-                self._publish_event("warning", "takes over without any state of the flight so far", message)
-            self.heartbeat.in_flight.set()
-            if self.standby.leads != led:
-                self._change_role(message)
+        match received.message:
+            case ControllerState() as state:
+                if state.process != self.name:
+                    self._apply_leader_state(state)
+                return True
+            case Lease() as lease:
+                self.standby.leases.add(lease)
+                self._decide()
+                return True
+            case LostMessage(tick=tick) if received.topic is topics.LEASE:
+                self.standby.leases.add_lost(int(received.place or 0), tick)
+                self._decide()
+                return True
+            case Tick() as tick:
+                self.heartbeat.in_flight.set()
+                led = self.standby.leads
+                self.standby.update(tick)
+                if self.replaying and not led:
+                    self._change_role(tick)
+                self._decide()
         return False
 
+    def _decide(self, processed: Tick | None = None) -> None:
+        """Determine who commands, and take or leave the command; ``processed``: see ``HotStandby.decide``."""
+        standby = self.standby
+        newest, led = processed or standby.newest, standby.leads
+        if newest is None:
+            return
+        if standby.decide(processed):
+            self._publish_event("warning", "takes over without any state of the flight so far", newest)
+        if standby.leads != led:
+            self._change_role(newest)
+        if not standby.leads and (processed is not None or not self.realtime):
+            self._leave_unused_leases(newest)
+
+    def _leave_unused_leases(self, tick: Tick) -> None:
+        """Let the chasers wait that have granted their lease to this controller, which lacks a majority."""
+        stamp = (tick.tick, tick.revision)
+        if stamp <= self._left_at or not self.standby.is_decided(tick):
+            return
+        self._left_at = stamp
+        for i, (term, gives_back) in sorted(self.standby.leases.take_idle(tick).items()):
+            mode = "yield" if gives_back else "wait"
+            head = {"term": term, "commander": self.name, "instance": self.standby.instance}
+            self.node.publish(
+                topics.WRENCH, msgspec.structs.replace(no_command(i, tick), mode=mode, **head), i
+            )
+
     def _change_role(self, tick: Tick) -> None:
-        leads = self.standby.leads
+        leads, term = self.standby.leads, self.standby.authority.term
         if self._on_network and leads:
             self.node.restart_numbering()
             self.node.declare_queryable(topics.OPERATE_KEY, OperatorCommand, self.operate)
         elif self._on_network:
             self.node.undeclare_queryable(topics.OPERATE_KEY)
-            self.requests.refuse(tick)
-        if tick.term > 1:
-            self._publish_event("info", f"commands in term {tick.term}" if leads else "stands by", tick)
+            leader = self.standby.leader
+            self.requests.refuse(tick, "" if leader is None else leader.name)
+        if term > 1 or not leads:
+            self._publish_event("info", f"commands in term {term}" if leads else "stands by", tick)
         result = self._last_result
         if leads and result is not None and result[0].tick == tick.tick:
             # Processed already as a standby, for a leader that cannot publish its own result any more.

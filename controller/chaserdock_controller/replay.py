@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
 from typing import Any, cast
 
-import msgspec
 import numpy as np
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import WrenchCommand
@@ -18,6 +17,7 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 from .core import ControllerCore
 from .interfaces import TickInputs, TickOutputs
 from .process import ControllerProcess
+from .redundancy.lease_holder import Commander
 
 
 class _EstimationOnly:
@@ -42,41 +42,35 @@ def _core_of(scenario: FlightScenario) -> ControllerCore:
     return ControllerCore(scenario, now_s=lambda: 0.0)
 
 
-def _with_leader(recorded: Iterable[ReceivedMessage]) -> Iterator[tuple[str, list[ReceivedMessage]]]:
-    """Return the messages of each tick with its last leader, whom all revisions of the tick then name."""
+def _with_leader(
+    recorded: Iterable[ReceivedMessage],
+) -> Iterator[tuple[Commander | None, list[ReceivedMessage]]]:
+    """Return the messages of each tick with the last controller that commanded it, None if nobody did."""
     for _, group in groupby(recorded, key=lambda r: r.message.tick):
         received = list(group)
-        ticks = [r.message for r in received if r.topic is topics.TICK]
-        if not ticks:
-            yield "", received
-            continue
-        last = max(ticks, key=lambda tick: tick.revision)
-        names = {"term": last.term, "commander": last.commander, "instance": last.instance}
-        yield (
-            last.commander,
-            [
-                msgspec.structs.replace(r, message=msgspec.structs.replace(r.message, **names))
-                if r.topic is topics.TICK
-                else r
-                for r in received
-            ],
-        )
+        commands = [r.message for r in received if r.topic is topics.WRENCH]
+        commands = [c for c in commands if c.mode not in ("wait", "yield")]
+        last = max(commands, key=lambda c: c.term, default=None)
+        yield None if last is None else Commander(last.commander, last.instance, last.term), received
 
 
 def _play(
     scenario: FlightScenario, recorded: Iterable[ReceivedMessage], core_of: Callable[[], Any]
 ) -> Iterator[Published]:
     """Return the outputs of the leader. A new leader keeps the state of the one before; a restarted process does not."""
-    node, controller, last_seq, last_leader = ReplayNode("controller"), None, -1, ""
-    for named, messages in _with_leader(recorded):
-        leader = named or last_leader
+    node, controller, last_seq = ReplayNode("controller"), None, -1
+    last_leader = authority = Commander("controller", "", 0)
+    for commander, messages in _with_leader(recorded):
+        authority = commander or authority
+        leader = authority.name
         for received in messages:
             is_target = received.topic is topics.TARGET
-            restarted = is_target and received.message.seq < last_seq and leader == last_leader
+            restarted = is_target and received.message.seq < last_seq and leader == last_leader.name
             if controller is None or restarted:
                 node = ReplayNode("controller")
                 controller = ControllerProcess(cast(Node, node), scenario, core_of(), replaying=True)
                 controller.heartbeat = cast(Any, SilentHeartbeat())
+            controller.standby.replayed = authority
             if is_target:
                 last_seq = received.message.seq
             if received.topic is topics.WRENCH:
@@ -91,7 +85,7 @@ def _play(
                 yield from (
                     s for s in node.take_published() if s[0] is not topics.EVENT or leader != "standby"
                 )
-        last_leader = leader
+        last_leader = authority
 
 
 def play_controller(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:

@@ -185,7 +185,14 @@ class Controller:
     def listen(self):
         """Subscribe; presence last, so that a process that receives ours can reach all other subscriptions."""
         self.token = self.session.liveliness().declare_token(f"live/{NAME}")
-        keys = ("world/tick", "world/end", "world/chaser/*/odometry", "chaser/*/sighting", "**/presence")
+        keys = (
+            "world/tick",
+            "world/end",
+            "world/chaser/*/odometry",
+            "chaser/*/sighting",
+            "chaser/*/lease",
+            "**/presence",
+        )
         self.subscribers = [
             self.session.declare_subscriber(
                 key, lambda s: self.inbox.put((str(s.key_expr), msgpack.unpackb(s.payload.to_bytes())))
@@ -204,7 +211,7 @@ class Controller:
 
     def fly(self):
         scenario = self.join()
-        target, tick, odometry, sightings, done = Target(), None, {}, {}, -1
+        target, tick, odometry, sightings, leases, done = Target(), None, {}, {}, {}, -1
         self.listen()
         while True:
             key, message = self.inbox.get()
@@ -218,14 +225,26 @@ class Controller:
                 odometry[message["chaser"]] = message
             elif key.endswith("/sighting"):
                 sightings[message["chaser"]] = message
+            elif key.endswith("/lease"):
+                leases[message["chaser"]] = message
             if tick is None or tick["tick"] <= done:
                 continue
             now = tick["tick"]
             here = [i for i in tick["chasers"] if odometry.get(i, {}).get("tick") == now]
+            stated = [
+                i
+                for i in tick["chasers"]
+                if (leases.get(i, {}).get("tick"), leases.get(i, {}).get("revision"))
+                == (now, tick.get("revision", 0))
+            ]
             looked = [i for i in tick["chasers"] if sightings.get(i, {}).get("tick") == now]
             # Lock-step: answer when everything that belongs to this tick has come.
-            if len(here) == len(tick["chasers"]) and (not tick["images"] or len(looked) == len(here)):
-                self.answer(scenario, tick, target, odometry, sightings if tick["images"] else {})
+            if len(here) == len(stated) == len(tick["chasers"]) and (
+                not tick["images"] or len(looked) == len(here)
+            ):
+                # It is the only controller, to which all chasers grant their leases. With a second one, see docs/protocol.md.
+                term = max((leases[i]["term"] for i in stated), default=0)
+                self.answer(scenario, tick, term, target, odometry, sightings if tick["images"] else {})
                 done = now
         self.over.set()
         self.heartbeat.join()  # its last messages belong to the counts
@@ -236,7 +255,7 @@ class Controller:
         )
         self.session.close()
 
-    def answer(self, scenario, tick, target, odometry, sightings):
+    def answer(self, scenario, tick, term, target, odometry, sightings):
         now_s, latency_s = tick["sim_time_ns"] / 1e9, scenario["time"]["latency_s"]
         for i, sighting in sorted(sightings.items()):
             if i in odometry and sighting["solutions"]:
@@ -259,10 +278,9 @@ class Controller:
                 mode="nmpc" if known else "coast",
                 force_N=force,
                 torque_N_m=torque,
-                # It is the only controller; with a second one, only who is named in the tick may command.
-                term=tick.get("term", 0),
-                commander=tick.get("commander", ""),
-                instance=tick.get("instance", ""),
+                term=term,
+                commander=NAME,
+                instance=self.instance,
             )
         self.publish(
             f"{NAME}/target",

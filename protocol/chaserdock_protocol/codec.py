@@ -225,5 +225,5 @@ def without_wall_time(message: Message) -> dict[str, Any]:
     return {
         name: getattr(message, name)
         for name in message.__struct_fields__
-        if not name.startswith("wall_") and name not in ("instance", "standing_by")
+        if not name.startswith("wall_") and name not in ("instance", "controllers")
     }

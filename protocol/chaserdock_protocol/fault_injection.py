@@ -35,10 +35,11 @@ _CORRUPTED_BYTES = 4
 
 @dataclass(frozen=True)
 class LostMessage:
-    """Placeholder, in lock-step, for a message of this tick that the reader will not receive."""
+    """Placeholder, in lock-step, for a message of this tick that the reader will not receive from ``sender``."""
 
     tick: int
     sim_time_ns: int
+    sender: str = ""
 
 
 def sender_of(topic: Topic, place: str | None, receiver: str, message: Any = None) -> str:
@@ -151,7 +152,8 @@ class FaultLayer:
             if not self._affects(k, fault, topic, place, message):
                 continue
             self._count(fault, None)
-            lost = [LostMessage(message.tick, message.sim_time_ns)] if self.lockstep else []
+            sender = sender_of(topic, place, self.name, message)
+            lost = [LostMessage(message.tick, message.sim_time_ns, sender)] if self.lockstep else []
             if fault.kind == "duplicate":
                 return [*out, message, message, *self._release_overtaken(key)]
             if fault.kind == "delay":

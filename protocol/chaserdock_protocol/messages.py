@@ -143,21 +143,18 @@ class Message(Struct, frozen=True, kw_only=True):
 
 
 class Tick(Message, frozen=True, kw_only=True):
-    """Start of a tick, or (``revision`` > 0) a correction of the processes that the world expects replies from.
+    """Start of a tick, or (``revision`` > 0) a correction of the processes that take part in it.
 
-    ``controller``: whether a controller is in command: ``commander``, with its ``instance``. ``term`` counts changes of
-    command, 0 before the first and in logs without terms. ``standing_by``: standby controllers with their instances, in
-    the order of succession.
+    ``chasers``: those whose reply the world expects. ``controllers``: connected controllers with their instances, in the
+    order of succession. ``since``: by process, the tick since which it takes part without a break; a lease that was stated
+    before is void.
     """
 
     revision: Count = 0
     images: bool
     chasers: ChaserIds
-    controller: bool
-    term: Count = 0
-    commander: Text = ""
-    instance: Text = ""
-    standing_by: Names = msgspec.field(default_factory=dict)
+    controllers: Names = msgspec.field(default_factory=dict)
+    since: Counts = msgspec.field(default_factory=dict)
 
 
 class MissionEnd(Message, frozen=True, kw_only=True):
@@ -359,15 +356,16 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     that no chaser sees, the ``pull`` that verifies a latch, the ``detumble`` of a stack, or ``none``: no command, as the
     chaser's state is unknown. ``thrusts_N``, with ``detumble`` only: thrust of every thruster, in place of an allocation by
     the chaser; force and torque are then those of the thrusts.
+    Without a majority of leases a controller commands nothing: it lets the chaser ``wait``, or gives its lease back (``yield``).
     ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
     healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
-    thruster faults. ``term``, ``commander`` and ``instance`` are those of the ``Tick`` that put the sender in command.
+    thruster faults. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
     """
 
     chaser: ChaserId
     effective_time_ns: Count
     expires_ns: Count
-    mode: Literal["nmpc", "track", "brake", "coast", "pull", "search", "detumble", "none"]
+    mode: Literal["nmpc", "track", "brake", "coast", "pull", "search", "detumble", "none", "wait", "yield"]
     force_N: Vector3
     torque_N_m: Vector3
     thrusts_N: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
@@ -409,7 +407,7 @@ class SolverStatus(Message, frozen=True, kw_only=True):
 class ActuatorCommand(Message, frozen=True, kw_only=True):
     """A chaser's command to its actuators, body axes, from ``effective_time_ns`` on.
 
-    ``source``: ``command`` for the controller's command of ``term``. Without a valid command the chaser flies its last
+    ``source``: ``command`` for the command of the controller that holds its lease, in ``term``. Without one it flies its last
     ``plan`` to its end, comes to rest (``brake``) and then keeps clear of the target (``hold``).
     With thrusters, ``pulses`` are those of the carrier periods that begin while this command acts, ``isolated`` the
     thrusters whose shut-off valves are closed from ``effective_time_ns`` on, and force and torque the demand.
@@ -424,6 +422,24 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
     pulses: Annotated[tuple[ThrusterPulse, ...], Meta(max_length=10_000)] = ()
     isolated: Thrusters = ()
     term: Count = 0
+
+
+class Lease(Message, frozen=True, kw_only=True):
+    """Command authority over chaser ``chaser``, granted by it to the controller ``holder``; empty: to nobody.
+
+    Its ticks are those from ``from_tick`` (in revision ``from_revision`` on) to ``until_tick``. The chaser executes commands
+    of that controller's ``instance`` only, and of no term before ``term``. ``tick`` and ``revision`` are those of the newest
+    ``Tick`` that the chaser has received.
+    """
+
+    chaser: ChaserId
+    revision: Count = 0
+    holder: Text
+    instance: Text
+    term: Count
+    from_tick: Count
+    from_revision: Count = 0
+    until_tick: Annotated[int, Meta(ge=-1, le=MAX_COUNT)]
 
 
 class ThrusterReport(Message, frozen=True, kw_only=True):
@@ -578,7 +594,7 @@ class ScenarioReply(Struct, frozen=True, kw_only=True):
 
 
 VERSION: dict[type[Struct], int] = {
-    Tick: 2,
+    Tick: 3,
     MissionEnd: 1,
     Image: 1,
     Odometry: 2,
@@ -594,6 +610,7 @@ VERSION: dict[type[Struct], int] = {
     Plan: 1,
     SolverStatus: 1,
     ActuatorCommand: 2,
+    Lease: 1,
     ThrusterReport: 2,
     Event: 1,
     Health: 1,

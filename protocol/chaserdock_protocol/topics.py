@@ -77,6 +77,7 @@ TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
 THRUSTERS = _topic("chaser/{chaser}/thrusters", m.ThrusterReport, "chaser", {"controller"}, "tick", "state")
+LEASE = _topic("chaser/{chaser}/lease", m.Lease, "chaser", {"controller"}, "tick", "command")
 WRENCH = _topic(
     "controller/chaser/{chaser}/wrench", m.WrenchCommand, "controller", {"chaser"}, "tick", "command"
 )
@@ -107,6 +108,7 @@ TOPICS: tuple[Topic, ...] = (
     SIGHTING,
     ACTUATORS,
     THRUSTERS,
+    LEASE,
     WRENCH,
     REFERENCE,
     PLAN,
@@ -122,7 +124,7 @@ TOPICS: tuple[Topic, ...] = (
     FAREWELL,
 )
 
-EXPRESS = (WRENCH, ACTUATORS, ACK, STATE)
+EXPRESS = (WRENCH, ACTUATORS, LEASE, ACK, STATE)
 """Sent at once (not batched), together with messages of their priority published before."""
 WORLD_BRANCHES = ("world/", "truth/")
 """Beginnings of the keys that only the world writes."""

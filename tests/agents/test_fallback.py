@@ -215,17 +215,14 @@ def deliver(chaser: ChaserProcess, topic: Any, message: Any) -> list[tuple[Any, 
     return [(t, m) for t, _, m in node.take_published()]
 
 
-def tick_of(scenario: Scenario, tick: int, commander: str, term: int, revision: int = 0) -> Tick:
+def tick_of(scenario: Scenario, tick: int, *controllers: str, revision: int = 0) -> Tick:
     return Tick(
         tick=tick,
         revision=revision,
         sim_time_ns=scenario.timing.tick_time_ns(tick),
         images=False,
         chasers=(0,),
-        controller=bool(commander),
-        term=term,
-        commander=commander,
-        instance=commander[:1],
+        controllers={name: name[:1] for name in controllers},
     )
 
 
@@ -265,18 +262,18 @@ def sources(published: list[tuple[Any, Any]]) -> list[tuple[str, int]]:
 
 def test_lost_controller_reports_each_fallback_mode_once(chaser: ChaserProcess, scenario: Scenario) -> None:
     plan = msgspec.structs.replace(straight(0.0), sim_time_ns=scenario.timing.effective_ns(0))
-    deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
+    deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
     deliver(chaser, topics.PLAN, plan)
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 0, "controller", 1))) == [("command", 1)]
     published = []
     for tick in range(1, 40):
-        published += deliver(chaser, topics.TICK, tick_of(scenario, tick, "", 1))
+        published += deliver(chaser, topics.TICK, tick_of(scenario, tick))
         published += deliver(chaser, topics.ODOMETRY, at(scenario, tick))
     events = [m.what for t, m in published if t is topics.EVENT]
     assert events == ["fallback: plan", "fallback: hold"]  # at rest when the plan ends: no braking
     assert [s for s, _ in sources(published)].count("plan") == STAGES - 1
-    deliver(chaser, topics.TICK, tick_of(scenario, 40, "standby", 2))
+    deliver(chaser, topics.TICK, tick_of(scenario, 40, "standby"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 40))
     published = deliver(chaser, topics.WRENCH, command(scenario, 40, "standby", 2))
     assert sources(published) == [("command", 2)]
@@ -294,7 +291,7 @@ def test_fallback_does_not_depend_on_order_of_arrival(scenario: Scenario, topic:
         made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
         published = []
         for tick in (0, 1):
-            deliver(made, topics.TICK, tick_of(scenario, tick, "controller", 1))
+            deliver(made, topics.TICK, tick_of(scenario, tick, "controller"))
             deliver(made, topics.ODOMETRY, odometry[tick])
             stamp = {"tick": tick, "sim_time_ns": odometry[tick].sim_time_ns}
             messages = {
@@ -307,7 +304,7 @@ def test_fallback_does_not_depend_on_order_of_arrival(scenario: Scenario, topic:
             for name in order:
                 if name in messages:
                     deliver(made, *messages[name])
-        deliver(made, topics.TICK, tick_of(scenario, 2, "", 1))
+        deliver(made, topics.TICK, tick_of(scenario, 2))
         published += deliver(made, topics.ODOMETRY, odometry[2])
         return [m for t, m in published if t is topics.ACTUATORS]
 
@@ -317,10 +314,10 @@ def test_fallback_does_not_depend_on_order_of_arrival(scenario: Scenario, topic:
 
 
 def test_plan_without_its_command_is_not_executed(chaser: ChaserProcess, scenario: Scenario) -> None:
-    deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller", 1))
+    deliver(chaser, topics.TICK, tick_of(scenario, 0, "controller"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 0))
     deliver(chaser, topics.PLAN, straight(0.0))
-    published = deliver(chaser, topics.TICK, tick_of(scenario, 0, "", 1, 1))
+    published = deliver(chaser, topics.TICK, tick_of(scenario, 0, revision=1))
     assert [s for s, _ in sources(published)] == ["hold"]
 
 
@@ -328,7 +325,7 @@ def test_stale_terms_are_rejected_counted_and_reported_once(
     chaser: ChaserProcess, scenario: Scenario
 ) -> None:
     for tick in (1, 2):
-        deliver(chaser, topics.TICK, tick_of(scenario, tick, "standby", 2))
+        deliver(chaser, topics.TICK, tick_of(scenario, tick, "standby"))
         deliver(chaser, topics.ODOMETRY, at(scenario, tick))
         published = deliver(chaser, topics.WRENCH, command(scenario, tick, "controller", 1))
         assert sources(published) == []  # waits for the leader's command
@@ -340,12 +337,12 @@ def test_stale_terms_are_rejected_counted_and_reported_once(
 def test_new_leader_within_a_tick_does_not_repeat_a_command(
     chaser: ChaserProcess, scenario: Scenario
 ) -> None:
-    deliver(chaser, topics.TICK, tick_of(scenario, 3, "controller", 1))
+    deliver(chaser, topics.TICK, tick_of(scenario, 3, "controller", "standby"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 3))
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 3, "controller", 1))) == [("command", 1)]
-    deliver(chaser, topics.TICK, tick_of(scenario, 3, "standby", 2, 1))
+    deliver(chaser, topics.TICK, tick_of(scenario, 3, "standby", revision=1))
     assert deliver(chaser, topics.WRENCH, command(scenario, 3, "standby", 2)) == []
-    deliver(chaser, topics.TICK, tick_of(scenario, 4, "standby", 2))
+    deliver(chaser, topics.TICK, tick_of(scenario, 4, "standby"))
     deliver(chaser, topics.ODOMETRY, at(scenario, 4))
     # Once the tick names the new term, commands of the previous leader are rejected.
     assert sources(deliver(chaser, topics.WRENCH, command(scenario, 4, "controller", 1))) == []

@@ -25,7 +25,13 @@ AT_REST: dict[str, Any] = {"velocity_m_s": (0.0, 0.0, 0.0), "omega_rad_s": (0.0,
 
 
 def tick(number: int) -> m.Tick:
-    return m.Tick(tick=number, sim_time_ns=number * 100_000_000, images=True, chasers=(0, 1), controller=True)
+    return m.Tick(
+        tick=number,
+        sim_time_ns=number * 100_000_000,
+        images=True,
+        chasers=(0, 1),
+        controllers={"controller": "c"},
+    )
 
 
 def odometry(chaser: int, number: int, x_m: float) -> m.Odometry:

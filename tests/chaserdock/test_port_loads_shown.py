@@ -59,7 +59,7 @@ def made_log(path: Path, forces_N: tuple[float, ...], measured: bool = True, **c
     for k, force_N in enumerate(forces_N):
         head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * TICK_NS}
         rest: dict[str, Any] = {"velocity_m_s": (0, 0, 0), "q_wxyz": (1, 0, 0, 0), "omega_rad_s": (0, 0, 0)}
-        put(topics.TICK, None, m.Tick(**head, images=False, chasers=(0,), controller=True))
+        put(topics.TICK, None, m.Tick(**head, images=False, chasers=(0,)))
         for name, x in (("target", 0.0), ("chaser/0", -1.0)):
             put(
                 topics.TRUTH_BODY,

@@ -138,8 +138,9 @@ class Log:
         raw = RawSample(topic.key_of(place), encoding_of(topic.kind), codec.encode(message), 0)
         self.checks.observe(sender, raw)
 
-    def tick(self, tick: int) -> None:
-        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=tick * 100_000_000)
+    def tick(self, tick: int, revision: int = 0) -> None:
+        time_ns = tick * 100_000_000
+        sample = msgspec.structs.replace(BY_TYPE[Tick], tick=tick, sim_time_ns=time_ns, revision=revision)
         self.publish(topics.TICK, sample)
 
     def bodies(self, tick: int, *bodies: BodyTruth, contacts: tuple[tuple[str, str], ...] = ()) -> None:
@@ -395,14 +396,17 @@ def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     assert log.found[1:] == ["no superseded command"]
 
 
-def test_two_chasers_do_not_fly_different_commanders_beyond_a_hand_over(log: Log) -> None:
+def test_chasers_fly_different_commanders_only_in_a_tick_that_is_repeated(log: Log) -> None:
     log.tick(20)
-    log.flies(0, 20, term=2)
     log.flies(1, 20, term=1)
-    log.flies(1, 21, term=1)
+    log.tick(20, revision=1)
+    log.flies(0, 20, term=2)
+    log.tick(21)
+    log.flies(0, 21, term=2)
+    log.flies(1, 21, term=4)
     assert log.found == []
-    log.tick(22)
-    log.flies(1, 22, term=1)
+    log.flies(1, 22, term=5)
+    log.flies(0, 22, term=4)
     assert log.found == ["one commander"]
 
 

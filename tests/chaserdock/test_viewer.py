@@ -97,7 +97,7 @@ def test_faults_are_listed(mission: LoggedMission) -> None:
     state, history = mission.at(1.0), mission.history
     assert words.faults(state, history, set()) == "none"
     assert "**chaser/1** has disappeared" in words.faults(state, history, {"chaser/1"})
-    state.update(topics.TICK, Tick(tick=20, images=True, chasers=(0,), controller=False))
+    state.update(topics.TICK, Tick(tick=20, images=True, chasers=(0,)))
     brake = ActuatorCommand(
         chaser=0, effective_time_ns=0, source="brake", force_N=(0, 0, 0), torque_N_m=(0, 0, 0)
     )
@@ -426,7 +426,7 @@ def test_access_rights_give_ground_truth_to_viewers_only(tmp_path: Path) -> None
             got: set[tuple[str, str]] = set()
             deadline = time.monotonic() + 60.0
             while got != wanted and time.monotonic() < deadline:
-                world.publish(topics.TICK, Tick(images=False, chasers=(), controller=False))
+                world.publish(topics.TICK, Tick(images=False, chasers=()))
                 world.publish(topics.TRUTH_BODY, truth, "target")
                 world.publish(topics.EVENT, Event(process="world", level="info", what="x"), "world")
                 time.sleep(0.1)
@@ -447,12 +447,12 @@ def test_subscriber_gets_the_newest_and_never_blocks_the_publisher() -> None:
         world.advertise(topics.TICK)
         deadline, got = time.monotonic() + 30.0, []
         while not got and time.monotonic() < deadline:  # until they know each other
-            world.publish(topics.TICK, Tick(tick=0, images=False, chasers=(), controller=False))
+            world.publish(topics.TICK, Tick(tick=0, images=False, chasers=()))
             time.sleep(0.05)
             got = take()
         assert got
         for tick in range(1, 5001):
-            world.publish(topics.TICK, Tick(tick=tick, images=False, chasers=(), controller=False))
+            world.publish(topics.TICK, Tick(tick=tick, images=False, chasers=()))
         last: list[int] = []
         while last[-1:] != [5000] and time.monotonic() < deadline:
             time.sleep(0.2)

@@ -13,7 +13,7 @@ from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.process import ControllerProcess
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage
-from chaserdock_protocol.messages import Image, Message, Odometry, Sighting, Tick, WrenchCommand
+from chaserdock_protocol.messages import Image, Lease, Message, Odometry, Sighting, Tick, WrenchCommand
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
@@ -47,7 +47,7 @@ def tick_of(scenario: Scenario, tick: int, chasers: tuple[int, ...]) -> Tick:
         sim_time_ns=scenario.timing.tick_time_ns(tick),
         images=True,
         chasers=chasers,
-        controller=True,
+        controllers={"controller": "c"},
     )
 
 
@@ -74,7 +74,14 @@ def chaser(scenario: Scenario) -> ChaserProcess:
 
 def wrench(scenario: Scenario, tick: int, **values: Any) -> WrenchCommand:
     now_ns = scenario.timing.tick_time_ns(tick)
-    given = {"mode": "nmpc", "force_N": (0.1, 0.0, 0.0), "torque_N_m": ZERO} | values
+    given = {
+        "commander": "controller",
+        "instance": "c",
+        "term": 1,
+        "mode": "nmpc",
+        "force_N": (0.1, 0.0, 0.0),
+        "torque_N_m": ZERO,
+    } | values
     return WrenchCommand(
         tick=tick,
         sim_time_ns=now_ns,
@@ -89,8 +96,14 @@ def actuated(published: list[tuple[Topic, Any]]) -> list[tuple[int, str]]:
     return [(m.tick, m.source) for t, m in published if t is topics.ACTUATORS]
 
 
-@pytest.mark.parametrize("order", [(0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)])
-@pytest.mark.parametrize("how", ["lost", "none", "expired"])
+@pytest.mark.parametrize(
+    ("how", "order"),
+    [
+        # A controller commands a tick after the chaser has stated its lease, and so has received the tick.
+        *((how, order) for how in ("lost", "none", "expired") for order in ((0, 1, 2), (0, 2, 1), (1, 0, 2))),
+        *(("lost", order) for order in ((1, 2, 0), (2, 0, 1), (2, 1, 0))),
+    ],
+)
 def test_chaser_without_command_actuates_once_per_tick(
     chaser: ChaserProcess, scenario: Scenario, order: tuple[int, ...], how: str
 ) -> None:
@@ -158,7 +171,23 @@ def test_older_odometry_does_not_replace_newer(chaser: ChaserProcess, scenario: 
 def controller(scenario: Scenario) -> ControllerProcess:
     made = ControllerProcess(ReplayNode("controller"), scenario, ControllerCore(scenario, lambda: 0.0))  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
+    made.standby.join("c")
+    made.standby.update(tick_of(scenario, 0, (0, 1)))
+    made.done_tick = 0
     return made
+
+
+def lease(scenario: Scenario, i: int, tick: int) -> Lease:
+    return Lease(
+        tick=tick,
+        sim_time_ns=scenario.timing.tick_time_ns(tick),
+        chaser=i,
+        holder="controller",
+        instance="c",
+        term=1,
+        from_tick=0,
+        until_tick=tick + 1,
+    )
 
 
 def sighting(scenario: Scenario, i: int, tick: int) -> Sighting:
@@ -183,7 +212,7 @@ def run_tick(
 ) -> dict[int, WrenchCommand]:
     """Run a tick without some of its messages; return the commands by chaser."""
     published = deliver(controller, topics.TICK, None, tick_of(scenario, tick, tuple(range(chasers))))
-    makers: dict[Topic, Any] = {topics.ODOMETRY: odometry, topics.SIGHTING: sighting}
+    makers: dict[Topic, Any] = {topics.LEASE: lease, topics.ODOMETRY: odometry, topics.SIGHTING: sighting}
     for topic, make in makers.items():
         for i in range(chasers):
             missing = i in without.get(topic, set())
@@ -220,9 +249,18 @@ def test_chaser_without_any_odometry_gets_no_command(
 def test_tick_waits_until_a_loss_is_known(controller: ControllerProcess, scenario: Scenario) -> None:
     deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0,)))
     deliver(controller, topics.ODOMETRY, 0, odometry(scenario, 0, 1))
-    assert controller.done_tick == -1
-    deliver(controller, topics.SIGHTING, 0, lost(scenario, 1))
+    deliver(controller, topics.SIGHTING, 0, sighting(scenario, 0, 1))
+    assert controller.done_tick == 0
+    deliver(controller, topics.LEASE, 0, lost(scenario, 1))
     assert controller.done_tick == 1
+
+
+def test_controller_without_a_majority_lets_the_others_wait(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
+    commands = run_tick(controller, scenario, 1, {topics.LEASE: {0}})
+    assert {i: c.mode for i, c in commands.items()} == {0: "wait", 1: "wait"}
+    assert {c.mode for c in run_tick(controller, scenario, 2, {}).values()} != {"wait"}
 
 
 class Clock:
@@ -240,8 +278,10 @@ def in_real_time(scenario: Scenario) -> tuple[ControllerProcess, Clock]:
     flight = ControllerCore(scenario, lambda: 0.0)
     made = ControllerProcess(ReplayNode("controller"), scenario, flight, realtime=True, now_s=clock)  # type: ignore[arg-type]
     made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
+    made.standby.join("c")
     deliver(made, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
     for i in (0, 1):
+        deliver(made, topics.LEASE, i, lease(scenario, i, 1))
         deliver(made, topics.ODOMETRY, i, odometry(scenario, i, 1))
     return made, clock
 

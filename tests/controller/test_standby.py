@@ -19,7 +19,7 @@ from chaserdock_controller.redundancy.standby import HotStandby
 from chaserdock_models.arrays import Array
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import without_wall_time
-from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
+from chaserdock_protocol.messages import ControllerState, Lease, OperatorCommand, Tick
 from chaserdock_protocol.recording.log import read_log, read_scenario
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, scenario_from_json
@@ -27,6 +27,24 @@ from chaserdock_protocol.transport import Node, ReceivedMessage
 
 LOG = Path(__file__).parents[1] / "golden" / "two-chasers.mcap"
 INPUTS = (topics.TICK, topics.ODOMETRY, topics.SIGHTING)
+
+
+BOTH = {"controller": "c", "standby": "s"}
+
+
+def granted(tick: Tick, chaser: int, holder: str, term: int) -> ReceivedMessage:
+    """A chaser's lease in a tick."""
+    lease = Lease(
+        tick=tick.tick,
+        revision=tick.revision,
+        chaser=chaser,
+        holder=holder,
+        instance=BOTH[holder],
+        term=term,
+        from_tick=0,
+        until_tick=tick.tick + 1,
+    )
+    return ReceivedMessage(topics.LEASE, str(chaser), lease, 0)
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +60,9 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
         if r.topic in INPUTS:
             message = r.message
             if isinstance(message, Tick):
-                standing_by = {"standby": "s"}
-                message = msgspec.structs.replace(
-                    message, term=1, commander="controller", instance="c", standing_by=standing_by
-                )
+                message = msgspec.structs.replace(message, controllers=BOTH)
+                for i in message.chasers:
+                    out.setdefault(message.tick, []).append(granted(message, i, "controller", 1))
             out.setdefault(message.tick, []).append(ReceivedMessage(r.topic, r.place, message, 0))
     last = max(tick for tick, came in out.items() if any(r.topic is topics.TICK for r in came))
     return {tick: came for tick, came in sorted(out.items()) if tick <= last}
@@ -54,7 +71,7 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
 def member(scenario: Scenario, name: str, instance: str) -> ControllerProcess:
     made = ControllerProcess(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
     made.heartbeat = cast(Any, SilentHeartbeat())
-    made.standby.instance = instance
+    made.standby.join(instance)
     return made
 
 
@@ -64,8 +81,8 @@ def hear(process: ControllerProcess, *messages: ReceivedMessage) -> list[tuple[A
     for message in messages:
         tape.put(message)
     before = None
-    while tape._pending or before != (process.done_tick, len(process.standby._held)):
-        before = process.done_tick, len(process.standby._held)
+    while tape._pending or before != (process.done_tick, len(process.standby._held), process.standby.leads):
+        before = process.done_tick, len(process.standby._held), process.standby.leads
         process.listen()
     return [(t, m) for t, _, m in tape.take_published()]
 
@@ -84,15 +101,17 @@ def flown(said: list[tuple[Any, Any]]) -> list[Any]:
     return out
 
 
-def named(
-    came: list[ReceivedMessage], commander: str, instance: str, term: int, revision: int = 1
-) -> ReceivedMessage:
-    """A tick again, with another commander."""
-    tick = next(r for r in came if r.topic is topics.TICK)
-    fields = {"commander": commander, "instance": instance, "term": term, "revision": revision}
-    return ReceivedMessage(
-        topics.TICK, None, msgspec.structs.replace(tick.message, **fields, standing_by={}), 0
-    )
+def named(came: list[ReceivedMessage], holder: str, term: int, revision: int = 1) -> list[ReceivedMessage]:
+    """A tick again, and that all chasers have granted their leases to the only controller that is left."""
+    tick = next(r.message for r in came if r.topic is topics.TICK)
+    tick = msgspec.structs.replace(tick, revision=revision, controllers={holder: BOTH[holder]})
+    again = ReceivedMessage(topics.TICK, None, tick, 0)
+    return [again, *(granted(tick, i, holder, term) for i in tick.chasers)]
+
+
+def under(came: list[ReceivedMessage], holder: str, term: int) -> list[ReceivedMessage]:
+    """The messages of a tick in which another controller commands."""
+    return [*named(came, holder, term, 0), *(r for r in came if r.topic not in (topics.TICK, topics.LEASE))]
 
 
 def test_a_standby_says_nothing_and_then_the_same(scenario: Scenario, ticks: Any) -> None:
@@ -105,15 +124,13 @@ def test_a_standby_says_nothing_and_then_the_same(scenario: Scenario, ticks: Any
             assert flown(said)
             shadowed = hear(second, *ticks[tick], *(words(said) if tick < 11 or heard_the_word else []))
             assert not flown(shadowed)
-        said_second = hear(second, named(ticks[11], "standby", "s", 2))
+        said_second = hear(second, *named(ticks[11], "standby", 2))
         assert flown(said_second) == flown(said)
         commands = [m for t, m in said_second if t is topics.WRENCH]
         assert {(m.term, m.commander, m.instance) for m in commands} == {(2, "standby", "s")}
-        assert not flown(hear(first, named(ticks[11], "standby", "s", 2)))  # the other has understood
+        assert not flown(hear(first, *named(ticks[11], "standby", 2)))  # the other has understood
         for tick in list(ticks)[12:15]:
-            again = [named(ticks[tick], "standby", "s", 2, 0), *ticks[tick][1:]]
-            again += [r for r in ticks[tick][:1] if r.topic is not topics.TICK]
-            again = [r for r in again if r.topic is not topics.TICK or r.message.term == 2]
+            again = under(ticks[tick], "standby", 2)
             assert not flown(hear(first, *again))
             assert flown(hear(second, *again))
 
@@ -129,9 +146,7 @@ def test_in_lockstep_a_standby_waits_for_the_word_and_takes_ticks_in_their_order
     for tick in range(6):
         hear(second, *[w for w in words(said[tick]) if not w.message.state])
         assert second.done_tick == tick
-    before, after = (
-        flown(hear(c, *ticks[6], named(ticks[6], c.name, i, 2))) for c, i in ((first, "c"), (second, "s"))
-    )
+    before, after = (flown(hear(c, *ticks[6], *named(ticks[6], c.name, 2))) for c in (first, second))
     assert before == after
 
 
@@ -151,18 +166,16 @@ def test_who_comes_late_takes_the_state_over_and_goes_on_alike(scenario: Scenari
     tick = list(ticks)[14]
     before = flown(hear(first, *ticks[tick]))
     hear(late, *ticks[tick])
-    assert flown(hear(late, named(ticks[tick], "standby", "s", 2))) == before
+    assert flown(hear(late, *named(ticks[tick], "standby", 2))) == before
     for tick in list(ticks)[15:18]:
-        changed = [
-            named(ticks[tick], "standby", "s", 2, 0) if r.topic is topics.TICK else r for r in ticks[tick]
-        ]
+        changed = under(ticks[tick], "standby", 2)
         assert flown(hear(late, *changed)) == flown(hear(first, *ticks[tick]))
 
 
 def test_who_is_named_before_any_state_came_begins_anew_and_says_so(scenario: Scenario, ticks: Any) -> None:
     late = member(scenario, "standby", "s")
     assert not flown(hear(late, *ticks[9]))
-    said = hear(late, named(ticks[9], "standby", "s", 2))
+    said = hear(late, *named(ticks[9], "standby", 2))
     assert any(t is topics.EVENT and m.what.startswith("takes over without any state") for t, m in said)
     assert [m.tick for t, m in said if t is topics.WRENCH] == [9, 9]
 
@@ -273,39 +286,38 @@ def test_only_data_can_be_encoded(value: Any) -> None:
 # -- whom it listens to -------------------------------------------------------------------------------------
 
 
-def tick(number: int, commander: str, instance: str, term: int, revision: int = 0) -> Tick:
-    return Tick(
-        tick=number,
-        revision=revision,
-        images=False,
-        chasers=(),
-        controller=bool(commander),
-        commander=commander,
-        instance=instance,
-        term=term,
-    )
+def take(standby: HotStandby, number: int, holder: str, revision: int = 0, instance: str = "") -> None:
+    """Let a controller know a tick and that the only chaser has granted its lease."""
+    controllers = BOTH | ({holder: instance} if instance else {})
+    tick = Tick(tick=number, revision=revision, images=False, chasers=(0,), controllers=controllers)
+    lease = granted(tick, 0, holder, 1 if holder == "controller" else 2).message
+    standby.update(tick)
+    standby.leases.add(msgspec.structs.replace(lease, instance=controllers[holder]))
+    standby.decide()
 
 
-def test_the_command_is_of_the_very_start_that_is_named() -> None:
-    standby = HotStandby("standby", instance="s2")
-    standby.update(tick(0, "standby", "s1", 1))
+def test_the_command_is_of_the_very_start_that_holds_the_lease() -> None:
+    standby = HotStandby("standby")
+    standby.join("s2")
+    take(standby, 0, "standby", instance="s1")
     assert not standby.leads
-    standby.update(tick(0, "standby", "s2", 2, 1))
+    take(standby, 0, "standby", 1, instance="s2")
     assert standby.leads
     assert standby.leads_at(0)
-    standby.update(tick(0, "controller", "c", 1))  # late: it is of before
+    take(standby, 0, "controller")  # late: it is of before
     assert standby.leads
-    standby.update(tick(1, "controller", "c", 3))
+    take(standby, 1, "controller")
     assert not standby.leads_at(0)
 
 
 def test_missed_ticks_make_a_follower_ask_for_the_state() -> None:
     for realtime, missed in ((False, 1), (True, 11)):
-        standby = HotStandby("standby", realtime=realtime, instance="s")
+        standby = HotStandby("standby", realtime=realtime)
+        standby.join("s")
         for number in range(3):
-            standby.update(tick(number, "controller", "c", 1))
+            take(standby, number, "controller")
         assert not standby.needs_state(2, 2)
-        standby.update(tick(3 + missed, "controller", "c", 1))
+        take(standby, 3 + missed, "controller")
         assert standby.needs_state(3 + missed, 2)
         standby.state_restored(3 + missed)
         assert not standby.needs_state(4 + missed, 3 + missed)

@@ -132,7 +132,13 @@ def test_foreign_ticks_are_ignored_and_their_publisher_is_named(tmp_path: Path) 
             intruder = str(session.zid())
             time.sleep(1.0)
             for k in range(20):
-                tick = Tick(tick=5000 + k, sim_time_ns=10**12, images=True, chasers=(0, 1), controller=True)
+                tick = Tick(
+                    tick=5000 + k,
+                    sim_time_ns=10**12,
+                    images=True,
+                    chasers=(0, 1),
+                    controllers={"controller": "c"},
+                )
                 session.put(topics.TICK.key_of(), codec.encode(tick), encoding=encoding_of(Tick))
             time.sleep(1.0)
         for name in ("world", "controller", "recorder", "chaser/0", "chaser/1"):

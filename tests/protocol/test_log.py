@@ -286,7 +286,7 @@ def test_garbage_is_recorded_verbatim_counted_and_not_handed_out(tmp_path: Path)
 def test_unreadable_messages_take_the_time_of_the_one_before(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path)
-    record(writer, topics.TICK, None, m.Tick(sim_time_ns=77, images=False, chasers=(), controller=False), 5)
+    record(writer, topics.TICK, None, m.Tick(sim_time_ns=77, images=False, chasers=()), 5)
     writer.write("world/tick", m.encoding_of(m.Tick), b"\xc1", 0)
     assert writer.unreadable == 1
     writer.close()

@@ -21,6 +21,7 @@ from message_samples import BY_TYPE
 
 PRESENT: dict[str, msgspec.Struct] = {
     **{kind.__name__: sample for kind, sample in BY_TYPE.items()},
+    "Tick": msgspec.structs.replace(BY_TYPE[m.Tick], since={}),
     "BodyTruth": msgspec.structs.replace(
         BY_TYPE[m.BodyTruth], thruster_impulse_N_s=(0.5, 0.25), thruster_open_s=(0.125, 0.0)
     ),
@@ -51,6 +52,11 @@ def version_1(message: msgspec.Struct) -> tuple[dict[str, Any], str]:
     fields = {OLD_NAMES.get(name, {}).get(field, field): value for field, value in fields.items()}
     if fields.get("status") == "bad_image":
         fields["status"] = "bad_picture"
+    if name == "Tick":
+        del fields["since"]
+        (commander, instance), *others = fields.pop("controllers").items()
+        named = {"controller": True, "term": 2, "commander": commander, "instance": instance}
+        fields |= named | {"standing_by": dict(others)}
     if name == "Odometry":
         fields = {field: value for field, value in fields.items() if "covariance" not in field}
     for field in ("pulses", "operated"):
@@ -80,6 +86,13 @@ def test_message_of_version_1_decodes_to_the_present_message(name: str) -> None:
         codec.decode(kind_of(name), msgspec.msgpack.encode(fields), encoding)
 
 
+def test_old_ticks_without_names_list_the_only_controller() -> None:
+    for controller, expected in ((True, {"controller": ""}), (False, {})):
+        fields = {"images": False, "chasers": [0], "controller": controller}
+        encoding = "application/msgpack;chaserdock.Tick.v2"
+        assert decode_logged(m.Tick, msgspec.msgpack.encode(fields), encoding).controllers == expected
+
+
 def test_migrated_messages_are_validated() -> None:
     fields, encoding = version_1(PRESENT["BodyTruth"])
     for changed in ({"jet_open_s": [float("nan")]}, {"q_wxyz": [1.0, 1.0, 0.0, 0.0]}, {"jet_open_s": "x"}):
@@ -90,7 +103,7 @@ def test_migrated_messages_are_validated() -> None:
 @pytest.mark.parametrize(
     "encoding",
     [
-        "application/msgpack;chaserdock.Tick.v3",
+        "application/msgpack;chaserdock.Tick.v4",
         "application/msgpack;chaserdock.Tick.v0",
         "application/msgpack;chaserdock.JetReport.v1",
         "application/json;chaserdock.Tick.v1",

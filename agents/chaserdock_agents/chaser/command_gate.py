@@ -9,7 +9,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ActuatorCommand, Odometry, Tick, WrenchCommand
+from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
 from chaserdock_protocol.scenario.bodies import Body
 
 
@@ -44,22 +44,6 @@ def _thrusts_refusal(thrusts_N: tuple[float, ...], body: Body) -> str | None:
     for k, (thrust_N, thruster) in enumerate(zip(thrusts_N, body.thrusters, strict=True)):
         if not 0.0 <= thrust_N <= thruster.thrust_N * 1.01:
             return f"thrust of {thrust_N:.3g} N exceeds thruster {k}'s {thruster.thrust_N:.3g} N"
-    return None
-
-
-def stale_term(command: WrenchCommand, tick: Tick | None, last_term: int) -> str | None:
-    """Return why the sender of a command is not the leader, or None.
-
-    ``tick``: the newest one known; ``last_term``: term of the newest executed command. A term newer than both is valid: its
-    tick has not arrived yet.
-    """
-    known = max(last_term, tick.term if tick is not None else 0)
-    if command.term < known:
-        return f"stale term: sent in term {command.term}, current term is {known}"
-    if tick is None or command.term > tick.term or not tick.term:
-        return None
-    if (command.commander, command.instance) != (tick.commander, tick.instance):
-        return f"stale term: {command.commander} {command.instance} does not lead term {tick.term}"
     return None
 
 

@@ -41,8 +41,9 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 
-from .command_gate import autonomous_command, brake_command, passed_on, refusal, stale_term
+from .command_gate import autonomous_command, brake_command, passed_on, refusal
 from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, next_state
+from .lease_grantor import LeaseGrantor
 from .perception import make_perception
 from .sighting import look, prediction_from
 
@@ -94,6 +95,7 @@ class ChaserProcess:
         # Whether the current series of missing, refused or stale commands has been reported.
         self._reported_missing = self._reported_refusal = self._reported_stale = False
         self._term = 0
+        self.leases = LeaseGrantor(self.number, self.scenario.time.rate_hz)
         self._plan: Plan | None = None
         self._target: TargetEstimate | None = None
         self._last = LastCommand()
@@ -117,6 +119,7 @@ class ChaserProcess:
         self.realtime = realtime
         node.advertise(topics.SIGHTING, i)
         node.advertise(topics.ACTUATORS, i)
+        node.advertise(topics.LEASE, i)
         if self._thrusters is not None:
             node.advertise(topics.THRUSTERS, i)
         node.subscribe(topics.IMAGE, i, latest=realtime)
@@ -178,8 +181,12 @@ class ChaserProcess:
         return tuple(topic.key_of(self.number) for topic in missing or [topics.WRENCH])
 
     def _begin_tick(self, tick: Tick) -> None:
+        if self.tick is not None and (tick.tick, tick.revision) < (self.tick.tick, self.tick.revision):
+            return
         self.tick = tick
         self.heartbeat.in_flight.set()
+        if (lease := self.leases.update(tick)) is not None:
+            self.node.publish(topics.LEASE, lease, self.number)
         self._report_thrusters()
         self._reply_without_command()
         if tick.revision == 0 and tick.tick % self.scenario.time.rate_hz == 0:
@@ -232,7 +239,7 @@ class ChaserProcess:
             )
             self.docking = msgspec.structs.replace(assumed, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
             self._report_thrusters()
-        elif topic is topics.WRENCH:
+        elif topic is topics.WRENCH and lost.sender in ("", self.leases.holder):
             self._mark_uncommanded(lost.tick)
 
     def _process_image(self, image: Image) -> None:
@@ -273,21 +280,26 @@ class ChaserProcess:
 
     def _handle_command(self, command: WrenchCommand) -> None:
         """Execute a command of the controller, or refuse it."""
-        if command.mode == "none":
-            if not self.realtime:  # in real time the last command remains valid for its lifetime
-                self._mark_uncommanded(command.tick)
-            return
         now_ns = self._now_ns()
-        if stale := stale_term(command, self.tick, self._term):
+        if stale := self.leases.refusal(command):
             self.node.counts.rejected["wrench:stale term"] += 1
             if not self._reported_stale:  # the first of a series
                 self._publish_warning("command refused", stale, command.tick, now_ns)
             self._reported_stale = True
+            if self.leases.is_of_holder(command) and not self.realtime:
+                self._mark_uncommanded(
+                    command.tick
+                )  # it does not know its term, and sends nothing else in this tick
+            return
+        if command.mode in ("none", "wait", "yield"):
+            self._take_no_command(command)
             return
         if command.tick == self.executed_tick and command.term > self._term:
+            self._renew_lease(command)
             return  # repeated by a controller that became leader within the tick
         reason = refusal(command, self.number, self.scenario.chaser, self.executed_tick, now_ns)
         if reason is None:
+            self._renew_lease(command)
             self._execute(command)
             return
         self.node.counts.stale += 1
@@ -296,6 +308,21 @@ class ChaserProcess:
         self._reported_refusal = True
         # The world waits for a reply to the tick: without this command, a safe one.
         self._mark_uncommanded(command.tick)
+
+    def _take_no_command(self, command: WrenchCommand) -> None:
+        """Go on without a command of the lease's holder, which sends none in this tick."""
+        if command.mode == "yield":
+            self.leases.give_back(command)
+        elif command.mode == "none":
+            self._renew_lease(command)
+        if not self.realtime:  # in real time the last command remains valid for its lifetime
+            self._mark_uncommanded(command.tick)
+
+    def _renew_lease(self, command: WrenchCommand) -> None:
+        self.leases.renew(command)
+        if self.realtime and self.tick is not None:
+            # The holder may need it before this process receives the next tick.
+            self.node.publish(topics.LEASE, self.leases.stated(self.tick), self.number)
 
     def _now_ns(self) -> int:
         """Return the simulated time: in real time it goes on while this process does not run or hears nothing."""
@@ -336,10 +363,11 @@ class ChaserProcess:
         tick, odometry = self.tick, self.odometry
         if tick is None or odometry is None or odometry.tick != tick.tick:
             return
-        if tick.controller and self._uncommanded_tick < tick.tick:
+        commanded = self.leases.is_held_at(tick)
+        if commanded and self._uncommanded_tick < tick.tick:
             return
         if self.number in tick.chasers and tick.tick > self.executed_tick:
-            if tick.controller and not self._reported_missing:
+            if commanded and not self._reported_missing:
                 self._reported_missing = True
                 self._publish_warning("no command", "lost or refused", tick.tick, odometry.sim_time_ns)
             self._reply(self._fallback_command(odometry))

@@ -115,6 +115,7 @@ class Recorder:
     _expected: set[str] = field(default_factory=set)
     _latest: dict[str, int] = field(default_factory=dict)
     _acked: int = -1
+    _commanded: int = -1
 
     def __post_init__(self) -> None:
         self._queue: BoundedQueue[RawSample] = self.node.host.new_queue()
@@ -158,12 +159,14 @@ class Recorder:
                     self.faults.apply_process_faults(tick.tick)
                 self.heartbeat.in_flight.set()
                 self._expected = {topics.ACTUATORS.key_of(i) for i in tick.chasers}
-                self._controllers = {tick.commander or "controller", *tick.standing_by}
-                if tick.controller:
-                    self._expected.add(topics.SOLVER.key_of())
+                if tick.revision or self._controllers != set(tick.controllers):
+                    self._commanded = -1  # a controller that is lost may owe the end of a tick
+                self._controllers = set(tick.controllers)
                 self._latest[key] = tick.tick
                 self._acknowledge()
             case ActuatorCommand() | SolverStatus():
+                if isinstance(message, ActuatorCommand) and message.source == "command":
+                    self._commanded = max(self._commanded, message.tick)
                 self._latest[key] = message.tick
                 self._acknowledge()
             case Farewell(process=process, published=published):
@@ -176,7 +179,9 @@ class Recorder:
         return tuple(sorted(key for key in self._awaited() if self._latest.get(key, -1) <= self._acked))
 
     def _awaited(self) -> set[str]:
-        return self._expected | {topics.TICK.key_of()}
+        awaited = self._expected | {topics.TICK.key_of()}
+        solver = topics.SOLVER.key_of()
+        return awaited | {solver} if self._latest.get(solver, -1) < self._commanded else awaited
 
     def _acknowledge(self) -> None:
         held = min(self._latest.get(key, -1) for key in self._awaited())

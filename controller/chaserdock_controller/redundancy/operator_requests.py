@@ -29,9 +29,9 @@ class OperatorRequests:
             requests, self._requests = self._requests, []
         return requests
 
-    def refuse(self, tick: Tick) -> None:
-        """Refuse all requests: another controller commands."""
-        reason = f"{tick.commander or 'no controller'} commands now: repeat the command"
+    def refuse(self, tick: Tick, commander: str) -> None:
+        """Refuse all requests: ``commander`` commands, or nobody if it is empty."""
+        reason = f"{commander or 'no controller'} commands now: repeat the command"
         for command, reply in self.take():
             reply(
                 CommandReply(

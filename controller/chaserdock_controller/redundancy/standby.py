@@ -13,8 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from chaserdock_protocol.messages import ControllerState, OperatorCommand, Tick
-from chaserdock_protocol.topics import CONTROLLERS
 from chaserdock_protocol.transport import ReceivedMessage
+
+from .lease_holder import Commander, LeaseHolder
 
 _MISSABLE_TICKS = 10
 """In real time a standby may miss this many ticks and keep its state."""
@@ -23,7 +24,11 @@ _MOST_HELD = 100_000
 
 @dataclass
 class HotStandby:
-    """Role of this process. ``leads``: the newest tick names it as the leader; ``since``: from which tick on."""
+    """Role of this process. ``leads``: it commands the newest tick; ``since``: from which tick on.
+
+    ``leader``: who commands the newest tick, None if nobody does. ``replayed``: in a replay, in which this process commands
+    every tick, the commander in the log.
+    """
 
     name: str
     realtime: bool = False
@@ -32,39 +37,76 @@ class HotStandby:
     leads: bool = False
     since: int = -1
     newest: Tick | None = None
+    leader: Commander | None = None
+    replayed: Commander | None = None
     leader_commands: dict[int, tuple[OperatorCommand, ...]] = field(default_factory=dict)
     _held: deque[ReceivedMessage] = field(default_factory=lambda: deque(maxlen=_MOST_HELD))
     _synced: bool = True
+    _missed: bool = False
     _release_all: bool = False
     _state_sent_to: dict[str, str] = field(default_factory=dict)
 
-    def _is_leader(self, tick: Tick) -> bool:
-        if self.replaying:
-            return True
-        if tick.commander:
-            return (tick.commander, tick.instance) == (self.name, self.instance)
-        return tick.term == 0 and self.name == CONTROLLERS[0]
+    def __post_init__(self) -> None:
+        self.leases = LeaseHolder(self.name)
 
-    def update(self, tick: Tick) -> bool:
-        """Take the leader from a new tick, before held messages; return whether this process leads without any state."""
+    def join(self, instance: str) -> None:
+        """Take the instance of this process."""
+        self.instance = self.leases.instance = instance
+
+    def update(self, tick: Tick) -> None:
+        """Take a new tick, before held messages."""
         before = self.newest
         if before is not None and (tick.tick, tick.revision) < (before.tick, before.revision):
-            return False
-        self.newest, led = tick, self.leads
-        self.leads = self._is_leader(tick)
-        if self.leads and not led:
-            self.since = tick.tick
+            return
+        self.newest = tick
         missed = tick.tick - (before.tick if before is not None else -1) - 1
-        if self.replaying or (led and self.leads):
+        self._missed |= missed > (_MISSABLE_TICKS if self.realtime else 0)
+        if self.replaying:
+            self.leads, self.leader = True, self.replayed
+
+    def is_decided(self, tick: Tick) -> bool:
+        """Return whether it is known who commands a tick: in lock-step, once each chaser has stated its lease."""
+        newest = self.newest
+        if self.realtime or self.replaying or newest is None or newest.tick > tick.tick:
+            return True
+        return not self.leases.missing(newest)
+
+    def decide(self, processed: Tick | None = None) -> bool:
+        """Determine who commands the newest tick; return whether this process begins to, without any state.
+
+        In real time leases of a tick may be on their way: a commander goes on until it processes a tick (``processed``) that
+        it does not command, or until another one commands.
+        """
+        tick = processed or self.newest
+        if tick is None or self.replaying or not self.is_decided(tick):
             return False
-        if missed > (_MISSABLE_TICKS if self.realtime else 0):
+        self.leader = self.leases.commander_of(tick)
+        leads = self.leases.claim(tick)
+        if self.realtime and processed is None and self.leader is None:
+            leads = self.leads
+        led, self.leads = self.leads, leads
+        if leads and not led:
+            self.since = tick.tick
+        if self._missed and not (led and leads):
             self._synced = False
-        if self._synced or not self.leads:
+        self._missed = False
+        if self._synced or not leads:
             return False
         # A controller without state is better than none.
         self._synced = self._release_all = True
         self._keep(lambda held_tick: held_tick >= tick.tick)
         return True
+
+    @property
+    def authority(self) -> Commander:
+        """Name, instance and term of this process' commands."""
+        return self.replayed or Commander(self.name, self.instance, self.leases.term)
+
+    @property
+    def others(self) -> dict[str, str]:
+        """The other controllers that take part in the newest tick, with their instances."""
+        controllers = {} if self.newest is None or self.replaying else self.newest.controllers
+        return {n: i for n, i in controllers.items() if (n, i) != (self.name, self.instance)}
 
     def _keep(self, predicate: Callable[[int], bool]) -> None:
         kept = [r for r in self._held if predicate(r.message.tick)]
@@ -118,7 +160,7 @@ class HotStandby:
         """Return whether the operator commands of a tick are known, or need not be waited for."""
         if self.realtime or self.replaying or self.leads or self.newest is None:
             return True
-        return tick in self.leader_commands or not self.newest.commander
+        return tick in self.leader_commands or self.leader is None
 
     def take_leader_commands(self, tick: int) -> tuple[OperatorCommand, ...]:
         """Return the leader's operator commands of a tick; in real time, since the last call."""
@@ -139,13 +181,8 @@ class HotStandby:
 
     def should_send_state(self, periodic: bool) -> bool:
         """Return whether to send this leader's state: periodically, and to every new standby."""
-        newest = self.newest
-        if newest is None or not newest.standing_by or self.replaying:
-            new, standing_by = False, False
-        else:
-            new, standing_by = newest.standing_by != self._state_sent_to, True
-        if not standing_by or not (new or periodic):
+        others = self.others
+        if not others or not (periodic or others != self._state_sent_to):
             return False
-        assert newest is not None
-        self._state_sent_to = dict(newest.standing_by)
+        self._state_sent_to = others
         return True

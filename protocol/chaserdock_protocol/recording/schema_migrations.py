@@ -47,8 +47,18 @@ def _exact_odometry(fields: dict[str, Any]) -> dict[str, Any]:
     return fields | dict.fromkeys(names, exact)
 
 
+def _observed_controllers(fields: dict[str, Any]) -> dict[str, Any]:
+    """Replace the commander that the world named by the controllers that took part."""
+    controllers = dict(fields.get("standing_by", {}))
+    if fields.get("controller"):
+        controllers = {fields.get("commander") or "controller": fields.get("instance", ""), **controllers}
+    names = ("controller", "term", "commander", "instance", "standing_by")
+    return {name: value for name, value in fields.items() if name not in names} | {"controllers": controllers}
+
+
 UPGRADES: dict[tuple[str, int], Upgrade] = {
     ("Tick", 1): _renamed(pictures="images"),
+    ("Tick", 2): _observed_controllers,
     ("Odometry", 1): _exact_odometry,
     ("BodyTruth", 1): _renamed(jet_impulse_N_s="thruster_impulse_N_s", jet_open_s="thruster_open_s"),
     ("Sighting", 1): _bad_image,

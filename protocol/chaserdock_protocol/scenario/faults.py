@@ -37,7 +37,7 @@ FaultKind = Literal[
     "latch_open",
     "latch_stuck",
 ]
-TopicName = Literal["image", "odometry", "docking", "sighting", "thrusters", "wrench", "actuators"]
+TopicName = Literal["image", "odometry", "docking", "sighting", "thrusters", "lease", "wrench", "actuators"]
 
 FAULTY_TOPICS: dict[str, Topic] = {
     "image": topics.IMAGE,
@@ -45,6 +45,7 @@ FAULTY_TOPICS: dict[str, Topic] = {
     "docking": topics.DOCKING,
     "sighting": topics.SIGHTING,
     "thrusters": topics.THRUSTERS,
+    "lease": topics.LEASE,
     "wrench": topics.WRENCH,
     "actuators": topics.ACTUATORS,
 }

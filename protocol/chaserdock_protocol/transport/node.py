@@ -72,7 +72,7 @@ class Node:
         self._publishers: dict[str, Callable[[bytes], None]] = {}
         self._next_seq: Counter[str] = Counter()
         self._published_before_restart: Counter[str] = Counter()
-        self._last_seq: dict[str, int] = {}
+        self._last_seq: dict[tuple[str, str], int] = {}
         self._queryables: dict[str, Undo] = {}
         self._close_callbacks: list[Callable[[], None]] = []
         self._world_source = ""
@@ -250,10 +250,11 @@ class Node:
         received = self._decode(topic, place, raw, arrived_s)
         if received is None:
             return None
-        seq, last = received.message.seq, self._last_seq.get(raw.key)
+        publisher = (raw.key, raw.source)  # two controllers publish on the same keys
+        seq, last = received.message.seq, self._last_seq.get(publisher)
         if last is not None and seq > last + 1:
             self.counts.lost[raw.key] += seq - last - 1
-        self._last_seq[raw.key] = seq
+        self._last_seq[publisher] = seq
         if received.message.tick >= 0:
             self._newest = received.message
         if self.message_filter is None:

@@ -16,8 +16,8 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health
 
 from chaserdock_world.actuators.ideal import Actuators
 
-from .leader_election import LeaderElection, lease_s
 from .membership import Membership
+from .observed_commander import ObservedCommander
 from .stall import explain_stall
 
 RECORDER_WINDOW_TICKS = 8
@@ -26,6 +26,9 @@ LONGEST_STEP_S = 5.0
 """Time (s) without a look at its messages after which the world publishes no presence, as if it were gone."""
 _STATUS_INTERVAL_S = 5.0
 _POLL_S = 0.02
+_REPEAT_S, _MOST_REPEATS = 2.0, 3
+"""The first tick after all processes have returned is repeated after this wall time without a reply: chasers then state their
+leases again, which the network may have lost while it came up."""
 _MAX_CLOCK_ERROR_NS = 1_000_000_000
 """A command whose effective time differs from its tick's by more comes from a wrong clock."""
 
@@ -33,7 +36,8 @@ _MAX_CLOCK_ERROR_NS = 1_000_000_000
 class TickBarrier:
     """Opens ticks, collects the replies to them and decides when a tick is complete.
 
-    ``chasers``: ids of the chasers whose reply the open tick expects. ``election``: which controller leads.
+    ``chasers``: ids of the chasers whose reply the open tick expects. Who commands is decided by the chasers, which grant
+    leases; this process sees it in the commands that they execute.
     """
 
     def __init__(
@@ -51,9 +55,9 @@ class TickBarrier:
     ) -> None:
         self.chasers: tuple[int, ...] = ()
         self.faults: FaultLayer | None = None
-        self.election = LeaderElection(lease_s(timing.rate_hz))
-        self._oldest_term = 0
+        self._commander = ObservedCommander()
         self._controllers: dict[str, str] = {}
+        self._since: dict[str, int] = {}
         self._standby_expected = standby_expected
         self._node = node
         self._membership = membership
@@ -66,7 +70,7 @@ class TickBarrier:
         self._recorded_tick = -1
         self._tick = -1
         self._images = False
-        self._revision = 0
+        self._revision = self._repeats = 0
         # At least two ticks, as a command acts until that of the next tick arrives.
         self._watchdog_ns = round(max(watchdog_s, 2.0 / timing.rate_hz) * 1e9)
         self._commanded_ns: dict[str, int] = {}
@@ -90,19 +94,19 @@ class TickBarrier:
         self._heartbeat.in_flight.set()
 
     def open_tick(self, tick: int, images: bool) -> None:
-        """Open a tick: determine whose reply it expects, elect the leader and publish the tick."""
+        """Open a tick: determine who takes part in it, and publish it."""
         self._remove_departed()
         connected = self._connected()
         self.chasers = self._chasers_among(connected)
         self._controllers = {
             name: self._membership.instance_of(name) for name in topics.CONTROLLERS if name in connected
         }
+        present = [f"chaser/{i}" for i in self.chasers] + list(self._controllers)
+        self._since = {name: self._since.get(name, tick) for name in present}
         # A recorder that returns paces the flight again.
         self._recorder_expected |= self._recorder_configured and "recorder" in connected
         self._tick, self._images, self._revision = tick, images, 0
         self._replied.clear()
-        self._update_leader()
-        self._oldest_term = self.election.term.number
         if self.faults is not None:
             for what, detail in self.faults.transitions_at(tick):
                 self.publish_warning(what, detail)
@@ -130,12 +134,18 @@ class TickBarrier:
             if now != progress:
                 progress = now
                 timer.reset()
+            elif self._repeats and timer.update() >= _REPEAT_S:
+                self._repeats -= 1
+                self._revision += 1
+                self._publish_tick()
             return self.is_complete() or timer.update() >= stall_s
 
         self.wait_until(over, stopped, lambda: ", ".join(self._owed()))
+        self._repeats = 0
         if stopped() or self.is_complete():
             return ""
-        owed, leader = self._owed(), self.election.term.commander
+        owed = self._owed()
+        leader = self._commander.name or next(iter(self._controllers), "")
         explained = explain_stall(owed, leader, self._membership.progress())
         return f"stalled: no progress for {stall_s:g} s in tick {self._tick}: {explained}"
 
@@ -168,7 +178,7 @@ class TickBarrier:
         missing = self.missing_processes()
         self._recorder_expected &= "recorder" not in missing
         self.publish_warning("end of wait for lost processes", f"missing: {', '.join(missing) or 'none'}")
-        self._no_chaser_since_s = None
+        self._no_chaser_since_s, self._repeats = None, _MOST_REPEATS
         return not self._chasers_among(self._connected())
 
     def publish_warning(self, what: str, detail: str) -> None:
@@ -217,13 +227,9 @@ class TickBarrier:
             case Presence() as presence:
                 if self._membership.update_presence(presence):
                     self._heartbeat.take(presence)
-                    self.election.mark_responsive(presence.instance)
             case LostMessage(tick=tick) if received is not None and tick == self._tick:
                 self._replied.add(int(received.place or 0))  # its actuators keep their last command
-        changed = self._remove_departed()
-        if self._tick >= 0 and self._membership.realtime and self._update_leader():
-            self._oldest_term, changed = self.election.term.number, True
-        if changed:
+        if self._remove_departed():
             self._revision += 1
             self._publish_tick()
 
@@ -241,14 +247,14 @@ class TickBarrier:
         self._command_latch(command.chaser, command.latch, effective_step)
 
     def _check_command(self, command: ActuatorCommand) -> str:
-        """Renew the leader's lease and record the reply; return why the command is rejected, empty if it is not."""
+        """Note who commands and record the reply; return why the command is rejected, empty if it is not."""
         if f"chaser/{command.chaser}" not in self._actuators or command.tick > self._tick:
             return "unexpected"
         if command.source == "command":
-            # In lock-step a command of a leader that was lost within this tick is still valid.
-            if command.term < self._oldest_term:
-                return "stale term"
-            self.election.renew_lease(command.term, self._now_s())
+            if command.term < self._commander.terms.get(command.chaser, 0):
+                return "stale term"  # overtaken by a command that the same chaser has executed later
+            if reason := self._commander.update(command, self._controllers, self._now_s()):
+                self.publish_warning("hand-over", reason)
         if command.tick == self._tick:
             # In real time a chaser may brake before its command arrives: the later reply replaces the first.
             if command.chaser in self._replied and not self._membership.realtime:
@@ -266,18 +272,10 @@ class TickBarrier:
         return tuple(i for i in range(len(self._actuators)) if f"chaser/{i}" in connected)
 
     def _now_s(self) -> float:
-        """Return the time that leases are measured in."""
+        """Return the wall time in real time, the simulated time in lock-step."""
         if self._membership.realtime:
             return self._node.host.now_s()
         return self._timing.tick_time_ns(max(self._tick, 0)) / 1e9
-
-    def _update_leader(self) -> bool:
-        """Grant a new term if one is due; return whether the leader changed."""
-        before = self.election.term
-        reason = self.election.update(self._controllers, self._now_s())
-        if reason and before.number:
-            self.publish_warning("hand-over", reason)
-        return bool(reason)
 
     def _check_watchdogs(self) -> None:
         """Stop actuators that no longer receive commands, as the watchdog of a valve driver does."""
@@ -293,30 +291,28 @@ class TickBarrier:
         for name in self._membership.take_departed():
             self._heartbeat.forget(name)
             self.publish_warning("process lost", name)
+            self._since.pop(name, None)
             if name == "recorder":
                 self._recorder_expected = False
             elif name in self._controllers:
                 del self._controllers[name]
-                changed |= self._update_leader() or self._tick >= 0
+                changed = True
             elif name in self._actuators:
                 self._actuators[name].stop(self._current_step())
                 self._commanded_ns.pop(name, None)
+                self._commander.terms.pop(int(name.partition("/")[2]), None)
                 changed |= any(f"chaser/{i}" == name for i in self.chasers)
                 self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
         return changed and self._tick >= 0
 
     def _publish_tick(self) -> None:
-        term = self.election.term
         message = Tick(
             tick=self._tick,
             sim_time_ns=self._timing.tick_time_ns(self._tick),
             revision=self._revision,
             images=self._images,
             chasers=self.chasers,
-            controller=bool(term.commander),
-            term=term.number,
-            commander=term.commander,
-            instance=term.instance,
-            standing_by={n: i for n, i in self._controllers.items() if n != term.commander},
+            controllers=self._controllers,
+            since=self._since,
         )
         self._node.publish(topics.TICK, message)

@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Leases that chasers have granted, as a controller knows them: who commands a tick. No I/O; ticks are the only clock.
+
+A controller commands a tick (in its newest revision) while a majority of the chasers that take part in it have promised it to
+that controller. Any two majorities share a chaser, and a chaser promises a tick to one controller only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from chaserdock_protocol.leases import is_majority, next_term
+from chaserdock_protocol.messages import Lease, Tick
+
+PATIENCE_TICKS = 3
+"""A controller gives a lease back after it had no majority for so many ticks."""
+
+
+@dataclass(frozen=True)
+class Commander:
+    """The controller that commands a tick, and its term."""
+
+    name: str
+    instance: str
+    term: int
+
+
+@dataclass
+class LeaseHolder:
+    """The newest lease that each chaser has stated. ``name``, ``instance`` and ``term``: of this controller."""
+
+    name: str
+    instance: str = ""
+    term: int = 0
+    leases: dict[int, Lease] = field(default_factory=dict)
+    _lost: dict[int, int] = field(default_factory=dict)
+    _given_back: dict[int, int] = field(default_factory=dict)
+    _idle_since: dict[int, int] = field(default_factory=dict)
+
+    def add(self, lease: Lease) -> None:
+        """Add a lease, unless a newer one of that chaser is known."""
+        known = self.leases.get(lease.chaser)
+        if known is None or _age(lease) > _age(known):
+            self.leases[lease.chaser] = lease
+
+    def add_lost(self, chaser: int, tick: int) -> None:
+        """Note that the lease that a chaser states in a tick will not arrive."""
+        self._lost[chaser] = max(tick, self._lost.get(chaser, -1))
+
+    def missing(self, tick: Tick) -> list[int]:
+        """Return the chasers whose lease of a tick has neither arrived nor is lost."""
+        return [
+            i for i in tick.chasers if not self._has_stated(i, tick) and self._lost.get(i, -1) < tick.tick
+        ]
+
+    def _has_stated(self, chaser: int, tick: Tick) -> bool:
+        lease = self.leases.get(chaser)
+        return lease is not None and (lease.tick, lease.revision) >= (tick.tick, tick.revision)
+
+    def _granted(self, name: str, tick: Tick) -> list[Lease]:
+        """Return the leases of a tick that a controller holds."""
+        instance, begin = tick.controllers.get(name, ""), tick.since.get(name, 0)
+        granted = []
+        for i in tick.chasers:
+            lease = self.leases.get(i)
+            if lease is None or (lease.holder, lease.instance) != (name, instance):
+                continue
+            void = lease.tick < max(begin, tick.since.get(f"chaser/{i}", 0))
+            if (name, instance) == (self.name, self.instance):
+                void |= lease.tick <= self._given_back.get(i, -1)
+            if not void and (lease.from_tick, lease.from_revision) <= (tick.tick, tick.revision):
+                granted += [lease] if lease.until_tick >= tick.tick else []
+        return granted
+
+    def commander_of(self, tick: Tick) -> Commander | None:
+        """Return who commands a tick by the leases known, None if nobody does."""
+        for name, instance in tick.controllers.items():
+            granted = self._granted(name, tick)
+            if is_majority({lease.chaser for lease in granted}, tick.chasers):
+                return Commander(name, instance, max(lease.term for lease in granted))
+        return None
+
+    def claim(self, tick: Tick) -> bool:
+        """Return whether this controller commands a tick; ``term`` is then the number to command with.
+
+        It is no smaller than any that a chaser has stated, so that the newest commander always has the highest.
+        """
+        found = self.commander_of(tick)
+        if found is None or (found.name, found.instance) != (self.name, self.instance):
+            return False
+        newest = max(lease.term for lease in self.leases.values())
+        if max(newest, found.term) > self.term:
+            self.term = next_term(max(newest, found.term) - 1, self.name)
+        return True
+
+    def take_idle(self, tick: Tick) -> dict[int, tuple[int, bool]]:
+        """Return the chasers that may wait for a command of this controller, which does not command the tick.
+
+        Those are the chasers whose lease it holds, and those whose lease of this tick was lost: term, and whether the lease is
+        given back now.
+        """
+        held = {lease.chaser: lease.term for lease in self._granted(self.name, tick)}
+        self._idle_since = {i: self._idle_since.get(i, tick.tick) for i in held}
+        idle = {i: (self.term, False) for i in tick.chasers if self._lost.get(i) == tick.tick}
+        for i, term in held.items():
+            gives_back = tick.tick - self._idle_since[i] >= PATIENCE_TICKS
+            if gives_back:
+                self._given_back[i] = tick.tick
+            idle[i] = (term, gives_back)
+        return idle
+
+
+def _age(lease: Lease) -> tuple[int, int, int, int]:
+    return lease.tick, lease.revision, lease.term, lease.until_tick

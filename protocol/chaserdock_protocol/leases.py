@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Leases of command authority: rules that the chasers, which grant them, and all others share. Pure functions.
+
+A lease covers a range of the world's ticks, not a span of a clock: no delay of a message and no error of a clock lets two
+controllers hold one chaser's lease of the same tick.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection
+
+from .topics import CONTROLLERS
+
+LEASE_S = 0.18
+"""Shortest lease; it covers at least two ticks."""
+
+
+def lease_ticks(rate_hz: float) -> int:
+    """Return the length of a lease at this tick rate."""
+    return max(2, math.ceil(LEASE_S * rate_hz))
+
+
+def next_term(term: int, controller: str) -> int:
+    """Return the smallest number above ``term`` that belongs to a controller: no two controllers share a term."""
+    number = term + 1
+    while commander_of(number) != controller:
+        number += 1
+    return number
+
+
+def commander_of(term: int) -> str:
+    """Return the controller that a term belongs to, empty for 0."""
+    return CONTROLLERS[(term - 1) % len(CONTROLLERS)] if term else ""
+
+
+def is_majority(granted: Collection[int], live: Collection[int]) -> bool:
+    """Return whether chasers ``granted`` are a majority of those that are ``live``: of an even number, half with the first."""
+    if not live or not granted:
+        return False
+    return 2 * len(granted) + (min(live) in granted) > len(live)

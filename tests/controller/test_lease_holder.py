@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which tick a controller commands, by the leases that chasers state; and the model check of the whole protocol."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from chaserdock_agents.chaser import lease_grantor
+from chaserdock_controller.redundancy.lease_holder import PATIENCE_TICKS, Commander, LeaseHolder
+from chaserdock_controller.redundancy.standby import HotStandby
+from chaserdock_protocol.messages import Lease, Tick
+from lease_model import TwoCommanders, walk
+
+BOTH = {"controller": "c", "standby": "s"}
+
+
+def tick(number: int, chasers: tuple[int, ...] = (0, 1, 2), **changes: Any) -> Tick:
+    fields: dict[str, Any] = {"controllers": BOTH} | changes
+    return Tick(tick=number, images=False, chasers=chasers, **fields)
+
+
+def lease(chaser: int, number: int, holder: str = "standby", **changes: Any) -> Lease:
+    fields: dict[str, Any] = {
+        "instance": BOTH[holder],
+        "term": 2,
+        "from_tick": 0,
+        "until_tick": number + 1,
+    } | changes
+    return Lease(tick=number, chaser=chaser, holder=holder, **fields)
+
+
+def standby(*leases: Lease) -> LeaseHolder:
+    made = LeaseHolder("standby", "s")
+    for one in leases:
+        made.add(one)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("leases", "number", "changes", "claimed"),
+    [
+        ([lease(1, 5), lease(2, 5)], 5, {}, True),
+        ([lease(1, 5), lease(2, 5)], 7, {}, False),  # run out
+        ([lease(2, 5)], 5, {}, False),
+        ([lease(2, 5)], 5, {"chasers": (2,)}, True),  # the only one that takes part
+        ([lease(1, 5), lease(2, 5)], 5, {"controllers": {"controller": "c"}}, False),  # taken for lost
+        ([lease(1, 5), lease(2, 5)], 5, {"controllers": {"standby": "s2"}}, False),  # another start
+        ([lease(1, 5), lease(2, 5, instance="s2")], 5, {}, False),
+        ([lease(1, 5), lease(2, 5, from_tick=5)], 4, {}, False),  # another's tick
+        ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, {}, False),  # another's revision
+        ([lease(1, 5), lease(2, 5, from_tick=5, from_revision=1)], 5, {"revision": 1}, True),
+        ([lease(1, 5), lease(2, 5)], 6, {"since": {"chaser/2": 6}}, False),  # it may have forgotten
+        ([lease(1, 5), lease(2, 5)], 6, {"since": {"standby": 6}}, False),
+        ([lease(1, 5), lease(2, 5)], 6, {"since": {"controller": 6, "standby": 5, "chaser/2": 5}}, True),
+    ],
+)
+def test_who_commands_a_tick(
+    leases: list[Lease], number: int, changes: dict[str, Any], claimed: bool
+) -> None:
+    holder = standby(*leases)
+    at = tick(number, **changes)
+    assert holder.claim(at) is claimed
+    assert holder.commander_of(at) == (Commander("standby", "s", 2) if claimed else None)
+
+
+def test_older_statement_does_not_replace_a_newer_one() -> None:
+    holder = standby(lease(0, 6), lease(1, 6), lease(1, 5, "controller"))
+    assert holder.claim(tick(6))
+    holder.add(lease(1, 7, "controller", term=3))
+    assert not holder.claim(tick(7))
+
+
+def test_commander_takes_the_highest_term_of_all() -> None:
+    holder = standby(lease(0, 5), lease(1, 5), lease(2, 5, "controller", term=7))
+    assert holder.claim(tick(5))
+    assert holder.term == 8  # the next of its own
+    holder.add(lease(2, 6, "controller", term=3))
+    assert holder.claim(tick(6))
+    assert holder.term == 8
+
+
+def test_minority_waits_then_gives_its_lease_back_and_counts_it_no_more() -> None:
+    holder = standby()
+    for number in range(5, 5 + PATIENCE_TICKS):
+        holder.add(lease(2, number, until_tick=20))
+        assert holder.take_idle(tick(number)) == {2: (2, False)}
+    last = 5 + PATIENCE_TICKS
+    holder.add(lease(2, last, until_tick=20))
+    assert holder.take_idle(tick(last)) == {2: (2, True)}
+    holder.add(lease(1, last, until_tick=20))
+    assert not holder.claim(tick(last + 1))
+    holder.add(lease(2, last + 1, until_tick=20))  # granted again since
+    assert holder.claim(tick(last + 1))
+
+
+def test_chaser_whose_lease_is_lost_need_not_wait_for_a_command() -> None:
+    holder = standby(lease(0, 5, "controller"))
+    holder.add_lost(1, 5)
+    assert holder.missing(tick(5)) == [2]
+    assert holder.take_idle(tick(5)) == {1: (0, False)}
+    assert holder.missing(tick(6)) == [0, 1, 2]
+
+
+def test_lockstep_decides_with_all_leases_and_real_time_as_they_come() -> None:
+    for realtime in (False, True):
+        role = HotStandby("standby", realtime)
+        role.join("s")
+        role.update(tick(3))
+        for chaser in (0, 1):
+            role.leases.add(lease(chaser, 3))
+            role.decide()
+        assert role.leads is realtime
+        role.leases.add(lease(2, 3))
+        role.decide()
+        assert role.leads
+
+
+def test_real_time_commander_goes_on_until_it_processes_a_tick_without_leases() -> None:
+    role = HotStandby("standby", realtime=True)
+    role.join("s")
+    role.update(tick(3))
+    for chaser in (0, 1, 2):
+        role.leases.add(lease(chaser, 3))
+    role.decide()
+    role.update(tick(5))
+    role.decide()
+    assert role.leads  # the leases may be on their way
+    role.decide(tick(4))
+    assert role.leads
+    role.decide(tick(5))
+    assert not role.leads
+
+
+def test_never_two_commanders_in_any_interleaving() -> None:
+    """A short run of ``python tests/lease_model.py``."""
+    steps = commanded = 0
+    for seed in range(1000, 1030):
+        model = walk(seed)
+        steps, commanded = steps + model.steps, commanded + len(model.claims)
+    assert steps > 90_000
+    assert commanded > 2_000
+
+
+def test_model_finds_a_chaser_that_grants_while_a_lease_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Hasty(lease_grantor.LeaseGrantor):
+        def update(self, tick: Tick) -> Lease | None:
+            self.until_tick -= 2
+            return super().update(tick)
+
+    monkeypatch.setattr("lease_model.LeaseGrantor", Hasty)
+
+    def walks() -> None:
+        for seed in range(100):
+            walk(seed)
+
+    with pytest.raises(TwoCommanders):
+        walks()

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Who commands, as the world sees it in the commands that chasers execute. It decides nothing. No I/O; time is passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from chaserdock_protocol.leases import commander_of
+from chaserdock_protocol.messages import ActuatorCommand
+
+
+@dataclass
+class ObservedCommander:
+    """The controller ``name`` of the newest ``term`` that a chaser has flown. ``terms``: the newest of each chaser."""
+
+    name: str = ""
+    term: int = 0
+    terms: dict[int, int] = field(default_factory=dict)
+    _instance: str = ""
+    _commanded_s: float = 0.0
+
+    def update(self, command: ActuatorCommand, controllers: Mapping[str, str], now_s: float) -> str:
+        """Take an executed command; return the change of commander as text for the log, empty without one.
+
+        ``controllers``: those connected, name to instance.
+        """
+        self.terms[command.chaser] = max(command.term, self.terms.get(command.chaser, 0))
+        if command.term <= self.term:
+            self._commanded_s = now_s if command.term == self.term else self._commanded_s
+            return ""
+        before, instance, silent_s = self.name, self._instance, now_s - self._commanded_s
+        self.term, self.name, self._commanded_s = command.term, commander_of(command.term), now_s
+        self._instance = controllers.get(self.name, "")
+        if not before or (before, instance) == (self.name, self._instance):
+            return ""
+        connected = controllers.get(before) == instance
+        reason = f"no command of {before} executed for {silent_s:.2f} s" if connected else f"{before} lost"
+        return f"term {self.term}: {self.name} leads: {reason}"

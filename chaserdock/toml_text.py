@@ -30,7 +30,7 @@ def toml_value(value: Any) -> str:
 
 
 def toml_document(values: Mapping[str, Any]) -> str:
-    """Return the text of a file with these keys. Empty tables are left out. Raise TypeError as ``toml_value``."""
+    """Return the text of a file with these keys. A table may be empty. Raise TypeError as ``toml_value``."""
     return "\n".join(_table(values, ())).lstrip("\n") + "\n"
 
 
@@ -41,7 +41,7 @@ def _table(values: Mapping[str, Any], path: tuple[str, ...]) -> list[str]:
     for key, value in values.items():
         name = ".".join((*path, key))
         if isinstance(value, Mapping):
-            below += ["", f"[{name}]", *_table(value, (*path, key))] if value else []
+            below += ["", f"[{name}]", *_table(value, (*path, key))]
         elif isinstance(value, list) and value and isinstance(value[0], Mapping):
             for item in value:
                 below += ["", f"[[{name}]]", *_table(item, (*path, key))]

@@ -164,7 +164,8 @@ def as_toml(scenario: Scenario, changes: bool = False) -> str:
         mode="json", exclude_none=True, exclude_defaults=changes, exclude={"camera": unused}
     )
     if changes:
-        values = {"format": scenario.format, **values, "chaser": _changed_body(scenario)}
+        body = _changed_body(scenario)
+        values = {"format": scenario.format, **values, **({"chaser": body} if body else {})}
     return toml_document(values)
 
 

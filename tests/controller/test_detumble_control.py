@@ -13,6 +13,7 @@ from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.control import observed_motion
 from chaserdock_controller.guidance.detumble.stack import stack_motion
 from chaserdock_models import rotations
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import Scenario, ScenarioError
@@ -148,9 +149,10 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
         1,
         (),
     )
+    moving = BodyState(target.position_m, target.velocity_m_s, q, target.omega_rad_s)
     own = {}
     for i in range(3):
-        state = moving_with(target, rng.normal(size=3), rotations.normalize(rng.normal(size=4)))
+        state = moving_with(moving, rng.normal(size=3), rotations.normalize(rng.normal(size=4)))
         fields = {
             name: vector(getattr(state, name)) for name in Odometry.__struct_fields__ if hasattr(state, name)
         }

@@ -64,7 +64,7 @@ _ROUNDING = 1e-6
 FOLLOWING_S = 3.0
 """Longest time (s) in which a chaser flies none of the commands that are published for it, unless a fault lasts."""
 _GAP_S = 1.1
-"""Commands that pause for longer, at a hand-over, are published anew."""
+"""Commands that pause for longer, at a hand-over, are published again."""
 _HARMLESS = frozenset({"camera_off", "lying_sensor", "odometry_lie", "duplicate"})
 """Kinds of faults after which a chaser flies commands nevertheless."""
 _LIES = frozenset({"odometry_lie", "clock_jump", "corrupt"})

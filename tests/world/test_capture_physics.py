@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,22 +12,9 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import TARGET, Physics
-from docking_cases import CHASER_INERTIA, CHASER_KG, TARGET_INERTIA, TARGET_KG, scenario, world
+from docking_cases import CHASER_INERTIA, CHASER_KG, TARGET_INERTIA, TARGET_KG, scenario
 
 HZ = 960
-
-
-@pytest.fixture
-def worlds() -> Iterator[Any]:
-    opened: list[Physics] = []
-
-    def make(**changes: Any) -> Physics:
-        opened.append(world(**changes))
-        return opened[-1]
-
-    yield make
-    for physics in opened:
-        physics.close()
 
 
 def momentum(physics: Physics) -> tuple[Array, Array]:

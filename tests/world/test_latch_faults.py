@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -13,24 +12,11 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.compliant_latch import ENGAGED_M
 from chaserdock_world.physics.simulation import TARGET, Physics
-from docking_cases import CHASER_KG, HZ, TARGET_KG, balance, latch, momenta, world
+from docking_cases import CHASER_KG, HZ, TARGET_KG, balance, latch, momenta
 
 PULL = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 TARGET_SHARE = TARGET_KG / (TARGET_KG + CHASER_KG)
 STILL = (0.0, 0.0, 0.0)
-
-
-@pytest.fixture
-def worlds() -> Iterator[Any]:
-    opened: list[Physics] = []
-
-    def make(**changes: Any) -> Physics:
-        opened.append(world(**changes))
-        return opened[-1]
-
-    yield make
-    for physics in opened:
-        physics.close()
 
 
 def fault(kind: str, at_s: float, duration_s: float, **more: float) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -24,25 +23,11 @@ from docking_cases import (
     latch,
     momenta,
     scenario,
-    world,
 )
 
 HZ = 960
 FIRING = np.array([0.3, 0.5, -0.2, 0.05, 0.1, 0.02])
 MISMATCH = {"truth": {"preset": "mismatch", "target": {"centre_of_mass_m": 0.05, "inertia_turn_deg": 20.0}}}
-
-
-@pytest.fixture
-def worlds() -> Iterator[Any]:
-    opened: list[Physics] = []
-
-    def make(**changes: Any) -> Physics:
-        opened.append(world(**changes))
-        return opened[-1]
-
-    yield make
-    for physics in opened:
-        physics.close()
 
 
 @pytest.mark.parametrize("changes", [{}, MISMATCH], ids=["nominal", "mismatch"])

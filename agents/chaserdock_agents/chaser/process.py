@@ -286,17 +286,16 @@ class ChaserProcess:
             if not self._reported_stale:  # the first of a series
                 self._publish_warning("command refused", stale, command.tick, now_ns)
             self._reported_stale = True
+            # A holder that does not know its term sends nothing else in this tick.
             if self.leases.is_of_holder(command) and not self.realtime:
-                self._mark_uncommanded(
-                    command.tick
-                )  # it does not know its term, and sends nothing else in this tick
+                self._mark_uncommanded(command.tick)
             return
         if command.mode in ("none", "wait", "yield"):
             self._take_no_command(command)
             return
         if command.tick == self.executed_tick and command.term > self._term:
             self._renew_lease(command)
-            return  # repeated by a controller that became leader within the tick
+            return  # repeated by a controller that became commander within the tick
         reason = refusal(command, self.number, self.scenario.chaser, self.executed_tick, now_ns)
         if reason is None:
             self._renew_lease(command)

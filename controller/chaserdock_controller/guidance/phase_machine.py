@@ -344,7 +344,7 @@ class PhaseMachine:
             self._apply_docking_trigger(i, now_s, *outcome)
 
     def _update_stuck(self, i: int, dock: Dock, now_s: float) -> None:
-        """Begin the way out of a chaser anew, in every tick, for as long as its latch does not open."""
+        """Restart the way out of a chaser in every tick, for as long as its latch does not open."""
         c, observed = self.chasers[i], self._observed[i]
         sensed = observed.sensed or c.stuck
         stuck = observed.latched and sensed and now_s - c.since_s >= _RELEASE_S

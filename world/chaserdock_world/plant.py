@@ -33,7 +33,7 @@ class PrincipalFrame:
     def from_body(self, s: BodyState) -> BodyState:
         """Return the state of this frame from that of the body's frame."""
         arm = rotations.rotate(s.q_wxyz, self.offset_m)
-        turning = rotations.rotate(s.q_wxyz, np.cross(s.omega_rad_s, self.offset_m))
+        turning = rotations.rotate(s.q_wxyz, rotations.cross(s.omega_rad_s, self.offset_m))
         return BodyState(
             s.position_m + arm,
             s.velocity_m_s + turning,
@@ -47,14 +47,14 @@ class PrincipalFrame:
         omega = rotations.rotate(self.q_wxyz, s.omega_rad_s)
         return BodyState(
             s.position_m - rotations.rotate(q, self.offset_m),
-            s.velocity_m_s - rotations.rotate(q, np.cross(omega, self.offset_m)),
+            s.velocity_m_s - rotations.rotate(q, rotations.cross(omega, self.offset_m)),
             q,
             omega,
         )
 
     def wrench(self, wrench: Array) -> Array:
         """Return force and torque (6,) about the centre of mass, principal axes, of a wrench at the body's origin."""
-        torque = wrench[3:] - np.cross(self.offset_m, wrench[:3])
+        torque = wrench[3:] - rotations.cross(self.offset_m, wrench[:3])
         return np.concatenate([rotations.rotate_inverse(self.q_wxyz, part) for part in (wrench[:3], torque)])
 
     def place(self, position_m: Array, q_wxyz: Array) -> tuple[Array, Array]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.rigid_body import rk4_step
 
@@ -66,7 +67,7 @@ def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:
 
     The point is at p + R c and moves at v + R (omega x c); dtheta and omega are unchanged.
     """
-    rotation, spin = so3.to_matrix(q_wxyz), np.cross(omega_rad_s, centre_trf_m)
+    rotation, spin = so3.to_matrix(q_wxyz), rotations.cross(omega_rad_s, centre_trf_m)
     m = np.eye(12)
     m[0:3, 6:9] = -rotation @ so3.skew(centre_trf_m)
     m[3:6, 6:9] = -rotation @ so3.skew(spin)
@@ -89,13 +90,13 @@ def about_centre(
     position, velocity, q, omega = before
     q_after, omega_after = after
     arm, arm_after = so3.to_matrix(q) @ centre_trf_m, so3.to_matrix(q_after) @ centre_trf_m
-    spin = so3.to_matrix(q) @ np.cross(omega, centre_trf_m)
+    spin = so3.to_matrix(q) @ rotations.cross(omega, centre_trf_m)
     centre_velocity = velocity + spin
     centre_after = position + arm + centre_velocity * dt_s
     from_centre = np.linalg.inv(to_centre(q_after, omega_after, centre_trf_m))
     return (
         centre_after - arm_after,
-        centre_velocity - so3.to_matrix(q_after) @ np.cross(omega_after, centre_trf_m),
+        centre_velocity - so3.to_matrix(q_after) @ rotations.cross(omega_after, centre_trf_m),
         from_centre @ transition @ to_centre(q, omega, centre_trf_m),
     )
 

@@ -77,11 +77,11 @@ def facing(q_wxyz: ArrayLike, direction_w: ArrayLike) -> Array:
     """Return the attitude (4,) nearest to ``q_wxyz``, CRF to WRF, with +X along ``direction_w`` (3,), which is not zero."""
     a = rotations.rotate(q_wxyz, [1.0, 0.0, 0.0])
     b = np.asarray(direction_w, dtype=float) / np.linalg.norm(np.asarray(direction_w, dtype=float))
-    axis, cosine = np.cross(a, b), float(a @ b)
+    axis, cosine = rotations.cross(a, b), float(a @ b)
     size = float(np.linalg.norm(axis))
     if size < 1e-9:  # there already, or opposite: then about Z of the body
         axis, size = rotations.rotate(q_wxyz, [0.0, 0.0, 1.0]), 1.0
-    angle = math.atan2(float(np.linalg.norm(np.cross(a, b))), cosine)
+    angle = math.atan2(float(np.linalg.norm(rotations.cross(a, b))), cosine)
     return rotations.normalize(rotations.multiply(rotations.exp(axis / size * angle), q_wxyz))
 
 
@@ -92,7 +92,9 @@ def turning_wrench(odometry: Odometry, body: Body, q_wxyz: Array, q_soon_wxyz: A
     error = rotations.log(rotations.multiply(rotations.conjugate(odometry.q_wxyz), q_wxyz))
     ahead = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), q_soon_wxyz)) / _STEP_S
     omega, inertia = np.array(odometry.omega_rad_s), np.array(body.inertia)
-    torque = inertia * (_STIFFNESS * error + _DAMPING * (ahead - omega)) + np.cross(omega, inertia * omega)
+    torque = inertia * (_STIFFNESS * error + _DAMPING * (ahead - omega)) + rotations.cross(
+        omega, inertia * omega
+    )
     wrench[3:] = np.clip(torque, -body.torque_max_N_m, body.torque_max_N_m)
     return wrench
 

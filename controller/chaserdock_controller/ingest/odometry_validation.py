@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import msgspec
 import numpy as np
@@ -44,13 +45,19 @@ def why_invalid(odometry: Odometry) -> str:
     if abs(length - 1.0) > _UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
     return next(
-        (f"{name} is not a covariance" for name in COVARIANCES if not _is_covariance(odometry, name)), ""
+        (
+            f"{name} is not a covariance"
+            for name in COVARIANCES
+            if not _is_covariance(getattr(odometry, name))
+        ),
+        "",
     )
 
 
-def _is_covariance(odometry: Odometry, name: str) -> bool:
-    """Return whether a field is a symmetric positive semi-definite (3, 3) matrix, up to rounding."""
-    matrix = np.array(getattr(odometry, name)).reshape(3, 3)
+@lru_cache(maxsize=64)  # sensors mostly state the same covariance in every message
+def _is_covariance(elements: tuple[float, ...]) -> bool:
+    """Return whether elements (9,) are a symmetric positive semi-definite (3, 3) matrix, up to rounding."""
+    matrix = np.array(elements).reshape(3, 3)
     largest = np.abs(matrix).max()
     if not math.isfinite(largest) or np.abs(matrix - matrix.T).max() > _ROUNDING * largest:
         return False

@@ -73,7 +73,7 @@ def observed_impulse(before: Odometry, after: Odometry, body: Body) -> Array:
     first, last = np.asarray(before.omega_rad_s), np.asarray(after.omega_rad_s)
     omega = (first + last) / 2.0
     time_s = (after.sim_time_ns - before.sim_time_ns) * 1e-9
-    torque = inertia * (last - first) + np.cross(omega, inertia * omega) * time_s
+    torque = inertia * (last - first) + rotations.cross(omega, inertia * omega) * time_s
     return np.concatenate([body.mass_kg * rotations.rotate_inverse(middle, gained), torque])
 
 

@@ -8,6 +8,7 @@ target at p, R_t is seen at S^-1 exp(-delta) (E' (p - p_i - C_i l) - b) with the
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -36,6 +37,11 @@ from .state import (
 
 _EYE3 = np.eye(3)
 _ODOMETRY_ROWS = np.arange(12)
+_CONSTANT_JACOBIAN = np.zeros((12, CHASER))
+"""Elements of the Jacobian of odometry that are the same for every state."""
+_CONSTANT_JACOBIAN[0:3, POSITION] = _CONSTANT_JACOBIAN[0:3, POSITION_DRIFT] = _EYE3
+_CONSTANT_JACOBIAN[3:6, VELOCITY] = _EYE3
+_CONSTANT_JACOBIAN[9:12, RATE] = _CONSTANT_JACOBIAN[9:12, GYRO_BIAS] = _EYE3
 
 
 class CameraMounting(NamedTuple):
@@ -72,18 +78,14 @@ def linearize_odometry(
     r[3:6] = odometry.velocity_m_s - state.velocities_m_s[i]
     r[6:9] = so3.log(so3.normalize(so3.inverse_multiply(q, np.array(odometry.q_wxyz))))
     r[9:12] = odometry.omega_rad_s - state.omegas_rad_s[i] - state.of(i, GYRO_BIAS)
-    h = np.zeros((12, CHASER))
-    h[0:3, POSITION] = h[0:3, POSITION_DRIFT] = _EYE3
-    h[3:6, VELOCITY] = _EYE3
+    h = _CONSTANT_JACOBIAN.copy()
     h[6:9, ATTITUDE] = so3.to_matrix(so3.exp(-drift))
     h[6:9, ATTITUDE_DRIFT] = so3.right_jacobian(drift)
-    h[9:12, RATE] = h[9:12, GYRO_BIAS] = _EYE3
     return LinearizedMeasurement(r, np.zeros((12, TARGET)), h, odometry_noise(odometry, p))
 
 
 def odometry_noise(odometry: Odometry, p: JointParameters) -> Array:
     """Return the covariance (12, 12) of the white noise of odometry: as stated, and the floor."""
-    noise = np.zeros((12, 12))
     floors = (p.floor_position_m, p.floor_velocity_m_s, p.floor_attitude_rad, p.floor_omega_rad_s)
     stated = (
         odometry.position_covariance_m2,
@@ -91,10 +93,17 @@ def odometry_noise(odometry: Odometry, p: JointParameters) -> Array:
         odometry.attitude_covariance_rad2,
         odometry.omega_covariance_rad2_s2,
     )
+    return _white_noise(stated, floors)
+
+
+@lru_cache(maxsize=64)  # sensors mostly state the same covariance in every message
+def _white_noise(stated: tuple[tuple[float, ...], ...], floors: tuple[float, ...]) -> Array:
+    noise = np.zeros((12, 12))
     for k, covariance in enumerate(stated):
         part = slice(3 * k, 3 * k + 3)
         noise[part, part] = np.reshape(covariance, (3, 3))
     noise[_ODOMETRY_ROWS, _ODOMETRY_ROWS] += np.repeat([floor**2 for floor in floors], 3)
+    noise.flags.writeable = False
     return noise
 
 
@@ -159,5 +168,7 @@ def linearize_sighting(
 
 def sighting_covariance(solution: PoseSolution, p: JointParameters) -> Array:
     """Return the stated covariance (6, 6) of a sighting with the floor."""
-    floor = np.repeat([p.floor_sighting_m**2, p.floor_sighting_rad**2], 3)
-    return np.reshape(solution.covariance, (6, 6)) + np.diag(floor)
+    covariance = np.array(solution.covariance)
+    covariance[0:21:7] += p.floor_sighting_m**2
+    covariance[21::7] += p.floor_sighting_rad**2
+    return covariance.reshape(6, 6)

@@ -59,14 +59,17 @@ class GuidanceStage:
         """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed."""
         self._follow_estimate(observation, estimation)
         self.machine.update_planning(observation.time_s, failures)
-        stack = self.detumble.state(observation, estimation)
-        replies = self._apply_commands(observation, stack)
+        commands = (*self.machine.due_commands(observation.time_s), *observation.commands)
+        stack = None
+        if self.machine.detumbling() or any(c.command == "detumble" for c in commands):
+            stack = self.detumble.state(observation, estimation)
+        replies = self._apply_commands(commands, observation, stack)
         references: dict[int, ReferencePose] = {}
         if estimation.known:
             for i in sorted(observation.odometry):
                 references[i] = self._update_chaser(i, observation, estimation)
         self._update_stack(observation, stack)
-        commands = self._detumble_commands(observation, stack)
+        thrusts = self._detumble_commands(observation, stack)
         ids, attached = sorted(observation.odometry), self._attached(observation, estimation)
         planned = tuple(i for i in ids if self.chasers[i].phase is not Phase.SEARCHING)
         horizon = None
@@ -85,7 +88,7 @@ class GuidanceStage:
                 isolated=self.thrusters.isolated(i),
                 trusted=self.thrusters.trusted(i),
                 reference=references.get(i),
-                direct=commands.get(i) or self._direct_command(i, observation, estimation, i in attached),
+                direct=thrusts.get(i) or self._direct_command(i, observation, estimation, i in attached),
             )
         return GuidanceResult(directives, horizon, tuple(replies), tuple(self._events(estimation)))
 
@@ -102,9 +105,10 @@ class GuidanceStage:
             for i, odometry in estimation.own.items():
                 self.machine.target_settled(i, now_s, pose_in_target(target, odometry)[0])
 
-    def _apply_commands(self, observation: Observation, stack: StackState | None) -> list[CommandReply]:
+    def _apply_commands(
+        self, commands: Sequence[OperatorCommand], observation: Observation, stack: StackState | None
+    ) -> list[CommandReply]:
         now_s = observation.time_s
-        commands = (*self.machine.due_commands(now_s), *observation.commands)
         self.machine.set_pending_goals(commands)
         self.machine.set_detumble_refusal(self._why_not_detumble(commands, observation, stack))
         replies = []

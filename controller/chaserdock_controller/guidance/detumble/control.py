@@ -51,6 +51,7 @@ class DetumbleControl:
         self._thrusters = scenario.chaser.thrusters
         self._full_N = thrusts_max(self._thrusters)
         self._own = wrench_matrix(self._thrusters)
+        self._target = scenario.target_model()
         self._plume_free = lru_cache(maxsize=32)(self._compute_plume_free)
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
@@ -75,7 +76,7 @@ class DetumbleControl:
     def _variances(self, chasers: int) -> tuple[float, float]:
         """Return the variances per axis of velocity and rate of the stack by the odometry of so many chasers."""
         errors = self._scenario.navigation.errors()
-        size_m = math.hypot(*self._scenario.target_model().size_m)
+        size_m = math.hypot(*self._target.size_m)
         velocity = errors.velocity_noise_m_s**2 + (errors.omega_noise_rad_s * size_m / 2.0) ** 2
         omega = errors.omega_noise_rad_s**2
         return velocity / chasers + 1e-12, omega / chasers + errors.gyro_bias_rad_s**2 + 1e-12
@@ -150,7 +151,7 @@ class DetumbleControl:
             mounted,
             self._thrusters,
             math.radians(self._settings.plume_deg),
-            self._scenario.target_model().boxes,
+            self._target.boxes,
             [np.array(port.position_m) for port in self._scenario.docking.ports],
             self._scenario.chaser.size_m,
         )

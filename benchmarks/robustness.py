@@ -10,7 +10,7 @@ Figures of ``grades`` and ``sources`` are RMS over all chasers in the steady sta
 of a calibration; from 20 s on in ``sources``), mean over the seeds, in closed loop: the error of each chaser's pose relative to
 the target, ``estimate``, and of its distance from the reference on the true target, ``tracking``; ``nees`` of the relative pose
 (6 expected); ``worst_nees`` of a flight; share of gated sightings. The paper's estimator takes odometry as exact; its relative
-pose is that of odometry and target estimate.
+pose is that of odometry and target estimate. ``--figure FILE`` draws the curves of ``sources``.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -46,6 +47,8 @@ SOURCES = {
     "rate": ("omega_noise_deg_s",),
     "camera": ("camera_turn_deg", "camera_shift_m", "camera_focal_share"),
 }
+FACTORS = (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
+"""Multiples of the grade ``lab``."""
 ESTIMATORS = ("joint", "paper")
 CALIBRATED_S = 65.0
 """Steady after a calibration from 20 s on, which takes 30 s."""
@@ -176,7 +179,7 @@ def grades(options: argparse.Namespace) -> Figures:
 def sources(options: argparse.Namespace) -> Figures:
     """Fly four chasers with one error source at a time, in multiples of the grade ``lab``."""
     seeds, duration_s = (1, 30.0) if options.quick else (5, 40.0)
-    factors = (0.0, 1.0, 10.0) if options.quick else (0.0, 0.5, 1.0, 2.0, 5.0, 10.0)
+    factors = (0.0, 1.0, 10.0) if options.quick else FACTORS
     flights = []
     for source, keys in SOURCES.items():
         for factor in factors:
@@ -186,7 +189,28 @@ def sources(options: argparse.Namespace) -> Figures:
                 for seed in range(seeds):
                     scenario = scenario_of("four-chaser-docking", estimator, seed, duration_s, *overrides)
                     flights.append(Flight(f"{source}_{factor:g}_{estimator}", scenario, 20.0, False))
-    return fly_all(flights, options.jobs)
+    figures = fly_all(flights, options.jobs)
+    if options.figure is not None:
+        draw_sources(figures, factors, options.estimators, options.figure)
+    return figures
+
+
+def draw_sources(figures: Figures, factors: Sequence[float], estimators: Sequence[str], path: Path) -> None:
+    """Draw the position error of the estimate over the factor of each source, one panel a source, to an image file."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(10.0, 2.6), layout="constrained")
+    panels = figure.subplots(1, len(SOURCES), sharey=True)
+    for panel, source in zip(panels, SOURCES, strict=True):
+        for estimator, style in zip(estimators, ("o-", "s--"), strict=False):
+            errors_mm = [figures[f"{source}_{factor:g}_{estimator}_estimate_m"] * 1e3 for factor in factors]
+            panel.semilogy(factors, errors_mm, style, markersize=4, label=estimator)
+        panel.set_title(source, fontsize=10)
+        panel.set_xlabel("times lab", fontsize=9)
+        panel.grid(visible=True, which="both", alpha=0.3)
+    panels[0].set_ylabel("estimate, RMS, mm", fontsize=9)
+    panels[0].legend(fontsize=8)
+    figure.savefig(path)
 
 
 def jumped(odometry: Odometry) -> Odometry:
@@ -309,6 +333,7 @@ def main() -> None:
         help="of grades, rows whose name begins so, such as orbit_calibrated_4 (default: all)",
     )
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="flights at a time (default: 2)")
+    parser.add_argument("--figure", type=Path, metavar="FILE", help="draw the curves of sources (SVG, PNG)")
     options = parser.parse_args()
     run_parts(options, {name: partial(part, options) for name, part in PARTS.items()})
 

@@ -178,7 +178,7 @@ def grades(options: argparse.Namespace) -> Figures:
 
 def sources(options: argparse.Namespace) -> Figures:
     """Fly four chasers with one error source at a time, in multiples of the grade ``lab``."""
-    seeds, duration_s = (1, 30.0) if options.quick else (5, 40.0)
+    seeds, duration_s = (1, 30.0) if options.quick else (options.seeds, 40.0)
     factors = (0.0, 1.0, 10.0) if options.quick else FACTORS
     flights = []
     for source, keys in SOURCES.items():
@@ -319,7 +319,7 @@ def main() -> None:
         type=int,
         default=20,
         metavar="N",
-        help="flights per row of grades and failures (default: 20)",
+        help="flights per row (default: 20)",
     )
     parser.add_argument("--nominal", action="store_true", help="without plant mismatch in grades")
     parser.add_argument(

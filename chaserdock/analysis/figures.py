@@ -226,7 +226,9 @@ def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float
     if history is None:
         return []
     if s.docking.port_of(chaser) is None:
-        limits = dict.fromkeys(("approach", "retreat", "goto", "abort"), s.approach.max_speed_m_s)
+        limits: dict[str, float] = dict.fromkeys(
+            ("approach", "retreat", "goto", "abort"), s.approach.max_speed_m_s
+        )
     else:
         docking = s.docking
         limits = {

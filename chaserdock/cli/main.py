@@ -22,7 +22,7 @@ from .operate import command, status, thruster_fault, view
 from .options import fail
 from .processes import chaser, controller, record, router, world
 from .run import campaign, judge, run
-from .setup import calibrate, keys, markers
+from .setup import calibrate, compose, keys, markers
 from .simulate import simulate
 
 GROUPS: dict[str, tuple[Any, ...]] = {
@@ -33,7 +33,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Look at a flight": (summary, report, figures, video, snapshot),
     "Logs": (logs.app,),
     "Reproduce and compare": (replay, compare, reproduce, study, check),
-    "Setup": (markers, calibrate, keys),
+    "Setup": (markers, calibrate, keys, compose),
 }
 """Commands (functions) and groups of commands (apps) by the section of the help that lists them."""
 

@@ -369,6 +369,16 @@ def test_tick_waits_until_a_loss_is_known(controller: ControllerProcess, scenari
     assert controller.done_tick == 1
 
 
+def test_lease_that_contradicts_itself_counts_as_lost(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
+    deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    damaged = msgspec.structs.replace(lease(scenario, 1, 1), holder="contRoller")
+    deliver(controller, topics.LEASE, 1, damaged)
+    assert controller.standby.leases.missing(tick_of(scenario, 1, (0, 1))) == [0]
+    assert controller.node.counts.rejected["lease:contradictory"] == 1
+
+
 def test_controller_without_a_majority_lets_the_others_wait(
     controller: ControllerProcess, scenario: Scenario
 ) -> None:

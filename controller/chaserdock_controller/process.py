@@ -185,11 +185,11 @@ class ControllerProcess:
             case Odometry() as odometry:
                 self._add_odometry(odometry)
             case DockingStatus() as docking:
-                self.inputs.add_docking(docking)
+                self.node.counts.stale += not self.inputs.add_docking(docking)
             case Sighting() as sighting:
                 self.node.counts.stale += not self.inputs.add_sighting(sighting)
             case ThrusterReport() as report:
-                self.inputs.add_thruster_report(report)
+                self.node.counts.stale += not self.inputs.add_thruster_report(report)
             case Presence() as presence:
                 self.heartbeat.take(presence)
             case MissionEnd():
@@ -201,7 +201,9 @@ class ControllerProcess:
         late = self._open_tick()
         if late is not None and odometry.tick > late.tick:
             self._process(late)  # while its own odometry is still the newest
-        for level, text in self.inputs.add_odometry(odometry):
+        events = self.inputs.add_odometry(odometry)
+        self.node.counts.stale += events is None
+        for level, text in events or ():
             if self.standby.leads:
                 self._publish_event(level, text, odometry)
 

@@ -20,7 +20,7 @@ from .compare import check, compare, replay, reproduce, study
 from .help import HELP_OPTIONS, GroupedHelp, add_command
 from .operate import command, status, thruster_fault, view
 from .options import fail
-from .processes import chaser, controller, record, router, world
+from .processes import chaser, controller, record, ros2, router, world
 from .run import campaign, judge, run
 from .setup import calibrate, compose, keys, markers
 from .simulate import simulate
@@ -28,7 +28,7 @@ from .simulate import simulate
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Fly": (run, campaign, simulate),
     "Scenarios": (scenario.app,),
-    "Processes": (world, chaser, controller, record, router),
+    "Processes": (world, chaser, controller, record, router, ros2),
     "Operate": (command, thruster_fault, status, view, judge),
     "Look at a flight": (summary, report, figures, video, snapshot),
     "Logs": (logs.app,),

@@ -99,7 +99,7 @@ def test_container_mounts_only_its_own_keys() -> None:
             mounts.setdefault(service, []).append((name, where))
     everyone = {"router", *(who.common_name for who in identities(4))}
     assert {name for name, _ in mounts.pop("router")} == everyone
-    assert set(mounts) == everyone - {"router", "analysis"} | {"mission"}
+    assert set(mounts) == everyone - {"router", "analysis", "bridge"} | {"mission"}
     for service, mounted in mounts.items():
         owner = "operator" if service == "mission" else service
         assert mounted == [(owner, "/keys:ro")], service

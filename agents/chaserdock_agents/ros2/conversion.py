@@ -346,6 +346,26 @@ def plan_markers(message: m.Plan) -> ros.visualization_msgs__msg__MarkerArray:
 # -- all of them ------------------------------------------------------------------------------------------
 
 
+def topic_types(chasers: int) -> dict[str, str]:
+    """Return the topics of a mission, without ground truth, and their types."""
+    of_chaser = {
+        "image": "sensor_msgs/msg/Image",
+        "camera_info": "sensor_msgs/msg/CameraInfo",
+        "odometry": "nav_msgs/msg/Odometry",
+        "wrench": "geometry_msgs/msg/WrenchStamped",
+        "plan": "nav_msgs/msg/Path",
+        "reference": "geometry_msgs/msg/PoseStamped",
+    }
+    return {
+        "/clock": "rosgraph_msgs/msg/Clock",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/markers": "visualization_msgs/msg/MarkerArray",
+        "/target/odometry": "nav_msgs/msg/Odometry",
+        "/target/pose": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        **{f"/{chaser_frame(i)}/{name}": kind for i in range(chasers) for name, kind in of_chaser.items()},
+    }
+
+
 class Converter:
     """Converts messages of one mission. Nothing of one message influences another."""
 

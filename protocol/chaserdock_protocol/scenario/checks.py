@@ -84,6 +84,10 @@ def _check_mesh(scenario: Scenario) -> None:
     geometry = scenario.target.geometry
     if geometry is not None and geometry.mesh and scenario.camera.renderer != "pybullet":
         raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
+    if scenario.chaser.mesh and not scenario.target_model().satellite:
+        raise ValueError(
+            f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} has none"
+        )
     if scenario.camera.renderer != "exact":
         for key, name in (
             ("target.model", scenario.target_model().satellite),

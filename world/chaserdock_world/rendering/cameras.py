@@ -13,6 +13,8 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.meshes import moved
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
@@ -20,12 +22,13 @@ from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
 from chaserdock_world.physics.simulation import TARGET, BodyState
-from chaserdock_world.plant import true_target
+from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.sensors.errors import true_camera
 
 from .background import Earth, Light
 from .effects import CameraEffects
 from .glare import Glare, is_occluded
+from .mesh_renderer import MeshRenderer
 from .rasterizer import Renderer, chaser_boxes
 from .scene_geometry import Obstacle
 from .tinyrenderer import TinyRenderer
@@ -46,10 +49,18 @@ class Cameras:
         effects, earth = section.effects, section.earth
         self._exposure_s = effects.exposure_s
         background = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))
+        body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
+        mesh, substitutes = true_mesh(scenario), {}
+        if scenario.chaser.mesh:
+            shape = satellite(scenario.chaser.mesh)
+            low, high = shape.bounds_m()
+            substitutes[body] = moved(shape, np.zeros(3), np.array(body.size_m) / (high - low))
 
         @cache
-        def renderer(camera: Camera) -> Renderer | TinyRenderer:
+        def renderer(camera: Camera) -> Renderer | MeshRenderer | TinyRenderer:
             try:
+                if mesh is not None:
+                    return MeshRenderer(camera, mesh, background, effects.point_spread_px, substitutes)
                 kind = Renderer if section.renderer == "exact" else TinyRenderer
                 return kind(camera, self._target, background, effects.point_spread_px)
             except ValueError as error:
@@ -64,7 +75,6 @@ class Cameras:
         self._day = Light(section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp)
         night = section.ambient * section.eclipse_ambient
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
-        body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
         # PyBullet's renderer is shared by all cameras and not thread-safe.

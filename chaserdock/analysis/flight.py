@@ -30,6 +30,7 @@ from chaserdock_protocol.messages import (
     Tick,
     WorldTruth,
 )
+from chaserdock_protocol.recording.gaps import SequenceGaps
 from chaserdock_protocol.recording.log import LogSource, Record, logged_scenario, read_log
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
@@ -272,8 +273,7 @@ class _Collector:
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
     latency: Columns = field(default_factory=lambda: Columns(1))
     counts: Counter[str] = field(default_factory=Counter)
-    last_seq: dict[str, int] = field(default_factory=dict)
-    lost: Counter[str] = field(default_factory=Counter)
+    gaps: SequenceGaps = field(default_factory=SequenceGaps)
     hashes: dict[str, int] = field(default_factory=dict)
     wall: list[int] = field(default_factory=list)
     expected: int = 0
@@ -333,9 +333,7 @@ class _Collector:
         """Update counts, gaps in the sequence numbers, and the digest."""
         message = record.message
         self.counts[record.key] += 1
-        last = self.last_seq.get(record.key, -1)
-        self.lost[record.key] += max(0, message.seq - last - 1)
-        self.last_seq[record.key] = message.seq
+        self.gaps.update(record.key, message.seq)
         if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
             # A sum, as two controllers publish on the same keys, and their messages arrive in any order.
@@ -418,7 +416,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         events=c.events,
         replies=c.replies,
         counts=dict(sorted(c.counts.items())),
-        lost=dict(c.lost),
+        lost=dict(c.gaps.lost),
         rejected=dict(rejected),
         expected_commands=c.expected,
         latency_s=c.latency.table()[:, 0],

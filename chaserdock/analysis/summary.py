@@ -266,9 +266,7 @@ def _events(flight: RecordedFlight) -> list[dict[str, Any]]:
 def _messages(flight: RecordedFlight) -> dict[str, dict[str, int]]:
     out: dict[str, dict[str, int]] = defaultdict(lambda: {"count": 0, "lost": 0})
     for key, count in flight.counts.items():
-        # Presence is published before subscriptions exist: missing messages are not losses.
-        lost = 0 if key.endswith("/presence") else flight.lost.get(key, 0)
-        out[key] = {"count": count, "lost": lost}
+        out[key] = {"count": count, "lost": flight.lost.get(key, 0)}
     return dict(out)
 
 

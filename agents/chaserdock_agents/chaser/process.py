@@ -95,6 +95,7 @@ class ChaserProcess:
         self.name = f"chaser/{self.number}"
         # Whether the current series of missing, refused or stale commands has been reported.
         self._reported_missing = self._reported_refusal = self._reported_stale = False
+        self._refused = 0  # commands refused since the last one that was executed
         self._term = 0
         self.leases = LeaseGrantor(self.number, self.scenario.time.rate_hz)
         self._plan: Plan | None = None
@@ -307,6 +308,7 @@ class ChaserProcess:
         now_ns = self._now_ns()
         if stale := self.leases.refusal(command):
             self.node.counts.rejected["wrench:stale term"] += 1
+            self._refused += 1
             if not self._reported_stale:  # the first of a series
                 self._publish_warning("command refused", stale, command.tick, now_ns)
             self._reported_stale = True
@@ -326,6 +328,7 @@ class ChaserProcess:
             self._execute(command)
             return
         self.node.counts.stale += 1
+        self._refused += 1
         if not self._reported_refusal:  # the first of a series; all are counted
             self._publish_warning("command refused", reason, command.tick, now_ns)
         self._reported_refusal = True
@@ -356,6 +359,15 @@ class ChaserProcess:
 
     def _execute(self, command: WrenchCommand) -> None:
         self.executed_ns, self._term = command.sim_time_ns, command.term
+        if self._refused:
+            self._publish_event(
+                "info",
+                "commands accepted again",
+                f"{self._refused} refused",
+                command.tick,
+                command.sim_time_ns,
+            )
+        self._refused = 0
         self._reported_missing = self._reported_refusal = self._reported_stale = False
         self._remember(command)
         self._was_detumbling = command.mode == "detumble"

@@ -16,8 +16,9 @@ import random
 import sys
 from dataclasses import dataclass, field
 
-from chaserdock_agents.chaser.lease_grantor import LEASE_MAX_S, LeaseGrantor
+from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
 from chaserdock_controller.redundancy.lease_holder import LeaseHolder
+from chaserdock_protocol.leases import LEASE_MAX_S
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 

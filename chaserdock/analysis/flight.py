@@ -88,11 +88,16 @@ class Tracks(Mapping[str, Track]):
 
 @dataclass
 class ReferenceHistory:
-    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s) and name of its phases."""
+    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s) and name of its phases.
+
+    ``keep_out`` (L, 2): from a time (s) on, the distance from the target's centre that its plan keeps, m; 0: none, it is
+    latched.
+    """
 
     time_s: Array
     offset_m: Array
     phases: list[tuple[float, str]]
+    keep_out: Array
 
 
 @dataclass
@@ -219,9 +224,14 @@ class _ReferenceCollector:
     changes: Columns = field(default_factory=lambda: Columns(4))
     phases: list[tuple[float, str]] = field(default_factory=list)
     last: tuple[float, ...] | None = None
+    keep_out: Columns = field(default_factory=lambda: Columns(2))
+    last_keep_out_m: float | None = None
 
     def add(self, message: Reference) -> None:
         time_s = message.sim_time_ns / 1e9
+        if message.min_distance_target_m != self.last_keep_out_m:
+            self.keep_out.add((time_s, message.min_distance_target_m))
+            self.last_keep_out_m = message.min_distance_target_m
         if message.offset_m != self.last:
             self.changes.add((time_s,), message.offset_m)
             self.last = message.offset_m
@@ -230,7 +240,7 @@ class _ReferenceCollector:
 
     def finish(self) -> ReferenceHistory:
         table = self.changes.table()
-        return ReferenceHistory(table[:, 0], table[:, 1:], self.phases)
+        return ReferenceHistory(table[:, 0], table[:, 1:], self.phases, self.keep_out.table())
 
 
 def _motion_table() -> Columns:

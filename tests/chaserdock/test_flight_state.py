@@ -18,6 +18,7 @@ from rich.console import Console
 from chaserdock.launch import progress
 from chaserdock.launch.flight_state import FlightState
 from chaserdock.launch.json_events import CommandNotice, EventNotice, JsonLine, Progress, Start
+from chaserdock.launch.mission_address import MissionAddress
 from chaserdock.launch.progress import ProgressReporter, Show, headline, text_of
 
 SCENARIO = load_scenario(SHIPPED[0] / "two-chaser-tracking.toml")
@@ -169,7 +170,10 @@ def test_notices_as_text() -> None:
 
 def test_json_shows_one_object_per_line(capsys: pytest.CaptureFixture[str]) -> None:
     reporter = ProgressReporter(SCENARIO, Show.json)
-    reporter.report(Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b"))
+    address = MissionAddress(namespace="n", endpoint="tcp/127.0.0.1:1")
+    reporter.report(
+        Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b", address=address)
+    )
     reporter.update(tick(0))
     reporter.update(m.Event(process="world", level="error", what="gone", sim_time_ns=5_000_000_000))
     reporter.update(m.CommandReply(command="hold", chaser=0, accepted=True, reason="phase hold"))

@@ -41,9 +41,10 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 
-from .command_gate import autonomous_command, brake_command, passed_on, refusal
+from .command_gate import autonomous_command, brake_command, damping_command, passed_on, refusal
 from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, next_state
 from .lease_grantor import LeaseGrantor
+from .local_damping import LocalDamping
 from .perception import make_perception
 from .sighting import look, prediction_from
 
@@ -104,6 +105,7 @@ class ChaserProcess:
         self._clearance_m = clearance_m(self.scenario, self.number)
         self._thrusters_tick = self._uncommanded_tick = -1
         self._odometry_ns, self._odometry_arrived_s = 0, 0.0
+        self._odometry_tick = self._docking_tick = -1
         self._processed_images: deque[int] = deque(maxlen=64)
         self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._thrusters = (
@@ -111,6 +113,12 @@ class ChaserProcess:
             if self.scenario.chaser.actuation == "thrusters"
             else None
         )
+        self._damping = (
+            LocalDamping(self.scenario, self.number)
+            if self._has_port and self._thrusters is not None
+            else None
+        )
+        self._was_detumbling = self._is_damping = False
         self._perception = make_perception(self.scenario)
 
     def open(self, instance: str, realtime: bool, stall_s: float = DEFAULT_STALL_S) -> None:
@@ -147,11 +155,12 @@ class ChaserProcess:
             case Image() as image:
                 self._process_image(image)
             case Odometry() as odometry if received is not None:
-                self._odometry_ns, self._odometry_arrived_s = odometry.sim_time_ns, received.arrived_s
+                if odometry.tick > self._odometry_tick:
+                    self._odometry_tick, self._odometry_ns = odometry.tick, odometry.sim_time_ns
+                    self._odometry_arrived_s = received.arrived_s
                 self._update_odometry(odometry)
             case DockingStatus() as docking:
-                self.docking = docking
-                self._report_thrusters()
+                self._update_docking(docking)
             case Plan() as plan:
                 self._update_plan(plan)
             case TargetEstimate() as target:
@@ -203,12 +212,30 @@ class ChaserProcess:
         self._reply_without_command()
         self._check_command_timeout(odometry)
 
+    def _update_docking(self, docking: DockingStatus) -> None:
+        """Update the state of the docking sensor, unless a newer one has arrived before."""
+        if docking.tick <= self._docking_tick:
+            self.node.counts.stale += 1
+            return
+        self._docking_tick = docking.tick
+        if self.docking is not None and self.docking.tick > docking.tick:
+            # Late: the newest known, of a tick for which an older one was assumed.
+            docking = _assume_docking(docking, self.docking.tick, self.docking.sim_time_ns)
+        self.docking = docking
+        self._report_thrusters()
+
     def _update_plan(self, plan: Plan) -> None:
+        if self._plan is not None and plan.tick < self._plan.tick:
+            self.node.counts.stale += 1
+            return
         self._plan = plan
         if plan.tick == self._last_tick:  # the plan arrived after its command
             self._last = LastCommand(plan, self._last.target)
 
     def _update_target(self, target: TargetEstimate) -> None:
+        if self._target is not None and target.tick < self._target.tick:
+            self.node.counts.stale += 1
+            return
         self._target = target
         if target.tick == self._last_tick:  # the estimate arrived after its command
             self._last = LastCommand(self._last.plan, target)
@@ -230,14 +257,11 @@ class ChaserProcess:
             self.node.publish(topics.SIGHTING, no_image, self.number)
         elif topic is topics.ODOMETRY and self.odometry is not None:
             self._update_odometry(extrapolate(self.odometry, lost.tick, lost.sim_time_ns))
-        elif topic is topics.DOCKING:
-            last = self.docking
-            assumed = (
-                DockingStatus(chaser=self.number, contact=False, armed=False, latched=False)
-                if last is None
-                else msgspec.structs.replace(last, contact=False)
+        elif topic is topics.DOCKING and (self.docking is None or lost.tick > self.docking.tick):
+            last = self.docking or DockingStatus(
+                chaser=self.number, contact=False, armed=False, latched=False
             )
-            self.docking = msgspec.structs.replace(assumed, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
+            self.docking = _assume_docking(last, lost.tick, lost.sim_time_ns)
             self._report_thrusters()
         elif topic is topics.WRENCH and lost.sender in ("", self.leases.holder):
             self._mark_uncommanded(lost.tick)
@@ -334,6 +358,7 @@ class ChaserProcess:
         self.executed_ns, self._term = command.sim_time_ns, command.term
         self._reported_missing = self._reported_refusal = self._reported_stale = False
         self._remember(command)
+        self._was_detumbling = command.mode == "detumble"
         if self._thrusters is not None:
             self._thrusters.apply_command(command)
         self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
@@ -345,10 +370,12 @@ class ChaserProcess:
             plan if plan is not None and plan.tick == command.tick else None,
             target if target is not None and target.tick == command.tick else self._last.target,
         )
-        if self._fallback is not None:
+        if self._fallback is not None or self._is_damping:
             detail = f"tick {command.tick}"
             self._publish_event("info", "fallback ends", detail, command.tick, command.sim_time_ns)
-        self._fallback = None
+        self._fallback, self._is_damping = None, False
+        if self._damping is not None:
+            self._damping.reset()
 
     # -- fallback --------------------------------------------------------------------------------------------
 
@@ -369,7 +396,7 @@ class ChaserProcess:
             if commanded and not self._reported_missing:
                 self._reported_missing = True
                 self._publish_warning("no command", "lost or refused", tick.tick, odometry.sim_time_ns)
-            self._reply(self._fallback_command(odometry))
+            self._reply(*self._fallback_command(odometry))
 
     def _check_command_timeout(self, odometry: Odometry) -> None:
         """Real time: start the fallback when no command has arrived for its lifetime."""
@@ -385,17 +412,20 @@ class ChaserProcess:
             detail = f"for {silent_ns / 1e9:.2f} s"
             self._publish_warning("no command", detail, odometry.tick, odometry.sim_time_ns)
         # Not recorded as the reply to this tick: a command that still arrives takes precedence.
-        self._actuate(self._fallback_command(odometry))
+        self._actuate(*self._fallback_command(odometry))
 
-    def _fallback_command(self, odometry: Odometry) -> ActuatorCommand:
-        """Return the chaser's own command (see ``fallback``)."""
+    def _fallback_command(self, odometry: Odometry) -> tuple[ActuatorCommand, Array | None]:
+        """Return the chaser's own command (see ``fallback``), and thrusts (n,) in place of an allocation."""
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
         body = self.scenario.chaser
         latched = self.docking is not None and self.docking.latched
         # Without recent odometry the motion is unknown and cannot be braked.
         odometry_age_ns = odometry.sim_time_ns - self._odometry_ns
-        if latched or odometry_age_ns > self.scenario.controller.command_lifetime_s * 1e9:
-            return brake_command(odometry, body, effective_ns, latched=True)
+        stale = odometry_age_ns > self.scenario.controller.command_lifetime_s * 1e9
+        if latched and not stale and self._was_detumbling and self._damping is not None:
+            return self._damp(self._damping, odometry, effective_ns)
+        if latched or stale:
+            return brake_command(odometry, body, effective_ns, latched=True), None
         before = self._fallback
         state = next_state(before, odometry, effective_ns, self._last, self._clearance_m)
         self._fallback = state
@@ -403,7 +433,17 @@ class ChaserProcess:
             what = f"fallback: {state.mode}"
             self._publish_warning(what, state.text(), odometry.tick, odometry.sim_time_ns)
         wrench = fallback_wrench(state, odometry, effective_ns, self._last, body)
-        return autonomous_command(odometry, effective_ns, state.mode, wrench)
+        return autonomous_command(odometry, effective_ns, state.mode, wrench), None
+
+    def _damp(
+        self, damping: LocalDamping, odometry: Odometry, effective_ns: int
+    ) -> tuple[ActuatorCommand, Array]:
+        """Return the command of a latched chaser that the controller left while it stopped the stack (``local_damping``)."""
+        if not self._is_damping:
+            detail = "stopping the stack by the chaser's own odometry"
+            self._publish_warning("fallback: brake", detail, odometry.tick, odometry.sim_time_ns)
+        self._is_damping = True
+        return damping_command(damping, odometry, effective_ns, self.scenario.chaser)
 
     # -- publishing ------------------------------------------------------------------------------------------
 
@@ -430,3 +470,8 @@ class ChaserProcess:
             detail=detail,
         )
         self.node.publish(topics.EVENT, event, self.name)
+
+
+def _assume_docking(last: DockingStatus, tick: int, time_ns: int) -> DockingStatus:
+    """Return the status to assume for a tick whose status is lost: as last known, without contact."""
+    return msgspec.structs.replace(last, tick=tick, sim_time_ns=time_ns, contact=False)

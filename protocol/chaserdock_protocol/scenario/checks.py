@@ -13,6 +13,7 @@ from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.port_load import CarriedBody, tumble_load
 
 from .faults import check_faults
+from .schema import MARKER_PERCEPTIONS
 from .thrusters import check_pulses
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def check_flight(scenario: FlightScenario) -> None:
     """Check the part of a scenario that flight software receives."""
     _check_references(scenario)
     _check_named_chasers(scenario)
+    _check_perception(scenario)
     if scenario.chaser.actuation == "thrusters":
         check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
     if scenario.docking.kind == "capture":
@@ -99,6 +101,20 @@ def _check_mesh(scenario: Scenario) -> None:
     geometry = scenario.target.geometry
     if geometry is not None and geometry.mesh and scenario.camera.renderer != "pybullet":
         raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
+    if scenario.camera.renderer != "exact":
+        for key, name in (
+            ("target.model", scenario.target_model().satellite),
+            ("chaser.mesh", scenario.chaser.mesh),
+        ):
+            if name:
+                raise ValueError(f'{key}: only camera.renderer = "exact" draws the mesh {name!r}')
+
+
+def _check_perception(scenario: FlightScenario) -> None:
+    if scenario.perception.name in MARKER_PERCEPTIONS and not scenario.target_model().markers:
+        raise ValueError(
+            f"perception.name: {scenario.perception.name!r} needs markers; the target {scenario.target.model!r} has none"
+        )
 
 
 def _check_named_chasers(scenario: FlightScenario) -> None:

@@ -21,6 +21,7 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
+from chaserdock_world.orbit import TargetOrbit
 from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.sensors.errors import true_camera
@@ -47,8 +48,11 @@ class Cameras:
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
         self._target = true_target(scenario)
         effects, earth = section.effects, section.earth
+        self._orbit = None if scenario.orbit is None else TargetOrbit(scenario.orbit)
         self._exposure_s = effects.exposure_s
         background = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))
+        if self._orbit is not None:
+            background = Earth((-1.0, 0.0, 0.0), self._orbit.earth_radius_rad(0.0))
         body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         mesh, substitutes = true_mesh(scenario), {}
         if scenario.chaser.mesh:
@@ -109,18 +113,27 @@ class Cameras:
             data=data,
         )
 
+    def light_at(self, time_s: float) -> Light:
+        """Return the light at a time of the mission."""
+        section, orbit = self._scenario.camera, self._orbit
+        if orbit is None:
+            dark = any(e.from_s <= time_s < e.to_s for e in section.eclipses)
+            return self._night if dark else self._day
+        share = orbit.sunlit_share(time_s)
+        x, y, z = orbit.to_sun(time_s).tolist()
+        ambient = section.ambient * (section.eclipse_ambient + (1.0 - section.eclipse_ambient) * share)
+        return Light((x, y, z), (1.0 - section.ambient) * share, ambient, section.lamp)
+
     def render(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:
         """Return the image (h, w), uint8, before compression."""
-        eclipses = self._scenario.camera.eclipses
-        dark = any(e.from_s <= time_ns * 1e-9 < e.to_s for e in eclipses)
-        light = self._night if dark else self._day
+        light = self.light_at(time_ns * 1e-9)
         samples = [self._render_sharp(chaser, s, light) for s in self._sample_exposure(chaser, states)]
         image = samples[0]
         if len(samples) > 1:
             total = np.sum(samples, axis=0, dtype=np.uint16)
             image = np.asarray((total + len(samples) // 2) // len(samples), dtype=np.uint8)
         glare = self._glares[chaser]
-        if glare is not None and not dark:
+        if glare is not None and light.sun > 0.0:
             position, attitude = self._camera_pose(chaser, states)
             target = (self._target.boxes, states[TARGET].position_m, states[TARGET].q_wxyz)
             if not is_occluded(position, light.direction_w, [target, *self._bodies(chaser, states)]):

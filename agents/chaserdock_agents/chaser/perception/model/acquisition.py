@@ -64,6 +64,11 @@ class Acquisition:
         self._camera, self._mesh = camera, mesh
         self._templates: _Templates | None = None
 
+    def prepare(self) -> None:
+        """Render the templates, if that has not been done; takes about a second."""
+        if self._templates is None:
+            self._templates = _make_templates(self._mesh)
+
     def find(self, image: NDArray[np.uint8]) -> tuple[Alignment, ...]:
         """Return the alignments that pass the gate, best first; several if they explain the image about equally well."""
         pyramid = Pyramid(image, self._camera)
@@ -98,8 +103,8 @@ class Acquisition:
         region = _brightest_region(pyramid.level(0))
         if region is None:
             return []
-        if self._templates is None:
-            self._templates = _make_templates(self._mesh)
+        self.prepare()
+        assert self._templates is not None
         t, camera = self._templates, self._camera
         y, x = np.nonzero(region)
         px = camera.undistort(np.column_stack([x, y]).astype(float))

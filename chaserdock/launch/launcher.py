@@ -269,6 +269,7 @@ def fly_mission(
     # After the lease a silent peer counts as lost; in lock-step the mission waits for a stopped process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
     fleet, observers, hub = Fleet(), Fleet(), None
+    reporter = ProgressReporter(scenario, show, emit)
     try:
         if keys is not None:
             keys = keys.resolve()
@@ -279,18 +280,16 @@ def fly_mission(
             namespace=namespace, endpoint=endpoint, keys=None if keys is None else str(keys)
         )
         write_address(folder, address)
+        reporter.report(start_line(scenario, mode, folder, address))
+        reporter.refresh()
         network = network_options(namespace, endpoint, lease_ms, keys)
         if viewer_port is not None:
             observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
         stall = ["--stall-s", f"{stall_s:g}"]
         start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
-        reporter = ProgressReporter(scenario, show, emit)
-        reporter.report(start_line(scenario, mode, folder, address))
-        try:
-            failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
-        finally:
-            reporter.close()
+        failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
     finally:
+        reporter.close()
         fleet.end()
         if hub is not None:
             hub.close()

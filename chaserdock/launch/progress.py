@@ -65,7 +65,7 @@ class ProgressReporter:
         self.show = show
         self._emit = emit
         self._console = Console(stderr=True)
-        self._shown_s = time.monotonic()
+        self._shown_s = -math.inf  # the first refresh shows what the mission waits for
         self._lost: set[str] = set()
         self._last_line = ""
         self._live: Live | None = None

@@ -76,6 +76,19 @@ def test_speed_since_start_and_over_last_seconds() -> None:
     assert "15.0 of 120 s" in headline(state, progress_now)
 
 
+def test_progress_is_complete_at_the_end_of_the_mission() -> None:
+    state = flying_state()
+    end_ns = round(SCENARIO.duration_s * 1e9)
+    state.update(m.MissionEnd(tick=1200, sim_time_ns=end_ns, reason="completed", complete=True), 25.0)
+    assert state.progress(25.0).sim_time_s == SCENARIO.duration_s
+
+
+def test_first_refresh_shows_what_a_mission_waits_for(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = ProgressReporter(SCENARIO, Show.text)
+    reporter.refresh()
+    assert "starting, waiting for world, controller" in capsys.readouterr().err
+
+
 def test_stalled_mission_has_no_remaining_time() -> None:
     state = flying_state()
     progress_now = state.progress(1e6)

@@ -25,7 +25,7 @@ from .fields import (
     Vector,
 )
 
-MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
+MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "model", "statistical")
 PERCEPTIONS = MARKER_PERCEPTIONS
 ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
@@ -78,8 +78,9 @@ class PerceptionSection(Section):
     name: Name = Field(
         default="default",
         description="`default`, `paper` (the paper's method, with EPnP), `paper_iterative` (the same with OpenCV's iterative PnP, "
-        "as in the authors' public code), `statistical` (no images: measurements are drawn around the true pose, "
-        "[simulation.md](simulation.md)), or an installed plugin.",
+        "as in the authors' public code), `model` (by the target's shape, without markers: [markerless.md](markerless.md)), "
+        "`statistical` (no images: measurements are drawn around the true pose, [simulation.md](simulation.md)), or an installed "
+        "plugin.",
     )
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the target from markers in an image (ArUco detection, edge-fitted corners, PnP with covariance)."""
+"""Pose of the target in an image: from markers (ArUco detection, edge-fitted corners, PnP with covariance) or from its shape."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
 from numpy.typing import ArrayLike, NDArray
 
+from .model.mesh import TrackerMesh
+from .model.perception import ModelPerception
 from .pipeline import Method, Perception, PerceptionResult, TargetPose
 from .statistical import StatisticalPerception
 
@@ -31,6 +33,8 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
             return Perception(camera, target, method)
         case "statistical":
             return StatisticalPerception(camera, target)
+        case "model":
+            return ModelPerception(camera, TrackerMesh.of_boxes(target.boxes))
         case name:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
+from chaserdock_protocol.leases import defect_of
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -294,7 +295,11 @@ class ControllerProcess:
                     self._apply_leader_state(state)
                 return True
             case Lease() as lease:
-                self.standby.leases.add(lease)
+                if defect_of(lease, self.scenario.time.rate_hz):
+                    self.node.counts.rejected["lease:contradictory"] += 1
+                    self.standby.leases.add_lost(lease.chaser, lease.tick)
+                else:
+                    self.standby.leases.add(lease)
                 self._decide()
                 return True
             case LostMessage(tick=tick) if received.topic is topics.LEASE:

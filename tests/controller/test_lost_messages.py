@@ -137,6 +137,16 @@ def test_chaser_without_command_actuates_once_per_tick(
     assert any(t is topics.EVENT for t, _ in published)
 
 
+def test_older_tick_changes_no_lease(chaser: ChaserProcess, scenario: Scenario) -> None:
+    deliver(chaser, topics.TICK, None, tick_of(scenario, 9, (0,)))
+    repeated = msgspec.structs.replace(tick_of(scenario, 9, (0,)), revision=1)
+    assert [m.revision for t, m in deliver(chaser, topics.TICK, None, repeated) if t is topics.LEASE] == [1]
+    others = {"controllers": {"standby": "s"}}
+    for older in (tick_of(scenario, 8, (0,)), tick_of(scenario, 9, (0,))):
+        assert deliver(chaser, topics.TICK, None, msgspec.structs.replace(older, **others)) == []
+    assert (chaser.tick, chaser.leases.holder) == (repeated, "controller")
+
+
 def test_lost_image_gives_empty_sighting(chaser: ChaserProcess, scenario: Scenario) -> None:
     ((topic, sighting),) = deliver(chaser, topics.IMAGE, 0, lost(scenario, 4))
     assert topic is topics.SIGHTING
@@ -367,6 +377,16 @@ def test_tick_waits_until_a_loss_is_known(controller: ControllerProcess, scenari
     assert controller.done_tick == 0
     deliver(controller, topics.LEASE, 0, lost(scenario, 1))
     assert controller.done_tick == 1
+
+
+def test_lease_that_contradicts_itself_counts_as_lost(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
+    deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    damaged = msgspec.structs.replace(lease(scenario, 1, 1), holder="contRoller")
+    deliver(controller, topics.LEASE, 1, damaged)
+    assert controller.standby.leases.missing(tick_of(scenario, 1, (0, 1))) == [0]
+    assert controller.node.counts.rejected["lease:contradictory"] == 1
 
 
 def test_controller_without_a_majority_lets_the_others_wait(

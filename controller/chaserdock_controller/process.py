@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
+from chaserdock_protocol.leases import defect_of
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -27,7 +28,7 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.process import ProcessOptions, StopSignal
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.stall import DEFAULT_STALL_S
@@ -185,11 +186,11 @@ class ControllerProcess:
             case Odometry() as odometry:
                 self._add_odometry(odometry)
             case DockingStatus() as docking:
-                self.inputs.add_docking(docking)
+                self.node.counts.stale += not self.inputs.add_docking(docking)
             case Sighting() as sighting:
                 self.node.counts.stale += not self.inputs.add_sighting(sighting)
             case ThrusterReport() as report:
-                self.inputs.add_thruster_report(report)
+                self.node.counts.stale += not self.inputs.add_thruster_report(report)
             case Presence() as presence:
                 self.heartbeat.take(presence)
             case MissionEnd():
@@ -201,7 +202,9 @@ class ControllerProcess:
         late = self._open_tick()
         if late is not None and odometry.tick > late.tick:
             self._process(late)  # while its own odometry is still the newest
-        for level, text in self.inputs.add_odometry(odometry):
+        events = self.inputs.add_odometry(odometry)
+        self.node.counts.stale += events is None
+        for level, text in events or ():
             if self.standby.leads:
                 self._publish_event(level, text, odometry)
 
@@ -276,6 +279,12 @@ class ControllerProcess:
         event = Event(tick=at.tick, sim_time_ns=at.sim_time_ns, process=self.name, level=level, what=text)
         self.node.publish(topics.EVENT, event, self.name)
 
+    def _report_role(self, text: str, at: Tick) -> None:
+        """Publish, and print, that this controller takes or leaves the command."""
+        if self._on_network:
+            print_status(self.name, f"{at.sim_time_ns / 1e9:.2f} s: {text}")
+        self._publish_event("info", text, at)
+
     # -- leader and standby ----------------------------------------------------------------------------------
 
     def _dispatch_leadership(self, received: ReceivedMessage) -> bool:
@@ -286,7 +295,11 @@ class ControllerProcess:
                     self._apply_leader_state(state)
                 return True
             case Lease() as lease:
-                self.standby.leases.add(lease)
+                if defect_of(lease, self.scenario.time.rate_hz):
+                    self.node.counts.rejected["lease:contradictory"] += 1
+                    self.standby.leases.add_lost(lease.chaser, lease.tick)
+                else:
+                    self.standby.leases.add(lease)
                 self._decide()
                 return True
             case LostMessage(tick=tick) if received.topic is topics.LEASE:
@@ -338,7 +351,7 @@ class ControllerProcess:
             leader = self.standby.leader
             self.requests.refuse(tick, "" if leader is None else leader.name)
         if term > 1 or not leads:
-            self._publish_event("info", f"commands in term {term}" if leads else "stands by", tick)
+            self._report_role(f"commands in term {term}" if leads else "stands by", tick)
         result = self._last_result
         if leads and result is not None and result[0].tick == tick.tick:
             # Processed already as a standby, for a leader that cannot publish its own result any more.

@@ -50,7 +50,7 @@ EXACT = TrackerMesh.of_mesh(KNOWN, 0.0, 0.0)
 PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
 
 
-class Scene:
+class SatelliteImages:
     """Images of the satellite by the world's renderer, with the default effects of the camera."""
 
     def __init__(self) -> None:
@@ -76,7 +76,7 @@ def is_gross(error: tuple[float, float], range_m: float) -> bool:
 
 def track_cell(name: str, range_m: float, views: int, wrong: bool) -> Figures:
     """Track ``views`` single images at one range."""
-    rng, scene = np.random.default_rng([int(range_m), wrong]), Scene()
+    rng, scene = np.random.default_rng([int(range_m), wrong]), SatelliteImages()
     errors, nees, times, gross, rejected = [], [], [], 0, 0
     for number in range(views):
         mesh = _drawn_mesh(rng) if wrong else EXACT
@@ -107,7 +107,7 @@ def track_cell(name: str, range_m: float, views: int, wrong: bool) -> Figures:
 
 def acquire(views: int) -> Figures:
     """Acquire the target in ``views`` single images."""
-    rng, scene = np.random.default_rng(4), Scene()
+    rng, scene = np.random.default_rng(4), SatelliteImages()
     acquisition, times, found, wrong = Acquisition(CAMERA, EXACT), [], 0, 0
     acquisition.prepare()
     for number in range(views):
@@ -131,7 +131,7 @@ def acquire(views: int) -> Figures:
 
 def follow(images: int) -> Figures:
     """Follow a target that turns at 4 degrees/s and drifts."""
-    scene, perception = Scene(), ModelPerception(CAMERA, EXACT)
+    scene, perception = SatelliteImages(), ModelPerception(CAMERA, EXACT)
     pose, _ = random_view(np.random.default_rng(9), 3.0, CAMERA)
     errors, times, missed = [], [], 0
     for number in range(images):

@@ -3,7 +3,7 @@
 
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.perception import make_perception
+from chaserdock_agents.chaser.perception import make_perception, tracker_mesh
 from chaserdock_agents.chaser.perception.model import tracking
 from chaserdock_agents.chaser.perception.model.acquisition import Acquisition, spread_rotations
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
@@ -90,3 +90,27 @@ def test_rotations_are_unit_quaternions_spread_over_all_attitudes():
     for _ in range(50):
         other = rotations.normalize(rng.normal(size=4))
         assert np.rad2deg(2.0 * np.arccos(np.abs(q @ other).max().clip(0.0, 1.0))) < 45.0
+
+
+def test_satellite_is_tracked_as_known_with_the_uncertainty_of_its_joints_and_scale():
+    changes = [
+        "target.model=geo_servicer",
+        "target.knowledge.panel_deg=1.0",
+        "target.knowledge.scale_share=0.01",
+    ]
+    target = load_scenario(ROOT / "scenarios/single.toml", [*changes, "perception.name=model"]).target
+    mesh, known = tracker_mesh(target), target.known_mesh()
+    assert known is not None
+    assert len(mesh.triangles) == known.triangle_count
+    assert len(mesh.modes_m) == 3 * len(known.joints) + 1
+    body = np.concatenate([np.full(len(p.vertices_m), not p.joint) for p in known.parts])
+    assert np.allclose(mesh.modes_m[-1][body], 0.01 * mesh.vertices_m[body])
+    assert np.all(mesh.modes_m[:-1][:, body] == 0.0)
+    tip = np.abs(mesh.vertices_m[:, 1]).argmax()
+    arm = np.linalg.norm(
+        mesh.vertices_m[tip]
+        - min(known.joints.values(), key=lambda j: np.linalg.norm(mesh.vertices_m[tip] - j))
+    )
+    assert np.linalg.norm(mesh.modes_m[:-1, tip], axis=1).max() == pytest.approx(
+        np.deg2rad(1.0) * arm, rel=0.02
+    )

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
+from chaserdock_protocol.scenario.bodies import FlightTarget
 from numpy.typing import ArrayLike, NDArray
 
 from .model.mesh import TrackerMesh
@@ -34,9 +35,25 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
         case "statistical":
             return StatisticalPerception(camera, target)
         case "model":
-            return ModelPerception(camera, TrackerMesh.of_boxes(target.boxes))
+            return ModelPerception(camera, tracker_mesh(scenario.target))
         case name:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 
 
-__all__ = ["Method", "Perception", "PerceptionMethod", "PerceptionResult", "TargetPose", "make_perception"]
+def tracker_mesh(target: FlightTarget) -> TrackerMesh:
+    """Return what flight software knows of a target's shape: its mesh, or its cuboids."""
+    mesh, knowledge = target.known_mesh(), target.knowledge
+    if mesh is None:
+        return TrackerMesh.of_boxes(target.shape().boxes)
+    return TrackerMesh.of_mesh(mesh, np.deg2rad(knowledge.panel_deg), knowledge.scale_share)
+
+
+__all__ = [
+    "Method",
+    "Perception",
+    "PerceptionMethod",
+    "PerceptionResult",
+    "TargetPose",
+    "make_perception",
+    "tracker_mesh",
+]

@@ -67,7 +67,8 @@ def fit_light(
 ) -> Lighting | None:
     """Return the light from n pixels: reflectance (n,), unit normals (n, 3), grey levels (n,); ``ambient``: level, if known."""
     lit, weight = np.ones(len(grey)), np.ones(len(grey))
-    level, sun = ambient or 0.0, np.zeros(3)
+    level: float = ambient or 0.0
+    sun: Array = np.zeros(3)
     for _ in range(_ROUNDS):
         columns = reflectance[:, None] * np.column_stack([np.ones(len(grey)), normals * lit[:, None]])
         known = columns[:, 0] * level if ambient is not None else np.zeros(len(grey))
@@ -75,7 +76,7 @@ def fit_light(
         matrix = used.T @ (used * weight[:, None])
         matrix[np.diag_indices(len(matrix))] += _RIDGE * np.trace(matrix) + 1e-12
         solution = np.linalg.solve(matrix, used.T @ (weight * (grey - known)))
-        sun = solution[-3:]
+        sun = np.asarray(solution[-3:], dtype=np.float64)
         level = ambient if ambient is not None else float(solution[0])
         residual = np.abs(grey - known - used @ solution)
         scale = max(1.4826 * float(np.median(residual)), 1.0)

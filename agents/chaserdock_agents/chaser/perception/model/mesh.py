@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
 from chaserdock_models.targets import Box, cuboid_corners
 from numpy.typing import NDArray
 
@@ -73,6 +74,30 @@ class TrackerMesh:
         shade = np.repeat([b.shade for b in boxes], len(_CUBOID))
         modes = np.array([scale_sigma * vertices] if scale_sigma > 0.0 else []).reshape(-1, len(vertices), 3)
         return cls(vertices, triangles, shade, modes)
+
+    @classmethod
+    def of_mesh(cls, mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> TrackerMesh:
+        """Return the tracker mesh of a body's mesh; modes: the scale of the body, and a turn of each joint about each axis."""
+        counts = np.cumsum([0, *(len(part.vertices_m) for part in mesh.parts)])
+        triangles = np.concatenate(
+            [p.triangles + first for p, first in zip(mesh.parts, counts[:-1], strict=True)]
+        )
+        shade = np.repeat([p.material.diffuse for p in mesh.parts], [len(p.triangles) for p in mesh.parts])
+
+        def vertices(of: TriangleMesh) -> Array:
+            return np.concatenate([part.vertices_m for part in of.parts])
+
+        known = vertices(mesh)
+        turns = (
+            [{joint: joint_sigma_rad * axis} for joint in mesh.joints for axis in np.eye(3)]
+            if joint_sigma_rad
+            else []
+        )
+        modes = [vertices(with_geometry_errors(mesh, 0.0, turn)) - known for turn in turns]
+        if scale_sigma > 0.0:
+            modes.append(vertices(with_geometry_errors(mesh, scale_sigma, {})) - known)
+        stacked = np.array(modes).reshape(len(modes), len(known), 3)
+        return cls(known, triangles.astype(np.int64), shade, stacked)
 
     @cached_property
     def contiguous(self) -> tuple[Array, NDArray[np.int64], Array, Array]:

@@ -33,6 +33,11 @@ def check_flight(scenario: FlightScenario) -> None:
     if scenario.docking.kind == "capture":
         _check_capture(scenario)
     _check_detumble(scenario)
+    if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
+        raise ValueError(
+            'limits.passive_safety: needs the covariance of estimator.name = "joint", '
+            f"not {scenario.estimator.name!r}"
+        )
 
 
 def check_consistent(scenario: Scenario) -> None:

@@ -6,7 +6,7 @@ Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF 
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -163,6 +163,14 @@ class Limits(Section):
     )
     max_reference_distance_m: Positive = Field(
         default=25.0, description="Largest distance of a reference position from the target, m."
+    )
+    passive_safety: Literal["off", "monitor"] = Field(
+        default="off",
+        description="`monitor`: at every tick, whether the coast after a loss of all thrust at any moment of the plan stays "
+        "outside `min_distance_target_m`; changes are logged. Needs the estimator `joint`.",
+    )
+    passive_safety_s: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] | None = Field(
+        default=None, description="Length of that coast, s. Without it: two orbits, in free space 600 s."
     )
 
 

@@ -71,9 +71,9 @@ of a process.
 
 ## Queries
 A query whose payload is malformed, invalid, or of another type or version gets a Zenoh error reply with the reason as text
-(`reply_err`); a request that is only refused gets a normal reply that says so (`accepted`, `reason`). A query directly after
-the session is opened may end without any reply: the session has not yet learnt who answers it. Repeat it until a reply
-arrives, for instance every 0.05 s.
+(`reply_err`); a request that is only refused gets a normal reply that says so (`accepted`, `reason`). A query directly
+after the session is opened may end without any reply: the session has not yet learnt who answers it. Repeat it until a
+reply arrives, for instance every 0.05 s.
 
 ## Joining
 1. Query `{topics.JOIN_KEY}` with a `JoinRequest`: the process' name (`controller`, `chaser/0` …) and its
@@ -128,8 +128,8 @@ dropped for that reader only, and show as gaps in `seq`.
 
 ## Status of the target estimate
 `TargetEstimate.status` is `none` until the first accepted sighting (its values are meaningless), `tracking` while the last
-accepted sighting is recent, `predicting` while the target is extrapolated by the motion model, and `lost` when that
-has become too uncertain to fly by; what chasers then do is in [phases.md](phases.md). The limits are parameters of the
+accepted sighting is recent, `predicting` while the target is extrapolated by the motion model, and `lost` when that has
+become too uncertain to fly by; what chasers then do is in [phases.md](phases.md). The limits are parameters of the
 estimator ([estimation.md](estimation.md)).
 
 ## Leaving

@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
+import time
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -65,7 +67,7 @@ def run(
         if view:
             viewer_port = free_port(DEFAULT_HOST, None)
             os.environ[TOKEN_VARIABLE] = token = page_token()  # read by the viewer's process
-            print(f"the viewer is at {url_of(DEFAULT_HOST, viewer_port, token)}", file=sys.stderr, flush=True)
+            announce_viewer(viewer_port, url_of(DEFAULT_HOST, viewer_port, token))
         outcome = fly_mission(
             scenario,
             out,
@@ -82,6 +84,21 @@ def run(
         )
     print_outcome(outcome, show)
     raise typer.Exit(outcome.status)
+
+
+def announce_viewer(port: int, url: str) -> threading.Thread:
+    """Print the address of the viewer as soon as it answers, on a thread that does not outlive the program."""
+    from chaserdock.launch.container import is_listening
+    from chaserdock.viewer.address import DEFAULT_HOST
+
+    def wait() -> None:
+        while not is_listening(DEFAULT_HOST, port):
+            time.sleep(0.1)
+        print(f"the viewer is at {url}", file=sys.stderr, flush=True)
+
+    thread = threading.Thread(target=wait, name="viewer address", daemon=True)
+    thread.start()
+    return thread
 
 
 @with_link_options("listen")

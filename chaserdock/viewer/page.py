@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -20,14 +20,18 @@ from chaserdock.analysis.snapshot import annotated_image
 
 from . import text
 from .history import History
-from .plots import Plot, plots_of, points_of
+from .plots import COLOURS, Plot, plots_of, points_of
 from .scene import VIEWS, SceneView
 from .snapshot import MissionState
 
-COMMANDS = ("approach", "hold", "retreat", "abort")
+COMMANDS = ("approach", "hold", "retreat")
+ABORT = "abort"
+"""The command that needs a confirmation."""
 SendCommand = Callable[[str, int], None]
 
 _IMAGE_PX = 400
+_ALL = "all cameras"
+_ENLARGED_PX = 800
 _SLOW_S = 0.5
 _IMAGES_S = 0.25
 _GRID = {"stroke": "rgba(128,128,128,0.25)", "width": 1}
@@ -43,6 +47,24 @@ class Timeline:
     speed: float = 1.0
     moved: bool = field(default=False, repr=False)
     """The user has moved the slider since the last step of the player."""
+
+
+def _confirm_abort(gui: Any, chaser: int, command: SendCommand) -> None:
+    """Ask whether a chaser is to abort, and send the command if so."""
+    dialog = gui.add_modal(f"Abort chaser {chaser}?")
+    with dialog:
+        gui.add_markdown(f"Chaser {chaser} leaves its task and flies away from the target.")
+        confirm = gui.add_button(f"confirm: {ABORT} chaser {chaser}", color="red")
+        cancel = gui.add_button("cancel", color="gray")
+
+    @confirm.on_click
+    def _(_: Any) -> None:
+        dialog.close()
+        command(ABORT, chaser)
+
+    @cancel.on_click
+    def _(_: Any) -> None:
+        dialog.close()
 
 
 SPEEDS = ("0.25", "0.5", "1", "2", "5", "10", "20")
@@ -67,9 +89,7 @@ class Page:
         self._drawn_s = -math.inf
         self._plotted_s = -math.inf
         self._images_s = -math.inf
-        self._image_waits = False
         self._shown_images: dict[int, tuple[int, bool]] = {}
-        self._next_image = 0
         server.scene.reset()
         server.gui.reset()
         self._theme(dark)
@@ -116,6 +136,13 @@ class Page:
             def _(event: Any, chaser: int = i) -> None:
                 command(event.target.value, chaser)
 
+            stop = gui.add_button(f"{ABORT} chaser {i}", color="red")
+
+            @stop.on_click
+            def _(event: Any, chaser: int = i) -> None:
+                # In the tab of the operator only.
+                _confirm_abort((event.client or self._server).gui, chaser, command)
+
     def _time_line(self, line: Timeline) -> None:
         gui = self._server.gui
         with gui.add_folder("Time line"):
@@ -144,13 +171,13 @@ class Page:
     def _view_options(self, dark: bool) -> None:
         gui, scene_view = self._server.gui, self._scene_view
         frame = gui.add_dropdown("fixed frame", VIEWS, initial_value=VIEWS[0])
-        toggles: tuple[tuple[str, Callable[[bool], None]], ...] = (
-            ("corridors", scene_view.show_corridors),
-            ("keep-out", scene_view.show_keep_out),
-            ("camera views", scene_view.show_views),
+        toggles: tuple[tuple[str, Callable[[bool], None], bool], ...] = (
+            ("corridors", scene_view.show_corridors, True),
+            ("keep-out", scene_view.show_keep_out, False),
+            ("camera views", scene_view.show_views, True),
         )
-        for name, show in toggles:
-            box = gui.add_checkbox(name, True)
+        for name, show, at_first in toggles:
+            box = gui.add_checkbox(name, at_first)
 
             @box.on_update
             def _(event: Any, show: Callable[[bool], None] = show) -> None:
@@ -170,13 +197,24 @@ class Page:
         gui, scenario = self._server.gui, self._scenario
         images, plots = gui.add_panel(), gui.add_panel()
         images.dock_left()
-        images.set_width(360)
+        images.set_width(480)
         number, camera = len(scenario.chasers), scenario.camera_model()
         self._columns = 1 if number == 1 else 2 if number <= 8 else 3
         self._tile = (round(_IMAGE_PX * camera.height_px / camera.width_px), _IMAGE_PX)
         rows = -(-number // self._columns)
         self._mosaic = np.full((rows * self._tile[0], self._columns * self._tile[1], 3), 60, np.uint8)
         with images.add_tab("Cameras"):
+            self._enlarged: int | None = None
+            if number > 1:
+                names = (_ALL, *(f"chaser {i}" for i in range(number)))
+                shown = gui.add_dropdown("show", names, initial_value=_ALL)
+
+                @shown.on_update
+                def _(event: Any) -> None:
+                    value = event.target.value
+                    self._enlarged = None if value == _ALL else int(value.removeprefix("chaser "))
+                    self._shown_images.clear()
+
             self._images = gui.add_image(self._mosaic, format="jpeg", jpeg_quality=70)
         plots.dock_below(images)
         with plots.add_tab("Plots"):
@@ -187,13 +225,20 @@ class Page:
     def _chart(self, plot: Plot) -> Any:
         nothing = tuple(np.zeros(2) for _ in range(len(plot.curves) + 1))
         curves = [
-            {"label": label, "stroke": colour, "width": 1.5, "points": {"show": False}}
-            for label, colour, _, _ in plot.curves
+            {
+                "label": label,
+                "stroke": colour,
+                "width": 1.5,
+                "points": {"show": False},
+                "dash": [6, 4] if chaser is not None and chaser >= len(COLOURS) else [],
+            }
+            for label, colour, _, chaser in plot.curves
         ]
         return self._server.gui.add_uplot(
             nothing,
-            ({"label": "s"}, *curves),  # type: ignore[arg-type]
+            ({"label": "time, s"}, *curves),  # type: ignore[arg-type]
             title=plot.title,
+            legend={"show": True, "live": False},
             scales={"x": {"time": False}},
             axes=({"grid": _GRID}, {"grid": _GRID, "size": 55}),  # type: ignore[arg-type]
             height=130,
@@ -232,7 +277,7 @@ class Page:
             (self._head, text.head(self._scenario, state, mode, speed)),
             (self._table, text.chasers(state, history)),
             (self._faults, text.faults(state, history, lost)),
-            (self._events, text.events(history.lines_until(state.time_s(), 12))),
+            (self._events, text.events(history.lines_until(state.time_s(), 200), most=12)),
         ):
             if element.content != content:
                 element.content = content
@@ -242,32 +287,35 @@ class Page:
                 chart.data = points_of(plot, history, 0.0, state.time_s())
 
     def _draw_image(self, state: MissionState) -> None:
-        for i in self._in_turn():
+        """Draw the images that have changed, all at once, so that the tiles show the same moment."""
+        if time.monotonic() - self._images_s < _IMAGES_S:
+            return
+        enlarged, changed = self._enlarged, False
+        for i in range(len(state.chasers)) if enlarged is None else (enlarged,):
             image = state.chasers[i].image
             if image is None:
                 continue
             sighting = state.chasers[i].sighting_in(image)
             version = (image.sim_time_ns, sighting is not None)
-            if self._shown_images.get(i) != version:
-                self._shown_images[i] = version
-                row, column = (i // self._columns) * self._tile[0], (i % self._columns) * self._tile[1]
-                place = np.s_[row : row + self._tile[0], column : column + self._tile[1]]
-                self._mosaic[place] = self._image(image, sighting)
-                self._image_waits = True
-                break
-        if self._image_waits and time.monotonic() - self._images_s >= _IMAGES_S:
-            self._image_waits, self._images_s = False, time.monotonic()
-            self._images.image = self._mosaic
+            if self._shown_images.get(i) == version:
+                continue
+            self._shown_images[i], changed = version, True
+            if enlarged is not None:
+                self._images.image = self._image(image, sighting, _ENLARGED_PX)
+                continue
+            row, column = (i // self._columns) * self._tile[0], (i % self._columns) * self._tile[1]
+            place = np.s_[row : row + self._tile[0], column : column + self._tile[1]]
+            self._mosaic[place] = self._image(image, sighting, _IMAGE_PX)
+        if changed:
+            self._images_s = time.monotonic()
+            if enlarged is None:
+                self._images.image = self._mosaic
 
-    def _in_turn(self) -> Iterator[int]:
-        number = len(self._scenario.chasers)
-        first, self._next_image = self._next_image, (self._next_image + 1) % number
-        yield from ((first + k) % number for k in range(number))
-
-    def _image(self, image: Image, sighting: Any) -> Any:
-        """Return an RGB image of the size of a tile; black for an unreadable image."""
+    def _image(self, image: Image, sighting: Any, width_px: int) -> Any:
+        """Return an RGB image of this width; black for an unreadable image."""
+        size_px = (width_px, round(width_px * self._tile[0] / self._tile[1]))
         try:
-            drawn = annotated_image(self._scenario, image, sighting, _IMAGE_PX)[:, :, ::-1]
+            drawn = annotated_image(self._scenario, image, sighting, width_px)[:, :, ::-1]
         except LogError:
-            drawn = np.zeros((*self._tile, 3), np.uint8)
-        return drawn if drawn.shape[:2] == self._tile else cv2.resize(drawn, self._tile[::-1])
+            drawn = np.zeros((*size_px[::-1], 3), np.uint8)
+        return drawn if drawn.shape[1::-1] == size_px else cv2.resize(drawn, size_px)

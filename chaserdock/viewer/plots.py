@@ -9,30 +9,15 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models.arrays import Array
 
+from chaserdock.analysis.plots import SERIES
+
 from .history import ChartQuantity, History
 
 POINTS = 240
 """Maximum number of points of a curve: about one per pixel."""
 
-COLOURS = (
-    "#2f7ed8",
-    "#e8871e",
-    "#2ca05a",
-    "#d6455d",
-    "#8e6bd1",
-    "#a5673f",
-    "#d96bb4",
-    "#14a3b8",
-    "#8a8f1f",
-    "#5b7c99",
-    "#c0392b",
-    "#16a085",
-    "#f39c12",
-    "#7f8c8d",
-    "#3949ab",
-    "#6d9b3a",
-)
-"""Colour of each chaser, distinguishable on white and on black."""
+COLOURS = SERIES
+"""Colours of the chasers, those of the figures and the film; beyond the last they repeat, with dashed curves."""
 ESTIMATE_COLOUR = "#e0a800"
 
 
@@ -53,7 +38,7 @@ def plots_of(chasers: int, truth: bool, ports: Sequence[int] = ()) -> tuple[Plot
     truth."""
 
     def each(quantity: ChartQuantity, numbers: Iterable[int] = range(chasers)) -> tuple[Curve, ...]:
-        return tuple((str(i), COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
+        return tuple((f"chaser {i}", COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
 
     estimate: tuple[Curve, ...] = (
         ("position, mm", ESTIMATE_COLOUR, "estimate_error_mm", None),

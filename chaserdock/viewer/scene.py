@@ -11,6 +11,7 @@ import trimesh
 import viser
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_world.rendering.background import star_field
 
 from chaserdock.analysis.scene import scene_of
 
@@ -25,6 +26,8 @@ VIEWS: tuple[ViewFrom, ...] = get_args(ViewFrom)
 
 TRAIL_S = 60.0
 _VIEW_M = 0.22
+_STARS_M = 100.0
+"""Distance of the stars, m: far outside the scene."""
 _IDENTITY = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
@@ -40,6 +43,7 @@ class SceneView:
         self._scene = scene = server.scene
         scene.configure_default_lights(cast_shadow=False)
         self._root = scene.add_frame("/scene", show_axes=False)
+        self._add_space()
         bodies = scene_of(scenario)
         self._target = self._body("/scene/target", shapes.mesh_of(bodies.target))
         self._estimate = scene.add_frame("/scene/estimate", axes_length=0.25, axes_radius=0.003)
@@ -49,6 +53,7 @@ class SceneView:
         self._keep_out = self._lines(
             "/scene/estimate/keep_out", shapes.sphere(self._keep_out_m), (176, 118, 128), 1.0
         )
+        self._keep_out.visible = False
         self._chasers: list[Any] = []
         self._plans: list[Any] = []
         self._references: list[Any] = []
@@ -90,6 +95,18 @@ class SceneView:
         far = 2.0 * max(math.hypot(*c.position_m) for c in scenario.chasers)
         server.initial_camera.position = (-0.55 * far, -0.85 * far, 0.55 * far)
         server.initial_camera.look_at = (0.0, 0.0, 0.0)
+
+    def _add_space(self) -> None:
+        """Add the stars of the simulated images on black, whatever the theme of the page."""
+        self._scene.set_background_image(np.zeros((2, 2, 3), np.uint8))
+        directions, levels = star_field()
+        self._scene.add_point_cloud(
+            "/scene/stars",
+            (_STARS_M * directions).astype(np.float32),
+            np.repeat(levels[:, None], 3, axis=1),
+            point_size=0.0015 * _STARS_M,
+            point_shape="circle",
+        )
 
     def _body(self, name: str, mesh: shapes.Mesh) -> Any:
         solid = trimesh.Trimesh(

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 from chaserdock_protocol.scenario import FlightScenario
 
@@ -99,6 +100,16 @@ def _chaser_faults(i: int, chaser: ChaserState) -> list[str]:
     return out
 
 
-def events(lines: list[Line]) -> str:
-    """Return the event lines, newest first."""
-    return "\n".join(f"- `{x.time_s:7.2f} s` {_MARKS[x.level]}{x.text}" for x in lines) or "none"
+def events(lines: list[Line], most: int = 99) -> str:
+    """Return at most so many event lines, newest first; lines that differ in numbers only are one, with their count."""
+    groups: dict[tuple[str, str], list[Line]] = {}
+    for line in lines:
+        # A chaser's or thruster's number tells apart; measured values do not.
+        pattern = re.sub(r"(?<!chaser )(?<!chaser/)(?<!thruster )\b\d+(\.\d+)?", "#", line.text)
+        groups.setdefault((line.level, pattern), []).append(line)
+    out = []
+    for group in list(groups.values())[:most]:
+        newest = group[0]
+        times = f" ({len(group)} times since {group[-1].time_s:.2f} s)" if len(group) > 1 else ""
+        out.append(f"- `{newest.time_s:7.2f} s` {_MARKS[newest.level]}{newest.text}{times}")
+    return "\n".join(out) or "none"

@@ -35,10 +35,19 @@ from hypothesis import strategies as st
 from mission_keys import client, make_keys, router_with_rights
 from websockets.frames import Frame, Opcode
 
+from chaserdock.cli.run import announce_viewer
 from chaserdock.viewer import plots, shapes
 from chaserdock.viewer import text as words
-from chaserdock.viewer.address import TOKEN_VARIABLE, ViewError, is_own_origin, page_token, url_of
-from chaserdock.viewer.history import History, Series
+from chaserdock.viewer.address import (
+    DEFAULT_HOST,
+    TOKEN_VARIABLE,
+    ViewError,
+    free_port,
+    is_own_origin,
+    page_token,
+    url_of,
+)
+from chaserdock.viewer.history import History, Line, Series
 from chaserdock.viewer.logged import LoggedMission
 from chaserdock.viewer.page import Timeline
 from chaserdock.viewer.player import advance
@@ -208,6 +217,29 @@ def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
     assert table.count("1 marker") == 2
     assert "| approach |" in table
     assert "| hold |" in table
+
+
+def test_repeated_warnings_are_one_line_with_their_count() -> None:
+    repeated = [Line(10.0 - 0.1 * k, "warning", f"chaser 1: force of {k}.5 N exceeds 2 N") for k in range(30)]
+    other = [Line(5.0, "warning", "chaser 2: force of 3.5 N exceeds 2 N"), Line(1.0, "info", "started")]
+    shown = words.events([*repeated, *other], most=12).splitlines()
+    assert len(shown) == 3
+    assert "0.5 N exceeds 2 N (30 times since 7.10 s)" in shown[0]
+    assert "chaser 2" in shown[1]
+    assert "times" not in shown[2]
+
+
+def test_viewer_is_announced_once_it_answers(capsys: pytest.CaptureFixture[str]) -> None:
+    port = free_port(DEFAULT_HOST, None)
+    thread = announce_viewer(port, "http://somewhere/")
+    time.sleep(0.3)
+    assert capsys.readouterr().err == ""
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind((DEFAULT_HOST, port))
+        server.listen()
+        thread.join(timeout=30.0)
+    assert capsys.readouterr().err == "the viewer is at http://somewhere/\n"
 
 
 def test_truncated_log_is_shown_up_to_its_end(tmp_path: Path) -> None:

@@ -121,6 +121,11 @@ def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path) -> N
         wait_for(page, r"approach chaser 0 .*accepted, phase approach")
         page.get_by_role("button", name="retreat").nth(1).click()
         wait_for(page, r"retreat chaser 1 .*(accepted|refused)")
+        page.get_by_role("button", name="abort chaser 1").click()
+        page.get_by_role("button", name="cancel").click()
+        page.get_by_role("button", name="abort chaser 0").click()
+        page.get_by_role("button", name="confirm: abort chaser 0").click()
+        wait_for(page, r"abort chaser 0 .*(accepted|refused)")
         time.sleep(1.0)
         hand.processes["world"].send_signal(signal.SIGTERM)
         hand.said("recorder", LONG_S)
@@ -130,6 +135,10 @@ def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path) -> N
         r.message for r in read_log(log, [topics.OPERATED.key_of()]) if r.message.command == "approach"
     ]
     assert (asked.chaser, asked.operator) == (0, "viewer")
+    aborted = [
+        r.message.chaser for r in read_log(log, [topics.OPERATED.key_of()]) if r.message.command == "abort"
+    ]
+    assert aborted == [0]  # the other one was cancelled
     phases = [r.message.phase for r in read_log(log, [topics.REFERENCE.key_of(0)])]
     assert phases.index("approach") > phases.index("hold")
     distances = [sum(x * x for x in r.message.offset_m) for r in read_log(log, [topics.REFERENCE.key_of(0)])]

@@ -169,10 +169,11 @@ static void draw_meshes(void) {
     memset(depth, 0, (size_t)depth_size * sizeof *depth);
     BodyPose *placed = block((size_t)bodies * sizeof *placed);
     Triangle *triangles = block((size_t)(6 * m) * sizeof *triangles);
+    int32_t *spans = block((size_t)(12 * m) * sizeof *spans);
     uint8_t *canvas = bytes(width * height);
     memset(canvas, 4, (size_t)(width * height));
     NAME(draw_meshes)(f, width, height, camera, bodies, poses, first, corners, normals, uv, surface, surfaces, light, wrinkles, n, maps,
-                      depth, placed, triangles, samples, canvas);
+                      depth, placed, triangles, spans, samples, canvas);
     if (!m)
         for (int64_t i = 0; i < width * height; i++) CHECK(canvas[i] == 4);
 }

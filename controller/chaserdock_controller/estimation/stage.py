@@ -40,6 +40,7 @@ class EstimationStage:
         self.consistency = SensorConsistency()
         self._body, self._period_s = scenario.chaser, 1.0 / scenario.time.rate_hz
         orbit = scenario.orbit
+        self._passive_safety = scenario.limits.passive_safety != "off"
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
@@ -69,6 +70,7 @@ class EstimationStage:
             own=own,
             own_at_effect={i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own},
             disturbances=disturbances,
+            motion_covariances=self._motion_covariances(own) if known else {},
             relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
             visible_to=visible_to,
             cameras=camera_calibrations(estimator, self._camera),
@@ -111,6 +113,12 @@ class EstimationStage:
             estimated = disturbance(estimator.state, i, impulse / self._period_s, estimator.parameters)
             found[i] = found[i] + estimated if self._mean_motion_rad_s else estimated
         return found
+
+    def _motion_covariances(self, own: Mapping[int, Odometry]) -> dict[int, Array]:
+        if not self._passive_safety or not isinstance(self.estimator, JointEstimator):
+            return {}
+        found = {i: self.estimator.motion_covariance(i) for i in own}
+        return {i: covariance for i, covariance in found.items() if covariance is not None}
 
     def _orbital_wrench(self, o: Odometry) -> Array:
         state = np.array([*o.position_m, *o.velocity_m_s, *o.q_wxyz, *o.omega_rad_s])

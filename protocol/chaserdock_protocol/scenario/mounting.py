@@ -5,13 +5,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Set
+from typing import TYPE_CHECKING
 
 import numpy as np
 from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_models.mounting import MountedChaser, plume_free
 from numpy.typing import NDArray
 
-from .flight import FlightScenario
+if TYPE_CHECKING:
+    from . import FlightScenario
 
 
 def nominal_mounting(scenario: FlightScenario, chaser: int) -> MountedChaser:

@@ -30,6 +30,18 @@ _EARTH_STEP_PX = 4
 # Reflectance of the sea, and the additional reflectance of the thickest clouds.
 _SEA, _CLOUDS = 0.12, 0.6
 _MAP_ROWS, _MAP_COLUMNS = 256, 512
+_SEED = 20230619
+
+
+def star_field() -> tuple[Array, NDArray[np.uint8]]:
+    """Return the directions (K, 3) of the stars in WRF, unit length, and their grey levels (K,)."""
+    return _draw_star_field(np.random.Generator(np.random.PCG64(_SEED)))
+
+
+def _draw_star_field(generator: np.random.Generator) -> tuple[Array, NDArray[np.uint8]]:
+    stars = generator.standard_normal((_STARS, 3))
+    levels = (30.0 + 150.0 * generator.random(_STARS) ** 3).astype(np.uint8)
+    return stars / np.linalg.norm(stars, axis=1, keepdims=True), levels
 
 
 @dataclass(frozen=True)
@@ -87,10 +99,8 @@ class Background:
         self, camera: Camera, origin_px: Array, size_px: tuple[int, int], earth: Earth | None = None
     ):
         self._size, self._earth = size_px, earth
-        generator = np.random.Generator(np.random.PCG64(20230619))
-        stars = generator.standard_normal((_STARS, 3))
-        self._stars = stars / np.linalg.norm(stars, axis=1, keepdims=True)
-        self._star_levels = (30.0 + 150.0 * generator.random(_STARS) ** 3).astype(np.uint8)
+        generator = np.random.Generator(np.random.PCG64(_SEED))
+        self._stars, self._star_levels = _draw_star_field(generator)
         # As in Camera.project_ideal: focal lengths, centre, and the first pixel of the canvas.
         lens = (camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, *origin_px.tolist())
         self._lens = np.array(lens)

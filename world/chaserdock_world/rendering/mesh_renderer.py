@@ -8,6 +8,7 @@ pixel wide at its nearest point, as far as ``_MAP_TEXELS`` allow.
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping, Sequence
 from ctypes import byref, c_int64
 from dataclasses import dataclass
@@ -32,8 +33,8 @@ from .scene_geometry import NEAR_M, Frustum, Obstacle
 DAYLIGHT = Light()
 
 _TEXTURES = {"": 0.0, "insulation": 1.0, "cells": 2.0}
-_MAP_TEXELS = 3_000_000
-_TEXEL_PX = 0.5
+_MAP_TEXELS = 2_000_000
+_TEXEL_PX = 0.7
 _BAND_ROWS, _SAMPLES = 8, 8  # native/mesh.c
 _WRINKLES = 256
 
@@ -142,6 +143,7 @@ class MeshRenderer:
         self._substitutes = dict(substitutes or {})
         self._target = _body_of(mesh)
         self._bodies: dict[tuple[Box, ...], _Body] = {}
+        self._threads = threading.local()
         self._lens = Lens(camera)
         self._size = self._lens.size_px
         self._background = Background(camera, self._lens.origin_px, self._size, earth)
@@ -190,17 +192,26 @@ class MeshRenderer:
         first = np.cumsum([0, *counts]).astype(np.int64)
         illumination = self._illumination(camera[3:], light)
         maps, texels = self._shadow_maps(illumination, camera, bodies, poses)
-        depth = np.empty(texels, np.float32)
-        placed = np.empty(_POSE_BYTES * len(bodies), np.uint8)
-        triangles = np.empty(_TRIANGLE_BYTES * 6 * len(corners), np.uint8)
-        samples = np.empty(_BAND_ROWS * self._size[0] * _SAMPLES * 2, np.float32)
+        count = 6 * len(corners)
+        depth = self._memory("depth", 4 * texels)
+        placed = self._memory("placed", _POSE_BYTES * len(bodies))
+        triangles = self._memory("triangles", _TRIANGLE_BYTES * count)
+        spans = self._memory("spans", 8 * count)
+        samples = self._memory("samples", _BAND_ROWS * self._size[0] * _SAMPLES * 8)
         wrinkles = _wrinkles()
         function("draw_meshes")(
             byref(self._frustum.native), c_int64(self._size[0]), c_int64(self._size[1]), address(camera),
             c_int64(len(bodies)), address(poses), address(first), address(corners), address(normals), address(uv),
             address(surface), address(surfaces), address(illumination), address(wrinkles), c_int64(_WRINKLES), address(maps),
-            address(depth), address(placed), address(triangles), address(samples), address(canvas),
+            address(depth), address(placed), address(triangles), address(spans), address(samples), address(canvas),
         )  # fmt: skip
+
+    def _memory(self, name: str, size: int) -> NDArray[np.uint8]:
+        """Return working memory of this thread of at least ``size`` bytes: fresh pages would cost more than drawing."""
+        held = self._threads.__dict__
+        if name not in held or len(held[name]) < size:
+            held[name] = np.empty(size, np.uint8)
+        return held[name]
 
     def _illumination(self, q_w_irf: Array, light: Light) -> NDArray[np.void]:
         out = np.zeros(1, _ILLUMINATION)

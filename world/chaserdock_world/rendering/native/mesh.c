@@ -6,13 +6,16 @@
  * surfaces free of shadows of their own.
  */
 
-typedef float f8 __attribute__((vector_size(32), aligned(4)));
-typedef int32_t i8x __attribute__((vector_size(32), aligned(4)));
+typedef float f8 __attribute__((vector_size(32), aligned(4), may_alias));
+typedef int32_t i8x __attribute__((vector_size(32), aligned(4), may_alias));
 
 #define BAND 8
 #define SAMPLES 8
 #define PLANES 6 /* 1 / z; normal, u, v over z */
 #define SUN_FAR (-1e30f)
+
+/* Hides that a value is stored where it was loaded: compilers would use a masked store, which is slow on many processors. */
+#define HIDE_ADDRESS(pointer) __asm__("" : "+r"(pointer))
 
 /* Pixels from the centre of a pixel to its samples, in sixteenths: each row and each column of a grid has at most one. */
 static const float SAMPLE_X[8] = {1, -1, 5, -3, -5, -7, 3, 7}, SAMPLE_Y[8] = {-3, 3, 1, -5, 5, -1, 7, -7};
@@ -49,14 +52,27 @@ static inline f8 all8(float s) { return (f8){s, s, s, s, s, s, s, s}; }
 static inline f8 select8(i8x mask, f8 a, f8 b) { return (f8)((mask & (i8x)a) | (~mask & (i8x)b)); }
 static inline f8 max8(f8 a, f8 b) { return select8(a > b, a, b); }
 static inline f8 min8(f8 a, f8 b) { return select8(a < b, a, b); }
+#if defined(__clang__)
+static inline f8 sqrt8(f8 a) { return __builtin_elementwise_sqrt(a); }
+#else
 static inline f8 sqrt8(f8 a) {
     for (int i = 0; i < 8; i++) a[i] = __builtin_sqrtf(a[i]);
     return a;
 }
+#endif
+#if defined(__clang__)
+static inline int any8(i8x m) { return __builtin_reduce_or(m) != 0; }
+#else /* GCC, for the sanitizers */
 static inline int any8(i8x m) {
     int32_t s = 0;
     for (int i = 0; i < 8; i++) s |= m[i];
     return s != 0;
+}
+#endif
+/* Largest whole numbers not above numbers between -1e9 and 1e9. */
+static inline f8 floor8(f8 a) {
+    f8 truncated = __builtin_convertvector(__builtin_convertvector(a, i8x), f8);
+    return truncated - select8(truncated > a, all8(1.0f), all8(0.0f));
 }
 
 /* Edge from p to q as distance in pixels, positive to the left of it in axes x right, y down turned by the sign of the area.
@@ -171,7 +187,9 @@ static void cast_shadow(const ShadowMap *map, double p[3][3], float *depth) {
             f8 d = plane[0] * column + (plane[1] * (float)y + plane[2]);
             d = min8(max8(d, all8(farthest)), all8(nearest));
             f8 *cell = (f8 *)(row + x); /* rows are multiples of eight long */
-            *cell = select8(in & (d > *cell), d, *cell);
+            d = max8(select8(in, d, all8(SUN_FAR)), *cell);
+            HIDE_ADDRESS(cell);
+            *cell = d;
         }
     }
 }
@@ -179,70 +197,77 @@ static void cast_shadow(const ShadowMap *map, double p[3][3], float *depth) {
 /* Share (0 to 1) of sunlight at points given by map coordinates in texels and metres towards the sun: the four texels around
  * each, weighted bilinearly (W. T. Reeves, D. H. Salesin, R. L. Cook, 1987). */
 static f8 sunlit(const ShadowMap *map, const float *depth, f8 x, f8 y, f8 towards) {
-    f8 out;
+    i8x inside = (x >= 0.0f) & (y >= 0.0f) & (x < (float)(map->width - 1)) & (y < (float)(map->height - 1));
+    x = select8(inside, x, all8(0.0f)), y = select8(inside, y, all8(0.0f));
+    i8x column = __builtin_convertvector(x, i8x), row = __builtin_convertvector(y, i8x);
+    float cells[4][8];
+    int64_t down = map->height > 1 ? map->width : 0; /* a map has at least two rows where a point is inside */
     for (int i = 0; i < 8; i++) {
-        float fx = x[i], fy = y[i], d = towards[i], lit = 1.0f;
-        if (fx >= 0.0f && fy >= 0.0f && fx < (float)(map->width - 1) && fy < (float)(map->height - 1)) {
-            int64_t c = (int64_t)fx, r = (int64_t)fy;
-            const float *cell = depth + map->offset + r * map->width + c;
-            float u = fx - (float)c, v = fy - (float)r;
-            float a = cell[0] > d ? 0.0f : 1.0f - u, b = cell[1] > d ? 0.0f : u;
-            float e = cell[map->width] > d ? 0.0f : 1.0f - u, g = cell[map->width + 1] > d ? 0.0f : u;
-            lit = (1.0f - v) * (a + b) + v * (e + g);
-        }
-        out[i] = lit;
+        const float *cell = depth + map->offset + (int64_t)row[i] * map->width + column[i];
+        cells[0][i] = cell[0], cells[1][i] = cell[1], cells[2][i] = cell[down], cells[3][i] = cell[down + 1];
     }
-    return out;
+    f8 u = x - __builtin_convertvector(column, f8), v = y - __builtin_convertvector(row, f8), lit[4];
+    for (int k = 0; k < 4; k++) lit[k] = select8(*(const f8 *)cells[k] > towards, all8(0.0f), all8(1.0f));
+    f8 share = (1.0f - v) * (lit[0] + u * (lit[1] - lit[0])) + v * (lit[2] + u * (lit[3] - lit[2]));
+    return select8(inside, share, all8(1.0f));
 }
 
 typedef struct {
-    const Frustum *f;
-    const Illumination *light;
     const Surface *surfaces;
     const ShadowMap *maps;
     const float *depth, *wrinkles;
     int64_t wrinkle_size;
     const Triangle *triangles;
+    /* Of the lens: focal lengths and centre, pixels of the canvas; of the light, as in Illumination. */
+    float fx, fy, cx, cy, sun[3], across[3], along[3], sun_share, ambient, lamp, white;
 } Shading;
 
 #define WRINKLE_PER_M 640.0f
 #define CELL_M 0.04f
 #define GAP_M 0.0016f
 
-static inline float fraction_of(float a) { return a - __builtin_floorf(a); }
-
 /* Length of [a - h, a + h] that is within GAP_M / 2 of a multiple of CELL_M, over its length. */
-static float gap_share(float a, float h) {
-    float low = (a - h + 0.5f * GAP_M) / CELL_M, high = (a + h + 0.5f * GAP_M) / CELL_M, duty = GAP_M / CELL_M;
-    float fl = __builtin_floorf(low), fh = __builtin_floorf(high), rl = low - fl, rh = high - fh;
-    float total = (fh - fl) * duty + (rh < duty ? rh : duty) - (rl < duty ? rl : duty);
-    float share = total / (high - low);
-    return share < 0.0f ? 0.0f : (share > 1.0f ? 1.0f : share);
+static f8 gap_share(f8 a, f8 h) {
+    f8 low = (a - h + 0.5f * GAP_M) / CELL_M, high = (a + h + 0.5f * GAP_M) / CELL_M, duty = all8(GAP_M / CELL_M);
+    f8 below = floor8(low), above = floor8(high);
+    f8 total = (above - below) * duty + min8(high - above, duty) - min8(low - below, duty);
+    return min8(max8(total / (high - low), all8(0.0f)), all8(1.0f));
 }
 
-/* Change diffuse reflectance and normal by the texture of lane ``i``. ``h``: half a pixel on the surface, m. */
-static void apply_texture(const Shading *s, int kind, float u, float v, float h, float *diffuse, float *bend) {
-    bend[0] = bend[1] = 0.0f;
-    if (!(abs_of(u) < 1e4 && abs_of(v) < 1e4)) return;
-    if (kind == 2) {
-        float a = gap_share(u, h), b = gap_share(v, h), gap = a + b - a * b;
-        *diffuse += gap * (0.45f - *diffuse);
-    } else {
-        /* Wrinkles are some 12 mm wide; they average out where a pixel is larger. */
-        float scale = 0.006f / (h > 0.006f ? h : 0.006f), n = (float)s->wrinkle_size;
-        float x = fraction_of(u * WRINKLE_PER_M / n) * n, y = fraction_of(v * WRINKLE_PER_M / n) * n;
-        int64_t c = (int64_t)x % s->wrinkle_size, r = (int64_t)y % s->wrinkle_size;
-        const float *cell = s->wrinkles + 3 * (r * s->wrinkle_size + c);
-        bend[0] = scale * cell[0], bend[1] = scale * cell[1];
-        *diffuse *= 1.0f + scale * cell[2];
+/* Change diffuse reflectance and normal ``n`` by the textures ``kind`` at (u, v). ``h``: half a pixel on the surface, m; ``flat``:
+ * normal of the triangle. */
+static void apply_textures(const Shading *s, i8x kind, f8 u, f8 v, f8 h, const f8 *flat, f8 *diffuse, f8 *n) {
+    /* Bounded, so that the conversions are defined; of a number and NaN, the number. */
+    u = min8(max8(u, all8(-1e3f)), all8(1e3f)), v = min8(max8(v, all8(-1e3f)), all8(1e3f));
+    h = min8(max8(h, all8(1e-6f)), all8(10.0f));
+    if (any8(kind == 2)) {
+        f8 a = gap_share(u, h), b = gap_share(v, h);
+        *diffuse = select8(kind == 2, *diffuse + (a + b - a * b) * (0.45f - *diffuse), *diffuse);
     }
+    if (!any8(kind == 1)) return;
+    /* Wrinkles are some 12 mm wide; they average out where a pixel is larger. */
+    f8 scale = 0.006f / max8(h, all8(0.006f)), size = all8((float)s->wrinkle_size);
+    f8 x = u * WRINKLE_PER_M / size, y = v * WRINKLE_PER_M / size, bend_x, bend_y, tone;
+    i8x last = (i8x){0} + (int32_t)(s->wrinkle_size - 1);
+    i8x c = __builtin_convertvector((x - floor8(x)) * size, i8x), r = __builtin_convertvector((y - floor8(y)) * size, i8x);
+    c = ((c > last) & last) | (~(c > last) & c), r = ((r > last) & last) | (~(r > last) & r); /* a fraction may round to 1 */
+    for (int i = 0; i < 8; i++) {
+        const float *cell = s->wrinkles + 3 * ((int64_t)r[i] * s->wrinkle_size + c[i]);
+        bend_x[i] = cell[0], bend_y[i] = cell[1], tone[i] = cell[2];
+    }
+    scale = select8(kind == 1, scale, all8(0.0f));
+    bend_x *= scale, bend_y *= scale;
+    *diffuse *= 1.0f + scale * tone;
+    /* Along any two directions in the surface: wrinkles have none. */
+    n[0] += flat[2] * bend_x;
+    n[1] += flat[2] * bend_y;
+    n[2] -= flat[0] * bend_x + flat[1] * bend_y;
 }
 
 /* Grey levels of eight fragments: pixels (x, y) of triangles ``which``. */
 static f8 shade(const Shading *s, const int32_t *which, f8 x, f8 y) {
-    const Illumination *light = s->light;
     f8 value[PLANES], diffuse, specular, normal[3], footprint;
-    i8x shiny = {0};
+    i8x shiny = {0}, kind = {0};
     int uniform = 1;
     for (int i = 1; i < 8; i++) uniform &= which[i] == which[0];
     if (uniform) {
@@ -252,35 +277,32 @@ static f8 shade(const Shading *s, const int32_t *which, f8 x, f8 y) {
         for (int k = 0; k < 3; k++) normal[k] = all8(t->normal[k]);
         diffuse = all8((float)s->surfaces[t->surface].diffuse), specular = all8((float)s->surfaces[t->surface].specular);
         footprint = all8(t->footprint);
-    } else
+        shiny += clamped(s->surfaces[t->surface].shininess, 0.0, 1023.0), kind += clamped(s->surfaces[t->surface].texture, 0.0, 2.0);
+    } else {
+        float lane[PLANES + 6][8], px[8], py[8];
+        int32_t exponent[8], texture[8];
+        for (int i = 0; i < 8; i++) px[i] = x[i], py[i] = y[i];
         for (int i = 0; i < 8; i++) {
             const Triangle *t = s->triangles + which[i];
-            for (int k = 0; k < PLANES; k++) value[k][i] = t->plane[k][0] * x[i] + (t->plane[k][1] * y[i] + t->plane[k][2]);
-            value[0][i] = value[0][i] < t->far_w ? t->far_w : (value[0][i] > t->near_w ? t->near_w : value[0][i]);
-            for (int k = 0; k < 3; k++) normal[k][i] = t->normal[k];
-            diffuse[i] = (float)s->surfaces[t->surface].diffuse, specular[i] = (float)s->surfaces[t->surface].specular;
-            footprint[i] = t->footprint;
+            const Surface *surface = s->surfaces + t->surface;
+            for (int k = 0; k < PLANES; k++) lane[k][i] = t->plane[k][0] * px[i] + (t->plane[k][1] * py[i] + t->plane[k][2]);
+            lane[0][i] = lane[0][i] < t->far_w ? t->far_w : (lane[0][i] > t->near_w ? t->near_w : lane[0][i]);
+            for (int k = 0; k < 3; k++) lane[PLANES + k][i] = t->normal[k];
+            lane[PLANES + 3][i] = (float)surface->diffuse, lane[PLANES + 4][i] = (float)surface->specular;
+            lane[PLANES + 5][i] = t->footprint;
+            exponent[i] = clamped(surface->shininess, 0.0, 1023.0), texture[i] = clamped(surface->texture, 0.0, 2.0);
         }
+        for (int k = 0; k < PLANES; k++) value[k] = *(const f8 *)lane[k];
+        for (int k = 0; k < 3; k++) normal[k] = *(const f8 *)lane[PLANES + k];
+        diffuse = *(const f8 *)lane[PLANES + 3], specular = *(const f8 *)lane[PLANES + 4], footprint = *(const f8 *)lane[PLANES + 5];
+        shiny = *(const i8x *)exponent, kind = *(const i8x *)texture;
+    }
     f8 z = 1.0f / value[0], n[3], at[3], view[3];
-    at[0] = (x + (float)(s->f->origin[0] - s->f->cx)) / (float)s->f->fx * z;
-    at[1] = (y + (float)(s->f->origin[1] - s->f->cy)) / (float)s->f->fy * z;
+    at[0] = (x - s->cx) * (z / s->fx);
+    at[1] = (y - s->cy) * (z / s->fy);
     at[2] = z;
     for (int k = 0; k < 3; k++) n[k] = value[1 + k] * z;
-    f8 u = value[4] * z, v = value[5] * z, h = footprint * z;
-    for (int i = 0; i < 8; i++) {
-        const Triangle *t = s->triangles + which[i];
-        int kind = clamped(s->surfaces[t->surface].texture, 0.0, 2.0);
-        shiny[i] = clamped(s->surfaces[t->surface].shininess, 0.0, 1023.0);
-        if (!kind) continue;
-        float d = diffuse[i], bend[2];
-        apply_texture(s, kind, u[i], v[i], h[i], &d, bend);
-        diffuse[i] = d;
-        if (bend[0] != 0.0f || bend[1] != 0.0f) { /* any two directions in the surface: the wrinkles have none */
-            float nx = t->normal[0], ny = t->normal[1], nz = t->normal[2];
-            float sx = nz * bend[0], sz = -nx * bend[0], ty = nz * bend[1], tz = -ny * bend[1];
-            n[0][i] += sx, n[1][i] += ty, n[2][i] += sz + tz;
-        }
-    }
+    if (any8(kind)) apply_textures(s, kind, value[4] * z, value[5] * z, footprint * z, normal, &diffuse, n);
     f8 length = sqrt8(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
     length = max8(length, all8(1e-12f));
     f8 range = sqrt8(at[0] * at[0] + at[1] * at[1] + at[2] * at[2]);
@@ -289,18 +311,18 @@ static f8 shade(const Shading *s, const int32_t *which, f8 x, f8 y) {
     for (int k = 0; k < 3; k++) {
         n[k] = n[k] / length;
         view[k] = -at[k] / range;
-        f8 half = view[k] + (float)light->sun[k];
-        cosine += n[k] * (float)light->sun[k];
-        facing += normal[k] * (float)light->sun[k];
+        f8 half = view[k] + s->sun[k];
+        cosine += n[k] * s->sun[k];
+        facing += normal[k] * s->sun[k];
         to_lamp += n[k] * view[k];
         half2 += half * half;
         half_n += n[k] * half;
-        map_x += at[k] * (float)light->across[k], map_y += at[k] * (float)light->along[k];
-        towards += at[k] * (float)light->sun[k];
+        map_x += at[k] * s->across[k], map_y += at[k] * s->along[k];
+        towards += at[k] * s->sun[k];
     }
-    f8 sun = all8((float)light->sun_share);
+    f8 sun = all8(s->sun_share);
     i8x lit = (cosine > 0.0f) & (facing > 0.0f);
-    if (light->sun_share > 0.0 && any8(lit)) {
+    if (s->sun_share > 0.0f && any8(lit)) {
         const Triangle *t = s->triangles + which[0];
         int one = 1;
         for (int i = 1; i < 8; i++) one &= s->triangles[which[i]].body == t->body;
@@ -319,63 +341,84 @@ static f8 shade(const Shading *s, const int32_t *which, f8 x, f8 y) {
         power = select8((left & 1) == 1, power * gloss, power);
         gloss = gloss * gloss;
     }
-    f8 level = (float)light->white * (diffuse * ((float)light->ambient + sun * max8(cosine, all8(0.0f))) + specular * sun * power);
-    if (light->lamp > 0.0) level += (float)light->lamp * diffuse * max8(to_lamp, all8(0.0f)) / max8(range * range, all8(1e-6f));
+    f8 level = s->white * (diffuse * (s->ambient + sun * max8(cosine, all8(0.0f))) + specular * sun * power);
+    if (s->lamp > 0.0f) level += s->lamp * diffuse * max8(to_lamp, all8(0.0f)) / max8(range * range, all8(1e-6f));
     return level;
 }
 
-/* Sum the samples of a band of rows onto the canvas. ``owner``: triangle of every sample, -1 for none. */
-static void resolve(const Shading *s, const int32_t *owner, int64_t y0, int64_t rows, int64_t width, int64_t x0, int64_t x1,
-                    uint8_t *canvas) {
+/* Fragments of pixels with several surfaces, which wait to be shaded eight at a time. Each pixel keeps its sum, and the number of
+ * its fragments to come, in the depths of its first two samples. */
+typedef struct {
+    int32_t which[8], pixel[8];
+    float x[8], y[8], weight[8];
+    int count;
+} Pending;
+
+static void shade_pending(const Shading *s, Pending *p, float *depth, uint8_t *out) {
+    for (int k = p->count; k < 8; k++) p->which[k] = p->which[0], p->x[k] = p->x[0], p->y[k] = p->y[0];
+    f8 level = min8(max8(shade(s, p->which, *(const f8 *)p->x, *(const f8 *)p->y), all8(0.0f)), all8(255.0f));
+    for (int k = 0; k < p->count; k++) {
+        float *sum = depth + (int64_t)p->pixel[k] * SAMPLES;
+        sum[0] += p->weight[k] * level[k];
+        sum[1] -= 1.0f;
+        if (sum[1] == 0.0f) out[p->pixel[k]] = (uint8_t)(sum[0] + 0.5f);
+    }
+    p->count = 0;
+}
+
+/* Add the fragments of a pixel of several surfaces, each at the middle of its samples. */
+static void add_fragments(const Shading *s, const int32_t *o, int64_t x, int64_t y, Pending *p, float *depth, uint8_t *out) {
+    int32_t which[8];
+    float count[8] = {0}, mx[8] = {0}, my[8] = {0}, empty = 0.0f, *sum = depth + x * SAMPLES;
+    int n = 0;
+    for (int k = 0; k < SAMPLES; k++) {
+        int j = 0;
+        if (o[k] < 0) {
+            empty += 1.0f;
+            continue;
+        }
+        while (j < n && which[j] != o[k]) j++;
+        if (j == n) which[n++] = o[k];
+        count[j] += 1.0f, mx[j] += SAMPLE_X[k], my[j] += SAMPLE_Y[k];
+    }
+    sum[0] = empty * (float)out[x] / (float)SAMPLES;
+    sum[1] = (float)n;
+    for (int j = 0; j < n; j++) {
+        int k = p->count++;
+        p->which[k] = which[j], p->pixel[k] = (int32_t)x, p->weight[k] = count[j] / (float)SAMPLES;
+        p->x[k] = (float)x + mx[j] / (16.0f * count[j]), p->y[k] = (float)y + my[j] / (16.0f * count[j]);
+        if (p->count == 8) shade_pending(s, p, depth, out);
+    }
+}
+
+/* Sum the samples of a band of rows onto the canvas. ``owner``: triangle of every sample, -1 for none; overwrites ``depth``. */
+static void resolve(const Shading *s, const int32_t *owner, float *depth, int64_t y0, int64_t rows, int64_t width, int64_t x0,
+                    int64_t x1, uint8_t *canvas) {
     for (int64_t r = 0; r < rows; r++) {
         uint8_t *out = canvas + (y0 + r) * width;
-        float sum[8] = {0};
+        Pending pending = {.count = 0};
         for (int64_t x = x0; x < x1;) {
             /* Up to eight pixels that one triangle covers wholly. */
-            int32_t which[8];
-            f8 px = all8(0.0f), py = all8((float)(y0 + r));
+            const int32_t *o = owner + (r * width + x) * SAMPLES, first = o[0];
             int n = 0;
-            for (; n < 8 && x + n < x1; n++) {
-                const int32_t *o = owner + (r * width + x + n) * SAMPLES;
-                int same = o[0] >= 0;
-                for (int k = 1; k < SAMPLES; k++) same &= o[k] == o[0];
-                if (!same) break;
-                which[n] = o[0], px[n] = (float)(x + n);
-            }
-            if (n) {
-                for (int k = n; k < 8; k++) which[k] = which[0], px[k] = px[0];
-                f8 level = shade(s, which, px, py);
-                for (int k = 0; k < n; k++) out[x + k] = (uint8_t)(level[k] >= 0.0f && level[k] < 255.0f ? level[k] + 0.5f : 255.0f);
+            for (; n < 8 && x + n < x1; n++)
+                if (any8(*(const i8x *)(o + n * SAMPLES) != first)) break;
+            if (!n) {
+                add_fragments(s, o, x, y0 + r, &pending, depth + r * width * SAMPLES, out);
+                x++;
+            } else {
+                if (first >= 0) {
+                    const int32_t which[8] = {first, first, first, first, first, first, first, first};
+                    const f8 steps = {0, 1, 2, 3, 4, 5, 6, 7};
+                    f8 level = shade(s, which, all8((float)x) + steps, all8((float)(y0 + r)));
+                    level = min8(max8(level, all8(0.0f)), all8(255.0f)) + 0.5f;
+                    i8x whole = __builtin_convertvector(level, i8x);
+                    for (int k = 0; k < n; k++) out[x + k] = (uint8_t)whole[k];
+                }
                 x += n;
-                continue;
             }
-            /* A pixel of several surfaces: shade each at the middle of its samples. */
-            const int32_t *o = owner + (r * width + x) * SAMPLES;
-            float count[8] = {0}, mx[8] = {0}, my[8] = {0}, empty = 0.0f;
-            for (int k = 0; k < SAMPLES; k++) {
-                int j = 0;
-                if (o[k] < 0) {
-                    empty += 1.0f;
-                    continue;
-                }
-                while (j < n && which[j] != o[k]) j++;
-                if (j == n) which[n++] = o[k];
-                count[j] += 1.0f, mx[j] += SAMPLE_X[k], my[j] += SAMPLE_Y[k];
-            }
-            if (n) {
-                for (int k = 0; k < n; k++) {
-                    px[k] = (float)x + mx[k] / (16.0f * count[k]);
-                    py[k] = (float)(y0 + r) + my[k] / (16.0f * count[k]);
-                }
-                for (int k = n; k < 8; k++) which[k] = which[0], px[k] = px[0], py[k] = py[0];
-                f8 level = min8(max8(shade(s, which, px, py), all8(0.0f)), all8(255.0f));
-                sum[0] = empty * (float)out[x];
-                for (int k = 0; k < n; k++) sum[0] += count[k] * level[k];
-                sum[0] /= (float)SAMPLES;
-                out[x] = (uint8_t)(sum[0] >= 0.0f && sum[0] < 255.0f ? sum[0] + 0.5f : 255.0f);
-            }
-            x++;
         }
+        if (pending.count) shade_pending(s, &pending, depth + r * width * SAMPLES, out);
     }
 }
 
@@ -408,9 +451,11 @@ static void cover(const Triangle *t, int32_t number, int64_t band, int64_t rows,
             f8 *d = (f8 *)(depth + ((y - band) * width + x) * SAMPLES);
             i8x *o = (i8x *)(owner + ((y - band) * width + x) * SAMPLES);
             in &= w > *d;
-            *d = select8(in, w, *d);
-            i8x mine = {number, number, number, number, number, number, number, number};
-            *o = (in & mine) | (~in & *o);
+            if (!any8(in)) continue;
+            *d = max8(select8(in, w, all8(0.0f)), *d);
+            i8x kept = ~in & *o;
+            HIDE_ADDRESS(o);
+            *o = (in & number) | kept;
         }
     }
 }
@@ -494,12 +539,12 @@ static void fill_map(const ShadowMap *map, const Illumination *light, int64_t bo
  * WRF; ``first`` (bodies + 1): ranges of the triangles, whose ``corners`` and ``normals`` (m, 3, 3) are in body axes;
  * ``uv`` (m, 3, 2): texture coordinates, m; ``surface`` (m): their rows of ``surfaces``. ``wrinkles`` (n, n, 3): slopes and relative
  * reflectance of the insulation. ``maps`` (bodies) lie in ``depth``, whose rows are multiples of eight long.
- * Working memory: ``triangles`` (6 m), ``samples`` (BAND * width * 16). A body at NaN is not drawn. */
+ * Working memory: ``placed`` (bodies), ``triangles`` (6 m), ``spans`` (6 m, 2), ``samples`` (BAND * width * 16). A body at NaN is not drawn. */
 EXPORT void NAME(draw_meshes)(const Frustum *f, int64_t width, int64_t height, const double *camera, int64_t bodies,
                               const double *poses, const int64_t *first, const double *corners, const double *normals,
                               const double *uv, const int64_t *surface, const Surface *surfaces, const Illumination *light,
                               const float *wrinkles, int64_t wrinkle_size, const ShadowMap *maps, float *depth,
-                              BodyPose *placed, Triangle *triangles, float *samples, uint8_t *canvas) {
+                              BodyPose *placed, Triangle *triangles, int32_t *spans, float *samples, uint8_t *canvas) {
     double inverse[4] = {camera[3], -camera[4], -camera[5], -camera[6]}, to_irf[9];
     matrix_of(inverse, to_irf);
     int64_t count = 0;
@@ -515,12 +560,18 @@ EXPORT void NAME(draw_meshes)(const Frustum *f, int64_t width, int64_t height, c
     if (light->sun_share > 0.0)
         for (int64_t b = 0; b < bodies; b++)
             if (maps[b].used > 0.0) fill_map(maps + b, light, bodies, placed, first, corners, depth);
-    Shading s = {f, light, surfaces, maps, depth, wrinkles, wrinkle_size, triangles};
+    for (int64_t i = 0; i < count; i++) spans[2 * i] = triangles[i].y0, spans[2 * i + 1] = triangles[i].y1;
+    Shading s = {.surfaces = surfaces, .maps = maps, .depth = depth, .wrinkles = wrinkles, .wrinkle_size = wrinkle_size,
+                 .triangles = triangles, .fx = (float)f->fx, .fy = (float)f->fy, .cx = (float)(f->cx - f->origin[0]),
+                 .cy = (float)(f->cy - f->origin[1]), .sun_share = (float)light->sun_share, .ambient = (float)light->ambient,
+                 .lamp = (float)light->lamp, .white = (float)light->white};
+    for (int k = 0; k < 3; k++)
+        s.sun[k] = (float)light->sun[k], s.across[k] = (float)light->across[k], s.along[k] = (float)light->along[k];
     int32_t *owner = (int32_t *)(samples + BAND * width * SAMPLES);
     for (int64_t y = 0; y < height; y += BAND) {
         int64_t rows = height - y < BAND ? height - y : BAND, x0 = width, x1 = 0;
         for (int64_t i = 0; i < count; i++)
-            if (triangles[i].y0 < y + rows && triangles[i].y1 > y) {
+            if (spans[2 * i] < y + rows && spans[2 * i + 1] > y) {
                 if (triangles[i].x0 < x0) x0 = triangles[i].x0;
                 if (triangles[i].x1 > x1) x1 = triangles[i].x1;
             }
@@ -528,7 +579,7 @@ EXPORT void NAME(draw_meshes)(const Frustum *f, int64_t width, int64_t height, c
         for (int64_t r = 0; r < rows; r++)
             for (int64_t k = (r * width + x0) * SAMPLES; k < (r * width + x1) * SAMPLES; k++) samples[k] = 0.0f, owner[k] = -1;
         for (int64_t i = 0; i < count; i++)
-            if (triangles[i].y0 < y + rows && triangles[i].y1 > y) cover(triangles + i, (int32_t)i, y, rows, width, samples, owner);
-        resolve(&s, owner, y, rows, width, x0, x1, canvas);
+            if (spans[2 * i] < y + rows && spans[2 * i + 1] > y) cover(triangles + i, (int32_t)i, y, rows, width, samples, owner);
+        resolve(&s, owner, samples, y, rows, width, x0, x1, canvas);
     }
 }

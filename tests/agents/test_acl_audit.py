@@ -176,8 +176,9 @@ def test_every_unauthorized_publication_is_logged_once(
     assert process.returncode == 0
     assert out == b""  # Zenoh's own lines are suppressed
     reported = [line.removeprefix("router: denied: ") for line in err.decode().splitlines()]
-    assert Counter(reported[:-1]) == expected
-    assert reported[-1] == f"router: denied {len(denied)} messages and declarations in all"
+    assert Counter(reported[:-2]) == expected
+    assert reported[-2] == f"router: denied {len(denied)} messages and declarations in all"
+    assert reported[-1] == "router: ended"
 
 
 def test_connection_without_certificate_is_rejected_and_logged(

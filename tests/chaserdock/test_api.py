@@ -9,6 +9,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import threading
 from pathlib import Path
 
@@ -90,8 +91,13 @@ def test_keyboard_interrupt_ends_all_processes(tmp_path: Path) -> None:
     )
     assert program.stdout is not None
     assert program.stdout.readline() == "Start\n"
-    children = psutil.Process(program.pid).children(recursive=True)
-    assert children
+    children: list[psutil.Process] = []
+    deadline = time.monotonic() + 60
+    while len(children) < 4 and time.monotonic() < deadline:  # world, chaser, controller, recorder
+        time.sleep(0.1)
+        children = psutil.Process(program.pid).children(recursive=True)
+    assert len(children) >= 4
+    time.sleep(0.5)
     program.send_signal(signal.SIGINT)
     assert program.stdout.read().endswith("interrupted\n")
     assert program.wait(timeout=30) == 0

@@ -4,8 +4,9 @@
 Random walks through the state machines that fly (``LeaseGrantor`` of each chaser, ``LeaseHolder`` of each controller) with the
 worst network there is: messages come in any order, late, twice or never; processes restart without memory; the world takes
 living processes for lost. Checked after every step: no tick (in one revision) has two commanders, no chaser flies two
-controllers in one tick, and what is flown was commanded with authority. At the end of a walk the network recovers, and one
-controller must command all chasers.
+controllers in one tick, what is flown was commanded with authority, its sender holds the lease that the chaser has stated
+last, and terms do not decrease. At the end of a walk the network recovers, and one controller must command all chasers within
+``RECOVERY_TICKS``, less than it takes until leases run out.
 """
 
 from __future__ import annotations
@@ -16,15 +17,16 @@ import random
 import sys
 from dataclasses import dataclass, field
 
-from chaserdock_agents.chaser.lease_grantor import LEASE_MAX_S, LeaseGrantor
-from chaserdock_controller.redundancy.lease_holder import LeaseHolder
+from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
+from chaserdock_controller.redundancy.lease_holder import PATIENCE_TICKS, LeaseHolder
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 
 RATE_HZ = 10
 WALK_STEPS = 2000
-RECOVERY_TICKS = 2 * round(LEASE_MAX_S * RATE_HZ) + 20
-_MOST_IN_FLIGHT = 60
+RECOVERY_TICKS = PATIENCE_TICKS + 3
+"""A controller without a majority notices it in the first tick, and yields; the other gets the lease in the next, and commands."""
+_MOST_IN_FLIGHT, _MOST_LATE = 60, 10
 ZERO = (0.0, 0.0, 0.0)
 
 Stamp = tuple[int, int]
@@ -44,11 +46,13 @@ class Controller:
 
 @dataclass
 class Chaser:
-    """One start of a chaser. ``executed``: the newest tick whose command it has flown."""
+    """One start of a chaser. ``stated``: its newest lease; ``executed``, ``term``: tick and term of the command flown last."""
 
     leases: LeaseGrantor
     tick: Tick | None = None
+    stated: Lease | None = None
     executed: int = -1
+    term: int = 0
 
 
 class Model:
@@ -56,9 +60,13 @@ class Model:
 
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)
-        self.n = self.draw.randint(1, 5)
+        self.n = self.draw.choice([1, 1, 2, 2, 3, 4, 5])
         self.loss = self.draw.choice([0.0, 0.02, 0.2])
-        self.chaos = self.draw.choice([0.0, 0.02, 0.1])
+        self.chaos = self.draw.choice([0.0, 0.1, 0.5, 1.5])
+        self.in_order = self.draw.choice([0.95, 0.8, 0.4])
+        self.haste = self.draw.choice([0.01, 0.03, 0.06])
+        self.delay = self.draw.choice([0.0, 0.02, 0.2])
+        self.absence = self.draw.choice([0.2, 0.7])
         self.steps = self.starts = 0
         self.chasers = [Chaser(LeaseGrantor(i, RATE_HZ)) for i in range(self.n)]
         self.controllers = {name: self._started(name) for name in CONTROLLERS}
@@ -66,6 +74,7 @@ class Model:
         self.taking_part: dict[str, int] = {}
         self.away: set[str] = set()
         self.in_flight: list[tuple[object, object]] = []
+        self.late: list[tuple[object, object]] = []
         self.claims: dict[Stamp, tuple[str, str]] = {}
         self.claimed_ticks: set[tuple[int, str, str]] = set()
         self.flown: dict[tuple[int, int], tuple[str, str]] = {}
@@ -81,7 +90,7 @@ class Model:
         self.tick, self.revision = self.tick + 1, 0
         names = [f"chaser/{i}" for i in range(self.n)] + list(CONTROLLERS)
         self.taking_part = {n: self.taking_part.get(n, self.tick) for n in names if n not in self.away}
-        self.away = {n for n in self.away if self.draw.random() < 0.7}
+        self.away = {n for n in sorted(self.away) if self.draw.random() < self.absence}
         self._publish_tick()
 
     def lose(self, name: str) -> None:
@@ -93,8 +102,6 @@ class Model:
 
     def restart(self, name: str) -> None:
         """Start a process again, without memory. What was on its way to it is lost."""
-        if self.tick < 0:
-            return
         self.lose(name)
         if name in CONTROLLERS:
             gone: object = self.controllers[name]
@@ -103,7 +110,8 @@ class Model:
             number = int(name.partition("/")[2])
             gone = self.chasers[number]
             self.chasers[number] = Chaser(LeaseGrantor(number, RATE_HZ))
-        self.in_flight = [(to, message) for to, message in self.in_flight if to is not gone]
+        for messages in (self.in_flight, self.late):
+            messages[:] = [(to, message) for to, message in messages if to is not gone]
 
     def _publish_tick(self) -> None:
         instances = {n: c.leases.instance for n, c in self.controllers.items() if n in self.taking_part}
@@ -121,15 +129,18 @@ class Model:
     # -- the processes ----------------------------------------------------------------------------------------
 
     def send(self, to: object, message: object) -> None:
-        """Put a message on its way."""
-        if self.draw.random() >= self.loss:
-            self.in_flight.append((to, message))
-        if len(self.in_flight) > _MOST_IN_FLIGHT:
-            del self.in_flight[self.draw.randrange(len(self.in_flight))]
+        """Put a message on its way, or among those that are long on their way."""
+        if self.draw.random() < self.loss:
+            return
+        messages, most = (
+            (self.late, _MOST_LATE) if self.draw.random() < self.delay else (self.in_flight, _MOST_IN_FLIGHT)
+        )
+        messages.append((to, message))
+        if len(messages) > most:
+            del messages[self.draw.randrange(len(messages))]
 
-    def deliver(self, position: int, again: bool = False) -> None:
-        """Deliver the message at a position of those on their way."""
-        to, message = self.in_flight[position] if again else self.in_flight.pop(position)
+    def deliver(self, to: object, message: object) -> None:
+        """Deliver a message."""
         match to, message:
             case Chaser(), Tick():
                 self._chaser_tick(to, message)
@@ -143,11 +154,10 @@ class Model:
                 raise TypeError(f"{message} to {to}")
 
     def _chaser_tick(self, chaser: Chaser, tick: Tick) -> None:
-        if chaser.tick is not None and (tick.tick, tick.revision) < (chaser.tick.tick, chaser.tick.revision):
-            return
-        chaser.tick = tick
+        if chaser.tick is None or (tick.tick, tick.revision) >= (chaser.tick.tick, chaser.tick.revision):
+            chaser.tick = tick
         if (lease := chaser.leases.update(tick)) is not None:
-            self._state(lease)
+            self._state(chaser, lease)
 
     def _chaser_command(self, chaser: Chaser, command: WrenchCommand) -> None:
         if chaser.leases.refusal(command) is not None:
@@ -155,16 +165,25 @@ class Model:
         if command.mode == "yield":
             chaser.leases.give_back(command)
         elif command.mode != "wait":
+            lease = chaser.stated
             chaser.leases.renew(command)
             if chaser.tick is not None:
-                self._state(chaser.leases.stated(chaser.tick))
-            self._fly(chaser, command)
+                self._state(chaser, chaser.leases.stated(chaser.tick))
+            self._fly(chaser, command, lease)
 
-    def _fly(self, chaser: Chaser, command: WrenchCommand) -> None:
+    def _fly(self, chaser: Chaser, command: WrenchCommand, lease: Lease | None) -> None:
+        """Fly a command, unless one as new was flown. ``lease``: stated before it arrived."""
         if command.tick <= chaser.executed:
             return
         chaser.executed = command.tick
         sender, number = (command.commander, command.instance), chaser.leases.chaser
+        if lease is None or (lease.holder, lease.instance) != sender:
+            raise TwoCommanders(f"chaser {number} flies {sender} in tick {command.tick}, and has stated {lease}")
+        if command.term < max(lease.term, chaser.term):
+            raise TwoCommanders(
+                f"chaser {number} flies term {command.term} after {chaser.term}, stated: {lease.term}"
+            )
+        chaser.term = command.term
         if self.flown.setdefault((command.tick, number), sender) != sender:
             raise TwoCommanders(f"chaser {number} flies two controllers in tick {command.tick}")
         if (command.tick, *sender) not in self.claimed_ticks:
@@ -172,7 +191,8 @@ class Model:
                 f"chaser {number} flies {sender} in tick {command.tick}, which it did not command"
             )
 
-    def _state(self, lease: Lease) -> None:
+    def _state(self, chaser: Chaser, lease: Lease) -> None:
+        chaser.stated = lease
         for controller in self.controllers.values():
             self.send(controller, lease)
 
@@ -200,36 +220,37 @@ class Model:
         """Let one random thing happen."""
         self.steps += 1
         drawn = self.draw.random()
-        if drawn < 0.02 * self.chaos:
-            self.restart(self.draw.choice([*CONTROLLERS, *(f"chaser/{i}" for i in range(self.n))]))
-        elif drawn < 0.05 * self.chaos:
-            if self.tick >= 0:
-                self.lose(self.draw.choice([*CONTROLLERS, *(f"chaser/{i}" for i in range(self.n))]))
-        elif drawn < 0.06 or not self.in_flight:
+        if self.tick >= 0 and drawn < self.haste * self.chaos:
+            change = self.restart if drawn < 0.4 * self.haste * self.chaos else self.lose
+            change(self.draw.choice([*CONTROLLERS, *(f"chaser/{i}" for i in range(self.n))]))
+        elif drawn < self.haste or not self.in_flight:
             self.open_tick()
         elif drawn < 0.2:
             self.act(self.draw.choice(list(self.controllers.values())))
         else:
+            messages = self.late if self.late and self.draw.random() < 0.1 else self.in_flight
+            oldest = messages is self.in_flight and self.draw.random() < self.in_order
+            position = 0 if oldest else self.draw.randrange(len(messages))
             again = self.draw.random() < 0.02
-            newest_last = self.draw.random() < 0.8
-            self.deliver(0 if newest_last else self.draw.randrange(len(self.in_flight)), again)
+            self.deliver(*(messages[position] if again else messages.pop(position)))
 
     def recover(self) -> None:
         """Let all processes take part and all messages arrive; check that one controller then commands all chasers."""
-        self.loss, self.away = 0.0, set()
+        self.loss, self.delay, self.away = 0.0, 0.0, set()
+        self.in_flight += self.late
         for _ in range(RECOVERY_TICKS):
             self.away = set()
             self.open_tick()
             for _ in range(2):
                 while self.in_flight:
                     self.steps += 1
-                    self.deliver(0)
+                    self.deliver(*self.in_flight.pop(0))
                 for controller in self.controllers.values():
                     controller.ticks = controller.ticks[-1:]
                     self.act(controller)
         flown = {self.flown.get((self.tick, i)) for i in range(self.n)}
         if len(flown) != 1 or None in flown:
-            raise TwoCommanders(f"after recovery the chasers fly {flown}")
+            raise TwoCommanders(f"{RECOVERY_TICKS} ticks after recovery the chasers fly {flown}")
 
 
 def command_of(tick: Tick, chaser: int, mode: str, sender: tuple[str, str], term: int) -> WrenchCommand:

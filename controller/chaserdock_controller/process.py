@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage, create_fault_layer
+from chaserdock_protocol.leases import defect_of
 from chaserdock_protocol.messages import (
     CommandReply,
     ControllerState,
@@ -185,11 +186,11 @@ class ControllerProcess:
             case Odometry() as odometry:
                 self._add_odometry(odometry)
             case DockingStatus() as docking:
-                self.inputs.add_docking(docking)
+                self.node.counts.stale += not self.inputs.add_docking(docking)
             case Sighting() as sighting:
                 self.node.counts.stale += not self.inputs.add_sighting(sighting)
             case ThrusterReport() as report:
-                self.inputs.add_thruster_report(report)
+                self.node.counts.stale += not self.inputs.add_thruster_report(report)
             case Presence() as presence:
                 self.heartbeat.take(presence)
             case MissionEnd():
@@ -201,7 +202,9 @@ class ControllerProcess:
         late = self._open_tick()
         if late is not None and odometry.tick > late.tick:
             self._process(late)  # while its own odometry is still the newest
-        for level, text in self.inputs.add_odometry(odometry):
+        events = self.inputs.add_odometry(odometry)
+        self.node.counts.stale += events is None
+        for level, text in events or ():
             if self.standby.leads:
                 self._publish_event(level, text, odometry)
 
@@ -286,7 +289,11 @@ class ControllerProcess:
                     self._apply_leader_state(state)
                 return True
             case Lease() as lease:
-                self.standby.leases.add(lease)
+                if defect_of(lease, self.scenario.time.rate_hz):
+                    self.node.counts.rejected["lease:contradictory"] += 1
+                    self.standby.leases.add_lost(lease.chaser, lease.tick)
+                else:
+                    self.standby.leases.add(lease)
                 self._decide()
                 return True
             case LostMessage(tick=tick) if received.topic is topics.LEASE:

@@ -31,6 +31,8 @@ from .topics import Topic
 from .transport.network import Host
 
 _CORRUPTED_BYTES = 4
+_SENDER_FIELDS = ("commander", "instance", "holder")
+"""Fields that name a sender. In real time a reader must refuse a message that names another one; see ``FaultLayer``."""
 
 
 @dataclass(frozen=True)
@@ -215,9 +217,10 @@ class FaultLayer:
             damaged: Any = codec.decode(topic.kind, bytes(data))
         except Rejected:
             return None
-        # A message with another tick or chaser would not be accepted for this one.
-        same = damaged.tick == message.tick and getattr(damaged, "chaser", None) == getattr(
-            message, "chaser", None
+        # Not accepted for this one: in lock-step the reader would wait on.
+        same = all(
+            getattr(damaged, name, None) == getattr(message, name, None)
+            for name in ("tick", "chaser", "revision", *(_SENDER_FIELDS if self.lockstep else ()))
         )
         return damaged if same else None
 

@@ -10,15 +10,34 @@ from __future__ import annotations
 import math
 from collections.abc import Collection
 
+from .messages import Lease
 from .topics import CONTROLLERS
 
-LEASE_S = 0.18
-"""Shortest lease; it covers at least two ticks."""
+LEASE_S, LEASE_MAX_S = 0.18, 2.0
+"""Shortest and longest lease; each covers at least two ticks."""
 
 
 def lease_ticks(rate_hz: float) -> int:
     """Return the length of a lease at this tick rate."""
     return max(2, math.ceil(LEASE_S * rate_hz))
+
+
+def longest_lease_ticks(rate_hz: float) -> int:
+    """Return the greatest length of a lease at this tick rate."""
+    return max(lease_ticks(rate_hz), math.ceil(LEASE_MAX_S * rate_hz))
+
+
+def defect_of(lease: Lease, rate_hz: float) -> str:
+    """Return why no chaser can have stated a lease, empty if it is sound."""
+    if not lease.holder:
+        return ""
+    if commander_of(lease.term) != lease.holder:
+        return f"term {lease.term} belongs to {commander_of(lease.term) or 'nobody'}, not to {lease.holder}"
+    # A command may arrive, and renew the lease, before its tick.
+    latest = lease.tick + 2 * longest_lease_ticks(rate_hz)
+    if not lease.from_tick <= lease.tick <= lease.until_tick < latest:
+        return f"from tick {lease.from_tick} to {lease.until_tick}, stated in tick {lease.tick}"
+    return ""
 
 
 def next_term(term: int, controller: str) -> int:

@@ -8,7 +8,14 @@ from typing import Any
 import msgspec
 import pytest
 from chaserdock_agents.chaser.lease_grantor import FIRST_COMMAND_S, LeaseGrantor
-from chaserdock_protocol.leases import LEASE_S, commander_of, is_majority, lease_ticks, next_term
+from chaserdock_protocol.leases import (
+    LEASE_S,
+    commander_of,
+    defect_of,
+    is_majority,
+    lease_ticks,
+    next_term,
+)
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 
 RATE_HZ = 10
@@ -186,3 +193,23 @@ def test_repeated_expiry_doubles_the_lease() -> None:
     assert changes == 0
     changes, number = hand_overs(grantor, number, [2, 0])
     assert changes == 1  # calm since: the short lease again
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({}, None),
+        ({"holder": "", "term": 0, "until_tick": 0}, None),  # granted to nobody
+        ({"holder": "contRoller"}, "belongs to controller"),
+        ({"term": 2}, "belongs to standby"),
+        ({"term": 0}, "belongs to nobody"),
+        ({"until_tick": 0}, "from tick 0 to 0, stated in tick 1"),
+        ({"from_tick": 2}, "from tick 2"),
+        ({"until_tick": 200}, "to 200"),
+    ],
+)
+def test_lease_that_no_chaser_can_have_stated_is_recognized(
+    grantor: LeaseGrantor, changes: dict[str, Any], words: str | None
+) -> None:
+    defect = defect_of(msgspec.structs.replace(stated(grantor, tick(1)), **changes), RATE_HZ)
+    assert defect == "" if words is None else words in defect

@@ -10,10 +10,23 @@ import msgspec
 import pytest
 from chaserdock_agents.chaser.process import ChaserProcess
 from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.ingest.tick_inputs import TickInputCollector
 from chaserdock_controller.process import ControllerProcess
 from chaserdock_protocol import topics
 from chaserdock_protocol.fault_injection import LostMessage
-from chaserdock_protocol.messages import Image, Lease, Message, Odometry, Sighting, Tick, WrenchCommand
+from chaserdock_protocol.messages import (
+    DockingStatus,
+    Image,
+    Lease,
+    Message,
+    Odometry,
+    Plan,
+    Sighting,
+    TargetEstimate,
+    ThrusterReport,
+    Tick,
+    WrenchCommand,
+)
 from chaserdock_protocol.replay_node import ReplayNode, SilentHeartbeat
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.topics import Topic
@@ -164,6 +177,107 @@ def test_older_odometry_does_not_replace_newer(chaser: ChaserProcess, scenario: 
     assert chaser.odometry.tick == 2
 
 
+def target_estimate(scenario: Scenario, tick: int) -> TargetEstimate:
+    return TargetEstimate(
+        tick=tick,
+        sim_time_ns=scenario.timing.tick_time_ns(tick),
+        status="tracking",
+        position_m=ZERO,
+        velocity_m_s=ZERO,
+        q_wxyz=(1.0, 0.0, 0.0, 0.0),
+        omega_rad_s=ZERO,
+        covariance=(0.0,) * 144,
+        accepted=(),
+        rejected=(),
+    )
+
+
+def plan(scenario: Scenario, tick: int) -> Plan:
+    now_ns = scenario.timing.tick_time_ns(tick)
+    empty: Any = {"positions_m": (), "quaternions_wxyz": (), "inputs": ()}
+    return Plan(tick=tick, sim_time_ns=now_ns, chaser=0, step_s=0.1, **empty)
+
+
+def test_older_plan_and_target_do_not_replace_newer(chaser: ChaserProcess, scenario: Scenario) -> None:
+    """The command that they came with is flown with them, and the fallback goes on from there."""
+    deliver(chaser, topics.TICK, None, tick_of(scenario, 2, (0,)))
+    deliver(chaser, topics.ODOMETRY, 0, odometry(scenario, 0, 2))
+    for tick in (2, 1):
+        deliver(chaser, topics.PLAN, 0, plan(scenario, tick))
+        deliver(chaser, topics.TARGET, None, target_estimate(scenario, tick))
+    deliver(chaser, topics.WRENCH, 0, wrench(scenario, 2))
+    assert chaser._last.plan is not None
+    assert chaser._last.target is not None
+    assert (chaser._last.plan.tick, chaser._last.target.tick) == (2, 2)
+    assert chaser.node.counts.stale == 2
+
+
+# -- docking sensors and thrusters --------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def capture() -> Scenario:
+    return load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+
+
+def docking(scenario: Scenario, tick: int, latched: bool = False) -> DockingStatus:
+    now_ns = scenario.timing.tick_time_ns(tick)
+    return DockingStatus(
+        tick=tick, sim_time_ns=now_ns, chaser=0, contact=latched, armed=latched, latched=latched
+    )
+
+
+def at_port(capture: Scenario) -> ChaserProcess:
+    made = ChaserProcess(ReplayNode("chaser/0"), capture, 0)  # type: ignore[arg-type]
+    made.heartbeat = SilentHeartbeat()  # type: ignore[assignment]
+    return made
+
+
+def test_older_docking_status_does_not_replace_newer(capture: Scenario) -> None:
+    """The report of the tick needs the status of that tick."""
+    chaser = at_port(capture)
+    deliver(chaser, topics.TICK, None, tick_of(capture, 2, (0,)))
+    for tick, latched in ((2, True), (1, False)):
+        deliver(chaser, topics.DOCKING, 0, docking(capture, tick, latched))
+    published = deliver(chaser, topics.ODOMETRY, 0, odometry(capture, 0, 2))
+    assert [m.tick for t, m in published if t is topics.THRUSTERS] == [2]
+    assert chaser.docking is not None
+    assert chaser.docking.latched
+    assert chaser.node.counts.stale == 1
+
+
+def test_late_docking_status_replaces_an_assumed_one(capture: Scenario) -> None:
+    """In lock-step a late status arrives after the loss of newer ones."""
+    chaser = at_port(capture)
+    deliver(chaser, topics.DOCKING, 0, docking(capture, 1))
+    deliver(chaser, topics.DOCKING, 0, lost(capture, 3))
+    deliver(chaser, topics.DOCKING, 0, docking(capture, 2, latched=True))
+    assert chaser.docking == msgspec.structs.replace(docking(capture, 3, latched=True), contact=False)
+
+
+def test_controller_keeps_the_newest_docking_status_and_thruster_report(capture: Scenario) -> None:
+    """A tick is complete once both have arrived, whatever older messages follow."""
+    inputs, tick = TickInputCollector(capture), tick_of(capture, 2, (0,))
+    report = ThrusterReport(
+        chaser=0,
+        force_max_N=ZERO,
+        torque_max_N_m=ZERO,
+        coming_impulse_N_s=ZERO,
+        coming_angular_impulse_N_m_s=ZERO,
+        thrusters=(),
+    )
+    inputs.add_odometry(odometry(capture, 0, 2))
+    inputs.add_sighting(sighting(capture, 0, 2))
+    assert inputs.add_docking(docking(capture, 2, latched=True))
+    assert inputs.add_thruster_report(msgspec.structs.replace(report, tick=2))
+    assert not inputs.add_docking(docking(capture, 1))
+    assert not inputs.add_thruster_report(msgspec.structs.replace(report, tick=1))
+    assert inputs.is_complete(tick)
+    taken = inputs.take(tick, ())
+    assert taken.docking[0].latched
+    assert taken.thrusters[0].tick == 2
+
+
 # -- controller ---------------------------------------------------------------------------------------------
 
 
@@ -253,6 +367,16 @@ def test_tick_waits_until_a_loss_is_known(controller: ControllerProcess, scenari
     assert controller.done_tick == 0
     deliver(controller, topics.LEASE, 0, lost(scenario, 1))
     assert controller.done_tick == 1
+
+
+def test_lease_that_contradicts_itself_counts_as_lost(
+    controller: ControllerProcess, scenario: Scenario
+) -> None:
+    deliver(controller, topics.TICK, None, tick_of(scenario, 1, (0, 1)))
+    damaged = msgspec.structs.replace(lease(scenario, 1, 1), holder="contRoller")
+    deliver(controller, topics.LEASE, 1, damaged)
+    assert controller.standby.leases.missing(tick_of(scenario, 1, (0, 1))) == [0]
+    assert controller.node.counts.rejected["lease:contradictory"] == 1
 
 
 def test_controller_without_a_majority_lets_the_others_wait(

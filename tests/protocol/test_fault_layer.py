@@ -130,6 +130,22 @@ def test_corrupt_gives_nothing_or_a_sound_message() -> None:
     assert changed > 0
 
 
+def test_message_of_a_damaged_sender_is_lost_in_lockstep_only() -> None:
+    """In real time the reader must refuse it; in lock-step the reader would wait for the true sender's."""
+    corrupt = fault(kind="corrupt", process="chaser/0", topic="wrench", duration_s=500.0)
+    senders = {}
+    for lockstep in (True, False):
+        on = layer("chaser/0", corrupt, lockstep=lockstep)
+        senders[lockstep] = set()
+        for tick in range(10, 2000):
+            sent = msgspec.structs.replace(message(WrenchCommand, tick), commander="controller", instance="c")
+            for came in on.incoming(topics.WRENCH, "0", sent, codec.encode(sent)):
+                if not isinstance(came, LostMessage):
+                    senders[lockstep].add((came.commander, came.instance))
+    assert senders[True] == {("controller", "c")}
+    assert len(senders[False]) > 1
+
+
 @pytest.mark.parametrize(
     ("receiver", "topic", "kind", "chaser", "hit"),
     [

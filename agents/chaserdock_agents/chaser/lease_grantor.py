@@ -11,14 +11,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from chaserdock_protocol.leases import commander_of, lease_ticks, next_term
+from chaserdock_protocol.leases import commander_of, lease_ticks, longest_lease_ticks, next_term
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 
 FIRST_COMMAND_S = 1.0
 """Lease of a new holder, which may need longer for its first command."""
-BACKOFF_RESET_S, LEASE_MAX_S = 20.0, 2.0
-"""A lease that runs out again within ``BACKOFF_RESET_S`` doubles, up to ``LEASE_MAX_S``: repeated expiry means that the
+BACKOFF_RESET_S = 20.0
+"""A lease that runs out again within this time doubles, up to ``leases.LEASE_MAX_S``: repeated expiry means that the
 machine is overloaded, and a change of commander does not help."""
 
 
@@ -76,8 +76,7 @@ class LeaseGrantor:
         before, self._expired_tick = self._expired_tick, tick
         shortest = lease_ticks(self.rate_hz)
         if before is not None and tick - before < BACKOFF_RESET_S * self.rate_hz:
-            longest = max(shortest, math.ceil(LEASE_MAX_S * self.rate_hz))
-            self._length = min(2 * self._length, longest)
+            self._length = min(2 * self._length, longest_lease_ticks(self.rate_hz))
         else:
             self._length = shortest
 

@@ -104,6 +104,7 @@ class ChaserProcess:
         self._clearance_m = clearance_m(self.scenario, self.number)
         self._thrusters_tick = self._uncommanded_tick = -1
         self._odometry_ns, self._odometry_arrived_s = 0, 0.0
+        self._odometry_tick = self._docking_tick = -1
         self._processed_images: deque[int] = deque(maxlen=64)
         self._has_port = self.scenario.docking.port_of(self.number) is not None
         self._thrusters = (
@@ -147,11 +148,12 @@ class ChaserProcess:
             case Image() as image:
                 self._process_image(image)
             case Odometry() as odometry if received is not None:
-                self._odometry_ns, self._odometry_arrived_s = odometry.sim_time_ns, received.arrived_s
+                if odometry.tick > self._odometry_tick:
+                    self._odometry_tick, self._odometry_ns = odometry.tick, odometry.sim_time_ns
+                    self._odometry_arrived_s = received.arrived_s
                 self._update_odometry(odometry)
             case DockingStatus() as docking:
-                self.docking = docking
-                self._report_thrusters()
+                self._update_docking(docking)
             case Plan() as plan:
                 self._update_plan(plan)
             case TargetEstimate() as target:
@@ -203,12 +205,30 @@ class ChaserProcess:
         self._reply_without_command()
         self._check_command_timeout(odometry)
 
+    def _update_docking(self, docking: DockingStatus) -> None:
+        """Update the state of the docking sensor, unless a newer one has arrived before."""
+        if docking.tick <= self._docking_tick:
+            self.node.counts.stale += 1
+            return
+        self._docking_tick = docking.tick
+        if self.docking is not None and self.docking.tick > docking.tick:
+            # Late: the newest known, of a tick for which an older one was assumed.
+            docking = _assume_docking(docking, self.docking.tick, self.docking.sim_time_ns)
+        self.docking = docking
+        self._report_thrusters()
+
     def _update_plan(self, plan: Plan) -> None:
+        if self._plan is not None and plan.tick < self._plan.tick:
+            self.node.counts.stale += 1
+            return
         self._plan = plan
         if plan.tick == self._last_tick:  # the plan arrived after its command
             self._last = LastCommand(plan, self._last.target)
 
     def _update_target(self, target: TargetEstimate) -> None:
+        if self._target is not None and target.tick < self._target.tick:
+            self.node.counts.stale += 1
+            return
         self._target = target
         if target.tick == self._last_tick:  # the estimate arrived after its command
             self._last = LastCommand(self._last.plan, target)
@@ -230,14 +250,11 @@ class ChaserProcess:
             self.node.publish(topics.SIGHTING, no_image, self.number)
         elif topic is topics.ODOMETRY and self.odometry is not None:
             self._update_odometry(extrapolate(self.odometry, lost.tick, lost.sim_time_ns))
-        elif topic is topics.DOCKING:
-            last = self.docking
-            assumed = (
-                DockingStatus(chaser=self.number, contact=False, armed=False, latched=False)
-                if last is None
-                else msgspec.structs.replace(last, contact=False)
+        elif topic is topics.DOCKING and (self.docking is None or lost.tick > self.docking.tick):
+            last = self.docking or DockingStatus(
+                chaser=self.number, contact=False, armed=False, latched=False
             )
-            self.docking = msgspec.structs.replace(assumed, tick=lost.tick, sim_time_ns=lost.sim_time_ns)
+            self.docking = _assume_docking(last, lost.tick, lost.sim_time_ns)
             self._report_thrusters()
         elif topic is topics.WRENCH and lost.sender in ("", self.leases.holder):
             self._mark_uncommanded(lost.tick)
@@ -430,3 +447,8 @@ class ChaserProcess:
             detail=detail,
         )
         self.node.publish(topics.EVENT, event, self.name)
+
+
+def _assume_docking(last: DockingStatus, tick: int, time_ns: int) -> DockingStatus:
+    """Return the status to assume for a tick whose status is lost: as last known, without contact."""
+    return msgspec.structs.replace(last, tick=tick, sim_time_ns=time_ns, contact=False)

@@ -9,6 +9,7 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.extrapolation import extrapolate
 from chaserdock_protocol.messages import (
     DockingStatus,
+    Message,
     Odometry,
     OperatorCommand,
     Sighting,
@@ -41,21 +42,26 @@ class TickInputCollector:
         self._has_port = [scenario.docking.port_of(i) is not None for i in range(len(scenario.chasers))]
         self._extrapolation_ns = scenario.controller.command_lifetime_s * 1e9
 
-    def add_odometry(self, odometry: Odometry) -> list[LogEntry]:
-        """Add an odometry unless a newer one of that chaser is known; return the events to log."""
-        known = self._odometry.get(odometry.chaser)
-        if known is not None and odometry.tick <= known.tick:
-            return []
+    def add_odometry(self, odometry: Odometry) -> list[LogEntry] | None:
+        """Add an odometry and return the events to log; None if one of that chaser as new is known."""
+        if _is_overtaken(odometry, self._odometry.get(odometry.chaser)):
+            return None
         self._odometry[odometry.chaser], events = self.odometry_validation.update(odometry)
         return events
 
-    def add_docking(self, docking: DockingStatus) -> None:
-        """Add a docking status."""
+    def add_docking(self, docking: DockingStatus) -> bool:
+        """Add a docking status; return False if one of that chaser as new is known."""
+        if _is_overtaken(docking, self._docking.get(docking.chaser)):
+            return False
         self._docking[docking.chaser] = docking
+        return True
 
-    def add_thruster_report(self, report: ThrusterReport) -> None:
-        """Add a thruster report."""
+    def add_thruster_report(self, report: ThrusterReport) -> bool:
+        """Add a thruster report; return False if one of that chaser as new is known."""
+        if _is_overtaken(report, self._thrusters.get(report.chaser)):
+            return False
         self._thrusters[report.chaser] = report
+        return True
 
     def add_sighting(self, sighting: Sighting) -> bool:
         """Add a sighting; return False for a duplicate, which must not count as evidence twice."""
@@ -135,3 +141,8 @@ class TickInputCollector:
             if tick.sim_time_ns - last.sim_time_ns <= self._extrapolation_ns:
                 odometry[i] = extrapolate(last, tick.tick, tick.sim_time_ns)
         return dict(sorted(odometry.items()))
+
+
+def _is_overtaken(message: Message, known: Message | None) -> bool:
+    """Return whether a message is a duplicate of the known one, or older."""
+    return known is not None and message.tick <= known.tick

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from chaserdock_protocol.leases import commander_of
 from chaserdock_protocol.messages import ActuatorCommand
@@ -12,11 +12,10 @@ from chaserdock_protocol.messages import ActuatorCommand
 
 @dataclass
 class ObservedCommander:
-    """The controller ``name`` of the newest ``term`` that a chaser has flown. ``terms``: the newest of each chaser."""
+    """The controller ``name`` of the newest ``term`` that a chaser has flown."""
 
     name: str = ""
     term: int = 0
-    terms: dict[int, int] = field(default_factory=dict)
     _instance: str = ""
     _commanded_s: float = 0.0
 
@@ -25,7 +24,6 @@ class ObservedCommander:
 
         ``controllers``: those connected, name to instance.
         """
-        self.terms[command.chaser] = max(command.term, self.terms.get(command.chaser, 0))
         if command.term <= self.term:
             self._commanded_s = now_s if command.term == self.term else self._commanded_s
             return ""

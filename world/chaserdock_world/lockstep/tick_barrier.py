@@ -74,6 +74,7 @@ class TickBarrier:
         # At least two ticks, as a command acts until that of the next tick arrives.
         self._watchdog_ns = round(max(watchdog_s, 2.0 / timing.rate_hz) * 1e9)
         self._commanded_ns: dict[str, int] = {}
+        self._executed_tick: dict[int, int] = {}
         self._replied: set[int] = set()
         self._no_chaser_since_s: float | None = None
         self._polled_s = node.host.now_s()
@@ -250,9 +251,10 @@ class TickBarrier:
         """Note who commands and record the reply; return why the command is rejected, empty if it is not."""
         if f"chaser/{command.chaser}" not in self._actuators or command.tick > self._tick:
             return "unexpected"
+        if command.tick < self._executed_tick.get(command.chaser, -1):
+            return "overtaken"  # by a command that the same chaser has executed later
         if command.source == "command":
-            if command.term < self._commander.terms.get(command.chaser, 0):
-                return "stale term"  # overtaken by a command that the same chaser has executed later
+            self._executed_tick[command.chaser] = command.tick
             if reason := self._commander.update(command, self._controllers, self._now_s()):
                 self.publish_warning("hand-over", reason)
         if command.tick == self._tick:
@@ -300,7 +302,6 @@ class TickBarrier:
             elif name in self._actuators:
                 self._actuators[name].stop(self._current_step())
                 self._commanded_ns.pop(name, None)
-                self._commander.terms.pop(int(name.partition("/")[2]), None)
                 changed |= any(f"chaser/{i}" == name for i in self.chasers)
                 self.chasers = tuple(i for i in self.chasers if f"chaser/{i}" != name)
         return changed and self._tick >= 0

@@ -2,11 +2,11 @@
 """Model check of command authority: ``python tests/lease_model.py --steps 1000000``.
 
 Random walks through the state machines that fly (``LeaseGrantor`` of each chaser, ``LeaseHolder`` of each controller) with the
-worst network there is: messages come in any order, late, twice or never; processes restart without memory; the world takes
-living processes for lost. Checked after every step: no tick (in one revision) has two commanders, no chaser flies two
-controllers in one tick, what is flown was commanded with authority, its sender holds the lease that the chaser has stated
-last, and terms do not decrease. At the end of a walk the network recovers, and one controller must command all chasers within
-``RECOVERY_TICKS``, less than it takes until leases run out.
+worst network there is: messages come in any order, late, twice or never; processes restart without memory, some while their
+predecessor still runs; the world takes living processes for lost. Checked after every step: no tick (in one revision) has two
+commanders; a chaser flies the holder of its lease only, and no two controllers in one tick; what is flown was commanded with
+authority; ticks and terms that a chaser states never fall. At the end of a walk the network recovers, and within ``UNITED_TICKS``
+one controller must command all chasers, for good.
 """
 
 from __future__ import annotations
@@ -18,15 +18,17 @@ import sys
 from dataclasses import dataclass, field
 
 from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
-from chaserdock_controller.redundancy.lease_holder import PATIENCE_TICKS, LeaseHolder
+from chaserdock_controller.redundancy.lease_holder import LeaseHolder
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 
 RATE_HZ = 10
 WALK_STEPS = 2000
-RECOVERY_TICKS = PATIENCE_TICKS + 3
-"""A controller without a majority notices it in the first tick, and yields; the other gets the lease in the next, and commands."""
-_MOST_IN_FLIGHT, _MOST_LATE = 60, 10
+RECOVERY_TICKS = 40
+"""Length of the undisturbed end of a walk."""
+UNITED_TICKS = 6
+"""Ticks without a loss after which one controller commands all chasers."""
+_MOST_IN_FLIGHT = 60
 ZERO = (0.0, 0.0, 0.0)
 
 Stamp = tuple[int, int]
@@ -46,13 +48,13 @@ class Controller:
 
 @dataclass
 class Chaser:
-    """One start of a chaser. ``stated``: its newest lease; ``executed``, ``term``: tick and term of the command flown last."""
+    """One start of a chaser. ``executed``: the newest tick whose command it has flown; ``stated``: tick, revision and term of
+    its last lease."""
 
     leases: LeaseGrantor
     tick: Tick | None = None
-    stated: Lease | None = None
     executed: int = -1
-    term: int = 0
+    stated: tuple[int, int, int] = (-1, -1, 0)
 
 
 class Model:
@@ -60,21 +62,17 @@ class Model:
 
     def __init__(self, seed: int) -> None:
         self.draw = random.Random(seed)
-        self.n = self.draw.choice([1, 1, 2, 2, 3, 4, 5])
+        self.n = self.draw.randint(1, 5)
         self.loss = self.draw.choice([0.0, 0.02, 0.2])
-        self.chaos = self.draw.choice([0.0, 0.1, 0.5, 1.5])
-        self.in_order = self.draw.choice([0.95, 0.8, 0.4])
-        self.haste = self.draw.choice([0.01, 0.03, 0.06])
-        self.delay = self.draw.choice([0.0, 0.02, 0.2])
-        self.absence = self.draw.choice([0.2, 0.7])
-        self.steps = self.starts = 0
+        self.chaos = self.draw.choice([0.0, 0.02, 0.1])
+        self.steps = self.starts = self.united = 0
         self.chasers = [Chaser(LeaseGrantor(i, RATE_HZ)) for i in range(self.n)]
         self.controllers = {name: self._started(name) for name in CONTROLLERS}
+        self.replaced: list[Controller] = []
         self.tick, self.revision = -1, 0
         self.taking_part: dict[str, int] = {}
         self.away: set[str] = set()
         self.in_flight: list[tuple[object, object]] = []
-        self.late: list[tuple[object, object]] = []
         self.claims: dict[Stamp, tuple[str, str]] = {}
         self.claimed_ticks: set[tuple[int, str, str]] = set()
         self.flown: dict[tuple[int, int], tuple[str, str]] = {}
@@ -90,7 +88,7 @@ class Model:
         self.tick, self.revision = self.tick + 1, 0
         names = [f"chaser/{i}" for i in range(self.n)] + list(CONTROLLERS)
         self.taking_part = {n: self.taking_part.get(n, self.tick) for n in names if n not in self.away}
-        self.away = {n for n in sorted(self.away) if self.draw.random() < self.absence}
+        self.away = {n for n in sorted(self.away) if self.draw.random() < 0.7}
         self._publish_tick()
 
     def lose(self, name: str) -> None:
@@ -101,17 +99,21 @@ class Model:
             self._publish_tick()
 
     def restart(self, name: str) -> None:
-        """Start a process again, without memory. What was on its way to it is lost."""
+        """Start a process again, without memory. What was on its way to it is lost, unless it is a controller that still runs."""
+        if self.tick < 0:
+            return
         self.lose(name)
         if name in CONTROLLERS:
             gone: object = self.controllers[name]
+            if self.draw.random() < 0.5:  # cut off from the world only: it goes on
+                self.replaced.append(self.controllers[name])
+                gone = None
             self.controllers[name] = self._started(name)
         else:
             number = int(name.partition("/")[2])
             gone = self.chasers[number]
             self.chasers[number] = Chaser(LeaseGrantor(number, RATE_HZ))
-        for messages in (self.in_flight, self.late):
-            messages[:] = [(to, message) for to, message in messages if to is not gone]
+        self.in_flight = [(to, message) for to, message in self.in_flight if to is not gone]
 
     def _publish_tick(self) -> None:
         instances = {n: c.leases.instance for n, c in self.controllers.items() if n in self.taking_part}
@@ -123,24 +125,25 @@ class Model:
             controllers=instances,
             since=dict(self.taking_part),
         )
-        for process in (*self.chasers, *self.controllers.values()):
+        for process in (*self.chasers, *self.all_controllers()):
             self.send(process, message)
+
+    def all_controllers(self) -> list[Controller]:
+        """Return the controllers, with those that were replaced and still run."""
+        return [*self.controllers.values(), *self.replaced]
 
     # -- the processes ----------------------------------------------------------------------------------------
 
     def send(self, to: object, message: object) -> None:
-        """Put a message on its way, or among those that are long on their way."""
-        if self.draw.random() < self.loss:
-            return
-        messages, most = (
-            (self.late, _MOST_LATE) if self.draw.random() < self.delay else (self.in_flight, _MOST_IN_FLIGHT)
-        )
-        messages.append((to, message))
-        if len(messages) > most:
-            del messages[self.draw.randrange(len(messages))]
+        """Put a message on its way."""
+        if self.draw.random() >= self.loss:
+            self.in_flight.append((to, message))
+        if len(self.in_flight) > _MOST_IN_FLIGHT:
+            del self.in_flight[self.draw.randrange(len(self.in_flight))]
 
-    def deliver(self, to: object, message: object) -> None:
-        """Deliver a message."""
+    def deliver(self, position: int, again: bool = False) -> None:
+        """Deliver the message at a position of those on their way."""
+        to, message = self.in_flight[position] if again else self.in_flight.pop(position)
         match to, message:
             case Chaser(), Tick():
                 self._chaser_tick(to, message)
@@ -154,8 +157,9 @@ class Model:
                 raise TypeError(f"{message} to {to}")
 
     def _chaser_tick(self, chaser: Chaser, tick: Tick) -> None:
-        if chaser.tick is None or (tick.tick, tick.revision) >= (chaser.tick.tick, chaser.tick.revision):
-            chaser.tick = tick
+        if chaser.tick is not None and (tick.tick, tick.revision) < (chaser.tick.tick, chaser.tick.revision):
+            return
+        chaser.tick = tick
         if (lease := chaser.leases.update(tick)) is not None:
             self._state(chaser, lease)
 
@@ -165,25 +169,18 @@ class Model:
         if command.mode == "yield":
             chaser.leases.give_back(command)
         elif command.mode != "wait":
-            lease = chaser.stated
             chaser.leases.renew(command)
             if chaser.tick is not None:
                 self._state(chaser, chaser.leases.stated(chaser.tick))
-            self._fly(chaser, command, lease)
+            self._fly(chaser, command)
 
-    def _fly(self, chaser: Chaser, command: WrenchCommand, lease: Lease | None) -> None:
-        """Fly a command, unless one as new was flown. ``lease``: stated before it arrived."""
+    def _fly(self, chaser: Chaser, command: WrenchCommand) -> None:
         if command.tick <= chaser.executed:
             return
         chaser.executed = command.tick
         sender, number = (command.commander, command.instance), chaser.leases.chaser
-        if lease is None or (lease.holder, lease.instance) != sender:
-            raise TwoCommanders(f"chaser {number} flies {sender} in tick {command.tick}, and has stated {lease}")
-        if command.term < max(lease.term, chaser.term):
-            raise TwoCommanders(
-                f"chaser {number} flies term {command.term} after {chaser.term}, stated: {lease.term}"
-            )
-        chaser.term = command.term
+        if sender != (holder := (chaser.leases.holder, chaser.leases.instance)):
+            raise TwoCommanders(f"chaser {number} flies {sender}, but {holder} holds its lease")
         if self.flown.setdefault((command.tick, number), sender) != sender:
             raise TwoCommanders(f"chaser {number} flies two controllers in tick {command.tick}")
         if (command.tick, *sender) not in self.claimed_ticks:
@@ -192,8 +189,13 @@ class Model:
             )
 
     def _state(self, chaser: Chaser, lease: Lease) -> None:
-        chaser.stated = lease
-        for controller in self.controllers.values():
+        stated = (lease.tick, lease.revision, lease.term)
+        if lease.term < chaser.stated[2] or stated[:2] < chaser.stated[:2]:
+            raise TwoCommanders(
+                f"chaser {lease.chaser} states (tick, revision, term) {stated} after {chaser.stated}"
+            )
+        chaser.stated = stated
+        for controller in self.all_controllers():
             self.send(controller, lease)
 
     def act(self, controller: Controller) -> None:
@@ -220,37 +222,42 @@ class Model:
         """Let one random thing happen."""
         self.steps += 1
         drawn = self.draw.random()
-        if self.tick >= 0 and drawn < self.haste * self.chaos:
-            change = self.restart if drawn < 0.4 * self.haste * self.chaos else self.lose
-            change(self.draw.choice([*CONTROLLERS, *(f"chaser/{i}" for i in range(self.n))]))
-        elif drawn < self.haste or not self.in_flight:
+        if drawn < 0.02 * self.chaos:
+            self.restart(self.draw.choice([*CONTROLLERS, *(f"chaser/{i}" for i in range(self.n))]))
+        elif drawn < 0.05 * self.chaos:
+            if self.tick >= 0:
+                self.lose(self.draw.choice([*CONTROLLERS, *(f"chaser/{i}" for i in range(self.n))]))
+        elif drawn < 0.06 or not self.in_flight:
             self.open_tick()
         elif drawn < 0.2:
-            self.act(self.draw.choice(list(self.controllers.values())))
+            self.act(self.draw.choice(self.all_controllers()))
         else:
-            messages = self.late if self.late and self.draw.random() < 0.1 else self.in_flight
-            oldest = messages is self.in_flight and self.draw.random() < self.in_order
-            position = 0 if oldest else self.draw.randrange(len(messages))
             again = self.draw.random() < 0.02
-            self.deliver(*(messages[position] if again else messages.pop(position)))
+            newest_last = self.draw.random() < 0.8
+            self.deliver(0 if newest_last else self.draw.randrange(len(self.in_flight)), again)
 
     def recover(self) -> None:
-        """Let all processes take part and all messages arrive; check that one controller then commands all chasers."""
-        self.loss, self.delay, self.away = 0.0, 0.0, set()
-        self.in_flight += self.late
-        for _ in range(RECOVERY_TICKS):
+        """Let all processes take part and all messages arrive; check that one controller soon commands all chasers, for good.
+
+        ``united``: ticks until then.
+        """
+        self.loss, self.away = 0.0, set()
+        self.replaced.clear()
+        for k in range(RECOVERY_TICKS):
             self.away = set()
             self.open_tick()
             for _ in range(2):
                 while self.in_flight:
                     self.steps += 1
-                    self.deliver(*self.in_flight.pop(0))
+                    self.deliver(0)
                 for controller in self.controllers.values():
                     controller.ticks = controller.ticks[-1:]
                     self.act(controller)
-        flown = {self.flown.get((self.tick, i)) for i in range(self.n)}
-        if len(flown) != 1 or None in flown:
-            raise TwoCommanders(f"{RECOVERY_TICKS} ticks after recovery the chasers fly {flown}")
+            flown = {self.flown.get((self.tick, i)) for i in range(self.n)}
+            if len(flown) != 1 or None in flown:
+                self.united = k + 1
+                if k >= UNITED_TICKS:
+                    raise TwoCommanders(f"{k} ticks after the last loss the chasers fly {flown}")
 
 
 def command_of(tick: Tick, chaser: int, mode: str, sender: tuple[str, str], term: int) -> WrenchCommand:

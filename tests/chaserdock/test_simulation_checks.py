@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import copy
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +39,11 @@ from message_samples import BY_TYPE
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
+from chaserdock.simulation.mission import SimulatedFlight
+from chaserdock.simulation.network import Traffic
+from chaserdock.simulation.scheduler import Scheduler, VirtualQueue
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, draw_case
+from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, check_queues, draw_case
 from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
@@ -381,6 +385,49 @@ def test_a_touched_target_may_change_its_energy(log: Log) -> None:
         latched = (0,) if tick == 1 else ()
         log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=latched))
     assert log.found == []
+
+
+@pytest.mark.parametrize(
+    ("phase", "rates", "found"),
+    [
+        ("detumble", (0.4, 0.2, 0.1, 0.2), ["tumble falls"]),
+        ("stack_hold", (0.4, 0.0, 0.0, 0.1), ["tumble falls"]),
+        ("detumble", (0.4, 0.2, 0.21, 0.0), []),
+        ("verified", (0.1, 0.1, 0.1, 0.2), []),
+    ],
+)
+def test_latched_chasers_do_not_spin_the_stack_up(
+    log: Log, phase: str, rates: tuple[float, ...], found: list[str]
+) -> None:
+    """The chaser is 1 m from the target: both turn about their common centre of mass."""
+    drawn = [
+        DrawnBody(body=name, mass_kg=2.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+        for name in ("target", "chaser/0")
+    ]
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=tuple(drawn)))
+    reference: Any = msgspec.structs.replace(BY_TYPE[Reference], phase=phase)
+    log.publish(topics.REFERENCE, reference, 0)
+    for tick, rate in enumerate(rates):
+        for name, x_m in (("target", 0.0), ("chaser/0", -1.0)):
+            moving: dict[str, Any] = {"omega_rad_s": (0, 0, rate), "velocity_m_s": (0, rate * (x_m + 0.5), 0)}
+            log.publish(topics.TRUTH_BODY, body(name, x_m, **moving, tick=tick), name)
+        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=(0,)))
+    assert log.found == found
+
+
+@pytest.mark.parametrize(("mode", "found"), [("lockstep", []), ("realtime", ["bounded queues"])])
+def test_recorder_in_lockstep_may_be_some_ticks_behind(tmp_path: Path, mode: str, found: list[str]) -> None:
+    log = Log(variant(tmp_path, simulation={"mode": mode}))
+    log.publish(topics.END, MissionEnd(tick=10, reason="completed", complete=True))
+    traffic = Traffic(recorded=Counter({"world/tick": 600}))
+    traffic.queues["recorder 0"] = VirtualQueue(Scheduler(0), lambda: None, 1.0)
+    traffic.queues["recorder 0"].most = 9 * 60
+    flight = SimulatedFlight(tmp_path, {}, {}, (), "", 0.0, traffic)
+    check_queues(log.checks, flight)
+    assert log.found == found
+    traffic.queues["recorder 0"].most += 1
+    check_queues(log.checks, flight)
+    assert log.found == ["bounded queues"]
 
 
 def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:

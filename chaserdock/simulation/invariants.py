@@ -160,6 +160,11 @@ class Invariants:
         """Mission time of the newest tick (s)."""
         return max(0, self._tick, self._state_tick) / self.scenario.time.rate_hz
 
+    @property
+    def ticks(self) -> int:
+        """Number of ticks flown so far."""
+        return 1 + max(self._tick, self._state_tick)
+
     def violate(self, invariant: str, subject: str, text: str) -> None:
         """Note a violation, unless one of the same invariant and subject is noted already."""
         if (invariant, subject) not in self._seen:

@@ -299,7 +299,7 @@ def fly_case(
         if not over():
             checks.check_end(flight.crashes, flight.stalled)
             _check_recording(checks, flight, published)
-            check_queues(checks, flight)
+            _check_queues(checks, flight, published.total())
             if honest:
                 _check_consistency(checks)
     return SimulationResult(
@@ -362,20 +362,23 @@ def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Cou
             )
 
 
-def check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
-    """Check that queues stay short unless a flood or a slow or frozen reader fills them.
+def queue_limit(reader: str, published: int, ticks: int) -> int:
+    """Return how many messages may wait for a process in a flight with so many messages and ticks.
 
-    In lock-step the recorder may be a few ticks behind, with all their messages.
+    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean.
     """
+    behind = math.ceil((RECORDER_WINDOW_TICKS + 2) * published / max(1, ticks)) if reader == "recorder" else 0
+    return max(QUEUE_LIMIT, behind)
+
+
+def _check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
+    """Check that queues stay short unless a flood or a slow or frozen reader fills them."""
     s = checks.scenario
     if s.simulation.slow or s.simulation.partition or any(f.kind in ("flood", "freeze") for f in s.fault):
         return
-    ticks = max(1, 0 if checks.end is None else checks.end.tick)
-    per_tick = math.ceil(flight.traffic.recorded.total() / ticks)
-    behind = (RECORDER_WINDOW_TICKS + 1) * per_tick if s.simulation.mode == "lockstep" else 0
     for name, items in flight.traffic.queues.items():
         reader = name.split()[0]
-        if items.most > max(QUEUE_LIMIT, behind if reader == "recorder" else 0):
+        if items.most > queue_limit(reader, published, checks.ticks):
             checks.violate("bounded queues", reader, f"{items.most} messages waited")
 
 
@@ -383,4 +386,4 @@ LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
 """Largest mean normalized squared error (6 if consistent) of at least so many estimates of one flight without lying sensors."""
 _LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
 QUEUE_LIMIT = 400
-"""Most messages that may wait for a reader which is neither slow nor flooded."""
+"""Most messages that may wait for a reader which is neither slow nor flooded; see ``queue_limit``."""

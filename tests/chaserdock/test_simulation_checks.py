@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import copy
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -39,11 +38,8 @@ from message_samples import BY_TYPE
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
-from chaserdock.simulation.mission import SimulatedFlight
-from chaserdock.simulation.network import Traffic
-from chaserdock.simulation.scheduler import Scheduler, VirtualQueue
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, check_queues, draw_case
+from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, draw_case, queue_limit
 from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
@@ -68,6 +64,12 @@ def variant(folder: Path, **keys: Any) -> Scenario:
 def killed(tmp_path: Path) -> Scenario:
     """Scenario in which chaser 1 is killed."""
     return variant(tmp_path, fault=[{"kind": "kill", "process": "chaser/1", "at_s": 0.1}])
+
+
+def test_recorder_may_be_the_window_of_ticks_behind() -> None:
+    """Four chasers with ports and thrusters publish 54 messages a tick, 476 of which waited in `detumble`."""
+    assert 476 < queue_limit("recorder", 1619, 30) < 600
+    assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
 
 
 # -- cases ------------------------------------------------------------------------------------------------------
@@ -413,21 +415,6 @@ def test_latched_chasers_do_not_spin_the_stack_up(
             log.publish(topics.TRUTH_BODY, body(name, x_m, **moving, tick=tick), name)
         log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=(0,)))
     assert log.found == found
-
-
-@pytest.mark.parametrize(("mode", "found"), [("lockstep", []), ("realtime", ["bounded queues"])])
-def test_recorder_in_lockstep_may_be_some_ticks_behind(tmp_path: Path, mode: str, found: list[str]) -> None:
-    log = Log(variant(tmp_path, simulation={"mode": mode}))
-    log.publish(topics.END, MissionEnd(tick=10, reason="completed", complete=True))
-    traffic = Traffic(recorded=Counter({"world/tick": 600}))
-    traffic.queues["recorder 0"] = VirtualQueue(Scheduler(0), lambda: None, 1.0)
-    traffic.queues["recorder 0"].most = 9 * 60
-    flight = SimulatedFlight(tmp_path, {}, {}, (), "", 0.0, traffic)
-    check_queues(log.checks, flight)
-    assert log.found == found
-    traffic.queues["recorder 0"].most += 1
-    check_queues(log.checks, flight)
-    assert log.found == ["bounded queues"]
 
 
 def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:

@@ -105,13 +105,19 @@ def capture_failures(result: dict[str, Any], s: Scenario) -> list[str]:
     return out
 
 
+def capture_state(capture: dict[str, Any]) -> str:
+    """Return the state of a capture at the end of the flight in one or two words."""
+    if capture["latch_time_s"] is None:
+        return "never latched"
+    return "verified" if capture["verified"] else "latched" if capture["latched"] else "released"
+
+
 def capture_text(capture: dict[str, Any]) -> str:
     """Describe a capture as part of a line."""
     if capture["latch_time_s"] is None:
-        return "; never latched"
-    state = "verified" if capture["verified"] else "latched" if capture["latched"] else "released"
+        return f"; {capture_state(capture)}"
     return (
-        f"; {state}, latched at {capture['latch_time_s']:.1f} s: {capture['contact_lateral_m'] * 1e3:.2f} mm and "
+        f"; {capture_state(capture)}, latched at {capture['latch_time_s']:.1f} s: {capture['contact_lateral_m'] * 1e3:.2f} mm and "
         f"{np.degrees(capture['contact_angle_rad']):.2f} deg off, closing at "
         f"{capture['contact_closing_m_s'] * 1e3:.1f} mm/s"
     )

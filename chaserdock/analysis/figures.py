@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.errors import errors_of_writing
 from matplotlib.axes import Axes
+from matplotlib.colors import LinearSegmentedColormap, PowerNorm, to_rgba
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from .criteria import nearest_allowed_m
 from .flight import RecordedFlight, Track, load_flight
 from .plots import (
     AXES_XYZ,
@@ -39,7 +40,7 @@ from .plots import (
     save,
     styled,
 )
-from .summary import estimate_errors, known_estimates, tracking_errors
+from .summary import estimate_errors, known_estimates, tracking_components, tracking_errors
 from .time_series import OUTCOMES, ImageOutcome, ImageOutcomes, Traces, load_traces
 
 Drawing = Callable[[RecordedFlight, Traces], Figure]
@@ -97,7 +98,7 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     target = flight.truth["target"]
     paths = {i: _path(flight.truth[f"chaser/{i}"], target) for i in numbers}
-    figure = Figure(figsize=(9.6, 4.6))
+    figure = Figure(figsize=(9.6, 4.8))
     for place, title in enumerate(("World frame (WRF)", "Relative to the target, target frame (TRF)")):
         axes: Any = figure.add_subplot(1, 2, place + 1, projection="3d")
         if place:
@@ -116,8 +117,7 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
             axes.scatter(*p[-1], color=colour(i), marker="^", s=22)
         axes.set_title(title)
         axes.set(xlabel="x / m", ylabel="y / m", zlabel="z / m")
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_box_aspect(None, zoom=0.86)
+        _equal_scale(axes, [paths[i][place] for i in numbers] + ([] if place else [target.position_m]))
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
             axis.pane.set_visible(False)
             axis.set_major_locator(MaxNLocator(5))
@@ -125,6 +125,17 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
         if not place:
             axes.legend(loc="upper left", bbox_to_anchor=(-0.12, 1.0))
     return figure
+
+
+def _equal_scale(axes: Any, paths: list[Array]) -> None:
+    """Set limits around the paths and the origin of the axes with one scale, the box no larger than the paths need."""
+    points = np.concatenate([*paths, np.zeros((1, 3))])
+    low, high = points.min(axis=0), points.max(axis=0)
+    half = np.maximum(high - low, 0.3 * float(np.max(high - low)) + 1e-3) / 2.0 * 1.05
+    middle = (low + high) / 2.0
+    for set_limits, m, h in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, half, strict=True):
+        set_limits(m - h, m + h)
+    axes.set_box_aspect(half, zoom=1.0)
 
 
 def _mark_phases(axes: Axes, flight: RecordedFlight, labelled: bool) -> None:
@@ -174,45 +185,118 @@ def tracking(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
-@_figure("Docking", "Distance between the centres of chaser and target, and the closing speed.")
+@_figure(
+    "Tracking errors by axis",
+    "Pose of each chaser minus its reference pose on the true target: position in target axes, orientation as a rotation vector "
+    "in chaser axes.",
+)
+def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
+    numbers = flown(flight)
+    figure, axes = new_figure(2, 3, height=1.7, sharex=True, sharey="row")
+    step = decimation(len(flight.truth["target"].time_s))
+    reach = np.zeros(2)
+    for i in numbers:
+        time_s, position, turn = tracking_components(flight, i, step)
+        for row, values in enumerate((position * 1e3, np.degrees(turn))):
+            # Transients after commands may exceed the scale.
+            reach[row] = max(reach[row], 1.4 * float(np.percentile(np.abs(values), 98.0)), 1e-3)
+            for k in range(3):
+                axes[3 * row + k].plot(
+                    time_s,
+                    values[:, k],
+                    color=colour(i),
+                    linestyle=dashes(i),
+                    linewidth=0.9,
+                    label=f"chaser {i}",
+                )
+    for row, label in enumerate(("position / mm", "orientation / °")):
+        axes[3 * row].set_ylabel(label)
+        axes[3 * row].set_ylim(-reach[row], reach[row])
+    for k, name in enumerate("xyz"):
+        axes[k].set_title(name)
+        axes[3 + k].set_xlabel("time / s")
+    axes[0].set_xlim(_span_s(flight.truth["target"].time_s))
+    legend_above(axes[2])
+    return figure
+
+
+def speed_limits(flight: RecordedFlight, chaser: int) -> list[tuple[float, float, float]]:
+    """Return begin (s), end (s) and limit of the closing speed (m/s) for the phases of a chaser that have one."""
+    s, history = flight.scenario, flight.references.get(chaser)
+    if history is None:
+        return []
+    if s.docking.port_of(chaser) is None:
+        limits: dict[str, float] = dict.fromkeys(
+            ("approach", "retreat", "goto", "abort"), s.approach.max_speed_m_s
+        )
+    else:
+        docking = s.docking
+        limits = {
+            "approach": docking.corridor.closing_m_s,
+            "final": docking.final.closing_m_s,
+            "contact": docking.tolerances.closing_m_s,
+        }
+    ends = [begin_s for begin_s, _ in history.phases[1:]] + [float(flight.truth["target"].time_s[-1])]
+    return [
+        (begin_s, end_s, limits[phase])
+        for (begin_s, phase), end_s in zip(history.phases, ends, strict=True)
+        if phase in limits
+    ]
+
+
+def keep_out(flight: RecordedFlight, chaser: int) -> tuple[Array, Array]:
+    """Return times (K,) s and, from each on, the distance from the target (K,) m that a chaser keeps; NaN: none."""
+    end_s = float(flight.truth["target"].time_s[-1])
+    history = flight.references.get(chaser)
+    if history is None:
+        return np.array([0.0, end_s]), np.full(2, flight.scenario.limits.min_distance_target_m)
+    time_s, limit_m = history.keep_out.T
+    values = np.where(limit_m > 0.0, limit_m, np.nan)
+    return np.append(time_s, max(end_s, float(time_s[-1]))), np.append(values, values[-1])
+
+
+@_figure(
+    "Docking",
+    "Distance between the centres of chaser and target, and the closing speed. Dotted, in the colour of the chaser: the limits "
+    "that hold for it at that time (keep-out distance, none once it is latched; closing speed in the phases that limit it).",
+)
 def docking(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)
     figure, (top, bottom) = new_figure(2, sharex=True)
     s, target = flight.scenario, flight.truth["target"]
-    nearest = np.inf
+    nearest, fastest = np.inf, 0.0
     for i in numbers:
         own = flight.truth[f"chaser/{i}"]
         distance = own.distance_to(target)
         n = len(distance)
-        nearest = min(nearest, float(distance.min()))
+        limit_s, limit_m = keep_out(flight, i)
+        top.step(limit_s, limit_m, where="post", color=colour(i), linestyle=":", linewidth=1.3)
+        nearest = min([nearest, float(distance.min()), *limit_m[np.isfinite(limit_m)]])
         d, time_s = decimated(n), own.time_s[:n]
         top.plot(time_s[d], distance[d], color=colour(i), linestyle=dashes(i), label=f"chaser {i}")
         if n > 2:
             speed = -np.gradient(distance, time_s)
             bottom.plot(time_s[d], speed[d] * 1e3, color=colour(i), linestyle=dashes(i))
-    limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
-    keep_out_m = min(nearest_allowed_m(s, i) for i in numbers)
-    # The two limits may be close: the label of this one is below its line.
-    top.axhspan(0.0, keep_out_m, color=LIMIT, alpha=0.10, linewidth=0)
-    top.annotate(
-        f"keep-out: below {keep_out_m:g} m",
-        (1.0, keep_out_m),
-        xycoords=("axes fraction", "data"),
-        xytext=(-2, -10),
-        textcoords="offset points",
-        ha="right",
-        fontsize=8,
-        color=LIMIT,
-    )
-    top.set(ylabel="distance to the target / m", ylim=(min(nearest, keep_out_m) * 0.5, None))
-    limit_line(bottom, s.approach.max_speed_m_s * 1e3, "approach speed limit")
+        for begin_s, end_s, limit in speed_limits(flight, i):
+            bottom.plot((begin_s, end_s), (limit * 1e3,) * 2, color=colour(i), linestyle=":", linewidth=1.3)
+            fastest = max(fastest, limit * 1e3)
+    if any(_docks_at_distance(flight, i) for i in numbers):
+        limit_line(top, s.approach.dock_distance_m, f"docking distance {s.approach.dock_distance_m:g} m")
+    top.set(ylabel="distance to the target / m", ylim=(nearest * 0.5, None))
     bottom.set(ylabel="closing speed / mm s⁻¹", xlabel="time / s", xlim=_span_s(target.time_s))
-    settled = s.approach.max_speed_m_s * 1e3
-    bottom.set_ylim(-settled, 2.0 * settled)
+    fastest = fastest or s.approach.max_speed_m_s * 1e3
+    bottom.set_ylim(-fastest, 2.0 * fastest)
     for axes in (top, bottom):
         _mark_phases(axes, flight, axes is top)
     legend_above(top)
     return figure
+
+
+def _docks_at_distance(flight: RecordedFlight, chaser: int) -> bool:
+    """Return whether a chaser approaches the docking distance, instead of a port."""
+    history = flight.references.get(chaser)
+    phases = set() if history is None else {name for _, name in history.phases}
+    return flight.scenario.docking.port_of(chaser) is None and not phases.isdisjoint(("approach", "docked"))
 
 
 @_figure(
@@ -269,12 +353,21 @@ def separation(flight: RecordedFlight, _: Traces) -> Figure:
 
 @_figure(
     "Actuator forces and torques",
-    "Applied force and torque, body axes, mean over each tick; dashed: actuator limits.",
+    "Applied force and torque, body axes, mean over each tick; dashed: limits of the planned force and torque. Pulses of thrusters "
+    "may exceed them within a tick; dotted: all thrusters of an axis open.",
 )
 def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     if not traces.inputs:
         raise MissingData("the log holds fewer than two ticks of every chaser")
     body = flight.scenario.chaser
+    attainable = None
+    if body.actuation == "thrusters":
+        thrusts_N = [thruster.thrust_N for thruster in body.thrusters]
+        attainable = np.maximum(wrench_matrix(body.thrusters) * thrusts_N, 0.0).sum(axis=1)
+    largest = [
+        max(float(np.abs(v).max()) for v in pair)
+        for pair in zip(*((t.force_N, t.torque_N_m) for t in traces.inputs.values()), strict=True)
+    ]
     figure, axes = new_figure(len(traces.inputs), 2, height=1.55, sharex=True, sharey="col")
     for row, (i, applied) in enumerate(traces.inputs.items()):
         for column, (values, limit) in enumerate(
@@ -285,9 +378,13 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
                 a.stairs(
                     values[:, k], applied.edges_s, color=AXES_XYZ[k], label=name, linewidth=0.9, baseline=None
                 )
+            unit = 1e3 if column else 1.0
             for sign in (1.0, -1.0):
                 a.axhline(sign * limit, color=LIMIT, linestyle=(0, (5, 3)), linewidth=0.9)
-            a.set_ylim(-1.15 * limit, 1.15 * limit)
+                for most in () if attainable is None else np.unique(attainable[3 * column : 3 * column + 3]):
+                    a.axhline(sign * most * unit, color=LIMIT, linestyle=":", linewidth=0.9)
+            reach = 1.15 * max(limit, largest[column] * unit)
+            a.set_ylim(-reach, reach)
             a.set_ylabel("torque / mN m" if column else f"chaser {i}\nforce / N")
     axes[0].set_xlim(0, max(float(t.edges_s[-1]) for t in traces.inputs.values()))
     for a in axes[-2:]:
@@ -296,7 +393,11 @@ def inputs(flight: RecordedFlight, traces: Traces) -> Figure:
     return figure
 
 
-@_figure("Thruster firings", "Share of each tick during which each valve was open.")
+_DUTY = LinearSegmentedColormap.from_list("duty", [to_rgba(SERIES[0], 0.0), to_rgba(SERIES[0], 1.0)])
+"""Transparent for closed valves, so that it suits light and dark pages."""
+
+
+@_figure("Thruster firings", "Share of each tick during which each valve was open; blank: closed.")
 def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
     firing = {i: t for i, t in traces.inputs.items() if t.thruster_duty.shape[1]}
     if not firing:
@@ -308,9 +409,8 @@ def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
             applied.edges_s,
             np.arange(number + 1) - 0.5,
             applied.thruster_duty.T,
-            cmap="cividis_r",
-            vmin=0.0,
-            vmax=1.0,
+            cmap=_DUTY,
+            norm=PowerNorm(0.5, 0.0, 1.0),
             rasterized=True,
         )
         a.set(ylabel=f"chaser {i}\nthruster")
@@ -385,6 +485,24 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+def consistency_text(nees: Array, low: float, high: float) -> str:
+    """Judge NEES values (K,) against the band from ``low`` to ``high``, which 2.5 % exceed on either side if consistent."""
+    above, below = float(np.mean(nees > high)), float(np.mean(nees < low))
+    verdict = "consistent"
+    if above > _TAIL_SHARE:
+        verdict = "overconfident"
+    elif below > _TAIL_SHARE:
+        verdict = "conservative"
+    return (
+        f"{verdict}: mean {np.mean(nees):.2f} (6 expected); {100 * above:.1f} % above the band, "
+        f"{100 * below:.1f} % below (2.5 % each expected)"
+    )
+
+
+_TAIL_SHARE = 0.05
+"""Share of values on one side of the band from which on a filter is not called consistent: twice the expected one."""
+
+
 @_figure(
     "Consistency of the target estimate",
     "Normalized estimation error squared (NEES) of the pose, six degrees of freedom. A consistent filter "
@@ -402,10 +520,7 @@ def consistency(flight: RecordedFlight, _: Traces) -> Figure:
     axes.semilogy(errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8)
     axes.axhspan(low, high, color=SERIES[2], alpha=0.15, linewidth=0)
     axes.axhline(6.0, color=SERIES[2], linewidth=0.8)
-    outside = np.mean((errors["nees"] < low) | (errors["nees"] > high))
-    axes.set_title(
-        f"mean {np.mean(errors['nees']):.2f} (6 expected); {100 * outside:.1f} % outside the 95 % band"
-    )
+    axes.set_title(consistency_text(errors["nees"], low, high))
     axes.set(ylabel="NEES", xlabel="time / s", xlim=_span_s(errors["time_s"]))
     return figure
 

@@ -30,6 +30,7 @@ from chaserdock_protocol.messages import (
     Tick,
     WorldTruth,
 )
+from chaserdock_protocol.recording.gaps import SequenceGaps
 from chaserdock_protocol.recording.log import LogSource, Record, logged_scenario, read_log
 from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
@@ -88,11 +89,16 @@ class Tracks(Mapping[str, Track]):
 
 @dataclass
 class ReferenceHistory:
-    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s) and name of its phases."""
+    """Commanded offsets of a chaser, ``offset_m`` (K, 3) TRF from ``time_s`` (K,) on, and start (s) and name of its phases.
+
+    ``keep_out`` (L, 2): from a time (s) on, the distance from the target's centre that its plan keeps, m; 0: none, it is
+    latched.
+    """
 
     time_s: Array
     offset_m: Array
     phases: list[tuple[float, str]]
+    keep_out: Array
 
 
 @dataclass
@@ -219,9 +225,14 @@ class _ReferenceCollector:
     changes: Columns = field(default_factory=lambda: Columns(4))
     phases: list[tuple[float, str]] = field(default_factory=list)
     last: tuple[float, ...] | None = None
+    keep_out: Columns = field(default_factory=lambda: Columns(2))
+    last_keep_out_m: float | None = None
 
     def add(self, message: Reference) -> None:
         time_s = message.sim_time_ns / 1e9
+        if message.min_distance_target_m != self.last_keep_out_m:
+            self.keep_out.add((time_s, message.min_distance_target_m))
+            self.last_keep_out_m = message.min_distance_target_m
         if message.offset_m != self.last:
             self.changes.add((time_s,), message.offset_m)
             self.last = message.offset_m
@@ -230,7 +241,7 @@ class _ReferenceCollector:
 
     def finish(self) -> ReferenceHistory:
         table = self.changes.table()
-        return ReferenceHistory(table[:, 0], table[:, 1:], self.phases)
+        return ReferenceHistory(table[:, 0], table[:, 1:], self.phases, self.keep_out.table())
 
 
 def _motion_table() -> Columns:
@@ -262,8 +273,7 @@ class _Collector:
     sent: dict[tuple[int, int], int] = field(default_factory=dict)
     latency: Columns = field(default_factory=lambda: Columns(1))
     counts: Counter[str] = field(default_factory=Counter)
-    last_seq: dict[str, int] = field(default_factory=dict)
-    lost: Counter[str] = field(default_factory=Counter)
+    gaps: SequenceGaps = field(default_factory=SequenceGaps)
     hashes: dict[str, int] = field(default_factory=dict)
     wall: list[int] = field(default_factory=list)
     expected: int = 0
@@ -323,9 +333,7 @@ class _Collector:
         """Update counts, gaps in the sequence numbers, and the digest."""
         message = record.message
         self.counts[record.key] += 1
-        last = self.last_seq.get(record.key, -1)
-        self.lost[record.key] += max(0, message.seq - last - 1)
-        self.last_seq[record.key] = message.seq
+        self.gaps.update(record.key, message.seq)
         if record.topic not in NOT_IN_DIGEST:
             content = msgspec.msgpack.encode(without_wall_time(message))
             # A sum, as two controllers publish on the same keys, and their messages arrive in any order.
@@ -408,7 +416,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         events=c.events,
         replies=c.replies,
         counts=dict(sorted(c.counts.items())),
-        lost=dict(c.lost),
+        lost=dict(c.gaps.lost),
         rejected=dict(rejected),
         expected_commands=c.expected,
         latency_s=c.latency.table()[:, 0],

@@ -18,6 +18,7 @@ from chaserdock_protocol.errors import errors_of_writing
 
 from chaserdock.html_page import PAGE_FILES, html_page, table
 
+from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
 from .plots import decimation, to_inline_svg
@@ -55,7 +56,7 @@ def report_of(log: Path) -> str:
         svg = to_inline_svg(figure, kind.name, kind.title)
         figures.append(
             f'<h3 id="figure-{kind.name}">{escape(kind.title)}</h3>\n<figure>'
-            f"<figcaption>{escape(kind.caption)}</figcaption>\n{svg}</figure>"
+            f'<figcaption>{escape(kind.caption)}</figcaption>\n<div class="wide">{svg}</div></figure>'
         )
     replay, script = "", ""
     if "target" in flight.truth:
@@ -130,6 +131,8 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
     if not result["chasers"]:
         return "<h2>Chasers</h2><p>The log holds no motion of a chaser.</p>"
     degree = math.degrees(1.0)
+    at_distance = any("capture" not in c for c in result["chasers"].values())
+    fuel = any(c["propellant_kg"] > 0.0 for c in result["chasers"].values())
     rows = [
         (
             f"chaser {i}",
@@ -137,9 +140,10 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
             _quantity(c["position_mse_m2"], "m²"),
             _quantity(c["orientation_mse_rad2"], "rad²"),
-            f"{c['dock_time_s']:.2f} s" if c["docked"] else "no",
+            *([_docked(c)] if at_distance else []),
             _quantity(c["min_distance_target_m"], "m"),
             _quantity(c["impulse_N_s"], "N s"),
+            *([_quantity(c["propellant_kg"], "g", 1e3)] if fuel else []),
         )
         for i, c in result["chasers"].items()
     ]
@@ -150,9 +154,10 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         "steady orientation RMS",
         "position MSE, whole run",
         "orientation MSE, whole run",
-        "docked since",
+        *(["docked since"] if at_distance else []),
         "minimum distance to target",
         "impulse",
+        *(["propellant"] if fuel else []),
     )
     until = s.steady_until_s or s.duration_s
     return (
@@ -160,6 +165,41 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         + table(head, rows)
         + '<p class="faint">Errors relative to the reference pose on the true target. '
         + f"Steady state: {s.settling_s:g} s to {until:g} s.</p>"
+        + _captures(result)
+    )
+
+
+def _docked(c: dict[str, Any]) -> str:
+    if "capture" in c:
+        return _DASH  # a chaser with a port does not dock at a distance
+    return f"{c['dock_time_s']:.2f} s" if c["docked"] else "no"
+
+
+def _captures(result: dict[str, Any]) -> str:
+    """Return a table of the captures, with the values of the touch that closed the latch."""
+    degree = math.degrees(1.0)
+    rows = [
+        (
+            f"chaser {i}",
+            capture_state(k),
+            _quantity(k["latch_time_s"], "s", digits=4),
+            _quantity(k["contact_lateral_m"], "mm", 1e3),
+            _quantity(k["contact_angle_rad"], "°", degree),
+            _quantity(k["contact_closing_m_s"], "mm/s", 1e3),
+            _quantity(k["contact_lateral_speed_m_s"], "mm/s", 1e3),
+            str(k["probe_touches"]),
+        )
+        for i, c in result["chasers"].items()
+        if (k := c.get("capture")) is not None
+    ]
+    head = ("", "at the end", "latched at", "lateral offset", "misalignment", "closing speed", "lateral speed",
+            "touches of the probe")  # fmt: skip
+    if not rows:
+        return ""
+    return (
+        f"<h2>Capture</h2>{table(head, rows)}"
+        '<p class="faint">Offset, misalignment and speeds at the touch that closed the latch. Verified: the latch held in the '
+        "pull test.</p>"
     )
 
 

@@ -82,6 +82,19 @@ def tracking_errors(flight: RecordedFlight, chaser: int) -> tuple[Array, Array, 
     return target.time_s[:n], position, angle
 
 
+def tracking_components(flight: RecordedFlight, chaser: int, step: int) -> tuple[Array, Array, Array]:
+    """Return times (K,), position errors (K, 3) m, TRF, and orientation errors (K, 3) rad, CRF, of every ``step``-th tick.
+
+    Own pose relative to the true reference; the orientation error is a rotation vector.
+    """
+    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
+    rows = slice(0, min(len(target.time_s), len(own.time_s)), step)
+    positions, attitudes = true_reference(flight, chaser, rows, target)
+    offset = rotations.rotate_inverse(target.q_wxyz[rows], own.position_m[rows] - positions)
+    turn = rotations.log(rotations.multiply(rotations.conjugate(attitudes), own.q_wxyz[rows]))
+    return target.time_s[rows], offset, turn
+
+
 def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the rows of the estimate (K,) with a known target, and the rows of its truth at the same times."""
     none = np.zeros(0, dtype=np.intp)
@@ -253,9 +266,7 @@ def _events(flight: RecordedFlight) -> list[dict[str, Any]]:
 def _messages(flight: RecordedFlight) -> dict[str, dict[str, int]]:
     out: dict[str, dict[str, int]] = defaultdict(lambda: {"count": 0, "lost": 0})
     for key, count in flight.counts.items():
-        # Presence is published before subscriptions exist: missing messages are not losses.
-        lost = 0 if key.endswith("/presence") else flight.lost.get(key, 0)
-        out[key] = {"count": count, "lost": lost}
+        out[key] = {"count": count, "lost": flight.lost.get(key, 0)}
     return dict(out)
 
 

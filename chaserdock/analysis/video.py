@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
 from chaserdock_protocol.recording.log import LogError
+from chaserdock_world.orbit import to_sun
 
 from .chase_camera import BgrImage, BodyPose, Viewpoint, draw, tint
 from .columns import nanoseconds
@@ -142,7 +143,7 @@ class _ExternalView:
         self.flight = flight
         self.size = (width_px, height_px)
         self.scene = scene_of(flight.scenario)
-        sun = np.array(flight.scenario.camera.sun_direction)
+        sun = np.array(to_sun(flight.scenario))
         self.sun = sun / np.linalg.norm(sun)
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]

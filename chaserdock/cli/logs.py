@@ -24,11 +24,12 @@ LogFilesArg = Annotated[
 FolderOpt = Annotated[Path, typer.Option("--out", help="folder to write into")]
 
 
-class TableFormat(StrEnum):
-    """File formats of tables."""
+class ExportFormat(StrEnum):
+    """What a log is exported to."""
 
     parquet = "parquet"
     csv = "csv"
+    rosbag2 = "rosbag2"
 
 
 def _source(log: list[Path]) -> Path | list[Path]:
@@ -74,11 +75,21 @@ def export(
     log: LogFilesArg,
     out: FolderOpt,
     format: Annotated[
-        TableFormat, typer.Option(help="parquet keeps types and units; csv is readable everywhere")
-    ] = TableFormat.parquet,
-    images: Annotated[bool, typer.Option("--images", help="include the bytes of the images")] = False,
+        ExportFormat,
+        typer.Option(
+            help="parquet keeps types and units; csv is readable everywhere; rosbag2 is a bag of ROS 2 (MCAP), "
+            "which needs chaserdock[ros2]"
+        ),
+    ] = ExportFormat.parquet,
+    images: Annotated[bool, typer.Option("--images", help="include the images")] = False,
 ) -> None:
-    """Write one table per topic, all chasers together."""
+    """Write one table per topic, all chasers together, or a bag of ROS 2."""
+    if format is ExportFormat.rosbag2:
+        from chaserdock.logs.rosbag import export_bag
+
+        for topic, messages in export_bag(_source(log), out, images).items():
+            print(f"{topic}: {messages} messages")
+        return
     from chaserdock.logs.export import export as write
 
     for name, rows in write(_source(log), out, format.value, images).items():

@@ -20,20 +20,20 @@ from .compare import check, compare, replay, reproduce, study
 from .help import HELP_OPTIONS, GroupedHelp, add_command
 from .operate import command, status, thruster_fault, view
 from .options import fail
-from .processes import chaser, controller, record, router, world
+from .processes import chaser, controller, record, ros2, router, world
 from .run import campaign, judge, run
-from .setup import calibrate, keys, markers
+from .setup import calibrate, compose, keys, markers
 from .simulate import simulate
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Fly": (run, campaign, simulate),
     "Scenarios": (scenario.app,),
-    "Processes": (world, chaser, controller, record, router),
+    "Processes": (world, chaser, controller, record, router, ros2),
     "Operate": (command, thruster_fault, status, view, judge),
     "Look at a flight": (summary, report, figures, video, snapshot),
     "Logs": (logs.app,),
     "Reproduce and compare": (replay, compare, reproduce, study, check),
-    "Setup": (markers, calibrate, keys),
+    "Setup": (markers, calibrate, keys, compose),
 }
 """Commands (functions) and groups of commands (apps) by the section of the help that lists them."""
 

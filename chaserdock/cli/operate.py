@@ -39,7 +39,7 @@ class CommandName(StrEnum):
     restore = "restore"
 
 
-@with_link_options("listen", "lease")
+@with_link_options("listen", "lease", joins_run=True)
 def command(
     what: Annotated[CommandName, typer.Argument(help="command")],
     number: ChaserArg,
@@ -82,7 +82,7 @@ class ThrusterFaultKind(StrEnum):
     healthy = "healthy"
 
 
-@with_link_options("listen", "lease")
+@with_link_options("listen", "lease", joins_run=True)
 def thruster_fault(
     number: ChaserArg,
     thruster: Annotated[int, typer.Argument(min=0, max=254, help="thruster number, from 0")],
@@ -117,7 +117,7 @@ def _print_reply(reply: CommandReply, as_json: bool) -> None:
     raise typer.Exit(0 if reply.accepted else 1)
 
 
-@with_link_options("listen", "lease")
+@with_link_options("listen", "lease", joins_run=True)
 def status(
     *,
     link: LinkOptions,
@@ -136,7 +136,7 @@ def status(
         Console().print(table_of(observed))
 
 
-@with_link_options()
+@with_link_options(joins_run=True)
 def view(
     log: Annotated[
         list[Path] | None,

@@ -12,7 +12,7 @@ import re
 import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from functools import wraps
 from inspect import Parameter, Signature, signature
@@ -189,6 +189,12 @@ class LinkOptions:
         Path | None, typer.Option("--config", "-c", envvar="ZENOH_CONFIG", help="Zenoh configuration file")
     ] = None
     keys: KeysOpt = None
+    run: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR", help="folder of a mission that `chaserdock run` flies: connect to that mission"
+        ),
+    ] = None
     lease: Annotated[
         float, typer.Option(min=0.1, max=86_400.0, help="seconds after which a silent peer counts as lost")
     ] = 60.0
@@ -200,6 +206,8 @@ class LinkOptions:
         """
         from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
 
+        if self.run is not None:
+            return self._of_run(self.run).link(process, timeout_s)
         connect, listen = self.connect, self.listen
         if process == "world" and not connect:
             connect = []
@@ -237,6 +245,16 @@ class LinkOptions:
             connect_timeout_s=timeout_s,
         )
 
+    def _of_run(self, folder: Path) -> LinkOptions:
+        """Return these options with the address of the mission that writes to ``folder``."""
+        from chaserdock.launch.mission_address import read_address
+
+        if self.connect is not None or self.namespace != LinkOptions.namespace:
+            raise fail("--run excludes --connect and --namespace; it takes both from the mission's folder")
+        address = read_address(folder)
+        keys = self.keys if self.keys is not None or address.keys is None else Path(address.keys)
+        return replace(self, run=None, namespace=address.namespace, connect=[address.endpoint], keys=keys)
+
     def router_link(self) -> Link:
         """Return the link of the router."""
         from chaserdock_protocol.transport import DEFAULT_ENDPOINT, Link
@@ -250,8 +268,14 @@ class LinkOptions:
         return Link(self.namespace, (), endpoints, "router", self.config, round(self.lease * 1000), tls)
 
 
-def with_link_options(*without: str, **defaults: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Replace a command's parameter ``link`` by the fields of LinkOptions, but ``without`` some, or with other defaults."""
+def with_link_options(
+    *without: str, joins_run: bool = False, **defaults: Any
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Replace a command's parameter ``link`` by the fields of LinkOptions, but ``without`` some, or with other defaults.
+
+    ``joins_run``: with the option ``--run``.
+    """
+    without = without if joins_run else (*without, "run")
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         hints = get_type_hints(LinkOptions, include_extras=True)

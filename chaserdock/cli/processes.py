@@ -46,6 +46,8 @@ def start_process(name: str, options: ProcessOptions) -> None:
                 f"the world needs PyBullet, which has no wheels for Python {python}; use Python 3.11, "
                 "e.g. uv run --python 3.11 chaserdock world …"
             ) from None
+        if error.name is not None and error.name.startswith("rosbags"):
+            raise fail("rosbags is not installed; install chaserdock[ros2]") from None
         raise
     sys.exit(process(options))
 
@@ -161,6 +163,51 @@ def record(
         watch_parent=watch_parent,
     )
     start_process("record", options)
+
+
+@with_link_options()
+def ros2(
+    *,
+    link: LinkOptions,
+    ros_connect: Annotated[
+        list[str] | None,
+        typer.Option(help="Zenoh endpoint of ROS 2's router (rmw_zenohd); tcp/127.0.0.1:7447 by default"),
+    ] = None,
+    ros_listen: Annotated[
+        list[str] | None, typer.Option(help="be ROS 2's router, in place of rmw_zenohd, at this endpoint")
+    ] = None,
+    ros_domain: Annotated[
+        int, typer.Option(min=0, max=232, envvar="ROS_DOMAIN_ID", help="domain of ROS 2")
+    ] = 0,
+    control: Annotated[
+        bool,
+        typer.Option(
+            "--control",
+            help="real time: take the controller's place, with wrenches from /chaser_N/wrench_command, instead of "
+            "showing the mission",
+        ),
+    ] = False,
+    timeout: JoinTimeoutOpt = None,
+    stall_s: StallOpt = DEFAULT_STALL_S,
+    watch_parent: WatchOpt = False,
+) -> None:
+    """Show a mission to ROS 2 (rmw_zenoh_cpp; Jazzy, Kilted) and serve its operator commands. Needs chaserdock[ros2], no ROS."""
+    from chaserdock_protocol.process import ProcessOptions, RosLink
+
+    from .options import check_endpoints
+
+    check_endpoints("--ros-connect", ros_connect or [])
+    check_endpoints("--ros-listen", ros_listen or [])
+    listen = tuple(ros_listen or ())
+    connect = tuple(ros_connect or (() if listen else RosLink().connect))
+    options = ProcessOptions(
+        link=link.link("controller" if control else "bridge", timeout),
+        patience_s=timeout,
+        stall_s=stall_s,
+        watch_parent=watch_parent,
+        ros=RosLink(connect, listen, ros_domain, control),
+    )
+    start_process("ros2", options)
 
 
 @with_link_options("connect", "net_mode", lease=10.0)

@@ -42,6 +42,17 @@ def run(
     view: Annotated[bool, typer.Option("--view", help="serve the live viewer, too (see `view`)")] = False,
     keys: KeysOpt = None,
     stall_s: StallOpt = DEFAULT_STALL_S,
+    port: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            max=65535,
+            help="port of 127.0.0.1 on which commands reach the mission; a free one by default",
+        ),
+    ] = None,
+    namespace: Annotated[
+        str | None, typer.Option(help="Zenoh namespace of the mission; a unique one by default")
+    ] = None,
 ) -> None:
     """Fly a scenario on this machine: start all processes, record, judge. Status 0 only if the flight is a success."""
     from chaserdock.launch.launcher import fly_mission, print_outcome
@@ -50,11 +61,11 @@ def run(
 
     show = show_of(quiet, as_json)
     with errors_as_json(as_json), stop_on_signals() as stop:
-        port = None
+        viewer_port = None
         if view:
-            port = free_port(DEFAULT_HOST, None)
+            viewer_port = free_port(DEFAULT_HOST, None)
             os.environ[TOKEN_VARIABLE] = token = page_token()  # read by the viewer's process
-            print(f"the viewer is at {url_of(DEFAULT_HOST, port, token)}", file=sys.stderr, flush=True)
+            print(f"the viewer is at {url_of(DEFAULT_HOST, viewer_port, token)}", file=sys.stderr, flush=True)
         outcome = fly_mission(
             scenario,
             out,
@@ -64,8 +75,10 @@ def run(
             keys=keys,
             stall_s=stall_s,
             show=show,
-            viewer_port=port,
+            viewer_port=viewer_port,
             stop_requested=stop.is_set,
+            port=port,
+            namespace=namespace,
         )
     print_outcome(outcome, show)
     raise typer.Exit(outcome.status)

@@ -90,6 +90,19 @@ def calibrate(
     print(out)
 
 
+def compose(
+    chasers: Annotated[int, typer.Option(min=1, max=16, help="number of chaser services")] = 4,
+    standby: Annotated[bool, typer.Option("--standby", help="with a standby controller")] = False,
+    view: Annotated[
+        bool, typer.Option("--view", help="with the viewer, which `docker compose --profile view up` starts")
+    ] = False,
+) -> None:
+    """Print the Docker Compose file of a mission: a service per process, with access control."""
+    from chaserdock.launch.compose_file import compose_file
+
+    print(compose_file(chasers, standby=standby, view=view), end="")
+
+
 keys = command_group("keys", "Make the keys and certificates of a mission.")
 
 

@@ -3,7 +3,7 @@
 
 ``python -m chaserdock.launch.container ARGUMENTS``. With ``--exit-code-from`` Compose stops all containers as soon as one
 exits, so a finished process waits until the router has exited; the router exits after the judge. Environment: SCENARIO,
-SET (overrides separated by blanks), ROUTER (``host:port``), COMPOSE_PROFILES.
+SET (overrides separated by blanks), ROUTER (``host:port``), CHASERS (number of chaser services).
 """
 
 from __future__ import annotations
@@ -66,14 +66,8 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
         return None
     return (
         f"SCENARIO={scenario} has {needed} chasers, but there are {services} chaser services; "
-        "set COMPOSE_PROFILES=8-chasers or 16-chasers"
+        f"make others with chaserdock compose --chasers {needed} > compose.yaml"
     )
-
-
-def count_services(profiles: str) -> int:
-    """Return the number of chaser services that compose.yaml starts under COMPOSE_PROFILES."""
-    active = profiles.split(",")
-    return 16 if "16-chasers" in active else 8 if "8-chasers" in active else 4
 
 
 def run(arguments: list[str], host: str, port: int) -> int:
@@ -136,17 +130,17 @@ def main() -> int:
         if check.returncode != 0:
             return check.returncode
     if arguments[:1] == ["--check"]:
-        return _check(arguments[1:], scenario, overrides, environment.get("COMPOSE_PROFILES", ""))
+        return _check(arguments[1:], scenario, overrides, int(environment.get("CHASERS", "4")))
     return run(with_overrides(arguments, overrides), host, int(port))
 
 
-def _check(arguments: list[str], scenario: str, overrides: str, profiles: str) -> int:
+def _check(arguments: list[str], scenario: str, overrides: str, services: int) -> int:
     from chaserdock_protocol.errors import ChaserdockError
 
     try:
         if arguments[0] == "chaser":
             return _NOT_IN_SCENARIO if int(arguments[1]) >= count_chasers(scenario, overrides) else 0
-        reason = too_many_chasers(scenario, overrides, count_services(profiles))
+        reason = too_many_chasers(scenario, overrides, services)
     except ChaserdockError as error:
         reason = str(error)
     if reason is None:

@@ -13,6 +13,7 @@ from chaserdock_protocol.messages import (
     CommandReply,
     Event,
     Health,
+    MissionEnd,
     Odometry,
     Presence,
     Reference,
@@ -58,6 +59,9 @@ class FlightState:
                 self._tick_times.append((now_s, message.sim_time_ns))
                 while now_s - self._tick_times[0][0] > _SPEED_WINDOW_S and len(self._tick_times) > 2:
                     self._tick_times.popleft()
+            case MissionEnd():
+                # The last tick begins one period before the end.
+                self.time_ns = max(self.time_ns, message.sim_time_ns)
             case Odometry():
                 self._odometry[message.chaser, message.tick] = message
                 self._odometry.pop((message.chaser, message.tick - _KEPT_TICKS), None)
@@ -67,27 +71,8 @@ class FlightState:
                 self.target = message
             case Presence():
                 self.present.add(message.process)
-            case Event():
-                return [
-                    EventNotice(
-                        sim_time_s=message.sim_time_ns / 1e9,
-                        process=message.process,
-                        level=message.level,
-                        what=message.what,
-                        detail=message.detail,
-                    )
-                ]
-            case CommandReply():
-                return [
-                    CommandNotice(
-                        sim_time_s=message.sim_time_ns / 1e9,
-                        command=message.command,
-                        chaser=message.chaser,
-                        accepted=message.accepted,
-                        reason=message.reason,
-                        operator=message.operator,
-                    )
-                ]
+            case Event() | CommandReply():
+                return [_notice_of(message)]
             case Health():
                 return self._health(message)
             case SolverStatus():
@@ -181,3 +166,22 @@ class FlightState:
         ]
         self._unsolved = set(failed)
         return notices
+
+
+def _notice_of(message: Event | CommandReply) -> EventNotice | CommandNotice:
+    if isinstance(message, Event):
+        return EventNotice(
+            sim_time_s=message.sim_time_ns / 1e9,
+            process=message.process,
+            level=message.level,
+            what=message.what,
+            detail=message.detail,
+        )
+    return CommandNotice(
+        sim_time_s=message.sim_time_ns / 1e9,
+        command=message.command,
+        chaser=message.chaser,
+        accepted=message.accepted,
+        reason=message.reason,
+        operator=message.operator,
+    )

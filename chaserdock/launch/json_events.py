@@ -11,6 +11,8 @@ from typing import Any, Literal
 import msgspec
 from msgspec import Struct
 
+from .mission_address import MissionAddress
+
 
 class ChaserProgress(Struct, frozen=True, kw_only=True):
     """State of a chaser as the controller estimates it: errors are relative to its reference on the *estimated* target."""
@@ -24,7 +26,8 @@ class ChaserProgress(Struct, frozen=True, kw_only=True):
 
 
 class Start(Struct, frozen=True, kw_only=True, tag_field="type", tag="start"):
-    """First line: the mission and the folder of its files. ``duration_s`` is simulated time."""
+    """First line: the mission, the folder of its files, and where `chaserdock command` reaches it. ``duration_s`` is
+    simulated time. ``address`` has ``namespace``, ``endpoint`` and ``keys`` (folder, or null)."""
 
     scenario: str
     seed: int
@@ -32,6 +35,7 @@ class Start(Struct, frozen=True, kw_only=True, tag_field="type", tag="start"):
     duration_s: float
     chasers: int
     folder: str
+    address: MissionAddress
 
 
 class Progress(Struct, frozen=True, kw_only=True, tag_field="type", tag="progress"):

@@ -20,6 +20,7 @@ from chaserdock_protocol.transport.session import join, request_scenario
 from chaserdock.exit_codes import STOPPED
 
 from .launcher import Fleet, judge, print_outcome, start_line
+from .mission_address import MissionAddress
 from .progress import ProgressReporter, Show
 
 LOG_CLOSED_S = 60.0
@@ -49,7 +50,9 @@ def judge_mission(out: Path, link: Link, timeout_s: float | None, world_timeout_
             return STOPPED
         scenario = scenario_from_json(full, "the world's scenario")
         reporter = ProgressReporter(scenario, show)
-        reporter.report(start_line(scenario, mission.mode, folder))
+        # Keys differ between the parties of a mission on several hosts: each has its own folder.
+        address = MissionAddress(namespace=link.namespace, endpoint=",".join(link.connect))
+        reporter.report(start_line(scenario, mission.mode, folder, address))
         try:
             failure = _watch(node, reporter, stop, world_timeout_s)
         finally:

@@ -36,6 +36,7 @@ from chaserdock.exit_codes import DONE, FAILED, STOPPED
 
 from .container import is_listening
 from .json_events import Failed, JsonLine, Result, Start
+from .mission_address import MissionAddress, remove_address, write_address
 from .progress import ProgressReporter, Show, print_json_line
 
 _START_TIMEOUT_S = 120
@@ -152,17 +153,31 @@ def free_port() -> int:
 
 
 def open_hub(
-    namespace: str, lease_ms: int, name: str = "operator", role: Role = "operator"
+    namespace: str, lease_ms: int, name: str = "operator", role: Role = "operator", port: int | None = None
 ) -> tuple[Node, str]:
-    """Open the launcher's node, which the processes connect to; return it and its endpoint. Raises TransportError."""
+    """Open the launcher's node, which the processes connect to, on ``port`` or a free one; return it and its endpoint.
+
+    Raises TransportError.
+    """
     for attempt in range(5):
-        endpoint = f"tcp/127.0.0.1:{free_port()}"
+        endpoint = f"tcp/127.0.0.1:{free_port() if port is None else port}"
         try:
             return Node(name, role, Link(namespace, (), (endpoint,), lease_ms=lease_ms)), endpoint
         except TransportError:
-            if attempt == 4:
+            if attempt == 4 or port is not None:
                 raise
     raise TransportError("no free port")
+
+
+def check_port(port: int) -> None:
+    """Raise RunError when the port is not available."""
+    with socket.socket() as probe:
+        # As in Zenoh: a port with connections in TIME_WAIT is available.
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", port))
+        except OSError as error:
+            raise RunError(f"--port {port}: {error.strerror}; choose another port") from None
 
 
 def check_keys(keys: Path, chasers: int) -> None:
@@ -173,24 +188,22 @@ def check_keys(keys: Path, chasers: int) -> None:
         raise RunError(f"--keys {keys}: {reason}; make a mission's keys with `chaserdock keys init {keys}`")
 
 
-def network_options(namespace: str, endpoint: str, lease_ms: int) -> list[str]:
+def network_options(namespace: str, endpoint: str, lease_ms: int, keys: Path | None = None) -> list[str]:
     """Return the command-line options with which a process joins the mission."""
-    return ["-e", endpoint, "--namespace", namespace, "--lease", f"{lease_ms / 1000:g}"]
+    secured = [] if keys is None else ["--keys", str(keys)]
+    return ["-e", endpoint, "--namespace", namespace, "--lease", f"{lease_ms / 1000:g}", *secured]
 
 
 def start_router(
-    observers: Fleet, output: Path, namespace: str, lease_ms: int, keys: Path
-) -> tuple[Node, list[str]]:
-    """Start a router that enforces the access rights of the mission's ``keys``.
+    observers: Fleet, output: Path, namespace: str, lease_ms: int, keys: Path, port: int
+) -> tuple[Node, str]:
+    """Start a router on ``port`` that enforces the access rights of the mission's ``keys``.
 
-    Returns the launcher's node, a client of it, and the options with which the processes connect. Raises RunError when the
-    router does not start.
+    Returns the launcher's node, a client of it, and the router's endpoint. Raises RunError when it does not start.
     """
-    port = free_port()
     endpoint = f"tls/127.0.0.1:{port}"
-    secured = ["--keys", str(keys)]
-    network = network_options(namespace, endpoint, lease_ms)
-    observers.start(ROUTER, ["router", "-l", *network[1:], *secured], output)
+    network = network_options(namespace, endpoint, lease_ms, keys)
+    observers.start(ROUTER, ["router", "-l", *network[1:]], output)
     router, deadline = observers.children[-1], time.monotonic() + _START_TIMEOUT_S
     while not is_listening("127.0.0.1", port):
         if router.process.poll() is not None or time.monotonic() > deadline:
@@ -205,7 +218,7 @@ def start_router(
         tls=Tls.in_folder(keys / "operator"),
         connect_timeout_s=_START_TIMEOUT_S,
     )
-    return Node("operator", "operator", link), [*network, *secured]
+    return Node("operator", "operator", link), endpoint
 
 
 def never() -> bool:
@@ -226,13 +239,16 @@ def fly_mission(
     stop_requested: Callable[[], bool] = never,
     emit: Callable[[JsonLine], None] = print_json_line,
     stall_s: float = DEFAULT_STALL_S,
+    port: int | None = None,
+    namespace: str | None = None,
 ) -> MissionOutcome:
     """Fly a scenario; write log, summary and the processes' output to ``folder``, by default a new one in ``runs/``.
 
     ``scenario_name``: a file, or the name of a shipped scenario. ``viewer_port``: serve the live viewer there until the end of
     the flight. ``keys``: connect through a router, over TLS, with access rights. ``stall_s``: longest time (s) without
-    progress. ``stop_requested`` is polled. Installs no signal handler; an exception ends all processes.
-    Raises RunError, ScenarioError or TransportError when the mission cannot start.
+    progress. ``port`` and ``namespace``: where other processes reach the mission, by default a free port and a unique name;
+    ``network.json`` in the folder contains them while the mission flies. ``stop_requested`` is polled. Installs no signal
+    handler; an exception ends all processes. Raises RunError, ScenarioError or TransportError when the mission cannot start.
     """
     path = find_scenario(str(scenario_name))
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
@@ -241,37 +257,44 @@ def fly_mission(
     output = folder / "processes"
     if keys is not None:
         check_keys(keys, len(scenario.chasers))
+    if port is not None:
+        check_port(port)
     if (folder / LOG_NAME).exists():
         raise RunError(f"{folder} contains a mission.mcap; a log is never overwritten, choose another --out")
     try:
         output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise RunError(f"{folder}: cannot be created: {error.strerror or error}") from None
-    namespace = f"run-{uuid.uuid4().hex[:12]}"
+    namespace = namespace or f"run-{uuid.uuid4().hex[:12]}"
     # After the lease a silent peer counts as lost; in lock-step the mission waits for a stopped process instead.
     lease_ms = 2_000 if mode == "realtime" else 600_000
     fleet, observers, hub = Fleet(), Fleet(), None
+    reporter = ProgressReporter(scenario, show, emit)
     try:
         if keys is not None:
-            hub, network = start_router(observers, output, namespace, lease_ms, keys.resolve())
+            keys = keys.resolve()
+            hub, endpoint = start_router(observers, output, namespace, lease_ms, keys, port or free_port())
         else:
-            hub, endpoint = open_hub(namespace, lease_ms)
-            network = network_options(namespace, endpoint, lease_ms)
+            hub, endpoint = open_hub(namespace, lease_ms, port=port)
+        address = MissionAddress(
+            namespace=namespace, endpoint=endpoint, keys=None if keys is None else str(keys)
+        )
+        write_address(folder, address)
+        reporter.report(start_line(scenario, mode, folder, address))
+        reporter.refresh()
+        network = network_options(namespace, endpoint, lease_ms, keys)
         if viewer_port is not None:
             observers.start("viewer", ["view", "--port", str(viewer_port), *network], output)
         stall = ["--stall-s", f"{stall_s:g}"]
         start_all(fleet, scenario, path, folder, mode, overrides, [*network, *stall])
-        reporter = ProgressReporter(scenario, show, emit)
-        reporter.report(start_line(scenario, mode, folder))
-        try:
-            failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
-        finally:
-            reporter.close()
+        failure = watch(fleet, hub, reporter, stop_requested, stall_s + _WORLD_ENDS_S)
     finally:
+        reporter.close()
         fleet.end()
         if hub is not None:
             hub.close()
         observers.end()
+        remove_address(folder)
     return judge(fleet, folder, failure, reporter)
 
 
@@ -291,7 +314,7 @@ def _new_folder(name: str) -> Path:
     return folder
 
 
-def start_line(scenario: Scenario, mode: Mode, folder: Path) -> Start:
+def start_line(scenario: Scenario, mode: Mode, folder: Path, address: MissionAddress) -> Start:
     """Return the first line about a mission."""
     return Start(
         scenario=scenario.name,
@@ -300,6 +323,7 @@ def start_line(scenario: Scenario, mode: Mode, folder: Path) -> Start:
         duration_s=scenario.duration_s,
         chasers=len(scenario.chasers),
         folder=str(folder),
+        address=address,
     )
 
 

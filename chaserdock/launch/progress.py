@@ -19,7 +19,7 @@ from rich.table import Table
 from rich.text import Text
 
 from .flight_state import FlightState
-from .json_events import CommandNotice, EventNotice, JsonLine, Progress, encode_line
+from .json_events import CommandNotice, EventNotice, JsonLine, Progress, Start, encode_line
 
 _LIVE_EVERY_S = 0.25
 _LINE_EVERY_S = 5.0
@@ -65,7 +65,7 @@ class ProgressReporter:
         self.show = show
         self._emit = emit
         self._console = Console(stderr=True)
-        self._shown_s = time.monotonic()
+        self._shown_s = -math.inf  # the first refresh shows what the mission waits for
         self._lost: set[str] = set()
         self._last_line = ""
         self._live: Live | None = None
@@ -109,6 +109,8 @@ class ProgressReporter:
         """Report one line: as JSON, or notices as text."""
         if self.show is Show.json:
             self._emit(line)
+        elif isinstance(line, Start):
+            self.print_text(f"{line.scenario}: {line.folder}; join with {line.address.options()}")
         elif isinstance(line, EventNotice | CommandNotice):
             self.print_text(text_of(line), _style_of(line))
 

@@ -17,7 +17,7 @@ from chaserdock_protocol.recording.log import LogError, LogSource, read_log
 
 from .tables import TopicTable
 
-ExportFormat = Literal["parquet", "csv"]
+TableFormat = Literal["parquet", "csv"]
 _ROWS, _IMAGE_ROWS = 4096, 64
 
 
@@ -37,7 +37,7 @@ class _CsvFile:
         self._file.close()
 
 
-def _create_file(path: Path, schema: pa.Schema, format: ExportFormat) -> Any:
+def _create_file(path: Path, schema: pa.Schema, format: TableFormat) -> Any:
     return (
         pq.ParquetWriter(path, schema, compression="zstd") if format == "parquet" else _CsvFile(path, schema)
     )
@@ -49,7 +49,7 @@ def _cell(value: Any) -> Any:
     return value.hex() if isinstance(value, bytes) else value
 
 
-def export(log: LogSource, folder: Path, format: ExportFormat, images: bool = False) -> dict[str, int]:
+def export(log: LogSource, folder: Path, format: TableFormat, images: bool = False) -> dict[str, int]:
     """Write every topic of a log into ``folder``, which is created; return the number of rows by file name.
 
     ``images``: include the bytes of the images. Raises LogError when the log or the files cannot be used.

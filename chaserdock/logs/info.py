@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
+from chaserdock_protocol.recording.gaps import SequenceGaps
 from chaserdock_protocol.recording.log import LogSource, logged_scenario
 from chaserdock_protocol.recording.scan import VIEWER_PREFIX, FileState, log_files, stored_messages
 from chaserdock_protocol.recording.schema_migrations import decode_logged
@@ -51,8 +52,7 @@ class LogInfo(msgspec.Struct):
     @property
     def whole(self) -> bool:
         """Whether every file was closed, no message is missing and every message is valid."""
-        # Presence is published before the recorder subscribes.
-        lost = any(k.lost for k in self.keys if not k.key.endswith("/presence"))
+        lost = any(k.lost for k in self.keys)
         return all(f.closed and not f.recovered for f in self.files) and not lost and not self.rejected
 
 
@@ -60,7 +60,7 @@ def info_of(log: LogSource) -> LogInfo:
     """Read all of a log, check every checksum and message. Raises LogError where it is damaged."""
     scenario, run = logged_scenario(log)
     keys: dict[str, KeyInfo] = {}
-    last_seq: dict[str, int] = {}
+    gaps = SequenceGaps()
     rejected: Counter[str] = Counter()
     files: list[FileInfo] = []
     viewer, sent = 0, [0, 0]
@@ -83,9 +83,8 @@ def info_of(log: LogSource) -> LogInfo:
             ]
             seq = _seq_of(channel.topic, stored.data, channel.metadata.get("zenoh_encoding", ""), rejected)
             if seq is not None:
-                # A restarted publisher counts from zero.
-                key.lost += max(0, seq - last_seq.get(channel.topic, -1) - 1)
-                last_seq[channel.topic] = seq
+                gaps.update(channel.topic, seq)
+                key.lost = gaps.lost[channel.topic]
         size = path.stat().st_size
         files.append(FileInfo(str(path), size, state.closed, state.cut_bytes, state.recovered))
     return LogInfo(

@@ -19,8 +19,24 @@ from chaserdock_protocol.recording.log import Record
 from chaserdock_protocol.topics import Topic
 from msgspec import inspect
 
-UNITS = ("rad_s", "N_m_s", "m_s", "N_m", "N_s", "rad", "deg", "px", "ns", "kg", "Hz", "m", "N", "s")
-"""Units that names end with; longer ones first. Slash and product as in the house style: ``m_s`` is m/s, ``N_m`` N m."""
+UNITS = {
+    "kg_m2": "kg m²",
+    "rad_s": "rad/s",
+    "N_m_s": "N m s",
+    "m_s": "m/s",
+    "N_m": "N m",
+    "N_s": "N s",
+    "rad": "rad",
+    "deg": "deg",
+    "px": "px",
+    "ns": "ns",
+    "kg": "kg",
+    "Hz": "Hz",
+    "m": "m",
+    "N": "N",
+    "s": "s",
+}
+"""Units by the end of a field's name; longer ends first."""
 
 Reader = Callable[[Any], Any]
 Column = tuple[str, pa.DataType, Reader]
@@ -28,10 +44,7 @@ Column = tuple[str, pa.DataType, Reader]
 
 def unit_of(name: str) -> str | None:
     """Return the unit in a field's name, None if it has none."""
-    for unit in UNITS:
-        if name.endswith(f"_{unit}"):
-            return unit
-    return None
+    return next((unit for end, unit in UNITS.items() if name.endswith(f"_{end}")), None)
 
 
 def _get(name: str) -> Reader:

@@ -28,7 +28,7 @@ from chaserdock_protocol.messages import (
     Tick,
     WrenchCommand,
 )
-from chaserdock_protocol.process import ProcessOptions, StopSignal
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.scenario.faults import process_faults_from_json
 from chaserdock_protocol.stall import DEFAULT_STALL_S
@@ -279,6 +279,12 @@ class ControllerProcess:
         event = Event(tick=at.tick, sim_time_ns=at.sim_time_ns, process=self.name, level=level, what=text)
         self.node.publish(topics.EVENT, event, self.name)
 
+    def _report_role(self, text: str, at: Tick) -> None:
+        """Publish, and print, that this controller takes or leaves the command."""
+        if self._on_network:
+            print_status(self.name, f"{at.sim_time_ns / 1e9:.2f} s: {text}")
+        self._publish_event("info", text, at)
+
     # -- leader and standby ----------------------------------------------------------------------------------
 
     def _dispatch_leadership(self, received: ReceivedMessage) -> bool:
@@ -345,7 +351,7 @@ class ControllerProcess:
             leader = self.standby.leader
             self.requests.refuse(tick, "" if leader is None else leader.name)
         if term > 1 or not leads:
-            self._publish_event("info", f"commands in term {term}" if leads else "stands by", tick)
+            self._report_role(f"commands in term {term}" if leads else "stands by", tick)
         result = self._last_result
         if leads and result is not None and result[0].tick == tick.tick:
             # Processed already as a standby, for a leader that cannot publish its own result any more.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Docking targets: their boxes and ArUco markers.
+"""Docking targets: their boxes, meshes and ArUco markers.
 
 Marker axes: x to the marker's right, y up, z out of the face, origin at the marker's centre.
 """
@@ -14,6 +14,8 @@ import numpy as np
 
 from . import rotations
 from .arrays import Array, Quaternion, Vector3
+from .meshes import MeshPart, TriangleMesh
+from .satellites import satellite
 
 # The six faces of a box in the order of the marker ids: outward normal, and up direction of the markers.
 FACES: tuple[tuple[Vector3, Vector3], ...] = (
@@ -74,6 +76,7 @@ class TargetModel:
     ``white_margin_m``: width of the white border printed around every marker, under its neighbours.
     ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws instead of the boxes, scaled by ``mesh_scale``;
     empty for none. Collisions always use the boxes.
+    ``satellite``: name of the shipped satellite whose mesh is drawn; then the boxes enclose its parts. Empty for none.
     """
 
     name: str
@@ -84,6 +87,7 @@ class TargetModel:
     white_margin_m: float
     mesh: str = ""
     mesh_scale: float = 1.0
+    satellite: str = ""
 
     def marker(self, marker_id: int) -> Marker | None:
         """Return the marker with that id, or None."""
@@ -142,10 +146,45 @@ def _with_clusters(name: str, size: Vector3) -> TargetModel:
     return TargetModel(name, (Box(size, shade=0.6),), markers, "DICT_4X4_100", size, 0.032)
 
 
+def box_around(part: MeshPart) -> Box:
+    """Return the smaller of the cuboids around a part along the body's axes and along the part's principal axes."""
+    vertices = part.vertices_m
+    _, principal = np.linalg.eigh(np.cov(vertices.T))
+    principal[:, 2] *= np.sign(np.linalg.det(principal))
+    candidates = []
+    for axes in (np.eye(3), principal):
+        local = vertices @ axes
+        low, high = local.min(axis=0), local.max(axis=0)
+        candidates.append((float(np.prod(high - low)), axes, axes @ (low + high) / 2.0, high - low))
+    along_body, along_part = candidates
+    # Principal axes of a cube are arbitrary, and its volume along them can only be equal or larger.
+    _, axes, centre, size = along_part if along_part[0] < along_body[0] * (1.0 - 1e-6) else along_body
+    x, y, z = np.round(centre, 9).tolist()
+    a, b, c = np.round(size, 9).tolist()
+    qw, qx, qy, qz = rotations.from_matrix(axes).tolist()
+    return Box((a, b, c), (x, y, z), (qw, qx, qy, qz), part.material.diffuse)
+
+
+def mesh_boxes(mesh: TriangleMesh) -> tuple[Box, ...]:
+    """Return a cuboid around each part of a mesh."""
+    return tuple(box_around(part) for part in mesh.parts)
+
+
+@lru_cache
+def _of_satellite(name: str) -> TargetModel:
+    """Return a shipped satellite without markers."""
+    mesh = satellite(name)
+    low, high = mesh.bounds_m()
+    x, y, z = (2.0 * np.maximum(-low, high)).tolist()
+    return TargetModel(name, mesh_boxes(mesh), (), "DICT_4X4_50", (x, y, z), 0.0, satellite=name)
+
+
 _MODELS: dict[str, Callable[[], TargetModel]] = {
     "paper": _paper,
     "servicer": partial(_with_clusters, "servicer", (0.40, 0.32, 0.32)),
     "client": partial(_with_clusters, "client", (1.0, 0.9, 0.8)),
+    "cubesat_12u": partial(_of_satellite, "cubesat_12u"),
+    "geo_servicer": partial(_of_satellite, "geo_servicer"),
 }
 
 

@@ -37,12 +37,26 @@ class Rotation:
 
 
 @dataclass(frozen=True)
+class RosLink:
+    """How a bridge reaches ROS 2: endpoints to connect to, or to ``listen`` on as the router; ``domain``: ROS_DOMAIN_ID.
+
+    ``control``: take the controller's place, with wrenches of ROS 2, instead of showing the mission.
+    """
+
+    connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    listen: tuple[str, ...] = ()
+    domain: int = 0
+    control: bool = False
+
+
+@dataclass(frozen=True)
 class ProcessOptions:
     """Start options of a process. Each process uses a subset.
 
     ``rejoin_s``: wall-clock time (s) that a lock-step world waits after it lost all processes. ``by_run``: the recorder
     creates one folder per run in ``out``. ``until``: the router ends when this process has joined and left.
     ``standby``: the controller starts as the standby. ``signals``: the process stops on SIGINT and SIGTERM.
+    ``ros``: for the bridge.
     """
 
     link: Link = field(default_factory=Link)
@@ -63,6 +77,7 @@ class ProcessOptions:
     until: str | None = None
     standby: bool = False
     signals: bool = True
+    ros: RosLink = RosLink()
 
     def stop_signal(self) -> StopSignal:
         """Return the signal that stops the process."""

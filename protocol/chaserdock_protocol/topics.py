@@ -15,14 +15,14 @@ from msgspec import Struct
 
 from . import messages as m
 
-Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysis", "viewer"]
+Role = Literal["world", "chaser", "controller", "recorder", "operator", "analysis", "viewer", "bridge"]
 Qos = Literal["bulk", "state", "command", "event"]
 
 CONTROLLERS = ("controller", "standby")
 """Processes of the role ``controller``, in the order of succession."""
 FLYING: frozenset[Role] = frozenset({"chaser", "controller"})
 _EVERYONE: frozenset[Role] = frozenset(get_args(Role))
-_OBSERVERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "viewer"})
+_OBSERVERS: frozenset[Role] = frozenset({"recorder", "operator", "analysis", "viewer", "bridge"})
 _TRUTH_READERS: frozenset[Role] = frozenset({"recorder", "analysis", "viewer"})
 
 
@@ -176,7 +176,7 @@ def is_process_name(name: str) -> bool:
     head, slash, number = name.partition("/")
     if head == "chaser":
         return slash == "/" and _is_number(number)
-    members = {"world", *CONTROLLERS, "recorder", "operator", "viewer"}
+    members = {"world", *CONTROLLERS, "recorder", "operator", "viewer", "bridge"}
     return slash == "" and head in members | _NON_MEMBERS
 
 

@@ -331,7 +331,14 @@ def test_stale_terms_are_rejected_counted_and_reported_once(
         assert sources(published) == []  # waits for the leader's command
         assert len([m for t, m in published if t is topics.EVENT]) == (1 if tick == 1 else 0)
     assert chaser.node.counts.rejected["wrench:stale term"] == 2
-    assert sources(deliver(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))) == [("command", 2)]
+    published = deliver(chaser, topics.WRENCH, command(scenario, 2, "standby", 2))
+    assert sources(published) == [("command", 2)]
+    ended = [m for t, m in published if t is topics.EVENT and m.what == "commands accepted again"]
+    assert [(m.level, m.detail) for m in ended] == [("info", "2 refused")]
+    deliver(chaser, topics.TICK, tick_of(scenario, 3, "standby"))
+    deliver(chaser, topics.ODOMETRY, at(scenario, 3))
+    published = deliver(chaser, topics.WRENCH, command(scenario, 3, "standby", 2))
+    assert not [m for t, m in published if t is topics.EVENT]
 
 
 def test_new_leader_within_a_tick_does_not_repeat_a_command(

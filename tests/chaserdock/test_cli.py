@@ -6,8 +6,11 @@ from __future__ import annotations
 import json
 import os
 import re
+import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from importlib import metadata
 from pathlib import Path
@@ -30,6 +33,8 @@ from chaserdock.launch.json_events import (
     Result,
     Start,
 )
+from chaserdock.launch.launcher import free_port
+from chaserdock.launch.mission_address import ADDRESS_FILE
 
 
 def commands(group: Any, parents: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
@@ -186,6 +191,50 @@ def test_run_prints_json_lines_for_the_whole_flight(tmp_path: Path) -> None:
     assert [c.chaser for c in progress[-1].chasers] == [0]
     assert [p.sim_time_s for p in progress] == sorted(p.sim_time_s for p in progress)
     assert "Traceback" not in error
+
+
+def test_commands_reach_a_mission_by_its_folder_and_by_its_address(tmp_path: Path) -> None:
+    out, port = tmp_path / "run", free_port()
+    mission = chaserdock(
+        *("run", "single", "--out", str(out), "--port", str(port), "--namespace", "berth"),
+        *sets(*SHORT, "duration_s=60.0"),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        deadline = time.monotonic() + 60.0
+        while not (out / ADDRESS_FILE).exists() and time.monotonic() < deadline:
+            time.sleep(0.05)
+        by_folder = ("--run", str(out))
+        by_address = ("-e", f"tcp/127.0.0.1:{port}", "--namespace", "berth")
+        for what, where in (("hold", by_folder), ("abort", by_address)):
+            status, output = 1, "refused: the target has not been found yet"
+            while "not been found yet" in output and time.monotonic() < deadline:
+                status, output = finished("command", what, "0", *where, "--timeout", "60")
+            assert (status, output.split(":")[0]) == (0, "accepted"), output
+    finally:
+        mission.send_signal(signal.SIGINT)
+        _, error = mission.communicate(timeout=60)
+    assert f"-e tcp/127.0.0.1:{port} --namespace berth" in error.decode()
+    status, output = finished("command", "hold", "0", *by_folder)
+    assert status == 2
+    assert ADDRESS_FILE in output  # removed at the end of the mission
+
+
+def test_run_excludes_another_address(tmp_path: Path) -> None:
+    status, output = finished("status", "--run", str(tmp_path), "--namespace", "other")
+    assert (status, "--run excludes" in output) == (2, True)
+
+
+def test_run_refuses_a_port_in_use(tmp_path: Path) -> None:
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        port = other.getsockname()[1]
+        status, output = finished("run", "single", "--out", str(tmp_path / "run"), "--port", str(port))
+    assert status == 2
+    assert output == f"chaserdock: --port {port}: Address already in use; choose another port\n"
+    assert not (tmp_path / "run").exists()
 
 
 def test_error_is_the_last_json_line() -> None:

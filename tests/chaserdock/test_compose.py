@@ -14,6 +14,10 @@ import pytest
 from chaserdock_protocol.transport.access_control import identities
 from compose_project import Project, compose_command, docker
 from harness import ROOT, SHORT
+from ruamel.yaml import YAML
+
+from chaserdock.launch import container
+from chaserdock.launch.compose_file import compose_file, default_scenario
 
 
 def why_no_docker() -> str:
@@ -93,12 +97,43 @@ def test_container_mounts_only_its_own_keys() -> None:
             service = found[1]
         for name, where in re.findall(r"keys-([a-z0-9-]+):(/keys[a-z0-9/:-]*)", line):
             mounts.setdefault(service, []).append((name, where))
-    everyone = {"router", *(who.common_name for who in identities(16))}
+    everyone = {"router", *(who.common_name for who in identities(4))}
     assert {name for name, _ in mounts.pop("router")} == everyone
-    assert set(mounts) == everyone - {"router", "analysis"} | {"mission"}
+    assert set(mounts) == everyone - {"router", "analysis", "bridge"} | {"mission"}
     for service, mounted in mounts.items():
         owner = "operator" if service == "mission" else service
         assert mounted == [(owner, "/keys:ro")], service
+
+
+def test_file_in_the_repository_is_the_output_for_four_chasers() -> None:
+    """Remedy: chaserdock compose --chasers 4 --standby --view > compose.yaml"""
+    assert (ROOT / "compose.yaml").read_text(encoding="utf-8") == compose_file(4, standby=True, view=True)
+
+
+@pytest.mark.parametrize("chasers", range(1, 17))
+@pytest.mark.parametrize("more", [False, True])
+def test_generated_file_has_the_services_and_volumes_of_the_mission(chasers: int, more: bool) -> None:
+    project = YAML(typ="safe").load(compose_file(chasers, standby=more, view=more))
+    members = {"router", "world", "controller", "recorder", "mission", "operator"}
+    members |= {"standby", "viewer"} if more else set()
+    assert set(project["services"]) == members | {f"chaser-{i}" for i in range(chasers)}
+    mounted = {
+        volume.partition(":")[0]
+        for service in project["services"].values()
+        for volume in service["volumes"]
+        if not volume.startswith(".")
+    }
+    assert set(project["volumes"]) == mounted
+    services = int(project["services"]["world"]["environment"]["CHASERS"])
+    assert services == chasers
+    assert container.too_many_chasers(default_scenario(chasers), "", services) is None
+    assert f"--chasers {chasers}" in project["services"]["router"]["command"][0]
+
+
+@pytest.mark.parametrize("chasers", [0, 17])
+def test_number_of_chasers_is_limited_by_the_image(chasers: int) -> None:
+    with pytest.raises(ValueError, match="must be from 1 to 16"):
+        compose_file(chasers)
 
 
 def test_build_context_contains_what_the_image_copies() -> None:

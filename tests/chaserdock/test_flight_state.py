@@ -18,6 +18,7 @@ from rich.console import Console
 from chaserdock.launch import progress
 from chaserdock.launch.flight_state import FlightState
 from chaserdock.launch.json_events import CommandNotice, EventNotice, JsonLine, Progress, Start
+from chaserdock.launch.mission_address import MissionAddress
 from chaserdock.launch.progress import ProgressReporter, Show, headline, text_of
 
 SCENARIO = load_scenario(SHIPPED[0] / "two-chaser-tracking.toml")
@@ -73,6 +74,19 @@ def test_speed_since_start_and_over_last_seconds() -> None:
     remaining_s = state.remaining_s(progress_now)
     assert remaining_s == pytest.approx((SCENARIO.duration_s - 15.0) / progress_now.speed_now)
     assert "15.0 of 120 s" in headline(state, progress_now)
+
+
+def test_progress_is_complete_at_the_end_of_the_mission() -> None:
+    state = flying_state()
+    end_ns = round(SCENARIO.duration_s * 1e9)
+    state.update(m.MissionEnd(tick=1200, sim_time_ns=end_ns, reason="completed", complete=True), 25.0)
+    assert state.progress(25.0).sim_time_s == SCENARIO.duration_s
+
+
+def test_first_refresh_shows_what_a_mission_waits_for(capsys: pytest.CaptureFixture[str]) -> None:
+    reporter = ProgressReporter(SCENARIO, Show.text)
+    reporter.refresh()
+    assert "starting, waiting for world, controller" in capsys.readouterr().err
 
 
 def test_stalled_mission_has_no_remaining_time() -> None:
@@ -169,7 +183,10 @@ def test_notices_as_text() -> None:
 
 def test_json_shows_one_object_per_line(capsys: pytest.CaptureFixture[str]) -> None:
     reporter = ProgressReporter(SCENARIO, Show.json)
-    reporter.report(Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b"))
+    address = MissionAddress(namespace="n", endpoint="tcp/127.0.0.1:1")
+    reporter.report(
+        Start(scenario="a", seed=0, mode="lockstep", duration_s=1.0, chasers=2, folder="b", address=address)
+    )
     reporter.update(tick(0))
     reporter.update(m.Event(process="world", level="error", what="gone", sim_time_ns=5_000_000_000))
     reporter.update(m.CommandReply(command="hold", chaser=0, accepted=True, reason="phase hold"))

@@ -124,7 +124,7 @@ INVALID = [
     ("log info nowhere.mcap", "nowhere.mcap"),
     ("log info", "Missing argument"),
     ("log recover {golden} --out {golden}", "already exists"),
-    ("log export {golden} --out {tmp} --format xls", "'xls' is not one of 'parquet', 'csv'"),
+    ("log export {golden} --out {tmp} --format xls", "'xls' is not one of 'parquet', 'csv', 'rosbag2'"),
     ("log tracks {golden} --out {tmp} --from nan", "--from"),
     ("log tracks {golden} --out {tmp} --from 5 --to 6", "contains no track between 5 and 6 s"),
     ("log play {golden} --speed nan", "--speed"),

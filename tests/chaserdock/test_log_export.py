@@ -73,7 +73,7 @@ def test_exported_files_hold_every_message_with_units(tmp_path: Path) -> None:
     assert messages == sum(count_messages(GOLDEN).values())
     truth = pq.read_table(tmp_path / "parquet" / "truth_body.parquet")
     field = truth.schema.field("velocity_m_s_x")
-    assert field.metadata == {b"unit": b"m_s"}
+    assert field.metadata == {b"unit": b"m/s"}
     assert truth.schema.field("q_w").metadata is None
     expected = [r.message.velocity_m_s[0] for r in read_log(GOLDEN) if r.topic is topics.TRUTH_BODY]
     assert truth["velocity_m_s_x"].to_pylist() == expected

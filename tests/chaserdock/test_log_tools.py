@@ -338,6 +338,9 @@ def test_info_counts_lost_and_rejected_messages(tmp_path: Path) -> None:
         writer.write(
             "recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(seq=seq, tick=seq)), 1
         )
+    for seq in (5, 6, 9):  # five sent before the recorder had subscribed; two lost
+        presence = m.Presence(seq=seq, process="world", instance="a", heard={})
+        writer.write("world/presence", m.encoding_of(m.Presence), codec.encode(presence), 1)
     writer.write("recorder/ack", m.encoding_of(m.RecorderAck), b"\xc1", 1)
     writer.write("somebody/else", "text/plain", b"hello", 1)
     writer.close()
@@ -345,6 +348,7 @@ def test_info_counts_lost_and_rejected_messages(tmp_path: Path) -> None:
     assert {k.key: (k.messages, k.lost) for k in info.keys} == {
         "recorder/ack": (7, 2),
         "somebody/else": (1, 0),
+        "world/presence": (3, 2),
     }
     assert info.rejected == {"recorder/ack: format": 1, "somebody/else: key": 1}
     assert not info.whole

@@ -251,8 +251,7 @@ def test_world_gets_overrides_and_too_many_chasers_are_rejected() -> None:
     assert container.too_many_chasers("four-chaser-docking", "", 4) is None
     reason = container.too_many_chasers("four-chaser-docking", "", 3) or ""
     assert "has 4 chasers" in reason
-    assert "COMPOSE_PROFILES=8-chasers" in reason
-    assert [container.count_services(p) for p in ("", "8-chasers", "tools,16-chasers")] == [4, 8, 16]
+    assert "chaserdock compose --chasers 4 > compose.yaml" in reason
 
 
 def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> None:

@@ -23,16 +23,28 @@ from chaserdock_protocol import topics
 from chaserdock_protocol.codec import encode
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.recording.log import LogError, LogWriter
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_protocol.shipped_scenarios import find_scenario
 from flight_cases import scenario
 from harness import finished
+from scipy.stats import chi2
 
 from chaserdock.analysis.chase_camera import Viewpoint, draw
-from chaserdock.analysis.figures import FIGURES, thrusters, write_figures
-from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.figures import (
+    FIGURES,
+    consistency_text,
+    docking,
+    keep_out,
+    speed_limits,
+    thrusters,
+    write_figures,
+)
+from chaserdock.analysis.flight import RecordedFlight, ReferenceHistory, load_flight
 from chaserdock.analysis.images import columns_for, pairs, shots
 from chaserdock.analysis.plots import MissingData
-from chaserdock.analysis.report import report_of, table, write_report
+from chaserdock.analysis.report import _chasers, report_of, table, write_report
 from chaserdock.analysis.scene import scene_of
+from chaserdock.analysis.summary import summary_of, tracking_components, tracking_errors
 from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutcomes, Traces, load_traces
 from chaserdock.analysis.video import frames, write_video
 
@@ -266,6 +278,76 @@ def test_thruster_figure_shows_duty_cycles(tmp_path: Path) -> None:
     figure = thrusters(flight, Traces({0: given}, {}, {}))
     drawn: Any = figure.axes[0].collections[0]
     np.testing.assert_array_equal(np.reshape(drawn.get_array(), (12, 2)), duty.T)
+
+
+def with_references(path: Path, shipped: str, phases: list[tuple[float, str]]) -> RecordedFlight:
+    """A flight of 20 s in a shipped scenario with these phases; the keep-out distance falls at 10 s and ends at 15 s."""
+    flight = load_flight(made_log(path, 301))
+    flight.scenario = load_scenario(find_scenario(shipped))
+    keep_out = np.array([[0.0, 0.75], [10.0, 0.5], [15.0, 0.0]])
+    flight.references = {0: ReferenceHistory(np.zeros(1), np.ones((1, 3)), phases, keep_out)}
+    return flight
+
+
+def test_docking_figure_draws_the_limits_of_each_moment(tmp_path: Path) -> None:
+    phases = [(0.0, "hold"), (5.0, "approach"), (10.0, "final"), (15.0, "verified")]
+    flight = with_references(tmp_path / "a.mcap", "docking-contact", phases)
+    time_s, limit_m = keep_out(flight, 0)
+    np.testing.assert_allclose(time_s, [0.0, 10.0, 15.0, 20.0], atol=1e-6)
+    np.testing.assert_array_equal(limit_m, [0.75, 0.5, np.nan, np.nan])
+    limits = flight.scenario.docking
+    expected = [(5.0, 10.0, limits.corridor.closing_m_s), (10.0, 15.0, limits.final.closing_m_s)]
+    assert speed_limits(flight, 0) == expected
+    figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
+    # The distance at which chasers without a port hold does not apply to this one.
+    assert not [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
+
+
+def test_docking_figure_draws_the_docking_distance_of_chasers_without_a_port(tmp_path: Path) -> None:
+    flight = with_references(tmp_path / "a.mcap", "four-chaser-docking", [(0.0, "hold"), (5.0, "approach")])
+    figure = docking(flight, load_traces(tmp_path / "a.mcap", [0]))
+    assert [t for t in figure.axes[0].texts if "docking distance" in t.get_text()]
+    ((begin_s, _, limit),) = speed_limits(flight, 0)
+    assert (begin_s, limit) == (5.0, flight.scenario.approach.max_speed_m_s)
+
+
+@pytest.mark.parametrize(
+    ("scale", "verdict"), [(1.0, "consistent"), (4.0, "overconfident"), (0.1, "conservative")]
+)
+def test_consistency_is_judged_on_both_sides(scale: float, verdict: str) -> None:
+    nees = scale * np.random.default_rng(1).chisquare(6, 20_000)
+    low, high = chi2.ppf((0.025, 0.975), df=6)
+    assert consistency_text(nees, low, high).startswith(f"{verdict}: mean")
+
+
+def test_errors_by_axis_have_the_length_of_the_errors(short_flight: Path) -> None:
+    flight = load_flight(short_flight / "mission.mcap")
+    time_s, position, angle = tracking_errors(flight, 1)
+    by_axis_s, offset, turn = tracking_components(flight, 1, 3)
+    np.testing.assert_array_equal(by_axis_s, time_s[::3])
+    np.testing.assert_allclose(np.linalg.norm(offset, axis=1), position[::3], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(turn, axis=1), angle[::3], rtol=1e-6, atol=1e-9)
+
+
+def test_captured_chaser_is_reported_by_its_latch(tmp_path: Path) -> None:
+    capture = {
+        "latched": True,
+        "verified": True,
+        "latch_time_s": 40.02,
+        "contact_lateral_m": 0.0012,
+        "contact_angle_rad": 0.01,
+        "contact_closing_m_s": 0.0101,
+        "contact_lateral_speed_m_s": 0.001,
+        "probe_touches": 1,
+    }
+    flight = load_flight(made_log(tmp_path / "a.mcap", 3))
+    result = summary_of(flight)
+    result["chasers"]["0"] |= {"capture": capture, "propellant_kg": 0.0123}
+    text = _chasers(flight, result)
+    for part in ("verified", "40.02 s", "1.20 mm", "0.573 °", "10.1 mm/s", "12.3 g"):
+        assert part in text
+    assert "docked since" not in text
+    assert "docked since" in _chasers(flight, summary_of(flight))
 
 
 # -- images and video ---------------------------------------------------------------------------------------

@@ -105,11 +105,102 @@ static void count_visible_markers(void) {
     if (size[row] != size[row]) CHECK(count == 0); /* it is behind the camera, or at NaN */
 }
 
+/* Tetrahedra with vertices anywhere, some of them behind the camera or at NaN. */
+typedef struct {
+    int64_t vertices, n, *triangles;
+    double *at, *normals, *reflectance, *pose;
+} Mesh;
+
+static Mesh any_mesh(void) {
+    Mesh m = {whole(3, 12), whole(0, 12), 0, 0, 0, 0, 0};
+    m.at = doubles(3 * m.vertices, -1.0, 1.0), m.normals = doubles(9 * m.n, -1.0, 1.0);
+    m.reflectance = doubles(m.n, 0.0, 1.0), m.pose = doubles(12, -1.0, 1.0);
+    m.pose[2] = value(-0.5, 4.0);
+    m.triangles = block((size_t)(3 * m.n) * sizeof(int64_t));
+    for (int64_t i = 0; i < 3 * m.n; i++) m.triangles[i] = whole(0, m.vertices - 1);
+    return m;
+}
+
+static ShadowMap shadow_settings(void) {
+    ShadowMap map = {{0}, value(0.1, 20.0), (double)whole(1, 20), value(0.0, 0.1)};
+    for (int i = 0; i < 9; i++) map.basis[i] = value(-1.0, 1.0);
+    return map;
+}
+
+static float *floats(int64_t n) { return block((size_t)n * sizeof(float)); }
+
+static void shadow_map(void) {
+    Mesh m = any_mesh();
+    ShadowMap map = shadow_settings();
+    float *depth = floats((int64_t)map.size * (int64_t)map.size);
+    NAME(shadow_map)(&map, m.at, m.triangles, m.n, depth);
+    for (int64_t i = 0; i < (int64_t)map.size * (int64_t)map.size; i++) CHECK(depth[i] >= -1e30f);
+}
+
+static void render_mesh(void) {
+    const int64_t height = whole(1, 24), width = whole(1, 24), samples = whole(1, 3), all = height * width;
+    Mesh m = any_mesh();
+    ShadowMap map = shadow_settings();
+    MeshLight light = {{value(-1.0, 1.0), value(-1.0, 1.0), value(-1.0, 1.0)}, value(0.0, 1.0), value(0.0, 1.0), (double)whole(0, 1)};
+    double *lens = lens_of_camera();
+    float *depth = floats((int64_t)map.size * (int64_t)map.size), *grey = floats(all), *coverage = floats(all), *nearest = floats(all);
+    int32_t *owner = block((size_t)(all) * sizeof(int32_t));
+    for (int64_t i = 0; i < (int64_t)map.size * (int64_t)map.size; i++) depth[i] = (float)value(-1.0, 1.0);
+    NAME(render_mesh)(lens, height, width, samples, m.pose, m.at, m.triangles, m.normals, m.reflectance, m.n, &light, &map, depth,
+                      grey, coverage, nearest, owner, floats(3 * samples * samples * all));
+    for (int64_t i = 0; i < all; i++) {
+        CHECK(coverage[i] >= 0.0f && coverage[i] <= 1.0f && owner[i] >= -1 && owner[i] < m.n);
+        CHECK((owner[i] >= 0) == (coverage[i] > 0.0f) && nearest[i] >= 0.0f);
+    }
+}
+
+static void control_points(void) {
+    const int64_t height = whole(1, 40), width = whole(1, 40), all = height * width;
+    Mesh m = any_mesh();
+    PointChoice choice = {(double)whole(2, 12), (double)whole(1, PER_CELL_MOST), value(0.0, 10.0)};
+    const int64_t cell = (int64_t)choice.cell_px, cells = (width + cell - 1) / cell * ((height + cell - 1) / cell);
+    const int64_t most = cells * (int64_t)choice.per_cell;
+    float *view = floats(all), *nearest = floats(all);
+    int32_t *owner = block((size_t)(all) * sizeof(int32_t));
+    for (int64_t i = 0; i < all; i++) {
+        view[i] = (float)value(0.0, 255.0), nearest[i] = (float)value(0.1, 2.0);
+        owner[i] = m.n ? (int32_t)whole(-1, m.n - 1) : -1;
+    }
+    double *points = outputs(3 * most), *ahead = outputs(3 * most), *profiles = outputs(PROFILE * most);
+    int64_t *owners = block((size_t)(most) * sizeof(int64_t));
+    int64_t n = NAME(control_points)(view, nearest, owner, height, width, lens_of_camera(), m.pose, m.at, m.triangles, &choice, points,
+                                     ahead, profiles, owners, outputs(all + cells * 5 * PER_CELL_MOST));
+    CHECK(n >= 0 && n <= most);
+    for (int64_t i = 0; i < n; i++) CHECK(owners[i] >= 0 && owners[i] < m.n);
+}
+
+static void align_points(void) {
+    const int64_t height = whole(2, 60), width = whole(2, 60), n = whole(0, 60);
+    LevelCamera camera = {value(20.0, 90.0), value(20.0, 90.0), value(0.0, 60.0), value(0.0, 60.0), {0}, (double)height, (double)width};
+    AlignSettings set = {(double)whole(0, 30), (double)whole(0, 6), value(0.0, 0.5), value(0.5, 4.0), value(0.05, 0.5), value(0.5, 3.0)};
+    for (int i = 0; i < 5; i++) camera.distortion[i] = value(-0.2, 0.2);
+    float *image = floats(height * width);
+    for (int64_t i = 0; i < height * width; i++) image[i] = (float)value(0.0, 255.0);
+    double *points = doubles(3 * n, -0.5, 0.5), *ahead = outputs(3 * n), *profiles = doubles(PROFILE * n, 0.0, 255.0);
+    double *pose = doubles(12, -0.1, 0.1), *residual = outputs(n), *weight = outputs(n), *correlation = outputs(n);
+    for (int64_t i = 0; i < 3 * n; i++) ahead[i] = points[i] + value(0.0, 0.02);
+    for (int i = 0; i < 3; i++) pose[3 + 4 * i] += 1.0;
+    pose[2] += 1.5;
+    int64_t inside = NAME(align_points)(&camera, image, &set, points, ahead, profiles, n, pose, residual, weight, correlation,
+                                        outputs(6 * n), outputs(2 * n));
+    CHECK(inside >= 0 && inside <= n);
+    if (inside) CHECK(all_finite(pose, 12));
+}
+
 static const Target TARGETS[] = {
     {"refine_corners", refine_corners},
     {"refine_pose", refine_pose},
     {"squared_errors", squared_errors},
     {"marker_errors", marker_errors},
     {"count_visible_markers", count_visible_markers},
+    {"shadow_map", shadow_map},
+    {"render_mesh", render_mesh},
+    {"control_points", control_points},
+    {"align_points", align_points},
 };
 FUZZ_MAIN(TARGETS)

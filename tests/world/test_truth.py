@@ -11,12 +11,13 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState
+from chaserdock_models.satellites import satellite
 from chaserdock_protocol.messages import ActuatorCommand, ThrusterPulse
 from chaserdock_protocol.scenario import ScenarioError
 from chaserdock_world.actuators.ideal import IdealActuators
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import TARGET, Physics
-from chaserdock_world.plant import chaser_plant, draw_moments, target_plant, true_target
+from chaserdock_world.plant import chaser_plant, draw_moments, target_plant, true_mesh, true_target
 from chaserdock_world.sensors.errors import OdometrySensor, camera_errors, true_camera
 from chaserdock_world.sensors.publish import drawn_truth
 from docking_cases import scenario as docking_scenario
@@ -46,6 +47,50 @@ def momenta(physics: Physics, name: str = "chaser/0") -> tuple[Array, Array, flo
     spin = plant.inertia_kg_m2 @ s.omega_rad_s
     energy = 0.5 * plant.mass_kg * velocity @ velocity + 0.5 * s.omega_rad_s @ spin
     return plant.mass_kg * velocity, rotations.rotate(s.q_wxyz, spin), float(energy)
+
+
+# -- mesh of the target -------------------------------------------------------------------------------------
+
+
+def mesh_errors(seed: int, **knowledge: float) -> tuple[float, Array]:
+    """Return scale and rotation vectors (2, 3) of the true mesh, recovered from its vertices."""
+    s = scenario(
+        seed=seed, target={"model": "geo_servicer", "knowledge": knowledge}, perception={"name": "model"}
+    )
+    mesh, nominal = true_mesh(s), satellite("geo_servicer")
+    assert mesh is not None
+    pairs = {p.name: (p.vertices_m, q.vertices_m) for p, q in zip(nominal.parts, mesh.parts, strict=True)}
+    scale = float(np.linalg.norm(pairs["bus"][1]) / np.linalg.norm(pairs["bus"][0])) - 1.0
+    turns = []
+    for joint, at in nominal.joints.items():
+        a, b = pairs[joint]
+        u, _, v = np.linalg.svd((a - np.array(at)).T @ (b - np.array(mesh.joints[joint])))
+        turns.append(rotations.log(rotations.from_matrix((u @ v).T)))
+    return scale, np.array(turns)
+
+
+def test_true_mesh_has_the_stated_errors() -> None:
+    drawn = [mesh_errors(seed) for seed in range(60)]
+    scales, turns = np.array([s for s, _ in drawn]), np.degrees(np.array([t for _, t in drawn]))
+    assert 0.002 < scales.std() < 0.004
+    assert abs(scales.mean()) < 0.0012
+    assert 0.42 < turns.std() < 0.58
+    assert mesh_errors(5)[0] == drawn[5][0]
+
+
+def test_mesh_is_exact_without_errors() -> None:
+    scale, turns = mesh_errors(1, panel_deg=0.0, scale_share=0.0)
+    assert scale == 0.0
+    assert np.abs(turns).max() < 1e-9
+
+
+def test_true_mesh_is_integrated_about_its_principal_axes() -> None:
+    s = scenario(
+        target={"model": "geo_servicer", "motion": "torque_free", "mass_kg": 9.0},
+        perception={"name": "model"},
+    )
+    np.testing.assert_allclose(target_plant(s).inertia_kg_m2, s.target.inertia_tensor, atol=1e-12)
+    assert np.abs(s.target.inertia_tensor - np.diag(s.target.moments)).max() > 1e-4
 
 
 # -- bodies -------------------------------------------------------------------------------------------------

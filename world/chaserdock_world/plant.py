@@ -11,7 +11,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
 from chaserdock_models.rigid_body import BodyState
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Marker, TargetModel
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.truth import Mismatch, TruthValues
@@ -201,8 +203,9 @@ def target_plant(scenario: Scenario) -> Plant:
         return Plant(target.mass_kg, target.moments)
     sigma, explicit = scenario.truth.mismatch("target"), scenario.truth.values_of(None)
     moments, axes = target.moments, None
-    if any(target.inertia_products_kg_m2):
-        moments, axes = _principal(target.inertia_tensor)
+    tensor = target.inertia_tensor
+    if np.any(tensor[~np.eye(3, dtype=bool)]):
+        moments, axes = _principal(tensor)
     place = np.array(target.centre_of_mass_m)
     return _plant(scenario.seed, TARGET_KEY, target.mass_kg, moments, sigma, explicit, axes, place)
 
@@ -239,6 +242,22 @@ def true_target(scenario: Scenario) -> TargetModel:
     draw = sigma * _normal(scenario.seed, Stream.MARKERS, TARGET_KEY, 2 * len(model.markers)).reshape(-1, 2)
     markers = tuple(_moved(m, off) for m, off in zip(model.markers, draw, strict=True))
     return replace(model, markers=markers)
+
+
+def true_mesh(scenario: Scenario) -> TriangleMesh | None:
+    """Return the target's mesh as it is: finer than the known one, its size and the angles of its joints in error.
+
+    None for a target without a mesh.
+    """
+    name, knowledge = scenario.target_model().satellite, scenario.target.knowledge
+    if not name:
+        return None
+    mesh = satellite(name)
+    draw = _normal(scenario.seed, Stream.MESH, TARGET_KEY, 1 + 3 * len(mesh.joints))
+    turns = np.radians(knowledge.panel_deg) * draw[1:].reshape(-1, 3)
+    return with_geometry_errors(
+        mesh, knowledge.scale_share * float(draw[0]), dict(zip(mesh.joints, turns, strict=True))
+    )
 
 
 def _moved(marker: Marker, offset: Array) -> Marker:

@@ -25,6 +25,7 @@ class Stream(IntEnum):
     SCATTER = 110
     UNKNOWN_CALIBRATION = 111
     MARKERS = 112
+    MESH = 113
 
 
 TARGET_KEY = 10_000

@@ -53,6 +53,7 @@ def main(options: ProcessOptions) -> int:
         node.close()
         if auditor is not None:
             auditor.publish_total()
+    print_status(NAME, "ended")
     return 0
 
 

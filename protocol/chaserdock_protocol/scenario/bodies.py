@@ -3,10 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh, mass_properties, without_parts
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import TargetModel, target_model, target_names
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
@@ -16,12 +18,35 @@ from .target import Geometry
 from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
 
+class MeshKnowledge(Section):
+    """What the flight software knows of a target's mesh. The world draws a mesh that differs: its errors are drawn from the
+    seed with these standard deviations."""
+
+    simplification_m: Annotated[float, Field(ge=2e-4, le=0.02, allow_inf_nan=False)] = Field(
+        default=0.001, description="Largest deviation of the known mesh's facets from curved surfaces, m."
+    )
+    panel_deg: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = Field(
+        default=0.5,
+        description="Standard deviation of the rotation of each joint (rotation vector, per axis), such as of a solar panel, "
+        "degrees.",
+    )
+    scale_share: Annotated[float, Field(ge=0, le=0.05, allow_inf_nan=False)] = Field(
+        default=0.003,
+        description="Standard deviation of the relative size of the body without what moves on joints.",
+    )
+    missing: tuple[Name, ...] = Field(
+        default=(),
+        description="Parts that the satellite has and the known mesh lacks, such as `antenna_whip`.",
+    )
+
+
 class FlightTarget(Section):
     """Nominal target of the flight software: shape, motion model, and assumed mass properties."""
 
     model: Name = Field(
         default="paper",
-        description="Name of a known target (`paper`, `servicer`, `client`), or, in a file, the path of a target file (`….toml`) "
+        description="Name of a known target: `paper`, `servicer`, `client` with markers, `geo_servicer`, `cubesat_12u` "
+        "without; or, in a file, the path of a target file (`….toml`) "
         "relative to it. With `geometry`: the name of that geometry.",
     )
     geometry: Geometry | None = Field(
@@ -36,7 +61,7 @@ class FlightTarget(Section):
     inertia_kg_m2: PositiveVector | None = Field(
         default=None,
         description="Moments of inertia about the axes of TRF through the centre of mass, kg m². Used by `torque_free` only. "
-        "Without it: those of a homogeneous cuboid of the model's size.",
+        "Without it: those of the model's mesh, or of a homogeneous cuboid of its size.",
     )
     inertia_products_kg_m2: Vector = Field(
         default=(0.0, 0.0, 0.0),
@@ -45,6 +70,8 @@ class FlightTarget(Section):
     centre_of_mass_m: Vector = Field(
         default=(0.0, 0.0, 0.0), description="Centre of mass (TRF), m. Used by `torque_free` only."
     )
+
+    knowledge: MeshKnowledge = MeshKnowledge()
 
     @model_validator(mode="after")
     def _known(self) -> FlightTarget:
@@ -63,22 +90,52 @@ class FlightTarget(Section):
             _check_inertia((a, b, c) if any(self.inertia_products_kg_m2) else self.inertia_kg_m2)
         elif any(self.inertia_products_kg_m2):
             raise ValueError("inertia_products_kg_m2: needs inertia_kg_m2")
+        self._check_knowledge()
         return self
+
+    def _check_knowledge(self) -> None:
+        name = self.shape().satellite
+        if not name:
+            # Defaults may be stated: a serialized scenario has all keys.
+            default = MeshKnowledge()
+            for key in MeshKnowledge.model_fields:
+                if getattr(self.knowledge, key) != getattr(default, key):
+                    raise ValueError(f"knowledge.{key}: {self.model!r} has no mesh")
+            return
+        try:
+            self.known_mesh()
+        except ValueError as error:
+            raise ValueError(f"knowledge.missing: {error}") from None
 
     @property
     def moments(self) -> tuple[float, float, float]:
         """Moments of inertia about the axes of TRF through the centre of mass, kg m^2."""
+        if self.inertia_kg_m2 is None and (name := self.shape().satellite):
+            x, y, z = np.diag(mass_properties(satellite(name), self.mass_kg)[1]).tolist()
+            return (x, y, z)
         return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.shape().size_m)
 
     @property
     def inertia_tensor(self) -> Array:
         """Inertia tensor (3, 3) about the centre of mass, TRF axes, kg m^2."""
+        if self.inertia_kg_m2 is None and (name := self.shape().satellite):
+            return mass_properties(satellite(name), self.mass_kg)[1]
         xy, xz, yz = self.inertia_products_kg_m2
         return np.diag(self.moments) + np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
 
     def shape(self) -> TargetModel:
         """Return geometry and markers."""
         return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
+
+    def known_mesh(self) -> TriangleMesh | None:
+        """Return the mesh that the flight software knows: simplified, and without the parts that are missing in it.
+
+        None for a target without a mesh. Raises ValueError for a missing part that the mesh does not have.
+        """
+        name = self.shape().satellite
+        if not name:
+            return None
+        return without_parts(satellite(name, self.knowledge.simplification_m), self.knowledge.missing)
 
 
 class Target(FlightTarget, Oriented):
@@ -129,6 +186,10 @@ class Body(Section):
     )
     force_max_N: Positive = Field(default=2.0, description="Largest force per body axis, N.")
     torque_max_N_m: Positive = Field(default=0.05, description="Largest torque per body axis, N m.")
+    mesh: Literal["", "chaser_body"] = Field(
+        default="",
+        description="Mesh that the cameras see in place of the body's cuboid, scaled to `size_m`; without it, the cuboid.",
+    )
     probe_reach_m: Positive = Field(
         default=0.35,
         description="Distance of the docking probe's tip from the body's centre along +X (CRF), m.",

@@ -13,6 +13,7 @@ from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.port_load import CarriedBody, tumble_load
 
 from .faults import check_faults
+from .schema import MARKER_PERCEPTIONS
 from .thrusters import check_pulses
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ def check_flight(scenario: FlightScenario) -> None:
     """Check the part of a scenario that flight software receives."""
     _check_references(scenario)
     _check_named_chasers(scenario)
+    _check_perception(scenario)
     if scenario.chaser.actuation == "thrusters":
         check_pulses(scenario.chaser.thrusters, scenario.chaser.modulation, scenario.time.physics_hz)
     if scenario.docking.kind == "capture":
@@ -33,6 +35,7 @@ def check_flight(scenario: FlightScenario) -> None:
 def check_consistent(scenario: Scenario) -> None:
     """Run the other checks, which need the full scenario."""
     _check_start_positions(scenario)
+    _check_orbit(scenario)
     _check_mesh(scenario)
     _check_success(scenario)
     _check_reached(scenario)
@@ -54,6 +57,22 @@ def _check_start_positions(scenario: Scenario) -> None:
                     f"chasers.{j} and chasers.{i} start {distance:.3f} m apart, inside one another; "
                     f"their bodies need {width:.3f} m"
                 )
+
+
+def _check_orbit(scenario: Scenario) -> None:
+    if scenario.orbit is None:
+        return
+    target, camera = scenario.target, scenario.camera
+    for key in ("position_m", "velocity_m_s"):
+        if any(getattr(target, key)) and not (key == "velocity_m_s" and target.motion == "static"):
+            raise ValueError(
+                f"target.{key}: with [orbit], WRF is the target's Hill frame: the target starts at rest in its origin, so "
+                "this must be [0, 0, 0]"
+            )
+    given = {"sun_direction", "eclipses", "earth"} & camera.model_fields_set
+    given -= {key for key in given if getattr(camera, key) == type(camera).model_fields[key].default}
+    if given:
+        raise ValueError(f"camera.{min(given)}: follows from [orbit]; leave it out")
 
 
 def _check_references(scenario: FlightScenario) -> None:
@@ -82,6 +101,24 @@ def _check_mesh(scenario: Scenario) -> None:
     geometry = scenario.target.geometry
     if geometry is not None and geometry.mesh and scenario.camera.renderer != "pybullet":
         raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
+    if scenario.chaser.mesh and not scenario.target_model().satellite:
+        raise ValueError(
+            f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} has none"
+        )
+    if scenario.camera.renderer != "exact":
+        for key, name in (
+            ("target.model", scenario.target_model().satellite),
+            ("chaser.mesh", scenario.chaser.mesh),
+        ):
+            if name:
+                raise ValueError(f'{key}: only camera.renderer = "exact" draws the mesh {name!r}')
+
+
+def _check_perception(scenario: FlightScenario) -> None:
+    if scenario.perception.name in MARKER_PERCEPTIONS and not scenario.target_model().markers:
+        raise ValueError(
+            f"perception.name: {scenario.perception.name!r} needs markers; the target {scenario.target.model!r} has none"
+        )
 
 
 def _check_named_chasers(scenario: FlightScenario) -> None:

@@ -25,7 +25,8 @@ from .fields import (
     Vector,
 )
 
-PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
+MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
+PERCEPTIONS = MARKER_PERCEPTIONS
 ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""

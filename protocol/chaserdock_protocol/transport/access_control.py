@@ -28,10 +28,10 @@ class QueryAccess:
 QUERIES = (
     QueryAccess(topics.JOIN_KEY, frozenset(get_args(Role)) - {"analysis"}, "world"),
     QueryAccess(topics.SCENARIO_KEY, frozenset({"recorder", "operator", "analysis", "viewer"}), "world"),
-    QueryAccess(topics.OPERATE_KEY, frozenset({"operator", "viewer"}), "controller"),
+    QueryAccess(topics.OPERATE_KEY, frozenset({"operator", "viewer", "bridge"}), "controller"),
     QueryAccess(topics.THRUSTER_FAULT_KEY, frozenset({"operator"}), "world"),
 )
-OBSERVERS: frozenset[Role] = frozenset({"analysis", "viewer"})
+OBSERVERS: frozenset[Role] = frozenset({"analysis", "viewer", "bridge"})
 """Roles that publish nothing and have no process name on the network."""
 
 
@@ -55,7 +55,7 @@ def common_name(process: str) -> str:
 
 def identities(chasers: int) -> tuple[Identity, ...]:
     """Return all processes that may connect to the router of a mission with at most ``chasers`` chasers."""
-    single: tuple[Role, ...] = ("world", "recorder", "operator", "analysis", "viewer")
+    single: tuple[Role, ...] = ("world", "recorder", "operator", "analysis", "viewer", "bridge")
     return (
         *(Identity(role, role) for role in single),
         *(Identity(name, "controller") for name in topics.CONTROLLERS),

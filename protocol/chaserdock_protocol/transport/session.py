@@ -101,7 +101,10 @@ def run_member(
         node.blocking = mission.mode == "lockstep"
         watch_for_foreign_publishers(node, mission.source)
         node.declare_liveliness()  # before the start-up work (compilation): reserves the process' name
-        return work(node, mission, instance, stop)
+        print_status(name, f"joined mission {mission.run_id} ({mission.mode})")
+        status = work(node, mission, instance, stop)
+        print_status(name, f"ended with status {status}")
+        return status
     except ChaserdockError as error:
         print_status(name, str(error))
         return 2

@@ -10,7 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, Literal
 
 import zenoh
 
@@ -198,6 +198,91 @@ class _ZenohConnection:
 
     def close(self) -> None:
         self._session.close()
+
+
+class PlainSession:
+    """A Zenoh session without a namespace and with attachments, for another protocol than that of a mission.
+
+    ``mode``: a ``peer``, or a ``router`` that other peers find each other by. Raises TransportError if it cannot be opened.
+    """
+
+    def __init__(
+        self, connect: tuple[str, ...], listen: tuple[str, ...], mode: Literal["peer", "router"]
+    ) -> None:
+        zenoh.init_log_from_env_or("error")
+        config = zenoh.Config()
+        values = {
+            "mode": mode,
+            "connect/endpoints": list(connect),
+            "connect/timeout_ms": -1 if mode == "router" else 5000,
+            "listen/endpoints": list(listen),
+            "scouting/multicast/enabled": False,
+            "transport/shared_memory/enabled": False,
+            **QUEUE_OPTIONS,
+        }
+        try:
+            for name, value in values.items():
+                config.insert_json5(name, json.dumps(value))
+            self._session = zenoh.open(config)
+        except zenoh.ZError as error:
+            raise TransportError(open_error(error, Link(connect=connect, listen=listen, mode=mode))) from None
+        self._declared: list[Any] = []
+        self.session_id = str(self._session.zid())
+
+    def declare_publisher(self, key: str, *, blocking: bool) -> Callable[[bytes, bytes], None]:
+        """Return a function that publishes a payload with an attachment; ``blocking``: it waits for slow readers."""
+        control = zenoh.CongestionControl
+        publisher = self._session.declare_publisher(
+            key, congestion_control=control.BLOCK if blocking else control.DROP
+        )
+        self._declared.append(publisher)
+        return lambda payload, attachment: publisher.put(payload, attachment=attachment)
+
+    def subscribe(self, key: str, arrived: Callable[[bytes, bytes], None]) -> None:
+        """Call ``arrived(payload, attachment)`` on Zenoh's thread for every sample on a key."""
+
+        def callback(sample: zenoh.Sample) -> None:
+            arrived(sample.payload.to_bytes(), _attachment(sample.attachment))
+
+        self._declared.append(self._session.declare_subscriber(key, callback))
+
+    def declare_queryable(self, key: str, arrived: Callable[[AttachedQuery], None]) -> None:
+        """Call ``arrived(query)`` on Zenoh's thread for every query on a key, which this session answers completely."""
+        queryable = self._session.declare_queryable(
+            key, lambda query: arrived(AttachedQuery(key, query)), complete=True
+        )
+        self._declared.append(queryable)
+
+    def declare_token(self, key: str) -> None:
+        """Declare a liveliness token."""
+        self._declared.append(self._session.liveliness().declare_token(key))
+
+    def close(self) -> None:
+        """Close the session, which ends everything declared."""
+        self._session.close()
+
+
+def _attachment(attachment: zenoh.ZBytes | None) -> bytes:
+    return b"" if attachment is None else attachment.to_bytes()
+
+
+class AttachedQuery:
+    """A query with an attachment, and its only reply."""
+
+    def __init__(self, key: str, query: zenoh.Query) -> None:
+        self._key, self._query = key, query
+        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        self.attachment = _attachment(query.attachment)
+
+    def reply(self, payload: bytes, attachment: bytes) -> None:
+        """Send the reply and end the query."""
+        self._query.reply(self._key, payload, attachment=attachment)
+        self._query.drop()
+
+    def refuse(self, text: str) -> None:
+        """Reply with an error and end the query."""
+        self._query.reply_err(text)
+        self._query.drop()
 
 
 class _ZenohQuery:

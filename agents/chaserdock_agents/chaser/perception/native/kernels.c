@@ -5,3 +5,5 @@
 #include "corners.c"
 #include "pose.c"
 #include "views.c"
+#include "mesh.c"
+#include "align.c"

@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Align a synthetic view of the tracker mesh with an image: pose, covariance and the share of inliers.
+
+Control points are gradient maxima of the synthetic view; their profiles are found in the image by signed correlation and give
+the pose by robust least squares (native/align.c).
+"""
+
+from __future__ import annotations
+
+import math
+from ctypes import c_double, c_int64
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
+from chaserdock_models.native import address
+from numpy.typing import NDArray
+
+from ..native import function
+from ..refine import PoseInCamera
+from .mesh import TrackerMesh
+from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
+
+_PROFILE, _PER_CELL_MOST = 9, 4
+_CELL_PX, _PER_CELL = 8, 2
+_MARGIN_PX = 14
+"""Border of a window around the target: reach of the search and half a profile."""
+_MIN_CORRELATION = 0.6
+_NOISE = 2.0
+"""Standard deviation of a grey level by noise and by texture that the mesh does not have."""
+_FLOOR_PX = 0.1
+INLIER_PX = 1.5
+MIN_POINTS = 24
+_CORRELATED_POINTS = 6.0
+"""Number of neighbouring control points that err together: their information counts once."""
+_SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
+"""Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
+
+
+class Pyramid:
+    """Levels of one image (h, w), uint8: level k has 2**-k as many pixels along each axis; made when first used."""
+
+    def __init__(self, image: NDArray[np.uint8], camera: Camera) -> None:
+        self.camera = camera
+        self._levels: dict[int, NDArray[np.float32]] = {0: image.astype(np.float32)}
+
+    def level(self, k: int) -> NDArray[np.float32]:
+        """Return the float image of level ``k``, -1 or more."""
+        if k not in self._levels:
+            if k < 0:
+                finer = self.level(k + 1)
+                size = (2 * finer.shape[1], 2 * finer.shape[0])
+                made = cv2.resize(finer, size, interpolation=cv2.INTER_CUBIC)
+            else:
+                finer = self.level(k - 1)
+                # The centres of pixels stay in place only for even sizes.
+                finer = finer[: finer.shape[0] // 2 * 2, : finer.shape[1] // 2 * 2]
+                made = cv2.resize(
+                    finer, (finer.shape[1] // 2, finer.shape[0] // 2), interpolation=cv2.INTER_AREA
+                )
+            self._levels[k] = np.ascontiguousarray(made, dtype=np.float32)
+        return self._levels[k]
+
+    def lens(self, k: int) -> tuple[float, float, float, float]:
+        """Return fx, fy, cx, cy of level ``k``."""
+        c, scale = self.camera, 0.5**k
+        return c.fx_px * scale, c.fy_px * scale, (c.cx_px + 0.5) * scale - 0.5, (c.cy_px + 0.5) * scale - 0.5
+
+
+@dataclass(frozen=True)
+class ControlPoints:
+    """n control points of a rendering: ``points_m`` (n, 3) and ``ahead_m`` (n, 3), a pixel further along the gradient, in TRF;
+    ``profiles`` (n, 9), grey levels; ``owners`` (n,): triangles; ``level``; ``pose`` of the rendering; ``displaced_m`` (k, n, 3):
+    displacements by the modes of the mesh."""
+
+    points_m: Array
+    ahead_m: Array
+    profiles: Array
+    owners: NDArray[np.int64]
+    level: int
+    pose: PoseInCamera
+    displaced_m: Array
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """An aligned pose: ``inlier_share`` of the points in the image, ``correlation``: mean of the points in the image, -1 to 1;
+    ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6, 6): as in `TargetPose`."""
+
+    pose: PoseInCamera
+    inlier_share: float
+    correlation: float
+    rms_px: float
+    covariance: Array
+    points: ControlPoints
+
+    @property
+    def score(self) -> float:
+        """How well the synthetic view explains the image, 0 to 1."""
+        return self.inlier_share * max(self.correlation, 0.0)
+
+
+def window_of(
+    pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera
+) -> tuple[PixelWindow, int, int] | None:
+    """Return the window of level ``k`` that the target can touch, and its first column and row; None if it is out of view."""
+    at = mesh.vertices_m @ pose.rotation.T + pose.position
+    at = at[at[:, 2] > 0.05]
+    if not len(at):
+        return None
+    fx, fy, cx, cy = pyramid.lens(k)
+    scale = 0.5**k
+    height, width = int(pyramid.camera.height_px * scale), int(pyramid.camera.width_px * scale)
+    u, v = fx * at[:, 0] / at[:, 2] + cx, fy * at[:, 1] / at[:, 2] + cy
+    left, right = max(0, math.floor(u.min()) - _MARGIN_PX), min(width, math.ceil(u.max()) + _MARGIN_PX)
+    top, bottom = max(0, math.floor(v.min()) - _MARGIN_PX), min(height, math.ceil(v.max()) + _MARGIN_PX)
+    if right - left < 3 * _PROFILE or bottom - top < 3 * _PROFILE:
+        return None
+    return PixelWindow(bottom - top, right - left, (fx, fy, cx - left, cy - top)), left, top
+
+
+def control_points(
+    pyramid: Pyramid, k: int, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting
+) -> ControlPoints | None:
+    """Render level ``k`` at ``pose`` and return its control points; None if there are too few."""
+    found = window_of(pyramid, k, mesh, pose)
+    if found is None:
+        return None
+    window, left, top = found
+    synthetic = render(mesh, pose, window, light)
+    patch = image_window(pyramid, k, window, left, top)
+    view, gain = in_grey_levels(synthetic, patch)
+    spread = _SPREAD_PX.get(k, 0.4)
+    view = np.asarray(cv2.GaussianBlur(view, (0, 0), spread), dtype=np.float32)
+    h, w = view.shape
+    cells = (-(-h // _CELL_PX)) * (-(-w // _CELL_PX))
+    most = cells * _PER_CELL
+    points, ahead = np.empty((most, 3)), np.empty((most, 3))
+    profiles, owners = np.empty((most, _PROFILE)), np.empty(most, dtype=np.int64)
+    work = np.empty(h * w + cells * 5 * _PER_CELL_MOST)
+    vertices, triangles, _, _ = mesh.contiguous
+    at = pose_array(pose)
+    n = function("control_points", c_int64)(
+        address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
+        (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
+        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain, 0.5), 4.0)),
+        address(points), address(ahead), address(profiles), address(owners), address(work),
+    )  # fmt: skip
+    if n < MIN_POINTS:
+        return None
+    points, owners = points[:n].copy(), owners[:n].copy()
+    displaced = mesh.mode_displacements(owners, points)
+    return ControlPoints(points, ahead[:n].copy(), profiles[:n].copy(), owners, k, pose, displaced)
+
+
+def image_window(pyramid: Pyramid, k: int, window: PixelWindow, left: int, top: int) -> NDArray[np.float32]:
+    """Return the image of level ``k`` on the grid of a window of ideal pixels."""
+    image = pyramid.level(k)
+    if not pyramid.camera.distortion:
+        return image[top : top + window.height, left : left + window.width]
+    # The distortion is smooth: its map is computed on every eighth pixel.
+    rows, columns = -(-window.height // 8) + 1, -(-window.width // 8) + 1
+    scale = 2.0**k
+    v, u = np.mgrid[0:rows, 0:columns] * 8.0
+    ideal = (np.stack([u + left, v + top], axis=-1) + 0.5) * scale - 0.5
+    px = (pyramid.camera.distort(ideal) + 0.5) / scale - 0.5
+    # Of a linear interpolation, as corners of the coarse grid lie on pixels.
+    to_coarse = np.array([[0.125, 0.0, 0.0], [0.0, 0.125, 0.0]])
+    maps = cv2.warpAffine(
+        px.astype(np.float32),
+        to_coarse,
+        (window.width, window.height),
+        flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+    )
+    return np.asarray(cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR), dtype=np.float32)
+
+
+def in_grey_levels(view: SyntheticView, patch: NDArray[np.float32]) -> tuple[NDArray[np.float32], float]:
+    """Return a synthetic view (h, w) in grey levels of the image, with the image's background behind it, and its gain.
+
+    ``patch`` (h, w): the image. The gain is the ratio of the means within the target. The background is a local mean of the image
+    outside of the target and a border, so that it follows the Earth without taking over edges of the target.
+    """
+    inside = view.coverage > 0.99
+    mean = float(view.grey[inside].mean()) if inside.any() else 0.0
+    gain = float(patch[inside].mean()) / mean if mean > 1e-6 else 100.0
+    small = (max(patch.shape[1] // 4, 1), max(patch.shape[0] // 4, 1))
+    covered = cv2.resize(view.coverage, small, interpolation=cv2.INTER_AREA)
+    outside = np.asarray(cv2.dilate(covered, np.ones((5, 5))) < 1e-3, dtype=np.float32)
+    values = cv2.resize(patch, small, interpolation=cv2.INTER_AREA) * outside
+    background = np.zeros_like(values)
+    missing = np.ones_like(values)
+    for side in (9, 33, 129):
+        share = cv2.blur(outside, (side, side), borderType=cv2.BORDER_CONSTANT)
+        local = cv2.blur(values, (side, side), borderType=cv2.BORDER_CONSTANT)
+        use = np.minimum(share / 0.05, 1.0) * missing
+        background += use * local / np.maximum(share, 1e-6)
+        missing -= use
+    background = cv2.resize(background, (patch.shape[1], patch.shape[0]), interpolation=cv2.INTER_LINEAR)
+    return np.asarray(gain * view.grey + (1.0 - view.coverage) * background, dtype=np.float32), gain
+
+
+def align(
+    pyramid: Pyramid, points: ControlPoints, prior: PoseInCamera, reach_px: int, iterations: int = 6
+) -> Alignment | None:
+    """Align control points with an image, searching ``reach_px`` of their level around ``prior``; None if that fails."""
+    image = pyramid.level(points.level)
+    n = len(points.points_m)
+    distortion = (*pyramid.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
+    camera = (c_double * 11)(*pyramid.lens(points.level), *distortion, *image.shape)
+    settings = (c_double * 6)(reach_px, iterations, _MIN_CORRELATION, _NOISE, _FLOOR_PX, INLIER_PX)
+    pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
+    correlation, rows, work = np.empty(n), np.empty((n, 6)), np.empty(2 * n)
+    inside = function("align_points", c_int64)(
+        camera, address(image), settings, address(points.points_m), address(points.ahead_m), address(points.profiles),
+        c_int64(n), address(pose), address(residual), address(weight), address(correlation), address(rows), address(work),
+    )  # fmt: skip
+    if inside < MIN_POINTS:
+        return None
+    used = weight > 0.0
+    if used.sum() < MIN_POINTS:
+        return None
+    aligned = PoseInCamera(pose[:3], pose[3:].reshape(3, 3))
+    covariance = _covariance(points, aligned, residual[used], weight[used], rows[used], used)
+    if covariance is None:
+        return None
+    rms = math.sqrt(float(np.average(residual[used] ** 2, weights=weight[used]))) * 2.0**points.level
+    seen = weight >= 0.0
+    return Alignment(
+        aligned, float(used.sum()) / inside, float(correlation[seen].mean()), rms, covariance, points
+    )
+
+
+def _covariance(
+    points: ControlPoints,
+    pose: PoseInCamera,
+    residual: Array,
+    weight: Array,
+    rows: Array,
+    used: NDArray[np.bool_],
+) -> Array | None:
+    """Return the covariance (6, 6), as in `TargetPose`: of the fit, and of the geometry's errors as considered parameters.
+
+    With J the rows and W the weights, the pose errs by K = (J'WJ)^-1 J'W times the residuals' errors. A mode of the geometry
+    displaces all of its points together: K times the shift that it causes is added as its outer product (consider covariance,
+    B. D. Tapley, B. E. Schutz, G. H. Born, "Statistical Orbit Determination", 2004, sec. 6.2).
+    """
+    # A rotation phi in camera axes is R dtheta.
+    jacobian = np.concatenate([rows[:, 3:], rows[:, :3] @ pose.rotation], axis=1)
+    information = jacobian.T @ (jacobian * weight[:, None])
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    if not values[0] > 1e-10 * values[-1]:
+        return None
+    inverse = (vectors / values) @ vectors.T * np.outer(scale, scale)
+    chi_square = float(residual**2 @ weight) / max(len(residual) - 6, 1)
+    total = inverse * max(chi_square, 1.0) * _CORRELATED_POINTS
+    for displaced in points.displaced_m:
+        # A displacement in TRF moves a projection as the same displacement of the position in IRF axes.
+        shift = np.einsum("ni,ni->n", rows[:, 3:], displaced[used] @ pose.rotation.T)
+        moved = inverse @ (jacobian.T @ (weight * shift))
+        total = total + np.outer(moved, moved)
+    return 0.5 * (total + total.T)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Synthetic views of the tracker mesh, implemented in native/mesh.c."""
+
+from __future__ import annotations
+
+from ctypes import c_double, c_int64
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.native import address
+from numpy.typing import NDArray
+
+from ..native import function
+from ..refine import PoseInCamera
+from .mesh import TrackerMesh
+
+_SHADOW_TEXELS = 512
+_NO_SHADOW = np.zeros(1, dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Lighting:
+    """Light on the target, up to an unknown common factor.
+
+    ``to_sun_irf`` (3,): unit vector to the sun in IRF; None: the only directed light is the lamp at the lens. ``direct`` and
+    ``ambient``: shares of the directed light and of light from all directions. ``shadows``: whether the target casts
+    shadows on itself.
+    """
+
+    to_sun_irf: Array | None
+    direct: float = 0.8
+    ambient: float = 0.2
+    shadows: bool = True
+
+
+@dataclass(frozen=True)
+class PixelWindow:
+    """A rectangle of the grid of ideal pixels of an image level: pinhole (fx, fy, cx, cy) relative to its first pixel."""
+
+    height: int
+    width: int
+    lens: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class SyntheticView:
+    """A rendering, each array (h, w): ``grey``, reflectance times light, times ``coverage``, the share that the target covers;
+    ``nearest``: inverse depth, 1/m, 0 for none; ``owner``: triangle or -1."""
+
+    grey: NDArray[np.float32]
+    coverage: NDArray[np.float32]
+    nearest: NDArray[np.float32]
+    owner: NDArray[np.int32]
+
+
+def pose_array(pose: PoseInCamera) -> Array:
+    """Return position (3) and rotation (3, 3) as the kernels take them, (12,)."""
+    return np.concatenate([pose.position, pose.rotation.ravel()])
+
+
+def render(
+    mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, light: Lighting, samples: int = 2
+) -> SyntheticView:
+    """Render ``mesh`` with ``samples`` by ``samples`` samples per pixel."""
+    vertices, triangles, normals, reflectance = mesh.contiguous
+    h, w = window.height, window.width
+    shape = (h, w)
+    view = SyntheticView(
+        np.empty(shape, np.float32),
+        np.empty(shape, np.float32),
+        np.empty(shape, np.float32),
+        np.empty(shape, np.int32),
+    )
+    at = pose_array(pose)
+    if light.to_sun_irf is None:
+        lamp_distance = max(float(np.linalg.norm(pose.position)), 1e-3)
+        settings = (0.0, 0.0, 1.0, light.direct * lamp_distance**2, light.ambient, 1.0)
+        shadow_settings, depth = (0.0,) * 12, _NO_SHADOW
+    else:
+        settings = (*light.to_sun_irf, light.direct, light.ambient, 0.0)
+        shadow_settings, depth = (
+            _shadow_map(mesh, pose.rotation.T @ light.to_sun_irf)
+            if light.shadows
+            else ((0.0,) * 12, _NO_SHADOW)
+        )
+    work = np.empty(3 * samples * samples * h * w, np.float32)
+    function("render_mesh")(
+        (c_double * 4)(*window.lens), c_int64(h), c_int64(w), c_int64(samples), address(at),
+        address(vertices), address(triangles), address(normals), address(reflectance), c_int64(len(triangles)),
+        (c_double * 6)(*settings), (c_double * 12)(*shadow_settings), address(depth),
+        address(view.grey), address(view.coverage), address(view.nearest), address(view.owner), address(work),
+    )  # fmt: skip
+    return view
+
+
+def _shadow_map(mesh: TrackerMesh, to_sun_trf: Array) -> tuple[tuple[float, ...], NDArray[np.float32]]:
+    axis = np.eye(3)[int(np.argmin(np.abs(to_sun_trf)))]
+    right = np.cross(axis, to_sun_trf)
+    right /= np.linalg.norm(right)
+    basis = np.stack([right, np.cross(to_sun_trf, right), to_sun_trf])
+    texels_per_m = 0.49 * _SHADOW_TEXELS / mesh.radius_m
+    settings = (*basis.ravel().tolist(), texels_per_m, float(_SHADOW_TEXELS), 1.5 / texels_per_m)
+    depth = np.empty(_SHADOW_TEXELS**2, np.float32)
+    vertices, triangles, _, _ = mesh.contiguous
+    function("shadow_map")(
+        (c_double * 12)(*settings),
+        address(vertices),
+        address(triangles),
+        c_int64(len(triangles)),
+        address(depth),
+    )
+    return settings, depth

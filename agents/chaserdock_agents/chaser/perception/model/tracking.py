@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Track a pose from a prior: coarse to fine alignment, validity gate, several starts. Pure functions."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import TypeGuard
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+
+from ..refine import PoseInCamera
+from .alignment import Alignment, ControlPoints, Pyramid, align, control_points, window_of
+from .mesh import TrackerMesh
+from .rendering import Lighting
+
+MIN_INLIER_SHARE = 0.55
+"""Gate: a smaller share of inliers rejects a pose."""
+MIN_SCORE = 0.45
+"""Gate: a smaller product of inlier share and mean correlation rejects a pose."""
+MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
+"""Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
+_FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 140_000, 12_000, 24_000
+_FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
+_START_SHARE, _START_RAD = 0.02, math.radians(3.0)
+
+
+def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
+    """Return whether an alignment passes the gate: enough inliers, well correlated, and a pose that is observable."""
+    if alignment is None or alignment.inlier_share < MIN_INLIER_SHARE or alignment.score < MIN_SCORE:
+        return False
+    position_m = math.sqrt(float(np.linalg.eigvalsh(alignment.covariance[:3, :3])[-1]))
+    attitude_rad = math.sqrt(float(np.linalg.eigvalsh(alignment.covariance[3:, 3:])[-1]))
+    range_m = float(np.linalg.norm(alignment.pose.position))
+    return position_m <= MAX_POSITION_SIGMA_SHARE * range_m and attitude_rad <= MAX_ATTITUDE_SIGMA_RAD
+
+
+def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
+    """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is out of view.
+
+    The finest one shows the target on at most 140,000 pixels, so that a rendering takes bounded time; small targets are
+    upsampled twice.
+    """
+    found = window_of(pyramid, 0, mesh, pose)
+    if found is None:
+        return ()
+    area = found[0].height * found[0].width
+    finest = -1 if area < _UPSAMPLED_AREA_PX else 0
+    while area / 4**finest > _FINEST_AREA_PX:
+        finest += 1
+    coarsest = finest
+    while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 3:
+        coarsest += 1
+    return tuple(range(coarsest, finest - 1, -1))
+
+
+def refine_pose(
+    pyramid: Pyramid,
+    mesh: TrackerMesh,
+    prior: PoseInCamera,
+    light: Lighting,
+    levels: tuple[int, ...],
+    first_reach_px: int = _FIRST_REACH_PX,
+) -> Alignment | None:
+    """Align the mesh with an image from ``prior``, level by level; None without an alignment at the last level."""
+    pose, alignment = prior, None
+    for number, k in enumerate(levels):
+        points = control_points(pyramid, k, mesh, pose, light)
+        alignment = (
+            None
+            if points is None
+            else align(pyramid, points, pose, first_reach_px if number == 0 else _NEXT_REACH_PX)
+        )
+        if alignment is not None:
+            pose = alignment.pose
+    return alignment
+
+
+def track_points(pyramid: Pyramid, points: ControlPoints, prior: PoseInCamera) -> Alignment | None:
+    """Align the control points of an earlier rendering from ``prior``."""
+    return align(pyramid, points, prior, _FIRST_REACH_PX)
+
+
+def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
+    """Return twelve poses around ``prior``: turned by 3 degrees about each axis, moved by 2 % of the range along each."""
+    starts, step_m = [], _START_SHARE * float(np.linalg.norm(prior.position))
+    for axis, sign in itertools.product(range(3), (1.0, -1.0)):
+        unit = sign * np.eye(3)[axis]
+        turn = rotations.to_matrix(rotations.exp(_START_RAD * unit))
+        starts.append(PoseInCamera(prior.position, turn @ prior.rotation))
+        starts.append(PoseInCamera(prior.position + step_m * unit, prior.rotation))
+    return starts
+
+
+def refine_from_starts(
+    pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
+) -> Alignment | None:
+    """Return the best alignment from several starts: all at the coarsest level, the best three at all levels."""
+    coarse: list[Alignment] = []
+    for start in starts:
+        levels = levels_of(pyramid, mesh, start)
+        found = refine_pose(pyramid, mesh, start, light, levels[:1])
+        if found is not None:
+            coarse.append(found)
+    coarse.sort(key=lambda a: -a.score)
+    best: Alignment | None = None
+    for candidate in coarse[:3]:
+        levels = levels_of(pyramid, mesh, candidate.pose)
+        found = refine_pose(pyramid, mesh, candidate.pose, light, levels)
+        if found is not None and (best is None or found.score > best.score):
+            best = found
+    return best
+
+
+def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:
+    """Return the angle between the attitudes of two poses, rad."""
+    cosine = 0.5 * (float(np.sum(a.rotation * b.rotation)) - 1.0)
+    return math.acos(min(1.0, max(-1.0, cosine)))
+
+
+def pose_error(estimate: PoseInCamera, truth: PoseInCamera) -> Array:
+    """Return the error (6,) of a pose in the coordinates of its covariance: position in IRF, rotation in TRF axes."""
+    turn = rotations.log(rotations.from_matrix(estimate.rotation.T @ truth.rotation))
+    return np.concatenate([truth.position - estimate.position, turn])

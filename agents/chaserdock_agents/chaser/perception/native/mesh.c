@@ -1,0 +1,203 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Synthetic views of a triangle mesh: z-buffer rasterization, Lambert shading, cast shadows. */
+#include "base.h"
+
+#define CLIPPED_MOST 4
+#define NEAR_M 0.02
+
+/* A vertex on the sample grid: position, depth (linear on the grid, larger is nearer) and Lambert factor. */
+typedef struct {
+    double x, y, depth, shade;
+} Sample;
+
+/* A light: unit vector to it in IRF; direct and ambient share; whether it is a lamp at the lens instead (inverse square). */
+typedef struct {
+    double to_light[3], direct, ambient, lamp;
+} MeshLight;
+
+/* A depth map towards the sun: rows right, up and to the sun in TRF, texels per metre, texels along each axis (0: none), and
+ * tolerance, metres. */
+typedef struct {
+    double basis[9], texels_per_m, size, tolerance_m;
+} ShadowMap;
+
+/* Limit ``value`` to [0, limit] and round up; NaN gives 0. */
+static inline int64_t ceiling(double value, double limit) {
+    if (!(value > 0.0)) return 0;
+    if (value >= limit) return (int64_t)limit;
+    int64_t whole = (int64_t)value;
+    return whole + ((double)whole < value);
+}
+
+/* Rasterize a triangle; write depth, index and shade of samples that are nearer than before. ``shade`` may be null. */
+static void fill_triangle(const Sample *a, const Sample *b, const Sample *c, int32_t index, int64_t width, int64_t height,
+                          float *depth, int32_t *owner, float *shade) {
+    const Sample *corner[3] = {a, b, c};
+    double area = (b->x - a->x) * (c->y - a->y) - (b->y - a->y) * (c->x - a->x);
+    if (!(abs_of(area) > 1e-12) || !finite(area)) return;
+    double low = min_of(a->y, min_of(b->y, c->y)), high = max_of(a->y, max_of(b->y, c->y)), edge[3][3];
+    for (int i = 0; i < 3; i++) {
+        const Sample *p = corner[i], *q = corner[(i + 1) % 3];
+        double sign = area > 0.0 ? 1.0 : -1.0;
+        edge[i][0] = -sign * (q->y - p->y);
+        edge[i][1] = sign * (q->x - p->x);
+        edge[i][2] = -(edge[i][0] * p->x + edge[i][1] * p->y);
+    }
+    double dx[2], dy[2], first[2];
+    for (int k = 0; k < 2; k++) {
+        double va = k ? a->shade : a->depth, vb = (k ? b->shade : b->depth) - va, vc = (k ? c->shade : c->depth) - va;
+        dx[k] = (vb * (c->y - a->y) - vc * (b->y - a->y)) / area;
+        dy[k] = (vc * (b->x - a->x) - vb * (c->x - a->x)) / area;
+        first[k] = va - dx[k] * a->x - dy[k] * a->y;
+    }
+    int64_t row = ceiling(low, (double)height), last_row = ceiling(high + 1e-9, (double)height);
+    for (; row < last_row; row++) {
+        double y = (double)row, left = 0.0, right = (double)width;
+        int empty = 0;
+        for (int i = 0; i < 3; i++) {
+            double value = edge[i][1] * y + edge[i][2];
+            if (edge[i][0] > 0.0)
+                left = max_of(left, -value / edge[i][0]);
+            else if (edge[i][0] < 0.0)
+                right = min_of(right, -value / edge[i][0]);
+            else
+                empty |= value < 0.0;
+        }
+        if (empty || !(left <= right)) continue;
+        int64_t x = ceiling(left, (double)width), end = ceiling(right + 1e-9, (double)width);
+        float at = (float)(first[0] + dy[0] * y), step = (float)dx[0];
+        float lit = (float)(first[1] + dy[1] * y), lit_step = (float)dx[1];
+        float *d = depth + row * width, *s = shade ? shade + row * width : 0;
+        int32_t *o = owner ? owner + row * width : 0;
+        for (; x < end; x++) {
+            float value = at + step * (float)x;
+            if (!(value > d[x])) continue;
+            d[x] = value;
+            if (o) o[x] = index;
+            if (s) s[x] = lit + lit_step * (float)x;
+        }
+    }
+}
+
+/* Compute the depth map (size, size), float, of a mesh towards the sun: of the faces turned away from it, so that a face never
+ * shadows itself. ``vertices`` (.., 3) TRF, ``triangles`` (n, 3) int64 with outward orientation. Texels without a surface: -1e30. */
+EXPORT void NAME(shadow_map)(const ShadowMap *map, const double *vertices, const int64_t *triangles, int64_t n, float *depth) {
+    int64_t size = (int64_t)map->size;
+    for (int64_t i = 0; i < size * size; i++) depth[i] = -1e30f;
+    for (int64_t t = 0; t < n; t++) {
+        Sample corner[3];
+        for (int i = 0; i < 3; i++) {
+            double at[3];
+            multiply3(map->basis, vertices + 3 * triangles[3 * t + i], at);
+            corner[i].x = at[0] * map->texels_per_m + 0.5 * map->size;
+            corner[i].y = at[1] * map->texels_per_m + 0.5 * map->size;
+            corner[i].depth = at[2], corner[i].shade = 0.0;
+        }
+        double area = (corner[1].x - corner[0].x) * (corner[2].y - corner[0].y) -
+                      (corner[1].y - corner[0].y) * (corner[2].x - corner[0].x);
+        if (area >= 0.0) continue; /* faces the sun */
+        fill_triangle(corner, corner + 1, corner + 2, (int32_t)t, size, size, depth, 0, 0);
+    }
+}
+
+/* Return whether a point in TRF lies behind a surface of the depth map. */
+static inline int in_shadow(const ShadowMap *map, const float *depth, const double *at) {
+    double x = dot3(map->basis, at) * map->texels_per_m + 0.5 * map->size + 0.5;
+    double y = dot3(map->basis + 3, at) * map->texels_per_m + 0.5 * map->size + 0.5;
+    if (!(x >= 0.0 && y >= 0.0 && x < map->size && y < map->size)) return 0;
+    return dot3(map->basis + 6, at) < (double)depth[(int64_t)y * (int64_t)map->size + (int64_t)x] - map->tolerance_m;
+}
+
+/* Project the corners of a triangle in IRF, clip them at NEAR_M, and rasterize. ``lens``: fx, fy, cx, cy on the sample grid. */
+static void draw_triangle(const double *lens, double at[3][4], int32_t index, int64_t width, int64_t height, float *depth,
+                          int32_t *owner, float *shade) {
+    double kept[CLIPPED_MOST][4];
+    Sample sample[CLIPPED_MOST];
+    int count = 0;
+    for (int i = 0; i < 3; i++) {
+        const double *a = at[(i + 2) % 3], *b = at[i];
+        if ((a[2] < NEAR_M) != (b[2] < NEAR_M)) {
+            double share = (NEAR_M - a[2]) / (b[2] - a[2]);
+            for (int k = 0; k < 4; k++) kept[count][k] = a[k] + share * (b[k] - a[k]);
+            count++;
+        }
+        if (b[2] >= NEAR_M) copy(b, kept[count++], 4);
+    }
+    for (int i = 0; i < count; i++) {
+        sample[i].depth = 1.0 / kept[i][2];
+        sample[i].x = kept[i][0] * sample[i].depth * lens[0] + lens[2];
+        sample[i].y = kept[i][1] * sample[i].depth * lens[1] + lens[3];
+        sample[i].shade = kept[i][3];
+    }
+    for (int i = 2; i < count; i++)
+        fill_triangle(sample, sample + i - 1, sample + i, index, width, height, depth, owner, shade);
+}
+
+/* Lambert factor, without shadows, of a surface at ``at`` with ``normal``, both in IRF. */
+static inline double lambert(const MeshLight *light, const double *at, const double *normal) {
+    if (light->lamp == 0.0) return max_of(0.0, dot3(normal, light->to_light));
+    double square = max_of(dot3(at, at), 1e-4), distance = sqrt_of(square);
+    return max_of(0.0, -dot3(normal, at)) / (distance * square);
+}
+
+/* Render a mesh. ``lens``: fx, fy, cx, cy of the image (height, width) of ideal pixels; ``samples``: per pixel along each axis;
+ * ``pose``: position (3) and rotation (3, 3) TRF to IRF; ``vertices`` (.., 3) and ``normals`` (n, 3, 3), of each corner, in TRF;
+ * ``triangles`` (n, 3) int64, outward orientation; ``reflectance`` (n). Output, (height, width): ``grey`` float, reflectance times
+ * light, averaged over the target's samples and black ones of the background; ``coverage`` float, share of the target's samples;
+ * ``nearest`` float, inverse depth of the nearest sample, 1/m, 0 without any; ``owner`` int32, its triangle or -1. ``work``:
+ * 3 samples^2 height width floats. Faces turned away are not drawn. */
+EXPORT void NAME(render_mesh)(const double *lens, int64_t height, int64_t width, int64_t samples, const double *pose,
+                             const double *vertices, const int64_t *triangles, const double *normals, const double *reflectance,
+                             int64_t n, const MeshLight *light, const ShadowMap *map, const float *map_depth, float *grey,
+                             float *coverage, float *nearest, int32_t *owner, float *work) {
+    int64_t wide = width * samples, high = height * samples, all = wide * high;
+    float *depth = work, *shade = work + all;
+    int32_t *index = (int32_t *)(work + 2 * all);
+    double scale = (double)samples, grid[4] = {lens[0] * scale, lens[1] * scale, (lens[2] + 0.5) * scale - 0.5,
+                                               (lens[3] + 0.5) * scale - 0.5};
+    for (int64_t i = 0; i < all; i++) depth[i] = 0.0f, shade[i] = 0.0f, index[i] = -1;
+    for (int64_t t = 0; t < n; t++) {
+        double at[3][4], ab[3], ac[3], facing[3], normal[3];
+        for (int i = 0; i < 3; i++) {
+            multiply3(pose + 3, vertices + 3 * triangles[3 * t + i], at[i]);
+            for (int k = 0; k < 3; k++) at[i][k] += pose[k];
+        }
+        subtract3(at[1], at[0], ab), subtract3(at[2], at[0], ac);
+        cross3(ab, ac, facing);
+        if (!(dot3(facing, at[0]) < 0.0)) continue;
+        for (int i = 0; i < 3; i++) {
+            multiply3(pose + 3, normals + 9 * t + 3 * i, normal);
+            at[i][3] = lambert(light, at[i], normal);
+        }
+        draw_triangle(grid, at, (int32_t)t, wide, high, depth, index, shade);
+    }
+    double share = 1.0 / (scale * scale), to_trf[9], offset[3];
+    for (int i = 0; i < 3; i++)
+        for (int j = 0; j < 3; j++) to_trf[3 * i + j] = pose[3 + 3 * j + i];
+    multiply3(to_trf, pose, offset);
+    for (int64_t y = 0; y < height; y++)
+        for (int64_t x = 0; x < width; x++) {
+            double sum = 0.0;
+            int64_t count = 0, best = -1;
+            float near = 0.0f;
+            for (int64_t k = 0; k < samples * samples; k++) {
+                int64_t sx = x * samples + k % samples, sy = y * samples + k / samples, at = sy * wide + sx;
+                int32_t which = index[at];
+                if (which < 0) continue;
+                count++;
+                if (depth[at] > near) near = depth[at], best = which;
+                double lit = shade[at];
+                if (lit > 0.0 && map->size > 0.0 && light->lamp == 0.0) {
+                    double z = 1.0 / (double)depth[at], point[3];
+                    double ray[3] = {((double)sx - grid[2]) / grid[0] * z, ((double)sy - grid[3]) / grid[1] * z, z};
+                    multiply3(to_trf, ray, point);
+                    subtract3(point, offset, point);
+                    if (in_shadow(map, map_depth, point)) lit = 0.0;
+                }
+                sum += reflectance[which] * (light->ambient + light->direct * lit);
+            }
+            int64_t at = y * width + x;
+            grey[at] = (float)(sum * share), coverage[at] = (float)((double)count * share);
+            nearest[at] = near, owner[at] = (int32_t)best;
+        }
+}

@@ -1,0 +1,65 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a log as a bag of ROS 2 (rosbag2 with MCAP storage): schemas and CDR of ROS 2, ``metadata.yaml``.
+
+Topics are those of the bridge, and the true states of the bodies under ``/truth/``. Needs the extra ``chaserdock[ros2]``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+
+from chaserdock_protocol import topics
+from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.recording.log import LogError, LogSource
+
+from .reader import open_log
+
+BAG_VERSION = 9
+"""Format of the metadata: that of ROS 2 Jazzy and later."""
+
+
+def export_bag(log: LogSource, folder: Path, images: bool = False) -> dict[str, int]:
+    """Write a log as the bag ``folder``, which must not exist, and return the number of messages by topic.
+
+    ``images``: include images (decoded) and camera calibrations.
+
+    A message's time in the bag is its simulated time, that of an image its exposure; a bag is in order of arrival, as the log
+    is. Raises LogError when the log or the bag cannot be used or rosbags is not installed.
+    """
+    try:
+        from rosbags.interfaces import Connection
+        from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer, WriterError
+        from rosbags.rosbag2.enums import CompressionFormat
+    except ImportError as error:
+        raise LogError(f"{error.name} is not installed; install chaserdock[ros2]") from None
+    from chaserdock_agents.ros2.conversion import Converter, InvalidImage
+    from chaserdock_agents.ros2.types import TYPES
+
+    opened = open_log(log)
+    converter = Converter(opened.scenario)
+    connections: dict[str, Connection] = {}
+    rows: Counter[str] = Counter()
+    try:
+        with errors_of_writing(folder, LogError):
+            writer = Writer(folder, version=BAG_VERSION, storage_plugin=StoragePlugin.MCAP)
+            writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+            with writer:
+                for record in opened.records():
+                    if record.topic is topics.IMAGE and not images:
+                        continue
+                    try:
+                        converted = converter.convert(record.message)
+                    except InvalidImage as error:
+                        raise LogError(f"{record.key}, tick {record.message.tick}: {error}") from None
+                    for ros in converted:
+                        if ros.topic not in connections:
+                            connections[ros.topic] = writer.add_connection(
+                                ros.topic, ros.type_name, typestore=TYPES
+                            )
+                        data = TYPES.serialize_cdr(ros.message, ros.type_name)
+                        writer.write(connections[ros.topic], ros.time_ns, data)
+                        rows[ros.topic] += 1
+    except WriterError:
+        raise LogError(f"{folder}: already exists; export into a new folder") from None
+    return dict(sorted(rows.items()))

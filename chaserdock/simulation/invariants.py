@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -58,6 +58,9 @@ SETTLING_S = 15.0
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
 ATTACHED = frozenset({"latched", "verified", "detumble", "stack_hold"})
 DOCKED = ATTACHED | {"docked"}
+DETUMBLING = frozenset({"detumble", "stack_hold"})
+_TUMBLE_SHARE, _TUMBLE_FLOOR_N_M_S = 0.05, 0.02
+"""By how much the angular momentum of a stack may rise above its least while it is stopped: share of its first value, floor."""
 _POSE = (0, 1, 2, 6, 7, 8)
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
 _ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
@@ -129,6 +132,7 @@ class Invariants:
     _seen_s: dict[int, float] = field(default_factory=dict)
     _unexplained: dict[int, Array] = field(default_factory=dict)
     _given_N_s: dict[int, float] = field(default_factory=dict)
+    _tumble_N_m_s: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         self._lifetime_ticks = math.ceil(
@@ -214,6 +218,7 @@ class Invariants:
         for body in self._bodies:
             self._check_body(body)
         self._bodies.clear()
+        self._check_stack()
 
     def _on_docking(self, status: DockingStatus) -> None:
         """Note a probe in contact, also one whose latch has opened: the world publishes it before the bodies of the tick."""
@@ -347,6 +352,28 @@ class Invariants:
             if abs(value - begin) > _CONSERVED_SHARE * size:
                 self.violate("energy and momentum", "target", f"{name} from {begin:.6g} to {value:.6g}")
 
+    def _check_stack(self) -> None:
+        """Check that the angular momentum of target and latched chasers does not rise while they stop its tumble."""
+        names = ["target", *(f"chaser/{i}" for i in sorted(self._latched))]
+        stopping = any(self.phases.get(i) in DETUMBLING for i in self._latched)
+        known = self._states.keys() & self._drawn.keys()
+        if not stopping or not known.issuperset(names) or self._device_disturbed(self.time_s):
+            self._tumble_N_m_s = None
+            return
+        now = float(np.linalg.norm(_angular_momentum([(self._states[n], self._drawn[n]) for n in names])))
+        first, least = self._tumble_N_m_s or (now, now)
+        self._tumble_N_m_s = (first, min(least, now))
+        if now > least + _TUMBLE_SHARE * first + _TUMBLE_FLOOR_N_M_S:
+            text = f"the angular momentum of the stack rises from {least:.3g} to {now:.3g} N m s"
+            self.violate("tumble falls", "target", text)
+
+    def _device_disturbed(self, now_s: float) -> bool:
+        """Return whether thrusters may give something else than commanded: failures, lost messages, recent faults."""
+        s = self.scenario
+        lossy = s.simulation.mode == "realtime" and (s.simulation.loss or s.simulation.reorder)
+        recent = any(f.at_s <= now_s <= f.at_s + (f.duration_s or 0.0) + 2.0 for f in s.fault)
+        return bool(lossy or s.thruster_failure or recent)
+
     def _check_target_in_orbit(self, before: BodyTruth, body: BodyTruth, drawn: DrawnBody) -> None:
         """Compare the change of the free target's angular momentum in a tick with what the orbit gives."""
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
@@ -464,12 +491,12 @@ class Invariants:
         """Compare the impulse that a chaser expects of its thrusters with the true one, summed since the last fault."""
         i, name = report.chaser, f"chaser/{report.chaser}"
         body, now_s = self._states.get(name), report.tick / self.scenario.time.rate_hz
-        s = self.scenario
-        lossy = s.simulation.mode == "realtime" and (s.simulation.loss or s.simulation.reorder)
-        if body is None or body.tick != report.tick or lossy or s.thruster_failure or name in self._touching:
-            self._unexplained.pop(i, None)
-            return
-        if any(f.at_s <= now_s <= f.at_s + (f.duration_s or 0.0) + 2.0 for f in s.fault):
+        if (
+            body is None
+            or body.tick != report.tick
+            or name in self._touching
+            or self._device_disturbed(now_s)
+        ):
             self._unexplained.pop(i, None)
             return
         true = [*body.impulse_N_s, *np.divide(body.angular_impulse_N_m_s, _ARM_M)]
@@ -629,6 +656,21 @@ def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth
     turn = rotations.log(rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), q))
     error = np.concatenate([place - np.array(estimate.position_m), turn])
     return float(error @ np.linalg.solve(np.reshape(estimate.covariance, (6, 6)), error))
+
+
+def _angular_momentum(bodies: Sequence[tuple[BodyTruth, DrawnBody]]) -> Array:
+    """Return the angular momentum (3,), WRF, of bodies about their common centre of mass (N m s)."""
+    mass = np.array([drawn.mass_kg for _, drawn in bodies])
+    spin = np.zeros(3)
+    at, velocity = np.zeros((len(bodies), 3)), np.zeros((len(bodies), 3))
+    for k, (body, drawn) in enumerate(bodies):
+        q, omega = np.array(body.q_wxyz), np.array(body.omega_rad_s)
+        arm = rotations.rotate(q, np.array(drawn.centre_of_mass_m))
+        at[k] = np.array(body.position_m) + arm
+        velocity[k] = np.array(body.velocity_m_s) + np.cross(rotations.rotate(q, omega), arm)
+        spin += rotations.rotate(q, np.reshape(drawn.inertia_kg_m2, (3, 3)) @ omega)
+    about = at - mass @ at / mass.sum()
+    return spin + (mass[:, None] * np.cross(about, velocity)).sum(axis=0)
 
 
 def _distance(a: Array, b: Array) -> float:

@@ -389,6 +389,34 @@ def test_a_touched_target_may_change_its_energy(log: Log) -> None:
     assert log.found == []
 
 
+@pytest.mark.parametrize(
+    ("phase", "rates", "found"),
+    [
+        ("detumble", (0.4, 0.2, 0.1, 0.2), ["tumble falls"]),
+        ("stack_hold", (0.4, 0.0, 0.0, 0.1), ["tumble falls"]),
+        ("detumble", (0.4, 0.2, 0.21, 0.0), []),
+        ("verified", (0.1, 0.1, 0.1, 0.2), []),
+    ],
+)
+def test_latched_chasers_do_not_spin_the_stack_up(
+    log: Log, phase: str, rates: tuple[float, ...], found: list[str]
+) -> None:
+    """The chaser is 1 m from the target: both turn about their common centre of mass."""
+    drawn = [
+        DrawnBody(body=name, mass_kg=2.0, inertia_kg_m2=(1.0, 0, 0, 0, 1.0, 0, 0, 0, 1.0))
+        for name in ("target", "chaser/0")
+    ]
+    log.publish(topics.TRUTH_DRAWN, DrawnTruth(bodies=tuple(drawn)))
+    reference: Any = msgspec.structs.replace(BY_TYPE[Reference], phase=phase)
+    log.publish(topics.REFERENCE, reference, 0)
+    for tick, rate in enumerate(rates):
+        for name, x_m in (("target", 0.0), ("chaser/0", -1.0)):
+            moving: dict[str, Any] = {"omega_rad_s": (0, 0, rate), "velocity_m_s": (0, rate * (x_m + 0.5), 0)}
+            log.publish(topics.TRUTH_BODY, body(name, x_m, **moving, tick=tick), name)
+        log.publish(topics.TRUTH_WORLD, WorldTruth(tick=tick, contacts=(), saturated=(), latched=(0,)))
+    assert log.found == found
+
+
 def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     log.tick(20)
     log.flies(0, 20)

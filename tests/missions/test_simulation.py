@@ -7,14 +7,20 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from chaserdock_protocol import codec
+from chaserdock_protocol.messages import ActuatorCommand, WrenchCommand
 from chaserdock_protocol.recording.log import read_log
+from chaserdock_protocol.transport import RawSample
 from harness import DRILL, ROOT, SHORT, simulated_digest, summary
 
 from chaserdock.analysis.flight import load_flight
+from chaserdock.simulation import mission
 from chaserdock.simulation.mission import simulate
+from chaserdock.simulation.network import SimulatedNetwork
 
 BRIEF = ("duration_s=2.0", "timeline=[]", "success.docked=[]", "settling_s=1.0")
 OTHER_SIMD = {
@@ -77,6 +83,53 @@ def test_a_seed_repeats_every_byte_whatever_the_hash_seed(tmp_path: Path) -> Non
         contents.append([(r.key, r.message, r.sent_ns) for r in read_log(tmp_path / str(k) / "mission.mcap")])
     assert len(contents[0]) > 500
     assert contents[0] == contents[1]
+
+
+@pytest.mark.parametrize("mode", ["lockstep", "realtime"])
+def test_chasers_fly_both_controllers_in_the_tick_in_which_the_commander_dies(
+    mode: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It dies after two of its four commands. Those of the standby are the same, so that no body moves otherwise."""
+    networks: list[SimulatedNetwork] = []
+    dies_at, sent = 8, 0
+
+    def network(*arguments: Any) -> SimulatedNetwork:
+        networks.append(SimulatedNetwork(*arguments))
+        return networks[-1]
+
+    def die(sender: str, raw: RawSample) -> None:
+        nonlocal sent
+        if sender != "controller" or not raw.key.endswith("wrench"):
+            return
+        sent += codec.decode(WrenchCommand, raw.payload, raw.encoding).tick == dies_at
+        host = networks[-1].host_of("controller")
+        if sent == 3 and host is not None:
+            host.kill()  # before the third leaves
+
+    monkeypatch.setattr(mission, "SimulatedNetwork", network)
+    changes = (
+        *BRIEF,
+        "controller.standby=true",
+        "perception.name='statistical'",
+        f"simulation.mode='{mode}'",
+    )
+    path, flown = ROOT / "scenarios" / "fault-drill.toml", {}
+    for name, tap in (("undisturbed", None), ("disturbed", die)):
+        flight = simulate(path, tmp_path / name, changes, tap)
+        assert (flight.crashes, flight.stalled) == ({}, ())
+        flown[name] = load_flight(tmp_path / name / "mission.mcap")
+    executed = [r.message for r in read_log(tmp_path / "disturbed" / "mission.mcap")]
+    commands = [m for m in executed if isinstance(m, ActuatorCommand) and m.source == "command"]
+    terms = {m.chaser: m.term for m in commands if m.tick == dies_at}
+    # The news of the death may overtake its last command.
+    assert (terms[0], terms[2], terms[3]) == (1, 2, 2)
+    assert {m.term for m in commands if m.tick > dies_at} == {2}
+    assert {m.term for m in commands if m.tick < dies_at} == {1}
+    apart_m = max(
+        np.linalg.norm(track.position_m - flown["disturbed"].truth[body].position_m, axis=1).max()
+        for body, track in flown["undisturbed"].truth.items()
+    )
+    assert apart_m == 0.0
 
 
 @pytest.mark.slow

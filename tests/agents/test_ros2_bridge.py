@@ -299,7 +299,8 @@ def test_bridge_sends_nothing_else_and_reads_no_truth() -> None:
 
 
 def wrench(frame: str = "chaser_1", force: tuple[float, float, float] = (1.0, -2.0, 3.0)) -> Any:
-    message = conversion.wrench(replace(BY_TYPE[topics.WRENCH.kind], chaser=1, force_N=force))
+    command: Any = replace(BY_TYPE[topics.WRENCH.kind], chaser=1, force_N=force)
+    message = conversion.wrench(command)
     message.header.frame_id = frame
     return message
 

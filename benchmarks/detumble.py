@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N] [--first SEED]
-[--sets 0123 013 03] [--set KEY=VALUE] [--results FILE]``.
+[--sets 0123 013 03] [--silent] [--set KEY=VALUE] [--results FILE]``.
 
 Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one process with the
 scenario's sensors and statistical perception. Tumbles of 5 to 10 degrees/s and attitudes are drawn from the seed. Five
@@ -9,11 +9,15 @@ are at opposite faces, 0 and 1 at adjacent ones.
 
 Prints the time until the stack stays below 0.05 degrees/s and 1 mm/s, the impulse of all thrusters until then, and both over
 those of the linear programme: the shortest time, and the least impulse in that time, if the attitude were frozen.
+``--silent``: nobody commands; each chaser damps the stack by its own odometry for at most 120 s, until 10 s after it stopped. The
+stack is then one rigid body (``chaserdock.evaluation.rigid_stack``), not the physics engine's.
+
 ``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
@@ -22,6 +26,7 @@ from common import Figures, append_line, make_parser, percentiles, print_figures
 
 from chaserdock.evaluation.detumble_flights import DetumbleOutcome, fly_stack, stack_scenario
 from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 
 class DetumbleRow(msgspec.Struct, frozen=True):
@@ -72,8 +77,58 @@ def figures_of(name: str, outcomes: list[DetumbleOutcome]) -> Figures:
     return out | {f"{name}_held_N_s_per_minute": 60.0 * sum(o.held_N_s for o in stopped) / held_s}
 
 
+class SilentRow(msgspec.Struct, frozen=True):
+    """One flight without controller in the results file."""
+
+    chasers: str
+    settings: str
+    seed: int
+    outcome: SilentOutcome
+
+
+def silent_figures(name: str, outcomes: list[SilentOutcome]) -> Figures:
+    """Return the figures of a set of chasers without controller."""
+    stopped = [o for o in outcomes if o.time_s is not None]
+    out: Figures = {f"{name}_flights": len(outcomes), f"{name}_stopped": len(stopped)}
+    for key, unit, values in (
+        ("time", "s", [o.time_s for o in stopped if o.time_s is not None]),
+        ("impulse", "N_s", [o.impulse_N_s for o in stopped]),
+        ("impulse_at_rest", "N_s", [o.held_N_s for o in stopped]),
+        ("final_rate", "deg_s", [o.final_rate_deg_s for o in outcomes]),
+        ("final_speed", "m_s", [o.final_speed_m_s for o in outcomes]),
+    ):
+        if values:
+            out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
+    return out
+
+
+def fly_sets_silent(o: argparse.Namespace, seeds: range) -> Figures:
+    """Fly every set of chasers without controller; return the figures."""
+    settings = f"silent set={sorted(o.set)}"
+    known = {
+        (row["chasers"], row["seed"]): msgspec.convert(row, SilentRow).outcome
+        for row in read_lines(o.results)
+        if row["settings"] == settings
+    }
+    figures: Figures = {}
+    for chasers in o.sets:
+        outcomes = []
+        for seed in seeds:
+            outcome = known.get((chasers, seed))
+            if outcome is None:
+                scenario = stack_scenario(seed, [int(c) for c in chasers], o.set)
+                outcome = fly_silent(scenario, rest_s=10.0)
+                append_line(o.results, msgspec.to_builtins(SilentRow(chasers, settings, seed, outcome)))
+                print(f"{chasers} seed {seed}: {outcome}", file=sys.stderr, flush=True)
+            outcomes.append(outcome)
+        figures |= (part := silent_figures(f"silent_{chasers}", outcomes))
+        print_figures(part)
+    return figures
+
+
 def main() -> None:
     parser = make_parser(__doc__)
+    parser.add_argument("--silent", action="store_true", help="without a controller")
     parser.add_argument("--tumbles", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sets", nargs="+", default=["0123", "013", "03"], metavar="CHASERS")
@@ -82,9 +137,12 @@ def main() -> None:
     parser.add_argument("--results", type=Path, metavar="FILE")
     o = parser.parse_args()
     number = 2 if o.quick else o.tumbles
+    if o.silent:
+        write_json(o.json, fly_sets_silent(o, range(o.first, o.first + number)))
+        return
     settings = f"duration={o.duration:g} set={sorted(o.set)}"
-    rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results)]
-    known = {(r.chasers, r.outcome.seed): r.outcome for r in rows if r.settings == settings}
+    rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results) if row["settings"] == settings]
+    known = {(r.chasers, r.outcome.seed): r.outcome for r in rows}
     figures: Figures = {}
     for chasers in o.sets:
         outcomes = []

@@ -154,12 +154,8 @@ def page() -> str:
     parts = [INTRODUCTION.format(statuses=status_table(), lines=line_table())]
     for kind in kinds():
         parts += [f"### {kind.__struct_config__.tag} lines", *fields(kind)]
-    parts += [
-        "### ChaserProgress",
-        one_line(json_events.ChaserProgress),
-        "",
-        *fields(json_events.ChaserProgress),
-    ]
+    for kind in (json_events.ChaserProgress, json_events.MissionAddress):
+        parts += [f"### {kind.__name__}", one_line(kind), "", *fields(kind)]
     for panel, members in panels_of(get_command(app)).items():
         parts += [f"## {panel}", ""]
         for name, member in members.items():

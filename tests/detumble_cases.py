@@ -7,9 +7,10 @@ import math
 
 import numpy as np
 from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
-from chaserdock_controller.guidance.detumble.stack import MountedChaser, plume_free, thruster_wrenches
+from chaserdock_controller.guidance.detumble.stack import thruster_wrenches
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser, plume_free
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario.bodies import Body
 

@@ -2,10 +2,11 @@
 """Model check of command authority: ``python tests/lease_model.py --steps 1000000``.
 
 Random walks through the state machines that fly (``LeaseGrantor`` of each chaser, ``LeaseHolder`` of each controller) with the
-worst network there is: messages come in any order, late, twice or never; processes restart without memory; the world takes
-living processes for lost. Checked after every step: no tick (in one revision) has two commanders, no chaser flies two
-controllers in one tick, and what is flown was commanded with authority. At the end of a walk the network recovers, and one
-controller must command all chasers.
+worst network there is: messages come in any order, late, twice or never; processes restart without memory, some while their
+predecessor still runs; the world takes living processes for lost. Checked after every step: no tick (in one revision) has two
+commanders; a chaser flies the holder of its lease only, and no two controllers in one tick; what is flown was commanded with
+authority; ticks and terms that a chaser states never fall. At the end of a walk the network recovers, and within ``UNITED_TICKS``
+one controller must command all chasers, for good.
 """
 
 from __future__ import annotations
@@ -18,13 +19,15 @@ from dataclasses import dataclass, field
 
 from chaserdock_agents.chaser.lease_grantor import LeaseGrantor
 from chaserdock_controller.redundancy.lease_holder import LeaseHolder
-from chaserdock_protocol.leases import LEASE_MAX_S
 from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
 from chaserdock_protocol.topics import CONTROLLERS
 
 RATE_HZ = 10
 WALK_STEPS = 2000
-RECOVERY_TICKS = 2 * round(LEASE_MAX_S * RATE_HZ) + 20
+RECOVERY_TICKS = 40
+"""Length of the undisturbed end of a walk."""
+UNITED_TICKS = 6
+"""Ticks without a loss after which one controller commands all chasers."""
 _MOST_IN_FLIGHT = 60
 ZERO = (0.0, 0.0, 0.0)
 
@@ -45,11 +48,13 @@ class Controller:
 
 @dataclass
 class Chaser:
-    """One start of a chaser. ``executed``: the newest tick whose command it has flown."""
+    """One start of a chaser. ``executed``: the newest tick whose command it has flown; ``stated``: tick, revision and term of
+    its last lease."""
 
     leases: LeaseGrantor
     tick: Tick | None = None
     executed: int = -1
+    stated: tuple[int, int, int] = (-1, -1, 0)
 
 
 class Model:
@@ -60,9 +65,10 @@ class Model:
         self.n = self.draw.randint(1, 5)
         self.loss = self.draw.choice([0.0, 0.02, 0.2])
         self.chaos = self.draw.choice([0.0, 0.02, 0.1])
-        self.steps = self.starts = 0
+        self.steps = self.starts = self.united = 0
         self.chasers = [Chaser(LeaseGrantor(i, RATE_HZ)) for i in range(self.n)]
         self.controllers = {name: self._started(name) for name in CONTROLLERS}
+        self.replaced: list[Controller] = []
         self.tick, self.revision = -1, 0
         self.taking_part: dict[str, int] = {}
         self.away: set[str] = set()
@@ -82,7 +88,7 @@ class Model:
         self.tick, self.revision = self.tick + 1, 0
         names = [f"chaser/{i}" for i in range(self.n)] + list(CONTROLLERS)
         self.taking_part = {n: self.taking_part.get(n, self.tick) for n in names if n not in self.away}
-        self.away = {n for n in self.away if self.draw.random() < 0.7}
+        self.away = {n for n in sorted(self.away) if self.draw.random() < 0.7}
         self._publish_tick()
 
     def lose(self, name: str) -> None:
@@ -93,12 +99,15 @@ class Model:
             self._publish_tick()
 
     def restart(self, name: str) -> None:
-        """Start a process again, without memory. What was on its way to it is lost."""
+        """Start a process again, without memory. What was on its way to it is lost, unless it is a controller that still runs."""
         if self.tick < 0:
             return
         self.lose(name)
         if name in CONTROLLERS:
             gone: object = self.controllers[name]
+            if self.draw.random() < 0.5:  # cut off from the world only: it goes on
+                self.replaced.append(self.controllers[name])
+                gone = None
             self.controllers[name] = self._started(name)
         else:
             number = int(name.partition("/")[2])
@@ -116,8 +125,12 @@ class Model:
             controllers=instances,
             since=dict(self.taking_part),
         )
-        for process in (*self.chasers, *self.controllers.values()):
+        for process in (*self.chasers, *self.all_controllers()):
             self.send(process, message)
+
+    def all_controllers(self) -> list[Controller]:
+        """Return the controllers, with those that were replaced and still run."""
+        return [*self.controllers.values(), *self.replaced]
 
     # -- the processes ----------------------------------------------------------------------------------------
 
@@ -148,7 +161,7 @@ class Model:
             return
         chaser.tick = tick
         if (lease := chaser.leases.update(tick)) is not None:
-            self._state(lease)
+            self._state(chaser, lease)
 
     def _chaser_command(self, chaser: Chaser, command: WrenchCommand) -> None:
         if chaser.leases.refusal(command) is not None:
@@ -158,7 +171,7 @@ class Model:
         elif command.mode != "wait":
             chaser.leases.renew(command)
             if chaser.tick is not None:
-                self._state(chaser.leases.stated(chaser.tick))
+                self._state(chaser, chaser.leases.stated(chaser.tick))
             self._fly(chaser, command)
 
     def _fly(self, chaser: Chaser, command: WrenchCommand) -> None:
@@ -166,6 +179,8 @@ class Model:
             return
         chaser.executed = command.tick
         sender, number = (command.commander, command.instance), chaser.leases.chaser
+        if sender != (holder := (chaser.leases.holder, chaser.leases.instance)):
+            raise TwoCommanders(f"chaser {number} flies {sender}, but {holder} holds its lease")
         if self.flown.setdefault((command.tick, number), sender) != sender:
             raise TwoCommanders(f"chaser {number} flies two controllers in tick {command.tick}")
         if (command.tick, *sender) not in self.claimed_ticks:
@@ -173,8 +188,14 @@ class Model:
                 f"chaser {number} flies {sender} in tick {command.tick}, which it did not command"
             )
 
-    def _state(self, lease: Lease) -> None:
-        for controller in self.controllers.values():
+    def _state(self, chaser: Chaser, lease: Lease) -> None:
+        stated = (lease.tick, lease.revision, lease.term)
+        if lease.term < chaser.stated[2] or stated[:2] < chaser.stated[:2]:
+            raise TwoCommanders(
+                f"chaser {lease.chaser} states (tick, revision, term) {stated} after {chaser.stated}"
+            )
+        chaser.stated = stated
+        for controller in self.all_controllers():
             self.send(controller, lease)
 
     def act(self, controller: Controller) -> None:
@@ -209,16 +230,20 @@ class Model:
         elif drawn < 0.06 or not self.in_flight:
             self.open_tick()
         elif drawn < 0.2:
-            self.act(self.draw.choice(list(self.controllers.values())))
+            self.act(self.draw.choice(self.all_controllers()))
         else:
             again = self.draw.random() < 0.02
             newest_last = self.draw.random() < 0.8
             self.deliver(0 if newest_last else self.draw.randrange(len(self.in_flight)), again)
 
     def recover(self) -> None:
-        """Let all processes take part and all messages arrive; check that one controller then commands all chasers."""
+        """Let all processes take part and all messages arrive; check that one controller soon commands all chasers, for good.
+
+        ``united``: ticks until then.
+        """
         self.loss, self.away = 0.0, set()
-        for _ in range(RECOVERY_TICKS):
+        self.replaced.clear()
+        for k in range(RECOVERY_TICKS):
             self.away = set()
             self.open_tick()
             for _ in range(2):
@@ -228,9 +253,11 @@ class Model:
                 for controller in self.controllers.values():
                     controller.ticks = controller.ticks[-1:]
                     self.act(controller)
-        flown = {self.flown.get((self.tick, i)) for i in range(self.n)}
-        if len(flown) != 1 or None in flown:
-            raise TwoCommanders(f"after recovery the chasers fly {flown}")
+            flown = {self.flown.get((self.tick, i)) for i in range(self.n)}
+            if len(flown) != 1 or None in flown:
+                self.united = k + 1
+                if k >= UNITED_TICKS:
+                    raise TwoCommanders(f"{k} ticks after the last loss the chasers fly {flown}")
 
 
 def command_of(tick: Tick, chaser: int, mode: str, sender: tuple[str, str], term: int) -> WrenchCommand:

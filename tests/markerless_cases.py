@@ -11,7 +11,7 @@ from chaserdock_agents.chaser.perception.refine import PoseInCamera
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.targets import Box, cuboid_corners
+from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
 from chaserdock_world.rendering.effects import CameraEffects
@@ -30,22 +30,14 @@ BOXES = (
     Box((0.06, 0.10, 0.10), (-0.23, -0.05, -0.04), shade=0.45),
 )
 PANELS = (1, 2)
-_TRIANGLES = np.array(
-    [
-        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
-        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
-    ]
-)
 
 
 def mesh_of(
     boxes: tuple[Box, ...] = BOXES, panel_sigma_rad: float = 0.0, scale_sigma: float = 0.0
 ) -> TrackerMesh:
     """Return the mesh of ``boxes``; modes: each panel about its boom (the y axis), and the scale of all."""
-    vertices = np.concatenate(
-        [rotations.rotate(np.array(b.q_wxyz), cuboid_corners(b.size_m)) + b.position_m for b in boxes]
-    )
-    triangles = np.concatenate([_TRIANGLES + 8 * i for i in range(len(boxes))])
+    exact = TrackerMesh.of_boxes(boxes, 0.0)
+    vertices = exact.vertices_m
     modes = []
     if panel_sigma_rad > 0.0:
         for panel in PANELS:
@@ -55,8 +47,8 @@ def mesh_of(
             modes.append(mode)
     if scale_sigma > 0.0:
         modes.append(scale_sigma * vertices)
-    shade = np.repeat([b.shade for b in boxes], 12)
-    return TrackerMesh(vertices, triangles, shade, np.array(modes).reshape(len(modes), len(vertices), 3))
+    stacked = np.array(modes).reshape(len(modes), len(vertices), 3)
+    return TrackerMesh(vertices, exact.triangles, exact.reflectance, stacked)
 
 
 def wrong_boxes(panel_rad: tuple[float, float], scale: float) -> tuple[Box, ...]:
@@ -75,11 +67,13 @@ def wrong_boxes(panel_rad: tuple[float, float], scale: float) -> tuple[Box, ...]
 class Scene:
     """A ray tracer of the cuboids, with cast shadows; independent of the tracker's and of the world's rasterizer.
 
-    ``background`` (h, w): grey levels behind the target, None for space. ``samples``: rays per pixel along each axis.
+    ``background`` (h, w): grey levels behind the target, None for space.
     """
 
-    def __init__(self, camera: Camera, background: Array | None = None, samples: int = 2) -> None:
-        self.camera, self.samples = camera, samples
+    def __init__(
+        self, camera: Camera, background: Array | None = None, boxes: tuple[Box, ...] = BOXES
+    ) -> None:
+        self.camera, self.boxes, self.samples = camera, boxes, 2
         shape = (camera.height_px, camera.width_px)
         self.background = np.full(shape, 4.0) if background is None else background
         self.effects = CameraEffects(camera.width_px, camera.height_px, Effects(), 11)
@@ -114,7 +108,7 @@ class Scene:
 
     def _rectangle(self, pose: PoseInCamera) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the pixels, first and end, that the target touches."""
-        corners = mesh_of().vertices_m @ pose.rotation.T + pose.position
+        corners = mesh_of(self.boxes).vertices_m @ pose.rotation.T + pose.position
         px = self.camera.project(np.where(corners[:, 2:] > 0.05, corners, [0.0, 0.0, 1.0]))
         size = np.array([self.camera.width_px, self.camera.height_px])
         low = np.clip(np.floor(px.min(axis=0)) - 4, 0, size)
@@ -125,7 +119,7 @@ class Scene:
         nearest, grey = np.full(len(rays), np.inf), np.full(len(rays), np.nan)
         normal = np.zeros((len(rays), 3))
         shade = np.zeros(len(rays))
-        for box in BOXES:
+        for box in self.boxes:
             near = _rays_near(box, origin, rays)
             enter, axis, direction = _enter(box, origin, rays[near])
             hit = enter < nearest[near]
@@ -138,7 +132,7 @@ class Scene:
         cosine = np.maximum(normal[seen] @ to_sun, 0.0)
         points = origin + rays[seen] * nearest[seen, None] + 1e-5 * normal[seen]
         lit = cosine > 0.0
-        for box in BOXES:
+        for box in self.boxes:
             rest = np.flatnonzero(lit)
             enter, _, _ = _enter(box, points[rest], np.broadcast_to(to_sun, (len(rest), 3)))
             lit[rest[np.isfinite(enter)]] = False

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.recording.log import LogError
+from chaserdock_world.orbit import to_sun
 from numpy.typing import NDArray
 
 from .flight import RecordedFlight, Track
@@ -85,7 +86,7 @@ def replay_data(flight: RecordedFlight, traces: Traces, images: dict[str, Any]) 
     return {
         "times": _numbers(target.time_s[rows], 3),
         "reach_m": reach_m,
-        "sun": list(flight.scenario.camera.sun_direction),
+        "sun": list(to_sun(flight.scenario)),
         "target": _thinned(target, rows),
         "chasers": chasers,
         "scene": {

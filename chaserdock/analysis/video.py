@@ -15,6 +15,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
 from chaserdock_protocol.recording.log import LogError
+from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import Background, Earth, Light
 
 from .chase_camera import BgrImage, BodyPose, Viewpoint, draw, tint
@@ -155,7 +156,7 @@ class _ExternalView:
         self.flight, self._plumes = flight, plumes
         self.size = (width_px, height_px)
         self.scene = scene_of(flight.scenario)
-        sun = np.array(flight.scenario.camera.sun_direction)
+        sun = np.array(to_sun(flight.scenario))
         self.sun = sun / np.linalg.norm(sun)
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]
@@ -205,10 +206,10 @@ class _ExternalView:
     def _background(self, look: Viewpoint) -> BgrImage:
         """Return stars and Earth as the simulated cameras see them; the view's direction is fixed."""
         if self._sky is None:
-            section = self.flight.scenario.camera
-            earth = section.earth and Earth(section.earth.direction, math.radians(section.earth.radius_deg))
-            space = Background(look.pinhole(), np.zeros(2), self.size, earth)
-            grey = space.draw(look.attitude(), Light(section.sun_direction))
+            disc = earth_disc(self.flight.scenario)
+            space = Background(look.pinhole(), np.zeros(2), self.size, None if disc is None else Earth(*disc))
+            x, y, z = self.sun.tolist()
+            grey = space.draw(look.attitude(), Light((x, y, z)))
             self._sky = np.repeat(grey[:, :, None], 3, axis=2)
         return self._sky
 

@@ -179,6 +179,14 @@ def ros2(
     ros_domain: Annotated[
         int, typer.Option(min=0, max=232, envvar="ROS_DOMAIN_ID", help="domain of ROS 2")
     ] = 0,
+    control: Annotated[
+        bool,
+        typer.Option(
+            "--control",
+            help="real time: take the controller's place, with wrenches from /chaser_N/wrench_command, instead of "
+            "showing the mission",
+        ),
+    ] = False,
     timeout: JoinTimeoutOpt = None,
     stall_s: StallOpt = DEFAULT_STALL_S,
     watch_parent: WatchOpt = False,
@@ -193,11 +201,11 @@ def ros2(
     listen = tuple(ros_listen or ())
     connect = tuple(ros_connect or (() if listen else RosLink().connect))
     options = ProcessOptions(
-        link=link.link("bridge", timeout),
+        link=link.link("controller" if control else "bridge", timeout),
         patience_s=timeout,
         stall_s=stall_s,
         watch_parent=watch_parent,
-        ros=RosLink(connect, listen, ros_domain),
+        ros=RosLink(connect, listen, ros_domain, control),
     )
     start_process("ros2", options)
 

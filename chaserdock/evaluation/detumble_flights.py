@@ -4,30 +4,32 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from chaserdock_controller.estimation.composite_body import nominal_mounting
+from chaserdock_agents.chaser.command_gate import damping_command
+from chaserdock_agents.chaser.local_damping import LocalDamping
 from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime, minimum_time
 from chaserdock_controller.guidance.detumble.stack import (
-    MountedChaser,
     StackMotion,
-    plume_free,
     stack_motion,
     thruster_wrenches,
 )
 from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import stay
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.rigid_body import BodyState
-from chaserdock_protocol.messages import OperatorCommand
-from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.messages import ActuatorCommand, Odometry, OperatorCommand
+from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.detumble import RestLimits
 from chaserdock_protocol.scenario.mission import Success
+from chaserdock_protocol.scenario.mounting import nominal_mounting, plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
@@ -77,20 +79,41 @@ def _random_vector(rng: np.random.Generator, length: float) -> list[float]:
 
 
 class StackMission(InProcessMission):
-    """A mission that begins with all chasers latched, with seeded errors at their ports, and verified."""
+    """A mission that begins with all chasers latched, with seeded errors at their ports, and verified.
 
-    def __init__(self, scenario: Scenario, perception: PerceptionModel) -> None:
+    ``silent_from_s``: from then on there is no controller, and each chaser damps the stack by itself.
+    """
+
+    def __init__(
+        self, scenario: Scenario, perception: PerceptionModel, silent_from_s: float = math.inf
+    ) -> None:
         super().__init__(scenario, perception)
+        self._silent_from_s = silent_from_s
+        flight = flight_scenario(scenario)
+        self._damping = {i: LocalDamping(flight, i) for i in self.thrusters}
         rng = np.random.default_rng([scenario.seed, 0x57A])
         target = self.physics.state(TARGET)
         for i in self.chasers:
-            place, q = nominal_mounting(scenario, i)
+            nominal = nominal_mounting(scenario, i)
+            place, q = nominal.position_m, nominal.q_wxyz
             place = place + rng.uniform(-_PORT_ERROR_M, _PORT_ERROR_M, 3)
             turn = rotations.exp(rng.uniform(-_PORT_ERROR_RAD, _PORT_ERROR_RAD, 3))
             self.physics.place(f"chaser/{i}", moving_with(target, place, rotations.multiply(q, turn)))
             self.physics.close_latch(i)
             verified = ChaserGuidance(Phase.VERIFIED, 0.0, stay(place, 0.0))
             self.controller.guidance.machine.chasers[i] = verified
+
+    def _control(self, inputs: TickInputs) -> TickOutputs | None:
+        return None if inputs.time_ns / 1e9 >= self._silent_from_s else super()._control(inputs)
+
+    def uncommanded(self, odometry: Mapping[int, Odometry], time_ns: int) -> dict[int, ActuatorCommand]:
+        """Return the commands of latched chasers that damp the stack, each by itself."""
+        effective_ns = self.scenario.timing.effective_ns(self.tick)
+        commands = {}
+        for i, damping in self._damping.items():
+            command, thrusts_N = damping_command(damping, odometry[i], effective_ns, self.scenario.chaser)
+            commands[i] = self.thrusters[i].add_pulses(command, thrusts_N)
+        return commands
 
     def truth(self, states: States) -> tuple[TargetBody, dict[int, MountedChaser], StackMotion]:
         """Return the true stack, where its chasers are, and its momentum in TRF axes."""
@@ -138,14 +161,7 @@ def least_time(
 ) -> MinimumTime | None:
     """Return the shortest time in which the plume-free thrusters stop a stack whose attitude is frozen, and its impulse."""
     thrusters = scenario.chaser.thrusters
-    free = plume_free(
-        mounted,
-        thrusters,
-        math.radians(scenario.detumble.plume_deg),
-        scenario.target_model().boxes,
-        [np.array(port.position_m) for port in scenario.docking.ports],
-        scenario.chaser.size_m,
-    )
+    free = np.concatenate([*plume_free_thrusters(scenario, mounted.keys()).values()])
     limits = np.where(free, np.tile(thrusts_max(thrusters), len(mounted)), 0.0)
     return minimum_time(thruster_wrenches(body, mounted, thrusters), motion.momentum, limits)
 
@@ -173,10 +189,14 @@ def fly_stack(
     perception_of: Callable[[Scenario], PerceptionModel],
     duration_s: float = 30.0,
     limits: RestLimits | None = None,
+    silent_after_s: float = math.inf,
 ) -> DetumbleOutcome:
-    """Fly a stack from ``COMMAND_AT_S`` on for ``duration_s``; ``limits``: of rest, without any the scenario's."""
+    """Fly a stack from ``COMMAND_AT_S`` on for ``duration_s``; ``limits``: of rest, without any the scenario's.
+
+    ``silent_after_s`` after the command the controller falls silent.
+    """
     limits = limits or scenario.detumble
-    with StackMission(scenario, perception_of(scenario)) as mission:
+    with StackMission(scenario, perception_of(scenario), COMMAND_AT_S + silent_after_s) as mission:
         while mission.time_s < COMMAND_AT_S:
             mission.step()
         states = mission.states()

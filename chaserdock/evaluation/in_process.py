@@ -9,7 +9,7 @@ out is what a network and separate processes add: injected message faults, proce
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Self
 
@@ -164,7 +164,7 @@ class InProcessMission:
             inputs = TickInputs(self.tick, time_ns, validated, sightings, commands, reports, docking)
             outputs = self._control(inputs)
         errors = {i: self.tracking_error(i, states, outputs) for i in self.chasers}
-        actuator_commands, delivered = self._act(outputs, time_ns)
+        actuator_commands, delivered = self._act(outputs, odometry, time_ns)
         record = TickRecord(
             self.tick,
             time_ns,
@@ -193,26 +193,35 @@ class InProcessMission:
         for _, what, detail in self.thrusters[chaser].drain_events():
             self.thruster_events.append((time_ns / 1e9, chaser, f"{what}: {detail}"))
 
-    def _control(self, inputs: TickInputs) -> TickOutputs:
+    def _control(self, inputs: TickInputs) -> TickOutputs | None:
+        """Return the controller's outputs; to be overridden where it is silent."""
         outputs = self.controller.step(inputs)
         self.events += [(inputs.time_ns / 1e9, e.level, e.what) for e in outputs.events]
         return outputs
 
     def _act(
-        self, outputs: TickOutputs | None, time_ns: int
+        self, outputs: TickOutputs | None, odometry: Mapping[int, Odometry], time_ns: int
     ) -> tuple[dict[int, ActuatorCommand], dict[int, ActuatorOutput]]:
         """Deliver the commands when a lock-step mission does, and move the bodies to the next tick."""
         timing = self.scenario.timing
         begin, end = timing.step_of_tick(self.tick), timing.step_of_tick(self.tick + 1)
         if self._solve_delay_s is None:
             self.advance(min(end, begin + timing.latency_steps))
-        commands = {} if outputs is None else self._actuator_commands(outputs, time_ns)
+        commands = (
+            self.uncommanded(odometry, time_ns)
+            if outputs is None
+            else self._actuator_commands(outputs, time_ns)
+        )
         for i, command in commands.items():
             effective = timing.step_of_time(command.effective_time_ns)
             self.actuators[f"chaser/{i}"].command(command, effective, self.physics.step_count)
             self.physics.command_latch(i, command.latch, effective)
         self.advance(end)
         return commands, {i: self.take_delivered(i) for i in self.chasers}
+
+    def uncommanded(self, odometry: Mapping[int, Odometry], time_ns: int) -> dict[int, ActuatorCommand]:
+        """Return what the chasers do without a controller's commands; to be overridden where it is silent."""
+        return {}
 
     def _actuator_commands(self, outputs: TickOutputs, time_ns: int) -> dict[int, ActuatorCommand]:
         commands = {}

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.relative_motion import relative_acceleration, relative_torque
 from chaserdock_protocol import codec, topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.leases import commander_of
@@ -22,6 +23,7 @@ from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
     DockingStatus,
+    DrawnBody,
     DrawnTruth,
     Event,
     MissionEnd,
@@ -38,6 +40,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.faults import LATCH_FAULTS, Fault
 from chaserdock_protocol.transport import RawSample
+from chaserdock_world.orbit import TargetOrbit
 
 from chaserdock.analysis.criteria import nearest_allowed_m
 
@@ -59,6 +62,8 @@ _POSE = (0, 1, 2, 6, 7, 8)
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
 _ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
 _CONSERVED_SHARE = 2e-3
+_SPUN_SHARE = 1e-5
+"""Largest unexplained change of angular momentum in a tick in an orbit, as a share of it; the turning frame gives 7e-5."""
 _DISPLACEMENT_FLOOR_M = 2e-5
 _ROUNDING = 1e-6
 FOLLOWING_S = 3.0
@@ -129,6 +134,7 @@ class Invariants:
         self._lifetime_ticks = math.ceil(
             self.scenario.controller.command_lifetime_s * self.scenario.time.rate_hz
         )
+        self._orbit = None if self.scenario.orbit is None else TargetOrbit(self.scenario.orbit)
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
         }
@@ -154,6 +160,11 @@ class Invariants:
     def time_s(self) -> float:
         """Mission time of the newest tick (s)."""
         return max(0, self._tick, self._state_tick) / self.scenario.time.rate_hz
+
+    @property
+    def ticks(self) -> int:
+        """Number of ticks flown so far."""
+        return 1 + max(self._tick, self._state_tick)
 
     def violate(self, invariant: str, subject: str, text: str) -> None:
         """Note a violation, unless one of the same invariant and subject is noted already."""
@@ -227,7 +238,7 @@ class Invariants:
             return
         self._check_displacement(before, body)
         if body.body == "target":
-            self._check_target(body)
+            self._check_target(before, body)
         else:
             self._check_momentum(before, body)
 
@@ -270,7 +281,8 @@ class Invariants:
         truth, dt_s = self.scenario.truth.mismatch("chaser"), 1.0 / self.scenario.time.rate_hz
         impulse = np.array(after.impulse_N_s) + np.array(drawn.force_N) * dt_s
         halfway = rotations.integrate(np.array(before.q_wxyz), np.array(before.omega_rad_s), 0.5 * dt_s)
-        gained = drawn.mass_kg * (np.array(after.velocity_m_s) - np.array(before.velocity_m_s))
+        linear, turning = self._orbital_impulse(before, drawn)
+        gained = drawn.mass_kg * (np.array(after.velocity_m_s) - np.array(before.velocity_m_s)) - linear
         error = float(np.linalg.norm(gained - rotations.rotate(halfway, impulse)))
         turned = float(np.linalg.norm(after.omega_rad_s)) * dt_s
         allowed = _IMPULSE_FLOOR_N_S + (_IMPULSE_SHARE + turned) * (
@@ -281,7 +293,7 @@ class Invariants:
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
         angular = np.array(after.angular_impulse_N_m_s) + np.array(drawn.torque_N_m) * dt_s
         spun = rotations.rotate(after.q_wxyz, inertia @ after.omega_rad_s)
-        spun = spun - rotations.rotate(before.q_wxyz, inertia @ before.omega_rad_s)
+        spun = spun - rotations.rotate(before.q_wxyz, inertia @ before.omega_rad_s) - turning
         error = float(np.linalg.norm(spun - rotations.rotate(halfway, angular)))
         allowed = _ANGULAR_FLOOR_N_M_S + (_IMPULSE_SHARE + turned) * (
             float(np.abs(angular).sum()) + _ARM_M * after.absolute_impulse_N_s
@@ -290,10 +302,33 @@ class Invariants:
             text = f"{error:.2e} N m s without a cause, {allowed:.2e} allowed"
             self.violate("angular momentum", after.body, text)
 
-    def _check_target(self, body: BodyTruth) -> None:
-        """Compare the untouched target's motion with what its kind of motion conserves."""
+    def _orbital_impulse(self, before: BodyTruth, drawn: DrawnBody) -> tuple[Array, Array]:
+        """Return the changes (3,) of momentum and angular momentum, WRF, that the orbit gives a body in a tick; 0 in free
+        space."""
+        if self._orbit is None:
+            return np.zeros(3), np.zeros(3)
+        dt_s = 1.0 / self.scenario.time.rate_hz
+        middle_s = (before.tick + 0.5) * dt_s
+        frame = self._orbit.frame_at(middle_s)
+        x, y, z = before.position_m
+        acceleration = np.array(relative_acceleration(frame, (x, y, z), before.velocity_m_s))
+        if before.body != "target":
+            acceleration += self._orbit.differential_drag(middle_s)
+        moments, axes = np.linalg.eigh(np.array(drawn.inertia_kg_m2).reshape(3, 3))
+        axes[:, 2] *= np.sign(np.linalg.det(axes))
+        q = rotations.multiply(np.array(before.q_wxyz), rotations.from_matrix(axes))
+        a, b, c = (np.array(before.omega_rad_s) @ axes).tolist()
+        ia, ib, ic = moments.tolist()
+        torque = relative_torque(frame, q.tolist(), (a, b, c), (ia, ib, ic))
+        return drawn.mass_kg * acceleration * dt_s, rotations.rotate(q, torque) * dt_s
+
+    def _check_target(self, before: BodyTruth, body: BodyTruth) -> None:
+        """Compare the untouched target's motion with what its kind of motion conserves; in an orbit, with what that gives."""
         drawn = self._drawn.get("target")
         if drawn is None:
+            return
+        if self._orbit is not None and self.scenario.target.motion == "torque_free":
+            self._check_target_in_orbit(before, body, drawn)
             return
         omega, velocity = np.array(body.omega_rad_s), np.array(body.velocity_m_s)
         inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
@@ -311,6 +346,17 @@ class Invariants:
             size = max(abs(begin), scale if name.startswith("angular") else abs(begin), 1e-9)
             if abs(value - begin) > _CONSERVED_SHARE * size:
                 self.violate("energy and momentum", "target", f"{name} from {begin:.6g} to {value:.6g}")
+
+    def _check_target_in_orbit(self, before: BodyTruth, body: BodyTruth, drawn: DrawnBody) -> None:
+        """Compare the change of the free target's angular momentum in a tick with what the orbit gives."""
+        inertia = np.array(drawn.inertia_kg_m2).reshape(3, 3)
+        spun = [rotations.rotate(s.q_wxyz, inertia @ s.omega_rad_s) for s in (before, body)]
+        _, given = self._orbital_impulse(before, drawn)
+        error = float(np.linalg.norm(spun[1] - spun[0] - given))
+        allowed = _SPUN_SHARE * float(np.linalg.norm(spun[1])) + 1e-12
+        if error > allowed:
+            text = f"target: {error:.2e} N m s without a cause, {allowed:.2e} allowed"
+            self.violate("energy and momentum", "target", text)
 
     def _check_distances(self) -> None:
         states, target = self._states, self._states.get("target")

@@ -8,6 +8,7 @@ flight is a ``Case``: the keys of a scenario file that extends a shipped scenari
 from __future__ import annotations
 
 import contextlib
+import math
 import random
 import tempfile
 import zlib
@@ -22,6 +23,7 @@ from chaserdock_protocol.recording.scan import LOG_NAME
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.scenario.faults import LATCH_FAULTS, FaultKind
 from chaserdock_protocol.transport import RawSample
+from chaserdock_world.lockstep.tick_barrier import RECORDER_WINDOW_TICKS
 from mcap.exceptions import McapError
 from mcap.reader import make_reader
 
@@ -297,7 +299,7 @@ def fly_case(
         if not over():
             checks.check_end(flight.crashes, flight.stalled)
             _check_recording(checks, flight, published)
-            _check_queues(checks, flight)
+            _check_queues(checks, flight, published.total())
             if honest:
                 _check_consistency(checks)
     return SimulationResult(
@@ -360,18 +362,28 @@ def _check_recording(checks: Invariants, flight: SimulatedFlight, published: Cou
             )
 
 
-def _check_queues(checks: Invariants, flight: SimulatedFlight) -> None:
+def queue_limit(reader: str, published: int, ticks: int) -> int:
+    """Return how many messages may wait for a process in a flight with so many messages and ticks.
+
+    The recorder may be ``RECORDER_WINDOW_TICKS`` behind, and a tick may have more messages than the mean.
+    """
+    behind = math.ceil((RECORDER_WINDOW_TICKS + 2) * published / max(1, ticks)) if reader == "recorder" else 0
+    return max(QUEUE_LIMIT, behind)
+
+
+def _check_queues(checks: Invariants, flight: SimulatedFlight, published: int) -> None:
     """Check that queues stay short unless a flood or a slow or frozen reader fills them."""
     s = checks.scenario
     if s.simulation.slow or s.simulation.partition or any(f.kind in ("flood", "freeze") for f in s.fault):
         return
     for name, items in flight.traffic.queues.items():
-        if items.most > QUEUE_LIMIT:
-            checks.violate("bounded queues", name.split()[0], f"{items.most} messages waited")
+        reader = name.split()[0]
+        if items.most > queue_limit(reader, published, checks.ticks):
+            checks.violate("bounded queues", reader, f"{items.most} messages waited")
 
 
 LEAST_ESTIMATES, FLIGHT_NEES = 5, 40.0
 """Largest mean normalized squared error (6 if consistent) of at least so many estimates of one flight without lying sensors."""
 _LIES = {"lying_sensor", "odometry_lie", "clock_jump", "corrupt"}
 QUEUE_LIMIT = 400
-"""Most messages that may wait for a reader which is neither slow nor flooded."""
+"""Most messages that may wait for a reader which is neither slow nor flooded; see ``queue_limit``."""

@@ -107,6 +107,7 @@ class TargetEstimation:
 
     ``own``: estimated states of the chasers with valid odometry; ``own_at_effect``: the same at ``Observation.effective_ns``,
     (13,): p, v (WRF), q_wxyz, omega (body). ``disturbances``: estimated force and torque (6,) on a chaser, body axes.
+    ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, if passive safety is monitored.
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
     target and these chasers as one rigid body.
@@ -117,6 +118,7 @@ class TargetEstimation:
     own: Mapping[int, Odometry]
     own_at_effect: Mapping[int, Array]
     disturbances: Mapping[int, Array]
+    motion_covariances: Mapping[int, Array]
     relative: tuple[RelativePose, ...]
     visible_to: frozenset[int]
     cameras: tuple[CameraCalibration, ...]

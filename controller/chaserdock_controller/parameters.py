@@ -72,5 +72,6 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         * body.torque_max_N_m
         / min(body.inertia)
         / scenario.time.rate_hz,
+        mean_motion_rad_s=0.0 if scenario.orbit is None else scenario.orbit.elements.mean_motion_rad_s,
     )
     return JointEstimator(joint, len(scenario.chasers))

@@ -160,6 +160,27 @@ def cw_transition(mean_motion_rad_s: float, time_s: ArrayLike) -> Array:
     return phi
 
 
+def cw_wrench(mean_motion_rad_s: float, state: Array, mass_kg: float, moments: Scalars3) -> Array:
+    """Return force and torque (6,), body axes, that move a body in free space as a circular orbit moves it in its Hill frame.
+
+    ``state`` (13,): position, velocity, attitude, rate as in ``rigid_body``; ``moments``: principal, along the body's axes.
+    """
+    n = mean_motion_rad_s
+    frame = HillFrame(
+        axes=np.eye(3),
+        radius_m=(EARTH_MU_M3_S2 / (n * n)) ** (1.0 / 3.0),
+        speed_m_s=(0.0, 0.0, 0.0),
+        rate_rad_s=(0.0, 0.0, n),
+        rate_change_rad_s2=(0.0, 0.0, 0.0),
+        pole=(0.0, 0.0, 1.0),
+        j2=0.0,
+    )
+    w, x, y, z, a, b, c = state[6:].tolist()
+    force = mass_kg * cw_acceleration(n, state[:3], state[3:6])
+    torque = relative_torque(frame, (w, x, y, z), (a, b, c), moments)
+    return np.array([*rotated_components(w, -x, -y, -z, *force.tolist()), *torque])
+
+
 def cw_acceleration(mean_motion_rad_s: float, position_m: ArrayLike, velocity_m_s: ArrayLike) -> Array:
     """Return the accelerations (..., 3) of Clohessy-Wiltshire at positions (..., 3) and velocities (..., 3)."""
     state = np.concatenate(

@@ -38,11 +38,15 @@ class Rotation:
 
 @dataclass(frozen=True)
 class RosLink:
-    """How a bridge reaches ROS 2: endpoints to connect to, or to ``listen`` on as the router; ``domain``: ROS_DOMAIN_ID."""
+    """How a bridge reaches ROS 2: endpoints to connect to, or to ``listen`` on as the router; ``domain``: ROS_DOMAIN_ID.
+
+    ``control``: take the controller's place, with wrenches of ROS 2, instead of showing the mission.
+    """
 
     connect: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     listen: tuple[str, ...] = ()
     domain: int = 0
+    control: bool = False
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from chaserdock_agents.ros2 import conversion, process, services
+from chaserdock_agents.ros2 import conversion, process, services, wrench_control
 from chaserdock_agents.ros2.rmw_zenoh import Attachment, endpoint_token, topic_key
 from chaserdock_agents.ros2.types import GOTO, INTERFACES, SELECT_THRUSTER, TRIGGER, TYPES, type_hash
 from chaserdock_protocol import topics
@@ -111,6 +111,7 @@ class Mission:
     controller: Node
     ros_port: int
     thread: threading.Thread
+    controller_link: Link
     commands: list[OperatorCommand] = field(default_factory=list)
     status: list[int] = field(default_factory=list)
 
@@ -148,12 +149,8 @@ def mission() -> Iterator[Mission]:
         signals=False,
         patience_s=WAIT_S,
     )
-    flown = Mission(
-        world,
-        controller,
-        ros_port,
-        threading.Thread(target=lambda: flown.status.append(process.main(options))),
-    )
+    thread = threading.Thread(target=lambda: flown.status.append(process.main(options)))
+    flown = Mission(world, controller, ros_port, thread, Link("ros", (endpoint,)))
 
     def operate(command: OperatorCommand, reply: Callable[[CommandReply], None]) -> None:
         flown.commands.append(command)
@@ -296,3 +293,45 @@ def test_bridge_sends_nothing_else_and_reads_no_truth() -> None:
     assert not any(topic.writer == "bridge" for topic in topics.TOPICS)
     assert not any(topics.may_read("bridge", t) for t in topics.TOPICS if t.key.startswith("truth/"))
     assert (Path(process.__file__).read_text().count(".publish(")) == 1  # to ROS 2
+
+
+# -- in place of the controller ---------------------------------------------------------------------------
+
+
+def wrench(frame: str = "chaser_1", force: tuple[float, float, float] = (1.0, -2.0, 3.0)) -> Any:
+    message = conversion.wrench(replace(BY_TYPE[topics.WRENCH.kind], chaser=1, force_N=force))
+    message.header.frame_id = frame
+    return message
+
+
+def test_wrench_becomes_a_command_of_the_newest_tick() -> None:
+    timing = load_scenario(ROOT / "scenarios" / "two-chaser-tracking.toml").timing
+    tick: Any = replace(BY_TYPE[topics.TICK.kind], tick=9, sim_time_ns=timing.tick_time_ns(9))
+    command = wrench_control.wrench_command(wrench(), 1, tick, timing, 3, "i1")
+    assert command.force_N == (1.0, -2.0, 3.0)
+    assert command.torque_N_m == BY_TYPE[topics.WRENCH.kind].torque_N_m  # type: ignore[attr-defined]
+    assert (command.tick, command.effective_time_ns) == (9, timing.effective_ns(9))
+    assert (command.chaser, command.term, command.commander, command.instance) == (1, 3, "controller", "i1")
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (wrench(), None),
+        (wrench(""), None),
+        (wrench("world"), "frame 'world', must be 'chaser_1'"),
+        (wrench(force=(0.0, float("inf"), 0.0)), "force or torque is not finite"),
+    ],
+    ids=["own", "empty", "world", "infinite"],
+)
+def test_wrench_in_another_frame_or_not_finite_is_refused(message: Any, reason: str | None) -> None:
+    assert wrench_control.why_invalid(message, 1) == reason
+
+
+def test_lock_step_mission_is_refused(mission: Mission, capsys: pytest.CaptureFixture[str]) -> None:
+    endpoint = mission.controller_link.connect[0]
+    options = ProcessOptions(
+        link=Link("ros", (endpoint,)), ros=RosLink(control=True), signals=False, patience_s=WAIT_S
+    )
+    assert process.main(options) == 2
+    assert "start the world with --mode realtime" in capsys.readouterr().err

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The criterion ``success.reached``: evaluation and validation."""
+"""The criteria ``success.reached`` and ``success.detumbled``: evaluation and validation."""
 
 from __future__ import annotations
 
@@ -12,7 +12,13 @@ import pytest
 from chaserdock_models import rotations
 from chaserdock_protocol.scenario import Scenario, ScenarioError, load_scenario
 
-from chaserdock.analysis.criteria import not_reached, reached_time
+from chaserdock.analysis.criteria import (
+    judged_criteria,
+    not_reached,
+    reached_time,
+    rest_failures,
+    stack_rest,
+)
 
 PATH = Path(__file__).resolve().parents[2] / "scenarios" / "collision-avoidance.toml"
 
@@ -77,3 +83,91 @@ def test_last_goto_defines_the_goal() -> None:
 def test_invalid_criteria_are_named(override: str, message: str) -> None:
     with pytest.raises(ScenarioError, match=message.replace(".", r"\.")):
         scenario(override)
+
+
+DETUMBLE = PATH.parent / "detumble-pair.toml"
+STEP_S = 0.1
+
+
+def stack_flight(speed_m_s: np.ndarray, omega_rad_s: np.ndarray, latched: tuple[int, ...] = (0,)) -> Any:
+    """Return a stub of a recorded flight of ``detumble-pair``: the stack of target and chaser 0 moves along +x with the speeds of
+    its centre (K,), and turns about +z with the rates (K,). Chaser 1 flies elsewhere, fast."""
+    n = len(speed_m_s)
+    times, still, zero = np.arange(n) * STEP_S, np.tile([1.0, 0.0, 0.0, 0.0], (n, 1)), np.zeros((n, 3))
+    target_kg, chaser_kg, apart_m = 150.0, 50.0, np.array([-1.0, 0.0, 0.0])
+    turning = np.outer(omega_rad_s, [0.0, 0.0, 1.0])
+    # The common centre is a quarter of the way to the chaser.
+    origin = np.outer(speed_m_s, [1.0, 0.0, 0.0]) - np.cross(turning, apart_m / 4.0)
+
+    def track(velocity: np.ndarray) -> Any:
+        return SimpleNamespace(time_s=times, velocity_m_s=velocity, q_wxyz=still, omega_rad_s=turning)
+
+    def drawn(name: str, mass_kg: float) -> Any:
+        return SimpleNamespace(body=name, mass_kg=mass_kg, centre_of_mass_m=(0.0, 0.0, 0.0))
+
+    return SimpleNamespace(
+        scenario=load_scenario(DETUMBLE),
+        truth={
+            "target": track(origin),
+            "chaser/0": track(origin + np.cross(turning, apart_m)),
+            "chaser/1": track(zero + 1.0),
+        },
+        drawn=(drawn("target", target_kg), drawn("chaser/0", chaser_kg), drawn("chaser/1", chaser_kg)),
+        world=SimpleNamespace(latched=latched),
+    )
+
+
+def test_the_stack_is_at_rest_from_when_speed_and_rate_stay_below_the_limits() -> None:
+    """Limits of 1 mm/s and 0.05 degrees/s; the speed is that of the common centre, which does not move when the stack turns."""
+    speed, rate = np.full(100, 0.0009), np.full(100, np.radians(0.049))
+    speed[:30], rate[:40] = 0.01, 0.1
+    rate[60] = np.radians(0.051)
+    rest = stack_rest(stack_flight(speed, rate))
+    assert rest is not None
+    assert rest["since_s"] == pytest.approx(6.1)
+    assert rest["speed_m_s"] == pytest.approx(0.0009)
+    assert rest["rate_rad_s"] == pytest.approx(np.radians(0.049))
+    assert rest_failures({"stack": rest}, load_scenario(DETUMBLE)) == []
+
+
+@pytest.mark.parametrize(
+    ("speed_m_s", "rate_deg_s", "text"),
+    [
+        (0.0011, 0.01, "the stack moves at 1.10 mm/s and 0.010 degrees/s; at most 1 mm/s and 0.05 degrees/s allowed"),
+        (0.0002, 0.06, "the stack moves at 0.20 mm/s and 0.060 degrees/s; at most 1 mm/s and 0.05 degrees/s allowed"),
+    ],
+)  # fmt: skip
+def test_a_stack_that_moves_at_the_end_violates_the_criterion(
+    speed_m_s: float, rate_deg_s: float, text: str
+) -> None:
+    speed, rate = np.zeros(50), np.zeros(50)
+    speed[-1], rate[-1] = speed_m_s, np.radians(rate_deg_s)
+    rest = stack_rest(stack_flight(speed, rate))
+    assert rest is not None
+    assert rest["since_s"] is None
+    assert rest_failures({"stack": rest}, load_scenario(DETUMBLE)) == [text]
+
+
+def test_a_released_chaser_is_no_part_of_the_stack() -> None:
+    """Without chaser 0 the speed is that of the target, whose centre circles the former common centre."""
+    turning = np.full(20, np.radians(0.04))
+    rest = stack_rest(stack_flight(np.zeros(20), turning, latched=()))
+    assert rest is not None
+    assert rest["speed_m_s"] == pytest.approx(0.25 * np.radians(0.04))
+    both = stack_rest(stack_flight(np.zeros(20), turning))
+    assert both is not None
+    assert both["speed_m_s"] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_rest_without_truth_or_criterion_is_not_judged() -> None:
+    stub = stack_flight(np.zeros(5), np.zeros(5))
+    s = stub.scenario
+    stub.truth = {}
+    assert stack_rest(stub) is None
+    assert rest_failures({}, s) == ["the log has no truth to judge success.detumbled"]
+    none = s.model_copy(update={"success": s.success.model_copy(update={"detumbled": None})})
+    assert rest_failures({}, none) == []
+    judged, skipped = judged_criteria(load_scenario(DETUMBLE, ("duration_s=40.0",)))
+    assert judged.success.detumbled is None
+    assert "success.detumbled: the flight ends at 40 s, detumble is at 50 s" in skipped
+    assert judged_criteria(s)[0].success.detumbled is not None

@@ -39,7 +39,7 @@ from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, draw_case
+from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, draw_case, queue_limit
 from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
@@ -64,6 +64,12 @@ def variant(folder: Path, **keys: Any) -> Scenario:
 def killed(tmp_path: Path) -> Scenario:
     """Scenario in which chaser 1 is killed."""
     return variant(tmp_path, fault=[{"kind": "kill", "process": "chaser/1", "at_s": 0.1}])
+
+
+def test_recorder_may_be_the_window_of_ticks_behind() -> None:
+    """Four chasers with ports and thrusters publish 54 messages a tick, 476 of which waited in `detumble`."""
+    assert 476 < queue_limit("recorder", 1619, 30) < 600
+    assert queue_limit("recorder", 300, 30) == queue_limit("world", 1619, 30) == 400
 
 
 # -- cases ------------------------------------------------------------------------------------------------------

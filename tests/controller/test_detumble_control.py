@@ -120,6 +120,18 @@ def test_hold_ends_the_detumbling_and_abort_releases_the_latch() -> None:
             "has no port",
         ),
         (("chaser.actuation='ideal'",), 'detumble needs chaser.actuation = "thrusters"'),
+        (("detumble.plume_deg=89.0",), "none of the 12 thrusters of chaser 0 may fire at its port"),
+        (
+            ("target.mass_kg=60000.0", "target.inertia_kg_m2=[16.73e3,20.29e3,22.98e3]"),
+            "timeline.1: stopping the stack of 6.007e+04 kg takes at least",
+        ),
+        (
+            (
+                "docking.ports.0.force_limit_N=0.05",
+                "target.inertia_kg_m2=[16.73,20.29,22.98]",
+            ),
+            "docking.ports.0.force_limit_N: 0.05 N is less than the",
+        ),
         (("target.inertia_products_kg_m2=[40.0,0.0,0.0]",), "too large for a body's inertia"),
         (("target.inertia_products_kg_m2=[9.0,9.0,9.0]",), "no principal moment may exceed the sum"),
     ],

@@ -9,8 +9,8 @@ import pytest
 from chaserdock_agents.chaser import lease_grantor
 from chaserdock_controller.redundancy.lease_holder import PATIENCE_TICKS, Commander, LeaseHolder
 from chaserdock_controller.redundancy.standby import HotStandby
-from chaserdock_protocol.messages import Lease, Tick
-from lease_model import TwoCommanders, walk
+from chaserdock_protocol.messages import Lease, Tick, WrenchCommand
+from lease_model import Chaser, Model, TwoCommanders, walk
 
 BOTH = {"controller": "c", "standby": "s"}
 
@@ -142,17 +142,51 @@ def test_never_two_commanders_in_any_interleaving() -> None:
     assert commanded > 2_000
 
 
-def test_model_finds_a_chaser_that_grants_while_a_lease_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Hasty(lease_grantor.LeaseGrantor):
-        def update(self, tick: Tick) -> Lease | None:
-            self.until_tick -= 2
-            return super().update(tick)
+class GrantsWhileALeaseRuns(lease_grantor.LeaseGrantor):
+    def update(self, tick: Tick) -> Lease | None:
+        self.until_tick -= 2
+        return super().update(tick)
 
-    monkeypatch.setattr("lease_model.LeaseGrantor", Hasty)
 
-    def walks() -> None:
-        for seed in range(100):
-            walk(seed)
+class IgnoresInstance(lease_grantor.LeaseGrantor):
+    def is_of_holder(self, command: WrenchCommand) -> bool:
+        return command.commander == self.holder
 
-    with pytest.raises(TwoCommanders):
-        walks()
+
+class IgnoresTerm(lease_grantor.LeaseGrantor):
+    def refusal(self, command: WrenchCommand) -> str | None:
+        return None if self.is_of_holder(command) else "another sender"
+
+
+class IgnoresYield(lease_grantor.LeaseGrantor):
+    def give_back(self, command: WrenchCommand) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("wrong", "seed", "words"),
+    [
+        (GrantsWhileALeaseRuns, 1, "command it"),
+        (IgnoresInstance, 95, "holds its lease"),
+        (IgnoresTerm, 5, "states"),
+        (IgnoresYield, 5, "after the last loss"),
+    ],
+)
+def test_model_finds_errors_of_a_chaser(
+    wrong: type, seed: int, words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The seeds are the first that find them."""
+    monkeypatch.setattr("lease_model.LeaseGrantor", wrong)
+    with pytest.raises(TwoCommanders, match=words):
+        walk(seed)
+
+
+def test_model_finds_a_chaser_that_does_not_ignore_older_ticks(monkeypatch: pytest.MonkeyPatch) -> None:
+    def chaser_tick(model: Model, chaser: Chaser, tick: Tick) -> None:
+        chaser.tick = None
+        in_order(model, chaser, tick)
+
+    in_order = Model._chaser_tick
+    monkeypatch.setattr(Model, "_chaser_tick", chaser_tick)
+    with pytest.raises(TwoCommanders, match="states"):
+        walk(0)

@@ -137,6 +137,16 @@ def test_chaser_without_command_actuates_once_per_tick(
     assert any(t is topics.EVENT for t, _ in published)
 
 
+def test_older_tick_changes_no_lease(chaser: ChaserProcess, scenario: Scenario) -> None:
+    deliver(chaser, topics.TICK, None, tick_of(scenario, 9, (0,)))
+    repeated = msgspec.structs.replace(tick_of(scenario, 9, (0,)), revision=1)
+    assert [m.revision for t, m in deliver(chaser, topics.TICK, None, repeated) if t is topics.LEASE] == [1]
+    others = {"controllers": {"standby": "s"}}
+    for older in (tick_of(scenario, 8, (0,)), tick_of(scenario, 9, (0,))):
+        assert deliver(chaser, topics.TICK, None, msgspec.structs.replace(older, **others)) == []
+    assert (chaser.tick, chaser.leases.holder) == (repeated, "controller")
+
+
 def test_lost_image_gives_empty_sighting(chaser: ChaserProcess, scenario: Scenario) -> None:
     ((topic, sighting),) = deliver(chaser, topics.IMAGE, 0, lost(scenario, 4))
     assert topic is topics.SIGHTING

@@ -139,8 +139,47 @@ static void draw_stars(void) {
     CHECK(drawn <= count);
 }
 
+static void draw_meshes(void) {
+    const int64_t bodies = whole(1, 2), each = whole(0, 4), m = bodies * each, width = whole(1, 70), height = whole(1, 20), n = whole(1, 3);
+    const Frustum *f = frustum();
+    double *camera = outputs(7), *poses = outputs(7 * bodies), *corners = doubles(9 * m, -0.5, 0.5);
+    double *normals = doubles(9 * m, -1.0, 1.0), *uv = doubles(6 * m, -1.0, 1.0);
+    int64_t *first = block((size_t)(bodies + 1) * 8), *surface = block((size_t)m * 8), depth_size = 0;
+    Surface *surfaces = block(2 * sizeof *surfaces);
+    Illumination *light = block(sizeof *light);
+    ShadowMap *maps = block((size_t)bodies * sizeof *maps);
+    float *wrinkles = block((size_t)(3 * n * n) * sizeof *wrinkles), *samples = block((size_t)(BAND * width * SAMPLES * 2) * 4);
+    fill_pose(camera, -0.1, 0.1);
+    if (chance(0.7)) camera[3] = 1.0, camera[4] = camera[5] = camera[6] = 0.0;
+    for (int64_t i = 0; i < bodies; i++) fill_pose(poses + 7 * i, -0.5, 3.0);
+    for (int64_t i = 0; i <= bodies; i++) first[i] = i * each;
+    for (int64_t i = 0; i < m; i++) surface[i] = whole(0, 1);
+    fill((double *)surfaces, 8, 0.0, 3.0);
+    fill((double *)light, (int64_t)(sizeof *light / 8), -1.0, 1.0);
+    if (chance(0.8)) light->sun_share = 0.8;
+    for (int64_t i = 0; i < 3 * n * n; i++) wrinkles[i] = (float)value(-0.5, 0.5);
+    for (int64_t i = 0; i < bodies; i++) {
+        maps[i].width = 8 * whole(1, 3), maps[i].height = whole(1, 20), maps[i].offset = depth_size, maps[i].padding = 0;
+        fill(maps[i].low, 2, -1.0, 1.0);
+        maps[i].texel_m = value(0.01, 0.2), maps[i].used = (double)chance(0.9);
+        depth_size += maps[i].width * maps[i].height;
+    }
+    /* What an unused map contains does not matter, but it must not be what a sanitizer reports. */
+    float *depth = block((size_t)depth_size * sizeof *depth);
+    memset(depth, 0, (size_t)depth_size * sizeof *depth);
+    BodyPose *placed = block((size_t)bodies * sizeof *placed);
+    Triangle *triangles = block((size_t)(6 * m) * sizeof *triangles);
+    int32_t *spans = block((size_t)(12 * m) * sizeof *spans);
+    uint8_t *canvas = bytes(width * height);
+    memset(canvas, 4, (size_t)(width * height));
+    NAME(draw_meshes)(f, width, height, camera, bodies, poses, first, corners, normals, uv, surface, surfaces, light, wrinkles, n, maps,
+                      depth, placed, triangles, spans, samples, canvas);
+    if (!m)
+        for (int64_t i = 0; i < width * height; i++) CHECK(canvas[i] == 4);
+}
+
 static const Target TARGETS[] = {
     {"add_noise", add_noise},         {"visible_faces", visible_faces}, {"paint_order", paint_order},
-    {"place_texture", place_texture}, {"draw_stars", draw_stars},
+    {"place_texture", place_texture}, {"draw_stars", draw_stars},       {"draw_meshes", draw_meshes},
 };
 FUZZ_MAIN(TARGETS)

@@ -73,3 +73,11 @@ def test_invalid_keys_are_one_line(override: str, message: str) -> None:
 def test_knowledge_without_a_mesh_is_an_error() -> None:
     with pytest.raises(ScenarioError, match=r"knowledge.panel_deg: '\w+' has no mesh"):
         parse_scenario(good(), "test", ("target.knowledge.panel_deg=1.0",))
+
+
+def test_chaser_mesh_needs_a_target_with_a_mesh() -> None:
+    assert with_mesh('chaser.mesh="chaser_body"').chaser.mesh == "chaser_body"
+    with pytest.raises(
+        ScenarioError, match=r"chaser\.mesh: drawn only with a target that has a mesh; 'paper' has none"
+    ):
+        parse_scenario(good(), "test", ('chaser.mesh="chaser_body"',))

@@ -8,9 +8,12 @@ from typing import Literal
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.braking import brake_wrench
+from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import ActuatorCommand, Odometry, WrenchCommand
 from chaserdock_protocol.scenario.bodies import Body
+
+from .local_damping import LocalDamping
 
 
 def refusal(command: WrenchCommand, chaser: int, body: Body, last_tick: int, now_ns: int) -> str | None:
@@ -68,6 +71,15 @@ def autonomous_command(
         force_N=vector(wrench[:3]),
         torque_N_m=vector(wrench[3:]),
     )
+
+
+def damping_command(
+    damping: LocalDamping, odometry: Odometry, effective_ns: int, body: Body
+) -> tuple[ActuatorCommand, Array]:
+    """Return the command of a latched chaser that damps the stack, and its thrusts (n,)."""
+    thrusts_N = damping.thrusts_N(odometry)
+    wrench = wrench_matrix(body.thrusters) @ thrusts_N
+    return autonomous_command(odometry, effective_ns, "brake", wrench), thrusts_N
 
 
 def passed_on(command: WrenchCommand) -> ActuatorCommand:

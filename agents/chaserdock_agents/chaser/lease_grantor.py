@@ -36,7 +36,7 @@ class LeaseGrantor:
     term: int = 0
     until_tick: int = -1
     since: tuple[int, int] = (0, 0)
-    _newest: tuple[int, int] = (-1, -1)
+    _newest_tick: int = -1
     _length: int = 0
     _expired_tick: int | None = None
     _given_back: bool = False
@@ -45,11 +45,13 @@ class LeaseGrantor:
         self._length = lease_ticks(self.rate_hz)
 
     def update(self, tick: Tick) -> Lease | None:
-        """Take a tick: keep the lease or grant the next one; return what to state, None if this chaser takes no part."""
-        stamp = (tick.tick, tick.revision)
-        if stamp < self._newest or self.chaser not in tick.chasers:
+        """Take the next tick: keep the lease or grant the next one; return what to state, None if this chaser takes no part.
+
+        An older tick than the last would give the lease to whom that lists; see ``ChaserProcess``, which ignores it.
+        """
+        if self.chaser not in tick.chasers:
             return None
-        self._newest = stamp
+        self._newest_tick = tick.tick
         listed = bool(self.holder) and tick.controllers.get(self.holder) == self.instance
         if not listed or self.until_tick < tick.tick:
             self._grant_next(tick, listed)
@@ -129,6 +131,6 @@ class LeaseGrantor:
 
         The holder counts no lease stated up to that tick, but may count one that was stated after it.
         """
-        if command.tick >= self._newest[0]:
+        if command.tick >= self._newest_tick:
             self.until_tick = min(self.until_tick, command.tick)
             self._given_back = True

@@ -41,9 +41,10 @@ from chaserdock_protocol.transport.session import Heartbeat, create_health, run_
 from chaserdock_agents.chaser.thrusters.controller import ThrusterController
 from chaserdock_agents.chaser.thrusters.failure_reports import FailureReports
 
-from .command_gate import autonomous_command, brake_command, passed_on, refusal
+from .command_gate import autonomous_command, brake_command, damping_command, passed_on, refusal
 from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, next_state
 from .lease_grantor import LeaseGrantor
+from .local_damping import LocalDamping
 from .perception import make_perception
 from .sighting import look, prediction_from
 
@@ -113,6 +114,12 @@ class ChaserProcess:
             if self.scenario.chaser.actuation == "thrusters"
             else None
         )
+        self._damping = (
+            LocalDamping(self.scenario, self.number)
+            if self._has_port and self._thrusters is not None
+            else None
+        )
+        self._was_detumbling = self._is_damping = False
         self._perception = make_perception(self.scenario)
 
     def open(self, instance: str, realtime: bool, stall_s: float = DEFAULT_STALL_S) -> None:
@@ -363,6 +370,7 @@ class ChaserProcess:
         self._refused = 0
         self._reported_missing = self._reported_refusal = self._reported_stale = False
         self._remember(command)
+        self._was_detumbling = command.mode == "detumble"
         if self._thrusters is not None:
             self._thrusters.apply_command(command)
         self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
@@ -374,10 +382,12 @@ class ChaserProcess:
             plan if plan is not None and plan.tick == command.tick else None,
             target if target is not None and target.tick == command.tick else self._last.target,
         )
-        if self._fallback is not None:
+        if self._fallback is not None or self._is_damping:
             detail = f"tick {command.tick}"
             self._publish_event("info", "fallback ends", detail, command.tick, command.sim_time_ns)
-        self._fallback = None
+        self._fallback, self._is_damping = None, False
+        if self._damping is not None:
+            self._damping.reset()
 
     # -- fallback --------------------------------------------------------------------------------------------
 
@@ -398,7 +408,7 @@ class ChaserProcess:
             if commanded and not self._reported_missing:
                 self._reported_missing = True
                 self._publish_warning("no command", "lost or refused", tick.tick, odometry.sim_time_ns)
-            self._reply(self._fallback_command(odometry))
+            self._reply(*self._fallback_command(odometry))
 
     def _check_command_timeout(self, odometry: Odometry) -> None:
         """Real time: start the fallback when no command has arrived for its lifetime."""
@@ -414,17 +424,20 @@ class ChaserProcess:
             detail = f"for {silent_ns / 1e9:.2f} s"
             self._publish_warning("no command", detail, odometry.tick, odometry.sim_time_ns)
         # Not recorded as the reply to this tick: a command that still arrives takes precedence.
-        self._actuate(self._fallback_command(odometry))
+        self._actuate(*self._fallback_command(odometry))
 
-    def _fallback_command(self, odometry: Odometry) -> ActuatorCommand:
-        """Return the chaser's own command (see ``fallback``)."""
+    def _fallback_command(self, odometry: Odometry) -> tuple[ActuatorCommand, Array | None]:
+        """Return the chaser's own command (see ``fallback``), and thrusts (n,) in place of an allocation."""
         effective_ns = self.scenario.timing.effective_ns(odometry.tick)
         body = self.scenario.chaser
         latched = self.docking is not None and self.docking.latched
         # Without recent odometry the motion is unknown and cannot be braked.
         odometry_age_ns = odometry.sim_time_ns - self._odometry_ns
-        if latched or odometry_age_ns > self.scenario.controller.command_lifetime_s * 1e9:
-            return brake_command(odometry, body, effective_ns, latched=True)
+        stale = odometry_age_ns > self.scenario.controller.command_lifetime_s * 1e9
+        if latched and not stale and self._was_detumbling and self._damping is not None:
+            return self._damp(self._damping, odometry, effective_ns)
+        if latched or stale:
+            return brake_command(odometry, body, effective_ns, latched=True), None
         before = self._fallback
         state = next_state(before, odometry, effective_ns, self._last, self._clearance_m)
         self._fallback = state
@@ -432,7 +445,17 @@ class ChaserProcess:
             what = f"fallback: {state.mode}"
             self._publish_warning(what, state.text(), odometry.tick, odometry.sim_time_ns)
         wrench = fallback_wrench(state, odometry, effective_ns, self._last, body)
-        return autonomous_command(odometry, effective_ns, state.mode, wrench)
+        return autonomous_command(odometry, effective_ns, state.mode, wrench), None
+
+    def _damp(
+        self, damping: LocalDamping, odometry: Odometry, effective_ns: int
+    ) -> tuple[ActuatorCommand, Array]:
+        """Return the command of a latched chaser that the controller left while it stopped the stack (``local_damping``)."""
+        if not self._is_damping:
+            detail = "stopping the stack by the chaser's own odometry"
+            self._publish_warning("fallback: brake", detail, odometry.tick, odometry.sim_time_ns)
+        self._is_damping = True
+        return damping_command(damping, odometry, effective_ns, self.scenario.chaser)
 
     # -- publishing ------------------------------------------------------------------------------------------
 

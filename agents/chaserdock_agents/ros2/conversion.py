@@ -235,12 +235,20 @@ def wrench(message: m.WrenchCommand) -> ros.geometry_msgs__msg__WrenchStamped:
 
 def path(message: m.Plan) -> ros.nav_msgs__msg__Path:
     """Return a plan's poses, each with its time."""
-    positions = np.reshape(message.positions_m, (-1, 3)).tolist()
-    attitudes = np.reshape(message.quaternions_wxyz, (-1, 4)).tolist()
-    step_ns = message.step_s * 1e9
+    p, q, step_ns = message.positions_m, message.quaternions_wxyz, message.step_s * 1e9
+    # Without the helpers above: most of the bridge's time for a plan goes here.
+    stamped, pose = ros.geometry_msgs__msg__PoseStamped, ros.geometry_msgs__msg__Pose
+    point, quaternion, header = (
+        ros.geometry_msgs__msg__Point,
+        ros.geometry_msgs__msg__Quaternion,
+        ros.std_msgs__msg__Header,
+    )
+    times = [time_of(message.sim_time_ns + round(k * step_ns)) for k in range(len(p) // 3)]
     poses = [
-        _pose_stamped(_header(message.sim_time_ns + round(k * step_ns), WORLD), p, q)
-        for k, (p, q) in enumerate(zip(positions, attitudes, strict=True))
+        stamped(header(stamp, WORLD), pose(point(x, y, z), quaternion(qx, qy, qz, qw)))
+        for stamp, x, y, z, qw, qx, qy, qz in zip(
+            times, p[::3], p[1::3], p[2::3], q[::4], q[1::4], q[2::4], q[3::4], strict=True
+        )
     ]
     return ros.nav_msgs__msg__Path(_header(message.sim_time_ns, WORLD), poses)
 
@@ -274,7 +282,7 @@ def _marker(
     size_m: Sequence[float] = _ZERO,
     rgb: Vector3 = _ZERO,
     alpha: float = 1.0,
-    points: Iterable[Sequence[float]] = (),
+    points: Sequence[ros.geometry_msgs__msg__Point] = (),
     action: int = _ADD,
     namespace: str,
 ) -> ros.visualization_msgs__msg__Marker:
@@ -290,7 +298,7 @@ def _marker(
         ros.std_msgs__msg__ColorRGBA(*rgb, a=alpha),
         ros.builtin_interfaces__msg__Duration(0, 0),
         True,
-        [ros.geometry_msgs__msg__Point(*p) for p in points],
+        list(points),
         [],
         "",
         ros.sensor_msgs__msg__CompressedImage(ros.std_msgs__msg__Header(none, ""), "", np.zeros(0, np.uint8)),
@@ -303,7 +311,7 @@ def _marker(
 
 
 def body_markers(
-    message: m.TargetEstimate, scenario: FlightScenario
+    message: m.TargetEstimate, target_size_m: Vector3, chaser_size_m: Vector3, chasers: int
 ) -> ros.visualization_msgs__msg__MarkerArray:
     """Return target and chasers as boxes in their frames; the target is transparent unless it is tracked, or deleted."""
     known = message.status in ("tracking", "predicting")
@@ -314,22 +322,21 @@ def body_markers(
             TARGET_FRAME,
             0,
             _CUBE,
-            size_m=scenario.target_model().size_m,
+            size_m=target_size_m,
             rgb=_TARGET_RGB,
             alpha=alpha,
             action=_ADD if known else _DELETE,
             namespace="target",
         )
     ]
-    size_m = scenario.chaser.size_m
-    for i in range(len(scenario.chasers)):
-        box: dict[str, Any] = {"size_m": size_m, "rgb": _CHASER_RGB, "namespace": "chasers"}
+    for i in range(chasers):
+        box: dict[str, Any] = {"size_m": chaser_size_m, "rgb": _CHASER_RGB, "namespace": "chasers"}
         markers.append(_marker(message.sim_time_ns, chaser_frame(i), i, _CUBE, **box))
     return ros.visualization_msgs__msg__MarkerArray(markers)
 
 
-def plan_markers(message: m.Plan) -> ros.visualization_msgs__msg__MarkerArray:
-    """Return a plan as a line in WRF."""
+def plan_markers(message: m.Plan, plan: ros.nav_msgs__msg__Path) -> ros.visualization_msgs__msg__MarkerArray:
+    """Return a plan, of which ``plan`` is the path, as a line in WRF."""
     line: Any = _marker(
         message.sim_time_ns,
         WORLD,
@@ -337,7 +344,7 @@ def plan_markers(message: m.Plan) -> ros.visualization_msgs__msg__MarkerArray:
         _LINE_STRIP,
         size_m=(0.01, 0.0, 0.0),
         rgb=_PLAN_RGB,
-        points=np.reshape(message.positions_m, (-1, 3)).tolist(),
+        points=[pose.pose.position for pose in plan.poses],
         namespace="plans",
     )
     return ros.visualization_msgs__msg__MarkerArray([line])
@@ -370,7 +377,7 @@ class Converter:
     """Converts messages of one mission. Nothing of one message influences another."""
 
     def __init__(self, scenario: FlightScenario) -> None:
-        self._scenario = scenario
+        self._bodies = (scenario.target_model().size_m, scenario.chaser.size_m, len(scenario.chasers))
         self._camera = scenario.camera_model()
         self._parts: dict[type, Callable[[Any], Iterable[tuple[str, Any]]]] = {
             m.Tick: lambda x: [("/clock", clock(x))],
@@ -407,8 +414,9 @@ class Converter:
             yield "/target/odometry", estimate
             yield "/target/pose", target_pose(estimate)
             yield "/tf", target_transform(message)
-        yield "/markers", body_markers(message, self._scenario)
+        yield "/markers", body_markers(message, *self._bodies)
 
     def _plan(self, message: m.Plan) -> Iterable[tuple[str, Any]]:
-        yield f"/{chaser_frame(message.chaser)}/plan", path(message)
-        yield "/markers", plan_markers(message)
+        plan = path(message)
+        yield f"/{chaser_frame(message.chaser)}/plan", plan
+        yield "/markers", plan_markers(message, plan)

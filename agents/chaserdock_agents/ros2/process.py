@@ -11,15 +11,15 @@ from collections import Counter
 from chaserdock_protocol import topics
 from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import CommandReply, JoinReply, MissionEnd, OperatorCommand
-from chaserdock_protocol.process import ProcessOptions, RosLink, StopSignal, print_status
+from chaserdock_protocol.process import ProcessOptions, StopSignal, print_status
 from chaserdock_protocol.scenario import FlightScenario, flight_scenario_from_json
 from chaserdock_protocol.stall import StallTimer
 from chaserdock_protocol.transport import Node
 from chaserdock_protocol.transport.session import join
-from chaserdock_protocol.transport.zenoh_network import PlainSession
 
+from . import wrench_control
 from .conversion import Converter, InvalidImage, topic_types
-from .rmw_zenoh import RosNode
+from .rmw_zenoh import RosNode, open_ros
 from .services import handler, services
 
 NAME = "bridge"
@@ -39,12 +39,17 @@ SOURCES = (
 
 
 def main(options: ProcessOptions) -> int:
-    """Bridge one mission; return 0 at its end, 1 if stopped before or the world is gone, 2 on an error."""
+    """Bridge one mission, or control it by wrenches (``options.ros.control``).
+
+    Return 0 at its end, 1 if stopped before or the world is gone, 2 on an error.
+    """
+    if options.ros.control:
+        return wrench_control.main(options)
     node: Node | None = None
     ros: RosNode | None = None
     stop = options.stop_signal()
     try:
-        ros = open_ros(options.ros)
+        ros = open_ros(options.ros, ROS_NODE)
         node = Node(NAME, "bridge", options.link)
         mission = join(node, node.host.unique_id(), stop, options.patience_s)
         if mission is None:
@@ -61,13 +66,6 @@ def main(options: ProcessOptions) -> int:
             ros.close()
         if node is not None:
             node.close()
-
-
-def open_ros(link: RosLink) -> RosNode:
-    """Open the session with ROS 2. Raises TransportError."""
-    session = PlainSession(link.connect, link.listen, "router" if link.listen else "peer")
-    print_status(NAME, f"ROS 2, domain {link.domain}: {', '.join((*link.listen, *link.connect))}")
-    return RosNode(session, link.domain, ROS_NODE)
 
 
 class Bridge:

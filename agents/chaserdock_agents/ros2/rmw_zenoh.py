@@ -17,6 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from chaserdock_protocol.process import RosLink, print_status
 from chaserdock_protocol.transport.zenoh_network import AttachedQuery, PlainSession
 
 from .types import TYPES, type_hash
@@ -165,6 +166,13 @@ class RosNode:
         """Answer the requests that have arrived, then close the session, which ends the node."""
         self._workers.shutdown()
         self._session.close()
+
+
+def open_ros(link: RosLink, name: str) -> RosNode:
+    """Open a session with ROS 2 and a node on it. Raises TransportError."""
+    session = PlainSession(link.connect, link.listen, "router" if link.listen else "peer")
+    print_status(name, f"ROS 2, domain {link.domain}: {', '.join((*link.listen, *link.connect))}")
+    return RosNode(session, link.domain, name)
 
 
 def _decoded(payload: bytes, type_name: str) -> Any:

@@ -9,7 +9,6 @@ from collections.abc import Mapping
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.docking_geometry import centre_offset
 from chaserdock_protocol.messages import DockingStatus, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
@@ -37,15 +36,6 @@ def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Arra
     """Return a chaser's estimated centre (3,) and attitude (4,) in TRF."""
     centre = rotations.rotate_inverse(target.q_wxyz, np.array(odometry.position_m) - target.position_m)
     return centre, rotations.multiply(rotations.conjugate(target.q_wxyz), odometry.q_wxyz)
-
-
-def nominal_mounting(scenario: FlightScenario, chaser: int) -> tuple[Array, Array]:
-    """Return centre (3,) and attitude (4,) in TRF of a chaser that is latched exactly at its port. Raises ValueError without one."""
-    port = scenario.docking.port_of(chaser)
-    if port is None:
-        raise ValueError(f"chaser {chaser} has no port")
-    centre = centre_offset(port, scenario.chaser.probe_reach_m, 0.0)
-    return centre, np.array(scenario.chasers[chaser].q_wxyz)
 
 
 class CompositeBody:

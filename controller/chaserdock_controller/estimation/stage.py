@@ -10,6 +10,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.relative_motion import cw_wrench
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CameraCalibration, Odometry
 from chaserdock_protocol.scenario import FlightScenario
@@ -38,6 +39,9 @@ class EstimationStage:
         self.composite = CompositeBody(scenario, estimator)
         self.consistency = SensorConsistency()
         self._body, self._period_s = scenario.chaser, 1.0 / scenario.time.rate_hz
+        orbit = scenario.orbit
+        self._passive_safety = scenario.limits.passive_safety != "off"
+        self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
 
@@ -66,6 +70,7 @@ class EstimationStage:
             own=own,
             own_at_effect={i: predict_state(own[i], o.ahead[i], disturbances[i], self._body) for i in own},
             disturbances=disturbances,
+            motion_covariances=self._motion_covariances(own) if known else {},
             relative=estimator.relative_poses() if isinstance(estimator, JointEstimator) else (),
             visible_to=visible_to,
             cameras=camera_calibrations(estimator, self._camera),
@@ -96,14 +101,28 @@ class EstimationStage:
         )
 
     def _disturbances(self, o: Observation, own: Mapping[int, Odometry]) -> dict[int, Array]:
-        """Return the estimated disturbance on each chaser; none on a latched one, whose motion is the target's."""
+        """Return the wrench of the orbit on each chaser, with the estimated disturbance; none on a latched one, whose motion
+        is the target's."""
         estimator, found = self.estimator, dict.fromkeys(own, _NO_DISTURBANCE)
+        if self._mean_motion_rad_s:
+            found |= {i: self._orbital_wrench(own[i]) for i in own.keys() - self.composite.latched}
         if not isinstance(estimator, JointEstimator) or estimator.state is None:
             return found
         for i in own.keys() - self.composite.latched:
             impulse = o.impulses[i].impulse if i in o.impulses else np.zeros(6)
-            found[i] = disturbance(estimator.state, i, impulse / self._period_s, estimator.parameters)
+            estimated = disturbance(estimator.state, i, impulse / self._period_s, estimator.parameters)
+            found[i] = found[i] + estimated if self._mean_motion_rad_s else estimated
         return found
+
+    def _motion_covariances(self, own: Mapping[int, Odometry]) -> dict[int, Array]:
+        if not self._passive_safety or not isinstance(self.estimator, JointEstimator):
+            return {}
+        found = {i: self.estimator.motion_covariance(i) for i in own}
+        return {i: covariance for i, covariance in found.items() if covariance is not None}
+
+    def _orbital_wrench(self, o: Odometry) -> Array:
+        state = np.array([*o.position_m, *o.velocity_m_s, *o.q_wxyz, *o.omega_rad_s])
+        return cw_wrench(self._mean_motion_rad_s, state, self._body.mass_kg, self._body.inertia)
 
 
 def _without_drift(

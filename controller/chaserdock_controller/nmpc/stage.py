@@ -24,6 +24,7 @@ from chaserdock_controller.interfaces import (
 from . import make_solver
 from .budget import Bounded, SolveBudget
 from .lost_chasers import with_lost_chasers
+from .passive_safety import PassiveSafetyMonitor
 from .plan_monitor import PlanMonitor
 from .types import NmpcInput, NmpcParameters, NmpcPlan
 
@@ -46,6 +47,9 @@ class PlanningStage:
         self._min_distance_chasers_m = scenario.limits.min_distance_chasers_m
         self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
         self.monitor = PlanMonitor()
+        self.passive_safety = None
+        if scenario.limits.passive_safety != "off":
+            self.passive_safety = PassiveSafetyMonitor(scenario)
         self._last_solve_ns: int | None = None
         self._budget: SolveBudget | None = None
         if realtime and c.solve_budget_s is not None:
@@ -91,6 +95,8 @@ class PlanningStage:
         if plan is not None:
             plan = _without(plan, [disturbances[i] for i in horizon.chasers])
         self.monitor.update(horizon.chasers, plan, observation.time_ns, observation.effective_ns)
+        if self.passive_safety is not None and plan is not None:
+            events += self.passive_safety.update(horizon.chasers, plan.states, estimation)
         return PlanResult(horizon.chasers, plan, wall_s, events, self.monitor.plans(observation.time_ns))
 
     def problem(

@@ -9,12 +9,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.port_load import CarriedBody, tumble_load
+from chaserdock_models.wrench_set import wrench_matrix
 
 from .faults import check_faults
+from .mounting import nominal_mounting, plume_free_thrusters
 from .schema import MARKER_PERCEPTIONS
-from .thrusters import check_pulses
+from .thrusters import check_pulses, thrusts_max
 
 if TYPE_CHECKING:
     from . import FlightScenario, Scenario
@@ -30,17 +33,24 @@ def check_flight(scenario: FlightScenario) -> None:
     if scenario.docking.kind == "capture":
         _check_capture(scenario)
     _check_detumble(scenario)
+    if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
+        raise ValueError(
+            'limits.passive_safety: needs the covariance of estimator.name = "joint", '
+            f"not {scenario.estimator.name!r}"
+        )
 
 
 def check_consistent(scenario: Scenario) -> None:
     """Run the other checks, which need the full scenario."""
     _check_start_positions(scenario)
+    _check_orbit(scenario)
     _check_mesh(scenario)
     _check_success(scenario)
     _check_reached(scenario)
     _check_thruster_failures(scenario)
     _check_latched(scenario)
     _check_load_limits(scenario)
+    _check_stopping_time(scenario)
     check_faults(scenario.fault, scenario)
     _check_truth(scenario)
 
@@ -56,6 +66,22 @@ def _check_start_positions(scenario: Scenario) -> None:
                     f"chasers.{j} and chasers.{i} start {distance:.3f} m apart, inside one another; "
                     f"their bodies need {width:.3f} m"
                 )
+
+
+def _check_orbit(scenario: Scenario) -> None:
+    if scenario.orbit is None:
+        return
+    target, camera = scenario.target, scenario.camera
+    for key in ("position_m", "velocity_m_s"):
+        if any(getattr(target, key)) and not (key == "velocity_m_s" and target.motion == "static"):
+            raise ValueError(
+                f"target.{key}: with [orbit], WRF is the target's Hill frame: the target starts at rest in its origin, so "
+                "this must be [0, 0, 0]"
+            )
+    given = {"sun_direction", "eclipses", "earth"} & camera.model_fields_set
+    given -= {key for key in given if getattr(camera, key) == type(camera).model_fields[key].default}
+    if given:
+        raise ValueError(f"camera.{min(given)}: follows from [orbit]; leave it out")
 
 
 def _check_references(scenario: FlightScenario) -> None:
@@ -84,6 +110,10 @@ def _check_mesh(scenario: Scenario) -> None:
     geometry = scenario.target.geometry
     if geometry is not None and geometry.mesh and scenario.camera.renderer != "pybullet":
         raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
+    if scenario.chaser.mesh and not scenario.target_model().satellite:
+        raise ValueError(
+            f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} has none"
+        )
     if scenario.camera.renderer != "exact":
         for key, name in (
             ("target.model", scenario.target_model().satellite),
@@ -213,6 +243,71 @@ def _check_detumble(scenario: FlightScenario) -> None:
                 raise ValueError(f"timeline.{k}: chaser {i} has no port and cannot be latched to the target")
         if scenario.chaser.actuation != "thrusters":
             raise ValueError(f'timeline.{k}: detumble needs chaser.actuation = "thrusters"')
+        for i, free in plume_free_thrusters(scenario, set(entry.chasers)).items():
+            if not free.any():
+                raise ValueError(
+                    f"timeline.{k}: none of the {len(free)} thrusters of chaser {i} may fire at its port: every plume "
+                    f"(half angle detumble.plume_deg, {scenario.detumble.plume_deg:g} degrees) hits the target, a port or a chaser"
+                )
+
+
+def _check_stopping_time(scenario: Scenario) -> None:
+    """Check that detumbling is not longer than allowed even if all thrusters could always push where it helps most."""
+    for k, entry in enumerate(scenario.timeline):
+        if entry.command != "detumble":
+            continue
+        linear, angular, force_N, torque_N_m, mass_kg = _momentum_and_thrust(scenario, set(entry.chasers))
+        least_s = max(linear / force_N, angular / torque_N_m)
+        if least_s > scenario.detumble.timeout_s:
+            raise ValueError(
+                f"timeline.{k}: stopping the stack of {mass_kg:.4g} kg takes at least {least_s:.3g} s, with {linear:.3g} N s and "
+                f"{angular:.3g} N m s against at most {force_N:.3g} N and {torque_N_m:.3g} N m; detumble.timeout_s is "
+                f"{scenario.detumble.timeout_s:g} s"
+            )
+
+
+def _momentum_and_thrust(scenario: Scenario, chasers: set[int]) -> tuple[float, float, float, float, float]:
+    """Return linear (N s) and angular momentum (N m s) of the target at the start with these chasers fixed to it, upper bounds of
+    force and torque of their plume-free thrusters in any direction, and the mass."""
+    target, body, mounted = scenario.target, scenario.chaser, {}
+    omega = np.array(target.omega_rad_s)
+    inertias = [target.inertia_tensor]
+    places = [np.array(target.centre_of_mass_m)]
+    for i in sorted(chasers):
+        mounted[i] = nominal_mounting(scenario, i)
+        turn = rotations.to_matrix(mounted[i].q_wxyz)
+        inertias.append(turn @ np.diag(body.inertia) @ turn.T)
+        places.append(mounted[i].position_m)
+    masses = np.array([target.mass_kg] + [body.mass_kg] * len(mounted))
+    centre = masses @ np.array(places) / masses.sum()
+    velocity = rotations.rotate_inverse(target.q_wxyz, target.velocity_m_s) + np.cross(omega, centre)
+    angular = sum(
+        inertia @ omega + mass * np.cross(place - centre, np.cross(omega, place - centre))
+        for inertia, mass, place in zip(inertias, masses, places, strict=True)
+    )
+    free = np.concatenate(list(plume_free_thrusters(scenario, chasers).values()))
+    limits = np.where(free, np.tile(thrusts_max(body.thrusters), len(mounted)), 0.0)
+    own = wrench_matrix(body.thrusters)
+    wrenches = np.concatenate([c.wrench_to_stack(own, centre) for c in mounted.values()], axis=1) * limits
+    return (
+        float(masses.sum() * np.linalg.norm(velocity)),
+        float(np.linalg.norm(angular)),
+        _largest_sum(wrenches[:3]),
+        _largest_sum(wrenches[3:]),
+        float(masses.sum()),
+    )
+
+
+def _largest_sum(vectors: Array) -> float:
+    """Return an upper bound of the length of the sum of some of these vectors (3, n).
+
+    The largest sum of components along a direction, over directions of which one is within 0.15 rad of any other.
+    """
+    k = np.arange(400) + 0.5
+    z, turn = 1.0 - 2.0 * k / len(k), math.pi * (1.0 + math.sqrt(5.0)) * k
+    across = np.sqrt(1.0 - z**2)
+    directions = np.stack([across * np.cos(turn), across * np.sin(turn), z], axis=1)
+    return float(np.maximum(directions @ vectors, 0.0).sum(axis=1).max() / math.cos(0.15))
 
 
 def _check_capture(scenario: FlightScenario) -> None:

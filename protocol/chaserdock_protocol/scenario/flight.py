@@ -23,6 +23,7 @@ from .errors import invalid
 from .fields import Name, Section
 from .migrations import FORMAT
 from .navigation import NavigationSection
+from .orbit import Orbit
 from .schema import (
     MAX_DURATION_S,
     Approach,
@@ -51,6 +52,7 @@ class FlightScenario(Section):
         description="Length of the mission, s of simulated time.",
     )
     time: Time = Time()
+    orbit: Orbit | None = None
     target: FlightTarget = FlightTarget()
     chaser: Body = Body()
     camera: FlightCamera = FlightCamera()

@@ -6,7 +6,7 @@ Keys are snake_case and end with their unit. Frames: WRF world, CRF chaser, TRF 
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -26,7 +26,7 @@ from .fields import (
 )
 
 MARKER_PERCEPTIONS = ("default", "paper", "paper_iterative", "statistical")
-PERCEPTIONS = MARKER_PERCEPTIONS
+PERCEPTIONS = (*MARKER_PERCEPTIONS, "model")
 ESTIMATORS = ("joint", "mekf", "paper")
 SOLVERS = ("rti", "ipopt", "fatrop", "alpaqa", "open")
 """Built-in parts, by the names that a scenario selects them with; others may be installed (see ``plugins``)."""
@@ -78,8 +78,9 @@ class PerceptionSection(Section):
     name: Name = Field(
         default="default",
         description="`default`, `paper` (the paper's method, with EPnP), `paper_iterative` (the same with OpenCV's iterative PnP, "
-        "as in the authors' public code), `statistical` (no images: measurements are drawn around the true pose, "
-        "[simulation.md](simulation.md)), or an installed plugin.",
+        "as in the authors' public code), `model` (by the target's shape, without markers: [markerless.md](markerless.md)), "
+        "`statistical` (no images: measurements are drawn around the true pose, [simulation.md](simulation.md)), or an installed "
+        "plugin.",
     )
 
 
@@ -162,6 +163,14 @@ class Limits(Section):
     )
     max_reference_distance_m: Positive = Field(
         default=25.0, description="Largest distance of a reference position from the target, m."
+    )
+    passive_safety: Literal["off", "monitor"] = Field(
+        default="off",
+        description="`monitor`: at every tick, whether the coast after a loss of all thrust at any moment of the plan stays "
+        "outside `min_distance_target_m`; changes are logged. Needs the estimator `joint`.",
+    )
+    passive_safety_s: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] | None = Field(
+        default=None, description="Length of that coast, s. Without it: two orbits, in free space 600 s."
     )
 
 

@@ -2,7 +2,8 @@
 """Rigid-body simulation in PyBullet; the only module that uses its conventions.
 
 PyBullet orders quaternions x, y, z, w and expresses angular velocity in world axes; this module's interface is scalar first
-with body rates. There is no gravity, damping or sleeping.
+with body rates. Bullet has no gravity, damping or sleeping; the
+forces of an orbit are applied to every body (orbital_forces.py).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario
 
+from chaserdock_world.orbit import TargetOrbit
 from chaserdock_world.plant import Plant, chaser_plant, target_plant
 from chaserdock_world.random_draws import GaussMarkov, Stream
 
@@ -27,6 +29,7 @@ from .bullet import connect, pybullet
 from .compliant_latch import ENGAGED_M, CompliantLatch, Grip
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch, latch_faults
+from .orbital_forces import OrbitalForces
 from .port_loads import PortLoadRecorder, port_attitude
 
 TARGET = "target"
@@ -59,6 +62,10 @@ class Physics:
         self._free = {name: self.plants[name] for name in chasers}
         if not self._prescribed:
             self._free[TARGET] = self.plants[TARGET]
+        self._orbital: OrbitalForces | None = None
+        if scenario.orbit is not None:
+            step_s, per_tick = 1.0 / scenario.time.physics_hz, scenario.timing.steps_per_tick
+            self._orbital = OrbitalForces(TargetOrbit(scenario.orbit), step_s, per_tick)
         self._noise = {
             name: _disturbance_noise(scenario, i) for name, i in chasers.items() if _has_noise(scenario)
         }
@@ -232,6 +239,7 @@ class Physics:
                 before[body] = pose, rates
                 force_on(body, -1, force, (0, 0, 0), frame, client)
                 torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
+                self._apply_orbital(body, pose, rates)
             if self._compliant:
                 self._apply_compliant_latches()
             pybullet.stepSimulation(client)
@@ -246,6 +254,18 @@ class Physics:
             if moves and self.step_count % self._steps_per_target_update == 0:
                 self.place(TARGET, self.state(TARGET))
         return touched
+
+    def _apply_orbital(self, body: int, pose: Any, rates: Any) -> None:
+        """Apply the loads of the orbit to a body for one step; ``pose``, ``rates``: Bullet's. None in free space."""
+        if (orbital := self._orbital) is None:
+            return
+        name = self._names[body]
+        plant = self.plants[name]
+        orbital.set_step(self.step_count)
+        force = orbital.force(body, plant.mass_kg, pose[0], rates[0], name != TARGET)
+        torque = orbital.torque(pose[1], rates[1], plant.moments_kg_m2)
+        pybullet.applyExternalForce(body, -1, force, pose[0], pybullet.WORLD_FRAME, self._client)
+        pybullet.applyExternalTorque(body, -1, torque, pybullet.LINK_FRAME, self._client)
 
     def _record_loads(self) -> None:
         """Record the loads at the ports with rigid joints in the last step; open latches that they are too large for."""

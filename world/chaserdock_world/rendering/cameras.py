@@ -13,19 +13,23 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.meshes import moved
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import cuboid_corners
 from chaserdock_protocol.messages import Image
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
+from chaserdock_world.orbit import TargetOrbit, earth_disc
 from chaserdock_world.physics.simulation import TARGET, BodyState
-from chaserdock_world.plant import true_target
+from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.sensors.errors import true_camera
 
 from .background import Earth, Light
 from .effects import CameraEffects
 from .glare import Glare, is_occluded
+from .mesh_renderer import MeshRenderer
 from .rasterizer import Renderer, chaser_boxes
 from .scene_geometry import Obstacle
 from .tinyrenderer import TinyRenderer
@@ -43,13 +47,22 @@ class Cameras:
         self._scenario, section = scenario, scenario.camera
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
         self._target = true_target(scenario)
-        effects, earth = section.effects, section.earth
+        effects, disc = section.effects, earth_disc(scenario)
+        self._orbit = None if scenario.orbit is None else TargetOrbit(scenario.orbit)
         self._exposure_s = effects.exposure_s
-        background = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))
+        background = None if disc is None else Earth(*disc)
+        body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
+        mesh, substitutes = true_mesh(scenario), {}
+        if scenario.chaser.mesh:
+            shape = satellite(scenario.chaser.mesh)
+            low, high = shape.bounds_m()
+            substitutes[body] = moved(shape, np.zeros(3), np.array(body.size_m) / (high - low))
 
         @cache
-        def renderer(camera: Camera) -> Renderer | TinyRenderer:
+        def renderer(camera: Camera) -> Renderer | MeshRenderer | TinyRenderer:
             try:
+                if mesh is not None:
+                    return MeshRenderer(camera, mesh, background, effects.point_spread_px, substitutes)
                 kind = Renderer if section.renderer == "exact" else TinyRenderer
                 return kind(camera, self._target, background, effects.point_spread_px)
             except ValueError as error:
@@ -64,7 +77,6 @@ class Cameras:
         self._day = Light(section.sun_direction, 1.0 - section.ambient, section.ambient, section.lamp)
         night = section.ambient * section.eclipse_ambient
         self._night = Light(section.sun_direction, 0.0, night, section.lamp)
-        body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         # A chaser's own body is behind its lens, its probe is not.
         self._own, self._others = (probe,), (body, probe)
         # PyBullet's renderer is shared by all cameras and not thread-safe.
@@ -99,18 +111,27 @@ class Cameras:
             data=data,
         )
 
+    def light_at(self, time_s: float) -> Light:
+        """Return the light at a time of the mission."""
+        section, orbit = self._scenario.camera, self._orbit
+        if orbit is None:
+            dark = any(e.from_s <= time_s < e.to_s for e in section.eclipses)
+            return self._night if dark else self._day
+        share = orbit.sunlit_share(time_s)
+        x, y, z = orbit.to_sun(time_s).tolist()
+        ambient = section.ambient * (section.eclipse_ambient + (1.0 - section.eclipse_ambient) * share)
+        return Light((x, y, z), (1.0 - section.ambient) * share, ambient, section.lamp)
+
     def render(self, chaser: int, number: int, time_ns: int, states: States) -> NDArray[np.uint8]:
         """Return the image (h, w), uint8, before compression."""
-        eclipses = self._scenario.camera.eclipses
-        dark = any(e.from_s <= time_ns * 1e-9 < e.to_s for e in eclipses)
-        light = self._night if dark else self._day
+        light = self.light_at(time_ns * 1e-9)
         samples = [self._render_sharp(chaser, s, light) for s in self._sample_exposure(chaser, states)]
         image = samples[0]
         if len(samples) > 1:
             total = np.sum(samples, axis=0, dtype=np.uint16)
             image = np.asarray((total + len(samples) // 2) // len(samples), dtype=np.uint8)
         glare = self._glares[chaser]
-        if glare is not None and not dark:
+        if glare is not None and light.sun > 0.0:
             position, attitude = self._camera_pose(chaser, states)
             target = (self._target.boxes, states[TARGET].position_m, states[TARGET].q_wxyz)
             if not is_occluded(position, light.direction_w, [target, *self._bodies(chaser, states)]):

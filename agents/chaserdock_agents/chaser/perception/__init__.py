@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pose of the target from markers in an image (ArUco detection, edge-fitted corners, PnP with covariance)."""
+"""Pose of the target in an image: from markers (ArUco detection, edge-fitted corners, PnP with covariance) or from its shape."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from typing import Protocol
 import numpy as np
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import PERCEPTIONS, FlightScenario
+from chaserdock_protocol.scenario.bodies import FlightTarget
 from numpy.typing import ArrayLike, NDArray
 
+from .model.mesh import TrackerMesh
+from .model.perception import ModelPerception
 from .pipeline import Method, Perception, PerceptionResult, TargetPose
 from .statistical import StatisticalPerception
 
@@ -31,8 +34,26 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
             return Perception(camera, target, method)
         case "statistical":
             return StatisticalPerception(camera, target)
+        case "model":
+            return ModelPerception(camera, tracker_mesh(scenario.target))
         case name:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 
 
-__all__ = ["Method", "Perception", "PerceptionMethod", "PerceptionResult", "TargetPose", "make_perception"]
+def tracker_mesh(target: FlightTarget) -> TrackerMesh:
+    """Return what flight software knows of a target's shape: its mesh, or its cuboids."""
+    mesh, knowledge = target.known_mesh(), target.knowledge
+    if mesh is None:
+        return TrackerMesh.of_boxes(target.shape().boxes)
+    return TrackerMesh.of_mesh(mesh, np.deg2rad(knowledge.panel_deg), knowledge.scale_share)
+
+
+__all__ = [
+    "Method",
+    "Perception",
+    "PerceptionMethod",
+    "PerceptionResult",
+    "TargetPose",
+    "make_perception",
+    "tracker_mesh",
+]

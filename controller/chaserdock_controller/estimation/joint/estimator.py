@@ -52,6 +52,7 @@ from .state import (
     FOCAL,
     SIGHTING_CHANNEL,
     TURN,
+    VELOCITY,
     JointState,
     block,
     empty_state,
@@ -152,6 +153,16 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         if s is None or not s.target_known:
             return ()
         return tuple(relative_pose(s, i) for i in np.flatnonzero(s.alive).tolist())
+
+    def motion_covariance(self, chaser: int) -> Array | None:
+        """Return the covariance (6, 6) of a chaser's position and velocity relative to the target, WRF, if both are known."""
+        s = self.state
+        if s is None or not s.target_known or not s.alive[chaser]:
+            return None
+        size = VELOCITY.stop
+        own, target = slice(block(chaser).start, block(chaser).start + size), slice(0, size)
+        p, cross = s.covariance, s.covariance[own, target]
+        return p[own, own] + p[target, target] - cross - cross.T
 
     def cameras(self) -> tuple[CameraError, ...]:
         """Return the estimated calibration errors of the cameras after the newest tick."""

@@ -62,6 +62,8 @@ class JointParameters:
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
     iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
+    mean_motion_rad_s: of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire; the target stays at the
+        origin of the Hill frame, where these forces vanish.
     overconfident_ticks, overconfident_ratio: odometry is reported as overconfident when its squared normalized
         innovation, averaged over so many ticks, exceeds its expectation by this factor.
     """
@@ -104,6 +106,7 @@ class JointParameters:
     overconfident_ticks: float = 30.0
     overconfident_ratio: float = 2.5
     restart_after_s: float = 1.0
+    mean_motion_rad_s: float = 0.0
     camera_turn_rad: float = field(init=False)
 
     def __post_init__(self) -> None:

@@ -3,7 +3,9 @@
 
 A chaser is a rigid body under its commanded wrench and an unknown, slowly changing disturbance (F_d, T_d), both in body axes:
 I omega' = T + T_d - c x (F + F_d) - omega x I omega, v' = C ((F + F_d) / m - omega' x c - omega x (omega x c)), where the
-origin of CRF is at -c from the centre of mass. Its sensor errors are Gauss-Markov processes or constants.
+origin of CRF is at -c from the centre of mass.
+In an orbit, the forces and torques of the Hill frame act as well (relative_motion.py). Its sensor errors
+are Gauss-Markov processes or constants.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
+from chaserdock_models.relative_motion import cw_matrix, cw_wrench
 from chaserdock_models.rigid_body import newton_euler, rk4_step
 
 from chaserdock_controller.estimation.motion_models import process_noise, propagate_target
@@ -77,6 +80,8 @@ def predict(
     totals = [at_origin(wrenches[i], centres[i], state.omegas_rad_s[i], p) for i in range(n)]
     mass, inertia = p.body.mass_kg, p.inertia
     for i, total in enumerate(totals):
+        if p.mean_motion_rad_s:
+            total = total + cw_wrench(p.mean_motion_rad_s, rows[i], mass, inertia)
         u = total.tolist()
         rows[i] = rk4_step(lambda y, u=u: newton_euler(y, u, mass, inertia), rows[i], dt)
     fade = _fading(state, dt, p)
@@ -185,6 +190,10 @@ def _motion_transitions(
         a[i, VELOCITY, FORCE] += c / p.body.mass_kg
         a[i, VELOCITY, CENTRE] -= c @ (so3.skew(alpha) + turning @ turning)
     a[:, POSITION, VELOCITY] = a[:, ATTITUDE, RATE] = _EYE3
+    if p.mean_motion_rad_s:
+        cw = cw_matrix(p.mean_motion_rad_s)[3:]
+        a[:, VELOCITY, POSITION] += cw[:, :3]
+        a[:, VELOCITY, VELOCITY] += cw[:, 3:]
     a *= dt
     return np.eye(MOTION) + a + 0.5 * (a @ a)
 

@@ -9,24 +9,25 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Set
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.mounting import plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
-from numpy.typing import NDArray
 
-from chaserdock_controller.estimation.composite_body import nominal_mounting, pose_in_target
+from chaserdock_controller.estimation.composite_body import pose_in_target
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.interfaces import DirectCommand, Observation, TargetEstimation
 
 from .allocation import feedback, minimum_time, spans_all_directions
-from .stack import MountedChaser, StackMotion, plume_free, thruster_wrenches
+from .stack import StackMotion, thruster_wrenches
 
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
@@ -52,7 +53,7 @@ class DetumbleControl:
         self._full_N = thrusts_max(self._thrusters)
         self._own = wrench_matrix(self._thrusters)
         self._target = scenario.target_model()
-        self._plume_free = lru_cache(maxsize=32)(self._compute_plume_free)
+        self._plume_free = lru_cache(maxsize=32)(partial(plume_free_thrusters, scenario))
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
         """Return the stack's state; None while the target is unknown or no latched chaser has odometry."""
@@ -143,19 +144,6 @@ class DetumbleControl:
             row[list(isolated.get(i, ()))] = 0.0
             rows.append(row)
         return np.concatenate(rows)
-
-    def _compute_plume_free(self, latched: frozenset[int]) -> dict[int, NDArray[np.bool_]]:
-        """Return which thrusters (n,) of latched chasers may fire, by their nominal poses, so that noise changes nothing."""
-        mounted = {i: MountedChaser(*nominal_mounting(self._scenario, i)) for i in sorted(latched)}
-        free = plume_free(
-            mounted,
-            self._thrusters,
-            math.radians(self._settings.plume_deg),
-            self._target.boxes,
-            [np.array(port.position_m) for port in self._scenario.docking.ports],
-            self._scenario.chaser.size_m,
-        )
-        return dict(zip(mounted, free.reshape(len(mounted), -1), strict=True))
 
 
 def observed_motion(

@@ -4,3 +4,4 @@
 #include "elementary.h"
 #include "scene.c"
 #include "noise.c"
+#include "mesh.c"

@@ -145,7 +145,7 @@ def control_points(
     n = function("control_points", c_int64)(
         address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
         (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
-        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain, 0.5), 4.0)),
+        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * (light.direct + light.ambient), 0.5), 4.0)),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
     if n < MIN_POINTS:

@@ -3,17 +3,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
+from chaserdock_models.targets import Box, cuboid_corners
 from numpy.typing import NDArray
 
 _CREASE_COSINE = 0.8
 """Normals are smoothed over edges of a smaller angle, 37 degrees: facets of a cylinder, not the edges of a box."""
 
 MAX_TRIANGLES = 200_000
+
+SCALE_SIGMA = 0.003
+"""Standard deviation of the scale of a target's known shape."""
+
+_CUBOID = np.array(
+    [
+        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
+        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
+    ]
+)
+"""Triangles of a cuboid's corners, in the order of `cuboid_corners`."""
 
 
 class MeshError(ValueError):
@@ -48,6 +63,41 @@ class TrackerMesh:
             raise MeshError(f"reflectance must be {len(triangles)} numbers from 0 to 1")
         if len(self.modes_m) and self.modes_m.shape[1:] != vertices.shape:
             raise MeshError(f"modes must have shape (k, {len(vertices)}, 3), not {self.modes_m.shape}")
+
+    @classmethod
+    def of_boxes(cls, boxes: Sequence[Box], scale_sigma: float = SCALE_SIGMA) -> TrackerMesh:
+        """Return the mesh of cuboids in TRF, eight vertices each; its mode is an error of the scale, if not 0."""
+        vertices = np.concatenate(
+            [rotations.rotate(np.array(b.q_wxyz), cuboid_corners(b.size_m)) + b.position_m for b in boxes]
+        )
+        triangles = np.concatenate([_CUBOID + 8 * i for i in range(len(boxes))])
+        shade = np.repeat([b.shade for b in boxes], len(_CUBOID))
+        modes = np.array([scale_sigma * vertices] if scale_sigma > 0.0 else []).reshape(-1, len(vertices), 3)
+        return cls(vertices, triangles, shade, modes)
+
+    @classmethod
+    def of_mesh(cls, mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> TrackerMesh:
+        """Return the tracker mesh of a body's mesh; modes: the scale of the body, and a turn of each joint about each axis."""
+        counts = np.cumsum([0, *(len(part.vertices_m) for part in mesh.parts)])
+        triangles = np.concatenate(
+            [p.triangles + first for p, first in zip(mesh.parts, counts[:-1], strict=True)]
+        )
+        shade = np.repeat([p.material.diffuse for p in mesh.parts], [len(p.triangles) for p in mesh.parts])
+
+        def vertices(of: TriangleMesh) -> Array:
+            return np.concatenate([part.vertices_m for part in of.parts])
+
+        known = vertices(mesh)
+        turns = (
+            [{joint: joint_sigma_rad * axis} for joint in mesh.joints for axis in np.eye(3)]
+            if joint_sigma_rad
+            else []
+        )
+        modes = [vertices(with_geometry_errors(mesh, 0.0, turn)) - known for turn in turns]
+        if scale_sigma > 0.0:
+            modes.append(vertices(with_geometry_errors(mesh, scale_sigma, {})) - known)
+        stacked = np.array(modes).reshape(len(modes), len(known), 3)
+        return cls(known, triangles.astype(np.int64), shade, stacked)
 
     @cached_property
     def contiguous(self) -> tuple[Array, NDArray[np.int64], Array, Array]:

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Damping of the stack by one latched chaser whose controller is silent, from its own odometry alone. No I/O.
+
+A thruster with unit force d at r fires against the velocity of its own place, u = -d . (v + omega x r). The power that it gives
+to the stack is -f u, never positive while u > 0: whatever the mass, the other chasers and their thrusters, the kinetic energy
+falls. Thrusts are proportional to u, so that several chasers together do not overshoot; below a deadband nothing fires.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.mounting import plume_free_thrusters
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+
+_GAIN_N_S_PER_M = 60.0
+"""Thrust per velocity of a thruster's place. Of 20, 60 and 120 the one that stopped two, three and four chasers soonest."""
+_FIRES_M_S, _CLOSES_M_S = 0.0005, 0.0001
+"""A thruster begins to fire above the first velocity of its place, and ends below the second."""
+_NOISE_SHARE = 5.0
+"""The deadband is at least so many standard deviations of the filtered velocity, so that noise fires nothing."""
+_SLOW_M_S, _SLOW_S, _FAST_S = 0.005, 0.8, 0.3
+"""Time constants of the filter: long below a velocity, where noise matters, short above, where the delay does."""
+
+
+class LocalDamping:
+    """Damping law of one chaser with a port; one ``thrusts`` a tick. ``reset`` after a tick with another command."""
+
+    def __init__(self, scenario: FlightScenario, chaser: int) -> None:
+        body, errors = scenario.chaser, scenario.navigation.errors()
+        ports = {p.chaser for p in scenario.docking.ports if p.chaser is not None}
+        # Which others are latched is not known here: none of them may be hit.
+        self._free = plume_free_thrusters(scenario, ports)[chaser]
+        self._wrenches = wrench_matrix(body.thrusters)
+        self._full_N = thrusts_max(body.thrusters)
+        arm_m = max(math.hypot(*t.position_m) for t in body.thrusters)
+        noise_m_s = math.hypot(errors.velocity_noise_m_s, arm_m * errors.omega_noise_rad_s)
+        share = _share(1.0 / scenario.time.rate_hz, _SLOW_S)
+        filtered_m_s = noise_m_s * math.sqrt(share / (2.0 - share)) + arm_m * errors.gyro_bias_rad_s
+        self.fires_m_s = max(_FIRES_M_S, _NOISE_SHARE * filtered_m_s)
+        self._closes_m_s = self.fires_m_s * _CLOSES_M_S / _FIRES_M_S
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the filtered motion."""
+        self._rates: Array | None = None
+        self._firing = np.zeros(len(self._full_N), dtype=bool)
+        self._time_ns, self._thrusts_N = -1, np.zeros(len(self._full_N))
+
+    def thrusts_N(self, odometry: Odometry) -> Array:
+        """Return the thrusts (n,) that slow the stack; the same odometry gives the same thrusts."""
+        if odometry.sim_time_ns == self._time_ns:
+            return self._thrusts_N
+        velocity = rotations.rotate_inverse(odometry.q_wxyz, odometry.velocity_m_s)
+        rates = np.concatenate([velocity, odometry.omega_rad_s])
+        if self._rates is not None:
+            moving = float(np.abs(self._wrenches.T @ self._rates).max()) > _SLOW_M_S
+            elapsed_s = (odometry.sim_time_ns - self._time_ns) * 1e-9
+            share = _share(elapsed_s, _FAST_S if moving else _SLOW_S)
+            rates = self._rates + share * (rates - self._rates)
+        # A force d at r does work on d . (v + omega x r): the transpose of the wrench of unit thrusts.
+        speeds = -self._wrenches.T @ rates
+        self._firing = self._free & (speeds > np.where(self._firing, self._closes_m_s, self.fires_m_s))
+        thrusts = np.where(self._firing, np.minimum(_GAIN_N_S_PER_M * speeds, self._full_N), 0.0)
+        self._rates, self._time_ns, self._thrusts_N = rates, odometry.sim_time_ns, thrusts
+        return thrusts
+
+
+def _share(elapsed_s: float, constant_s: float) -> float:
+    """Return the weight of a new sample in a first-order filter."""
+    return 1.0 - math.exp(-elapsed_s / constant_s)

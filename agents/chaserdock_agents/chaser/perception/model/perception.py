@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Perception `model`: acquire and track a target by its shape, and return to acquisition when the gate rejects it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from numpy.typing import ArrayLike, NDArray
+
+from ..pipeline import PerceptionResult
+from ..pnp import TargetPose
+from ..refine import PoseInCamera
+from .acquisition import Acquisition
+from .alignment import Alignment, Pyramid
+from .lighting import light_at
+from .mesh import TrackerMesh
+from .tracking import (
+    is_valid,
+    levels_of,
+    refine_from_starts,
+    refine_pose,
+    starts_around,
+    track_points,
+    turn_between,
+)
+
+_KEY_EVERY = 8
+"""A view is rendered at least at every eighth image; between, its control points are reused."""
+_KEY_TURN_RAD = 0.04
+"""Points of a view are not reused when the target has turned by more since."""
+_LOST_AFTER = 3
+"""Number of images in a row without a valid pose after which a track ends."""
+_ACQUIRE_EVERY = 5
+"""After a failed acquisition, the next one runs at the fifth image: it takes as long as many images."""
+_WORSE = 0.1
+"""An ambiguous pose is dropped when its score falls this far below the best one's."""
+
+
+@dataclass(frozen=True)
+class PoseTrack:
+    """One hypothesis: last alignment, the pose before it, and the numbers of images since its view and since it was valid."""
+
+    last: Alignment
+    before: PoseInCamera | None = None
+    age: int = 0
+    missed: int = 0
+
+    def predicted(self) -> PoseInCamera:
+        """Return the pose in the next image at a constant rate per image; the last pose after a miss."""
+        now = self.last.pose
+        if self.before is None or self.missed:
+            return now
+        turn = rotations.from_matrix(now.rotation @ self.before.rotation.T)
+        step = rotations.to_matrix(rotations.normalize(turn))
+        return PoseInCamera(2.0 * now.position - self.before.position, step @ now.rotation)
+
+
+class ModelPerception:
+    """Estimates the pose of the target from its shape. Stateful: equal sequences of images give equal results.
+
+    One instance belongs to one camera. ``solutions`` are ambiguous poses, the best first, and without markers.
+    """
+
+    def __init__(self, camera: Camera, mesh: TrackerMesh) -> None:
+        self.camera, self.mesh = camera, mesh
+        self._acquisition = Acquisition(camera, mesh)
+        self._tracks: tuple[PoseTrack, ...] = ()
+        self._until_acquisition = 0
+
+    def estimate(
+        self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
+    ) -> PerceptionResult:
+        """Estimate the target's pose in a grey image (h, w), uint8; ``predicted`` is not used, as tracks predict themselves.
+
+        Raises ValueError for an image of another shape or type than the camera's.
+        """
+        shape = (self.camera.height_px, self.camera.width_px)
+        if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
+            got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise ValueError(f"expected a uint8 image of {shape}, got {got}")
+        if self._tracks:
+            pyramid = Pyramid(image, self.camera)
+            updated = [advance(pyramid, self.mesh, track) for track in self._tracks]
+            self._tracks = _distinct([t for t in updated if t.missed < _LOST_AFTER])
+            self._until_acquisition = 0
+        elif self._until_acquisition > 0:
+            self._until_acquisition -= 1
+        else:
+            self._tracks = tuple(PoseTrack(found) for found in self._acquisition.find(image))
+            self._until_acquisition = _ACQUIRE_EVERY - 1
+        valid = [_target_pose(t.last) for t in self._tracks if t.missed == 0]
+        return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
+
+
+def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> PoseTrack:
+    """Return a track after the next image: with the points of its view while they hold, else by a new one, else from several
+    starts."""
+    prior = track.predicted()
+    fresh = track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
+    if fresh and not track.missed:
+        found = track_points(pyramid, track.last.points, prior)
+        if is_valid(found):
+            return PoseTrack(found, track.last.pose, track.age + 1)
+    levels = levels_of(pyramid, mesh, prior)
+    light = light_at(pyramid, mesh, prior, levels[0]) if levels else None
+    if light is None:
+        return PoseTrack(track.last, track.before, track.age, track.missed + 1)
+    for chosen in (levels[-1:], levels):
+        found = refine_pose(pyramid, mesh, prior, light, chosen)
+        if is_valid(found):
+            return PoseTrack(found, track.last.pose)
+    found = refine_from_starts(pyramid, mesh, starts_around(prior), light)
+    if is_valid(found):
+        return PoseTrack(found)
+    return PoseTrack(track.last, track.before, track.age, track.missed + 1)
+
+
+def _distinct(tracks: list[PoseTrack]) -> tuple[PoseTrack, ...]:
+    """Return the tracks, best first, without those that have become equal to a better one or much worse than the best."""
+    kept: list[PoseTrack] = []
+    for track in sorted(tracks, key=lambda t: (t.missed > 0, -t.last.score)):
+        if kept and (track.missed or track.last.score < kept[0].last.score - _WORSE):
+            continue
+        if all(turn_between(track.last.pose, other.last.pose) > 0.05 for other in kept):
+            kept.append(track)
+    return tuple(kept)
+
+
+def _target_pose(alignment: Alignment) -> TargetPose:
+    pose = alignment.pose
+    q = rotations.from_matrix(pose.rotation)
+    return TargetPose(pose.position, q, alignment.covariance, alignment.rms_px)

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stack of target and latched chasers as one rigid body, damped by its chasers without a controller.
+
+Joints, contacts and images of the physics engine, which a silent controller does not need, are left out. Thrusters and sensors
+are those of the simulator; ``tests/chaserdock/test_silent_controller.py`` compares both.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_agents.chaser.local_damping import LocalDamping
+from chaserdock_agents.chaser.thrusters.modulation import Modulator
+from chaserdock_controller.estimation.composite_body import target_body
+from chaserdock_controller.estimation.target_body import attach_bodies
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.rigid_body import BodyState, free_rotation
+from chaserdock_models.thruster_model import Valves
+from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol.scenario import Scenario, flight_scenario
+from chaserdock_protocol.scenario.mounting import nominal_mounting
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+from chaserdock_world.sensors.errors import OdometrySensor
+from chaserdock_world.sensors.publish import odometry_of
+
+_SUBSTEPS = 4
+
+
+@dataclass(frozen=True)
+class SilentOutcome:
+    """A flight without controller: time until the stack stays below the limits (None: it does not), the impulse of all
+    thrusters until then, that after it in ``held_s``, and the motion at the end."""
+
+    time_s: float | None
+    impulse_N_s: float
+    held_N_s: float
+    held_s: float
+    final_rate_deg_s: float
+    final_speed_m_s: float
+
+
+class RigidStack:
+    """All chasers of a scenario at their ports, and the target's start state. One ``step`` per tick."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self.scenario = scenario
+        flight, target = flight_scenario(scenario), scenario.target
+        self._mounted = {i: nominal_mounting(flight, i) for i in range(len(scenario.chasers))}
+        parts = [
+            (scenario.chaser.mass_kg, np.asarray(scenario.chaser.inertia), c.position_m, c.q_wxyz)
+            for c in self._mounted.values()
+        ]
+        self.body = attach_bodies(target_body(flight), parts)
+        self.q_wxyz = np.array(target.q_wxyz)
+        self.omega_rad_s = np.array(target.omega_rad_s)
+        arm = rotations.rotate(self.q_wxyz, rotations.cross(self.omega_rad_s, self.body.centre_trf_m))
+        self.velocity_m_s = np.array(target.velocity_m_s) + arm
+        self.centre_m = rotations.rotate(self.q_wxyz, self.body.centre_trf_m)
+        self.tick = 0
+        self._damping = {i: LocalDamping(flight, i) for i in self._mounted}
+        thrusters = scenario.chaser.thrusters
+        self._full_N = thrusts_max(thrusters)
+        self._modulators = {
+            i: Modulator(thrusters, scenario.chaser.modulation, scenario.timing) for i in self._mounted
+        }
+        self._valves = {i: Valves(thrusters) for i in self._mounted}
+        self._sensor = OdometrySensor(scenario)
+        own = wrench_matrix(thrusters)
+        self._wrenches = {i: c.wrench_to_stack(own, self.body.centre_trf_m) for i, c in self._mounted.items()}
+
+    def rates(self) -> tuple[float, float]:
+        """Return the speed of the centre of mass (m/s) and the angular rate (rad/s)."""
+        return float(np.linalg.norm(self.velocity_m_s)), float(np.linalg.norm(self.omega_rad_s))
+
+    def state(self, chaser: int) -> BodyState:
+        """Return the true state of a chaser."""
+        mounted = self._mounted[chaser]
+        arm = mounted.position_m - self.body.centre_trf_m
+        return BodyState(
+            self.centre_m + rotations.rotate(self.q_wxyz, arm),
+            self.velocity_m_s + rotations.rotate(self.q_wxyz, rotations.cross(self.omega_rad_s, arm)),
+            rotations.multiply(self.q_wxyz, mounted.q_wxyz),
+            rotations.rotate_inverse(mounted.q_wxyz, self.omega_rad_s),
+        )
+
+    def step(self, damping: bool = True) -> float:
+        """Fly one tick, in which all chasers damp the stack or none; return the impulse of all thrusters (N s)."""
+        timing = self.scenario.timing
+        begin_ns, end_ns = timing.tick_time_ns(self.tick), timing.tick_time_ns(self.tick + 1)
+        edges_ns = np.linspace(begin_ns, end_ns, _SUBSTEPS + 1).astype(int)
+        impulses = np.zeros((_SUBSTEPS, 6))
+        used_N_s = 0.0
+        for i, modulator in self._modulators.items():
+            if damping:
+                odometry = odometry_of(self._sensor, i, self.state(i), self.tick, begin_ns)
+                thrusts_N = self._damping[i].thrusts_N(odometry)
+                span_ns = timing.effective_ns(self.tick), timing.effective_ns(self.tick + 1)
+                for p in modulator.pulses(thrusts_N, self._full_N, *span_ns):
+                    self._valves[i].pulse(p.thruster, p.open_ns, p.close_ns)
+            given = self._valves[i].impulses(edges_ns)
+            self._valves[i].forget_before(begin_ns)
+            impulses += given @ self._wrenches[i].T
+            used_N_s += float(given.sum())
+        for impulse in impulses:
+            self._advance(impulse, (end_ns - begin_ns) * 1e-9 / _SUBSTEPS)
+        self.tick += 1
+        return used_N_s
+
+    def _advance(self, impulse: Array, step_s: float) -> None:
+        """Advance by ``step_s`` with an impulse (6,), TRF axes, half of it before and half after a free rotation."""
+        turn = np.linalg.solve(self.body.inertia_kg_m2, impulse[3:]) / 2.0
+        self.velocity_m_s = self.velocity_m_s + rotations.rotate(self.q_wxyz, impulse[:3]) / self.body.mass_kg
+        self.centre_m = self.centre_m + step_s * self.velocity_m_s
+        qs, omegas, _ = free_rotation(
+            self.q_wxyz, self.omega_rad_s + turn, self.body.inertia_kg_m2, step_s, 2
+        )
+        self.q_wxyz, self.omega_rad_s = qs[1], omegas[1] + turn
+
+
+def fly_silent(scenario: Scenario, duration_s: float = 120.0, rest_s: float = math.inf) -> SilentOutcome:
+    """Let all chasers damp the scenario's tumble without a controller, for ``duration_s`` or until ``rest_s`` after it stopped."""
+    stack, limits = RigidStack(scenario), scenario.detumble
+    impulses, inside, rate_hz = [], [], scenario.time.rate_hz
+    for _ in range(round(duration_s * rate_hz)):
+        impulses.append(stack.step())
+        speed, rate = stack.rates()
+        inside.append(speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s)
+        if (
+            math.isfinite(rest_s)
+            and len(inside) >= rest_s * rate_hz
+            and all(inside[-round(rest_s * rate_hz) :])
+        ):
+            break
+    since = len(inside) - next((k for k, x in enumerate(reversed(inside)) if not x), len(inside))
+    speed, rate = stack.rates()
+    period_s = 1.0 / rate_hz
+    return SilentOutcome(
+        time_s=since * period_s if since < len(inside) else None,
+        impulse_N_s=float(sum(impulses[:since])),
+        held_N_s=float(sum(impulses[since:])),
+        held_s=(len(inside) - since) * period_s,
+        final_rate_deg_s=math.degrees(rate),
+        final_speed_m_s=speed,
+    )

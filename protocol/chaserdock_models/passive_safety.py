@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passive safety: how far the coast after a total loss of thrust stays from a keep-out sphere around the target.
+
+The coast is free motion, or Clohessy-Wiltshire motion in an orbit (relative_motion.py). Definition: Fehse, Automated
+Rendezvous and Docking of Spacecraft, section 4.4 (passive trajectory protection).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from .arrays import Array
+from .relative_motion import cw_transition
+
+STEP_S = 10.0
+"""Step of the samples of a coast; between them the motion is bounded by chord and sagitta."""
+# Half of the change of acceleration in a step (1 %) on top of the sagitta |dv| dt / 8 of a constant acceleration.
+_SAGITTA_SHARE = 1.02 / 8.0
+
+
+@dataclass(frozen=True)
+class CoastCertificate:
+    """Closest approach of the coasts from the states of a plan.
+
+    ``margin_sigmas``: smallest distance from the keep-out sphere over the standard deviation along the line from the target;
+    negative inside. ``distance_m``: a lower bound on the distance from the target there. ``time_s``: time of it after the loss
+    of thrust. ``loss``: index of the state at which thrust is lost.
+    """
+
+    margin_sigmas: float
+    distance_m: float
+    time_s: float
+    loss: int
+
+
+class CoastModel:
+    """Transition matrices of a coast of ``duration_s`` on an orbit with this mean motion; without one, of free motion."""
+
+    def __init__(self, mean_motion_rad_s: float, duration_s: float) -> None:
+        self._step_s = duration_s / max(1, math.ceil(duration_s / STEP_S))
+        self._times_s = np.arange(round(duration_s / self._step_s) + 1) * self._step_s
+        self._transitions = cw_transition(mean_motion_rad_s, self._times_s)
+
+    def certify(self, states: Array, covariance: Array, keep_out_m: float) -> CoastCertificate:
+        """Return the certificate of the states (M, 6) of a plan: position and velocity relative to the target, WRF.
+
+        ``covariance`` (6, 6): of a state's error, the same for all states of the plan.
+        """
+        coasts = np.einsum("kij,mj->mki", self._transitions, states)
+        here, step = coasts[:, :-1, :3], np.diff(coasts[:, :, :3], axis=1)
+        length2 = np.maximum(np.einsum("mki,mki->mk", step, step), 1e-30)
+        share = np.clip(-np.einsum("mki,mki->mk", here, step) / length2, 0.0, 1.0)
+        nearest = here + share[..., None] * step
+        bulge = _SAGITTA_SHARE * self._step_s * np.linalg.norm(np.diff(coasts[:, :, 3:], axis=1), axis=2)
+        chord = np.linalg.norm(nearest, axis=2)
+        away = np.maximum(chord - bulge, 0.0)
+        rows = self._transitions[:, :3]
+        spread = rows @ covariance @ rows.transpose(0, 2, 1)
+        line = nearest / np.maximum(chord, 1e-9)[..., None]
+        ends = (np.einsum("mki,kij,mkj->mk", line, part, line) for part in (spread[:-1], spread[1:]))
+        sigma = np.sqrt(np.maximum(np.maximum(*ends), 1e-18))
+        margins = (away - keep_out_m) / sigma
+        loss, k = np.unravel_index(int(np.argmin(margins)), margins.shape)
+        time_s = float(self._times_s[k] + share[loss, k] * self._step_s)
+        return CoastCertificate(float(margins[loss, k]), float(away[loss, k]), time_s, int(loss))

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Perception `model`: acquisition without a prior, tracking of a turning target, loss, ambiguous shapes."""
+
+import numpy as np
+import pytest
+from chaserdock_agents.chaser.perception import make_perception, tracker_mesh
+from chaserdock_agents.chaser.perception.model import tracking
+from chaserdock_agents.chaser.perception.model.acquisition import Acquisition, spread_rotations
+from chaserdock_agents.chaser.perception.model.perception import ModelPerception
+from chaserdock_agents.chaser.perception.refine import PoseInCamera
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from chaserdock_models.targets import Box
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_world.rendering.background import Light
+from markerless_cases import BOXES, Scene, mesh_of, random_view
+from source_tree import ROOT
+
+CAMERA = Camera.from_hfov(480, 270, np.deg2rad(60.0))
+SPACE = np.full((270, 480), 4, np.uint8)
+
+
+@pytest.fixture(scope="module")
+def acquisition():
+    return Acquisition(CAMERA, mesh_of())
+
+
+def angle_deg(solution, pose):
+    return np.rad2deg(rotations.angle_between(solution.q_irf_trf_wxyz, rotations.from_matrix(pose.rotation)))
+
+
+def test_acquires_without_a_prior_and_accepts_no_wrong_pose(acquisition):
+    rng = np.random.default_rng(1)
+    scene, found = Scene(CAMERA), 0
+    for number in range(3):
+        pose, light = random_view(rng, rng.uniform(1.5, 3.0), CAMERA)
+        alignments = acquisition.find(scene.image(pose, light, number))
+        errors = [np.rad2deg(np.linalg.norm(tracking.pose_error(a.pose, pose)[3:])) for a in alignments]
+        assert not errors or min(errors) < 2.0
+        found += bool(errors) and errors[0] < 2.0
+    assert found >= 2
+
+
+@pytest.mark.parametrize("image", [SPACE, np.full((270, 480), 200, np.uint8)], ids=["space", "white"])
+def test_nothing_is_acquired_without_a_target(acquisition, image):
+    assert acquisition.find(image) == ()
+
+
+def test_turning_target_is_tracked_lost_in_the_dark_and_acquired_again():
+    scene, perception = Scene(CAMERA), ModelPerception(CAMERA, mesh_of())
+    pose, light = random_view(np.random.default_rng(3), 2.0, CAMERA)
+    light = Light((-0.5, -0.4, -1.0))
+    status = []
+    for number in range(18):
+        turn = rotations.to_matrix(rotations.exp(np.array([0.002, 0.004, 0.003]) * number))
+        moved = PoseInCamera(pose.position + 1e-3 * number * np.array([1.0, 0.0, -2.0]), turn @ pose.rotation)
+        dark = 8 <= number < 12
+        result = perception.estimate(SPACE if dark else scene.image(moved, light, number))
+        status.append(len(result.solutions))
+        if result.solutions:
+            best = result.solutions[0]
+            assert angle_deg(best, moved) < 0.6
+            assert np.linalg.norm(best.position_irf_m - moved.position) < 0.02
+    assert min(status[:8]) == 1
+    assert max(status[8:12]) == 0
+    assert status[-1] == 1
+
+
+def test_symmetric_target_gives_hypotheses_of_which_one_is_right():
+    boxes = (BOXES[0], Box((0.16, 1.2, 0.012), shade=0.25))
+    scene, perception = Scene(CAMERA, boxes=boxes), ModelPerception(CAMERA, mesh_of(boxes))
+    pose, light = random_view(np.random.default_rng(12), 2.5, CAMERA)
+    for number in range(2):
+        solutions = perception.estimate(scene.image(pose, light, number)).solutions
+        assert 2 <= len(solutions) <= 4
+        assert min(angle_deg(s, pose) for s in solutions) < 2.0
+
+
+def test_scenario_selects_it_and_other_images_are_refused():
+    perception = make_perception(load_scenario(ROOT / "scenarios/single.toml", ["perception.name=model"]))
+    assert isinstance(perception, ModelPerception)
+    with pytest.raises(ValueError, match=r"expected a uint8 image of \(720, 1280\), got uint8 \(270, 480\)"):
+        perception.estimate(SPACE)
+
+
+def test_rotations_are_unit_quaternions_spread_over_all_attitudes():
+    q = spread_rotations(500)
+    assert np.allclose(np.linalg.norm(q, axis=1), 1.0)
+    rng = np.random.default_rng(2)
+    for _ in range(50):
+        other = rotations.normalize(rng.normal(size=4))
+        assert np.rad2deg(2.0 * np.arccos(np.abs(q @ other).max().clip(0.0, 1.0))) < 45.0
+
+
+def test_satellite_is_tracked_as_known_with_the_uncertainty_of_its_joints_and_scale():
+    changes = [
+        "target.model=geo_servicer",
+        "target.knowledge.panel_deg=1.0",
+        "target.knowledge.scale_share=0.01",
+    ]
+    target = load_scenario(ROOT / "scenarios/single.toml", [*changes, "perception.name=model"]).target
+    mesh, known = tracker_mesh(target), target.known_mesh()
+    assert known is not None
+    assert len(mesh.triangles) == known.triangle_count
+    assert len(mesh.modes_m) == 3 * len(known.joints) + 1
+    body = np.concatenate([np.full(len(p.vertices_m), not p.joint) for p in known.parts])
+    assert np.allclose(mesh.modes_m[-1][body], 0.01 * mesh.vertices_m[body])
+    assert np.all(mesh.modes_m[:-1][:, body] == 0.0)
+    tip = np.abs(mesh.vertices_m[:, 1]).argmax()
+    arm = np.linalg.norm(
+        mesh.vertices_m[tip]
+        - min(known.joints.values(), key=lambda j: np.linalg.norm(mesh.vertices_m[tip] - j))
+    )
+    assert np.linalg.norm(mesh.modes_m[:-1, tip], axis=1).max() == pytest.approx(
+        np.deg2rad(1.0) * arm, rel=0.02
+    )

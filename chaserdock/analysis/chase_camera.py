@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
 from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ _NEAR_M = 0.02
 _SHIFT = 4
 _SPACE = (26, 21, 18)
 _TARGET_PATH = (150, 150, 150)
+_PLUME = np.array([255.0, 214.0, 150.0])
 
 
 def tint(chaser: int) -> Array:
@@ -51,12 +53,26 @@ class Viewpoint:
         right = np.array([-sa, ca, 0.0])
         return np.stack([right, np.cross(back, right), back])
 
+    @property
+    def focal_px(self) -> float:
+        """Focal length, pixels."""
+        return 1.25 * min(self.width_px, 1.35 * self.height_px)
+
+    def pinhole(self) -> Camera:
+        """Return the camera without its pose."""
+        w, h = self.width_px, self.height_px
+        return Camera(w, h, self.focal_px, self.focal_px, w / 2.0, h / 2.0)
+
+    def attitude(self) -> Array:
+        """Return the rotation (4,) from image axes (right, down, forward) to WRF."""
+        right, up, back = self.axes()
+        return rotations.from_matrix(np.stack([right, -up, -back], axis=1))
+
     def project(self, points_m: Array) -> tuple[Array, Array]:
         """Return pixels (..., 2) and depths (...) in metres of points (..., 3) WRF; pixels are invalid at depths <= 0."""
         local = (points_m - self.centre_m) @ self.axes().T
         depth = self.distance_m - local[..., 2]
-        focal = 1.25 * min(self.width_px, 1.35 * self.height_px)
-        scale = focal / np.maximum(depth, _NEAR_M)[..., None]
+        scale = self.focal_px / np.maximum(depth, _NEAR_M)[..., None]
         px = local[..., :2] * scale * (1.0, -1.0) + (self.width_px / 2.0, self.height_px / 2.0)
         return px, depth
 
@@ -86,13 +102,17 @@ def draw(
     chasers: dict[int, BodyPose],
     paths: dict[int | None, Array],
     seeing: frozenset[int],
+    plumes: dict[int, Array] | None = None,
+    background: BgrImage | None = None,
 ) -> BgrImage:
     """Draw target and chasers into an image (height, width, 3), BGR.
 
     ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
-    under None. ``seeing``: chasers whose image was used; their camera frustums are brighter.
+    under None. ``seeing``: chasers whose image was used; their camera frustums are brighter. ``plumes``: nozzles and ends of
+    thruster plumes (K, 2, 3) of each chaser, CRF. ``background``: stars and Earth; plain space without.
     """
-    image = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
+    space = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
+    image = space if background is None else background.copy()
     for body, points in paths.items():
         shade = _TARGET_PATH if body is None else (0.75 * tint(body)).tolist()
         _lines(image, view, points, shade)
@@ -118,6 +138,18 @@ def draw(
         for quad, grey in face.decals:
             px, _ = view.project(rotations.rotate(attitude, quad) + position)
             _fill(image, px, np.full(3, grey * light))
+    for i, lines in (plumes or {}).items():
+        position, attitude = chasers[i]
+        for nozzle, end in rotations.rotate(attitude, lines) + position:
+            _draw_plume(image, view, nozzle, end)
+    _draw_cameras(image, view, scene, chasers, seeing)
+    return image
+
+
+def _draw_cameras(
+    image: BgrImage, view: Viewpoint, scene: Scene, chasers: dict[int, BodyPose], seeing: frozenset[int]
+) -> None:
+    """Draw the frustum of each chaser's camera, and its number."""
     for i, (position, attitude) in chasers.items():
         strength = 1.0 if i in seeing else 0.4
         bgr = (strength * tint(i)).tolist()
@@ -129,4 +161,13 @@ def draw(
         (x, y), _ = view.project(position)
         label_px = (round(float(np.clip(x, -1e4, 1e4))) + 22, round(float(np.clip(y, -1e4, 1e4))) - 20)
         cv2.putText(image, str(i), label_px, cv2.FONT_HERSHEY_SIMPLEX, 0.55, (235, 235, 235), 1, cv2.LINE_AA)
-    return image
+
+
+def _draw_plume(image: BgrImage, view: Viewpoint, nozzle: Array, end: Array) -> None:
+    """Draw a plume as a triangle that widens from the nozzle (3,) to its end (3,), WRF."""
+    px, depth = view.project(np.stack([nozzle, end]))
+    along = px[1] - px[0]
+    if np.any(depth <= _NEAR_M) or float(np.linalg.norm(along)) < 1.0:
+        return
+    across = 0.22 * np.array([-along[1], along[0]])
+    _fill(image, np.stack([px[0], px[1] + across, px[1] - across]), _PLUME)

@@ -12,9 +12,11 @@ from typing import Any
 import av
 import cv2
 import numpy as np
+from chaserdock_models.arrays import Array
 from chaserdock_protocol.errors import ChaserdockError, errors_of_writing
 from chaserdock_protocol.recording.log import LogError
-from chaserdock_world.orbit import to_sun
+from chaserdock_world.orbit import earth_disc, to_sun
+from chaserdock_world.rendering.background import Background, Earth, Light
 
 from .chase_camera import BgrImage, BodyPose, Viewpoint, draw, tint
 from .columns import nanoseconds
@@ -22,7 +24,8 @@ from .flight import RecordedFlight, Track, load_flight
 from .images import Pair, columns_for, shots
 from .scene import scene_of
 from .snapshot import annotated_image
-from .summary import tracking_errors
+from .summary import summary_of, tracking_errors
+from .time_series import ActuatorHistory, load_traces
 
 ENDINGS = (".mp4", ".webp", ".gif")
 _CODECS = {".mp4": "libx264", ".webp": "libwebp_anim", ".gif": "gif"}
@@ -30,6 +33,11 @@ _AZIMUTH_RAD, _ELEVATION_RAD = math.radians(-52.0), math.radians(26.0)
 _TRAIL_S = 25.0
 _INK = (235, 235, 235)
 _MARGIN_PX = 8
+_DIM = (120, 120, 120)
+_PLUME_M = 0.16
+_TITLE_SHARE = 0.12
+"""Share of the video during which the description, and at the end the verdict, is shown."""
+_CLOSE_PHASES = frozenset({"approach", "final", "contact", "latched", "docked"})
 
 
 def write_video(
@@ -102,7 +110,7 @@ def frames(
     columns, shot_px = columns_for(number, aspect, round(0.38 * width_px), height_px)
     rows, shot_height_px = math.ceil(number / columns), round(shot_px / aspect)
     side_px = columns * shot_px
-    external = _ExternalView(flight, width_px - side_px, height_px, part_s)
+    external = _ExternalView(flight, load_plumes(log, flight), width_px - side_px, height_px, part_s)
     for time_s, latest in shots(log, number, every_s, part_s[0]):
         if time_s > part_s[1] + 1e-9:
             return
@@ -138,20 +146,35 @@ class _ExternalView:
     """Draws the mission from a fixed direction, one image at a time."""
 
     def __init__(
-        self, flight: RecordedFlight, width_px: int, height_px: int, part_s: tuple[float, float]
+        self,
+        flight: RecordedFlight,
+        plumes: dict[int, ActuatorHistory],
+        width_px: int,
+        height_px: int,
+        part_s: tuple[float, float],
     ) -> None:
-        self.flight = flight
+        self.flight, self._plumes = flight, plumes
         self.size = (width_px, height_px)
         self.scene = scene_of(flight.scenario)
         sun = np.array(to_sun(flight.scenario))
         self.sun = sun / np.linalg.norm(sun)
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]
+        self._verdict = "success" if summary_of(flight)["success"] else "not successful"
+        self._end_s = min(float(target.time_s[-1]), part_s[1])
+        self._begin_s = part_s[0]
+        self._sky: BgrImage | None = None
         self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
+        self.distances: dict[int, tuple[Array, Array, Array]] = {}
         reach = 0.3
-        for own in self.chasers.values():
+        for i, own in self.chasers.items():
             away_m = own.distance_to(target)
             time_s = own.time_s[: len(away_m)]
+            self.distances[i] = (
+                time_s,
+                away_m,
+                -np.gradient(away_m, time_s) if len(time_s) > 2 else 0.0 * away_m,
+            )
             away_m = away_m[(time_s >= part_s[0]) & (time_s <= part_s[1])]
             reach = max(reach, float(away_m.max(initial=0.0)))
         # Distant chasers must not reduce the scale for all others.
@@ -173,9 +196,117 @@ class _ExternalView:
         look = Viewpoint(at[0], self.distance_m, _AZIMUTH_RAD, _ELEVATION_RAD, *self.size)
         time_ns = round(_time_of(self.target, time_s) * 1e9)
         seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
-        image = draw(self.scene, look, self.sun, at, chasers, paths, seeing)
+        plumes = {i: self._plumes_at(i, time_s) for i in chasers if i in self._plumes}
+        image = draw(self.scene, look, self.sun, at, chasers, paths, seeing, plumes, self._background(look))
+        self._close_up(image, at, chasers, plumes, seeing, time_s)
+        self._draw_graph(image, time_s)
         self._write(image, time_s)
         return image
+
+    def _background(self, look: Viewpoint) -> BgrImage:
+        """Return stars and Earth as the simulated cameras see them; the view's direction is fixed."""
+        if self._sky is None:
+            disc = earth_disc(self.flight.scenario)
+            space = Background(look.pinhole(), np.zeros(2), self.size, None if disc is None else Earth(*disc))
+            x, y, z = self.sun.tolist()
+            grey = space.draw(look.attitude(), Light((x, y, z)))
+            self._sky = np.repeat(grey[:, :, None], 3, axis=2)
+        return self._sky
+
+    def _plumes_at(self, chaser: int, time_s: float) -> Array:
+        """Return nozzles and plume ends (K, 2, 3), CRF, of the thrusters that are open in the tick at a time."""
+        history, thrusters = self._plumes[chaser], self.flight.scenario.chaser.thrusters
+        row = min(
+            max(0, int(np.searchsorted(history.edges_s, time_s + 1e-6)) - 1), len(history.thruster_duty) - 1
+        )
+        lines = [
+            (t.position_m, np.subtract(t.position_m, np.multiply(t.direction, _PLUME_M * (0.4 + 0.6 * duty))))
+            for t, duty in zip(thrusters, history.thruster_duty[row], strict=True)
+            if duty > 0.02
+        ]
+        return np.array(lines).reshape(-1, 2, 3)
+
+    def _nearest(self, time_s: float) -> int | None:
+        """Return the chaser nearest to the target among those in the last part of their way, or None."""
+        phases = {i: _phase(self.phases[i], time_s) for i in self.numbers}
+        near = [i for i, phase in phases.items() if phase in _CLOSE_PHASES]
+        return min(near, key=lambda i: self._distance_m(i, time_s), default=None)
+
+    def _distance_m(self, chaser: int, time_s: float) -> float:
+        times, away_m, _ = self.distances[chaser]
+        return float(away_m[min(max(0, int(np.searchsorted(times, time_s + 1e-6)) - 1), len(away_m) - 1)])
+
+    def _close_up(
+        self,
+        image: BgrImage,
+        at: BodyPose,
+        chasers: dict[int, BodyPose],
+        plumes: dict[int, Array],
+        seeing: frozenset[int],
+        time_s: float,
+    ) -> None:
+        """Draw an enlarged view between the target and the chaser that is docking into the upper right corner."""
+        nearest = self._nearest(time_s)
+        width = round(0.38 * self.size[0])
+        if nearest is None or width < 120:
+            return
+        middle = (at[0] + chasers[nearest][0]) / 2.0
+        away = chasers[nearest][0] - at[0]
+        across_rad = (
+            math.atan2(away[1], away[0]) - math.pi / 2.0
+        )  # from the side: the gap between the bodies is visible
+        look = Viewpoint(
+            middle,
+            2.0 * self._distance_m(nearest, time_s),
+            across_rad,
+            _ELEVATION_RAD,
+            width,
+            round(0.75 * width),
+        )
+        view = draw(self.scene, look, self.sun, at, chasers, {}, seeing, plumes)
+        h, w = view.shape[:2]
+        x = self.size[0] - w - _MARGIN_PX
+        image[_MARGIN_PX : _MARGIN_PX + h, x : x + w] = view
+        cv2.rectangle(
+            image, (x, _MARGIN_PX), (x + w - 1, _MARGIN_PX + h - 1), tint(nearest).tolist(), 1, cv2.LINE_AA
+        )
+
+    def _draw_graph(self, image: BgrImage, time_s: float) -> None:
+        """Draw distances to the target and closing speeds since the begin of the video, lower right corner."""
+        width, height = round(0.38 * self.size[0]), round(0.15 * self.size[1])
+        if width < 160 or height < 40:
+            return
+        x0, span_s = self.size[0] - width - _MARGIN_PX, max(self._end_s - self._begin_s, 1e-3)
+        for place, (column, label, factor) in enumerate(
+            ((1, "distance / m", 1.0), (2, "closing / mm/s", 1e3))
+        ):
+            y0 = self.size[1] - (2 - place) * (height + _MARGIN_PX)
+            part = [
+                c[column][(c[0] >= self._begin_s) & (c[0] <= self._end_s)] * factor
+                for c in self.distances.values()
+            ]
+            known = np.concatenate([p for p in part if len(p)] or [np.zeros(1)])
+            low, high = min(0.0, float(np.percentile(known, 1))), max(1e-3, float(np.percentile(known, 99)))
+            cv2.line(image, (x0, y0 + height), (x0 + width, y0 + height), _DIM, 1)
+            cv2.putText(
+                image,
+                f"{label}, up to {high:.3g}",
+                (x0 + 4, y0 + 10),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.36,
+                _INK,
+                1,
+                cv2.LINE_AA,
+            )
+            for i, columns in self.distances.items():
+                inside = (columns[0] >= self._begin_s) & (columns[0] <= time_s + 1e-6)
+                x = x0 + (columns[0][inside] - self._begin_s) / span_s * width
+                share = np.clip((columns[column][inside] * factor - low) / (high - low), 0.0, 1.0)
+                points = np.stack([x, y0 + height - share * (height - 14)], axis=1).round().astype(np.int32)
+                cv2.polylines(image, [points], False, tint(i).tolist(), 1, cv2.LINE_AA)
+
+    def _span(self) -> float:
+        return max(self._end_s - self._begin_s, 1e-3)
 
     def _write(self, image: BgrImage, time_s: float) -> None:
         def put(text: str, x: int, y: int, bgr: Any, size: float = 0.5) -> None:
@@ -183,14 +314,33 @@ class _ExternalView:
 
         put(f"{self.flight.scenario.name}", _MARGIN_PX + 4, 24, _INK, 0.6)
         put(f"t = {time_s:6.1f} s", _MARGIN_PX + 4, 48, _INK, 0.6)
+        if time_s - self._begin_s < _TITLE_SHARE * self._span():
+            put(self.flight.scenario.description[: self.size[0] // 10], _MARGIN_PX + 4, 72, _INK, 0.5)
+        if (
+            self._end_s - time_s < _TITLE_SHARE * self._span()
+            and self._end_s >= float(self.target.time_s[-1]) - 1e-6
+        ):
+            put(self._verdict, _MARGIN_PX + 4, 72, _INK, 0.8)
         for line, i in enumerate(self.numbers):
-            phase = next((name for t, name in reversed(self.phases[i]) if t <= time_s + 1e-9), "waiting")
+            phase = _phase(self.phases[i], time_s)
             times, position, _ = self.errors[i]
             row = min(int(np.searchsorted(times, time_s + 1e-6)) - 1, len(times) - 1)
             error = f"{1e3 * position[max(row, 0)]:7.2f} mm error" if len(times) else ""
             y = self.size[1] - 14 - 20 * (len(self.numbers) - 1 - line)
             put(f"chaser {i}  {phase:<9}", _MARGIN_PX + 4, y, tint(i).tolist())
             put(error, _MARGIN_PX + 180, y, _INK)
+
+
+def _phase(phases: list[tuple[float, str]], time_s: float) -> str:
+    return next((name for t, name in reversed(phases) if t <= time_s + 1e-9), "waiting")
+
+
+def load_plumes(log: Path, flight: RecordedFlight) -> dict[int, ActuatorHistory]:
+    """Return the actuator histories of the chasers that have thrusters."""
+    if flight.scenario.chaser.actuation != "thrusters":
+        return {}
+    histories = load_traces(log, range(len(flight.scenario.chasers))).inputs
+    return {i: h for i, h in histories.items() if h.thruster_duty.shape[1]}
 
 
 def _row(track: Track, time_s: float) -> int:

@@ -46,7 +46,7 @@ from chaserdock.analysis.report import _chasers, report_of, table, write_report
 from chaserdock.analysis.scene import scene_of
 from chaserdock.analysis.summary import summary_of, tracking_components, tracking_errors
 from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutcomes, Traces, load_traces
-from chaserdock.analysis.video import frames, write_video
+from chaserdock.analysis.video import _ExternalView, frames, write_video
 
 TICK_NS = 1_000_000_000 // 15
 SIZE = {"width_px": 96, "height_px": 64}
@@ -403,6 +403,22 @@ def test_drawn_target_shows_its_markers(model: str, azimuth: float, elevation: f
         assert marker is not None
         expected, _ = view.project(marker.corners_trf_m())
         np.testing.assert_allclose(np.reshape(found, (4, 2)), expected, atol=2.0)
+
+
+def test_external_view_shows_plumes_and_the_simulated_stars(tmp_path: Path) -> None:
+    flight = load_flight(made_log(tmp_path / "a.mcap", 5))
+    flight.scenario = load_scenario(find_scenario("docking-contact"))
+    flight.references = {}
+    thrusters = len(flight.scenario.chaser.thrusters)
+    views = []
+    for duty in (np.zeros((1, thrusters)), np.ones((1, thrusters))):
+        history = ActuatorHistory(np.array([0.0, 1.0]), np.zeros((1, 3)), np.zeros((1, 3)), duty)
+        views.append(_ExternalView(flight, {0: history}, 640, 480, (0.0, 1.0)).draw(0.2))
+    idle, firing = (view.astype(int) for view in views)
+    brighter = (firing - idle).min(axis=2) > 20
+    assert np.count_nonzero(brighter) > 50
+    # Stars: single bright pixels far from the bodies, which are in the middle.
+    assert np.count_nonzero(idle[80:300, 10:200].min(axis=2) > 40) > 0
 
 
 def test_video_is_playable(short_flight: Path, tmp_path: Path) -> None:

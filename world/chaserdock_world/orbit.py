@@ -68,3 +68,11 @@ def to_sun(scenario: Scenario, time_s: float = 0.0) -> tuple[float, float, float
         return scenario.camera.sun_direction
     x, y, z = TargetOrbit(scenario.orbit).to_sun(time_s).tolist()
     return x, y, z
+
+
+def earth_disc(scenario: Scenario) -> tuple[tuple[float, float, float], float] | None:
+    """Return the direction (3,) to the Earth's centre, WRF, and its angular radius (rad); None without an Earth in images."""
+    if scenario.orbit is not None:
+        return (-1.0, 0.0, 0.0), TargetOrbit(scenario.orbit).earth_radius_rad(0.0)
+    earth = scenario.camera.earth
+    return None if earth is None else (earth.direction, math.radians(earth.radius_deg))

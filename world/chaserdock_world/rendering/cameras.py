@@ -21,7 +21,7 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.errors import ScenarioError
 from numpy.typing import NDArray
 
-from chaserdock_world.orbit import TargetOrbit
+from chaserdock_world.orbit import TargetOrbit, earth_disc
 from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.sensors.errors import true_camera
@@ -47,12 +47,10 @@ class Cameras:
         self._scenario, section = scenario, scenario.camera
         self._cameras = [true_camera(scenario, i) for i in range(len(scenario.chasers))]
         self._target = true_target(scenario)
-        effects, earth = section.effects, section.earth
+        effects, disc = section.effects, earth_disc(scenario)
         self._orbit = None if scenario.orbit is None else TargetOrbit(scenario.orbit)
         self._exposure_s = effects.exposure_s
-        background = None if earth is None else Earth(earth.direction, math.radians(earth.radius_deg))
-        if self._orbit is not None:
-            background = Earth((-1.0, 0.0, 0.0), self._orbit.earth_radius_rad(0.0))
+        background = None if disc is None else Earth(*disc)
         body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         mesh, substitutes = true_mesh(scenario), {}
         if scenario.chaser.mesh:

@@ -485,6 +485,10 @@ def estimate(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+_TAIL_SHARE = 0.05
+"""Share of values on one side of the band from which on a filter is not called consistent: twice the expected one."""
+
+
 def consistency_text(nees: Array, low: float, high: float) -> str:
     """Judge NEES values (K,) against the band from ``low`` to ``high``, which 2.5 % exceed on either side if consistent."""
     above, below = float(np.mean(nees > high)), float(np.mean(nees < low))
@@ -497,10 +501,6 @@ def consistency_text(nees: Array, low: float, high: float) -> str:
         f"{verdict}: mean {np.mean(nees):.2f} (6 expected); {100 * above:.1f} % above the band, "
         f"{100 * below:.1f} % below (2.5 % each expected)"
     )
-
-
-_TAIL_SHARE = 0.05
-"""Share of values on one side of the band from which on a filter is not called consistent: twice the expected one."""
 
 
 @_figure(

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -161,22 +162,20 @@ class _ExternalView:
         self.numbers = flight.flown
         self.target = target = flight.truth["target"]
         self._verdict = "success" if summary_of(flight)["success"] else "not successful"
-        self._end_s = min(float(target.time_s[-1]), part_s[1])
-        self._begin_s = part_s[0]
+        self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
+        self._span_s = max(self._end_s - self._begin_s, 1e-3)
         self._sky: BgrImage | None = None
         self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
-        self.distances: dict[int, tuple[Array, Array, Array]] = {}
-        reach = 0.3
+        reach, distances, speeds = 0.3, {}, {}
         for i, own in self.chasers.items():
             away_m = own.distance_to(target)
             time_s = own.time_s[: len(away_m)]
-            self.distances[i] = (
-                time_s,
-                away_m,
-                -np.gradient(away_m, time_s) if len(time_s) > 2 else 0.0 * away_m,
-            )
-            away_m = away_m[(time_s >= part_s[0]) & (time_s <= part_s[1])]
-            reach = max(reach, float(away_m.max(initial=0.0)))
+            closing_m_s = -np.gradient(away_m, time_s) if len(time_s) > 2 else 0.0 * away_m
+            inside = (time_s >= part_s[0]) & (time_s <= part_s[1])
+            distances[i] = time_s[inside], away_m[inside]
+            speeds[i] = time_s[inside], closing_m_s[inside] * 1e3
+            reach = max(reach, float(away_m[inside].max(initial=0.0)))
+        self._graphs = (_graph("distance / m", distances), _graph("closing / mm/s", speeds))
         # Distant chasers must not reduce the scale for all others.
         self.distance_m = 3.5 * min(reach, 3.0)
         self.errors = {i: tracking_errors(flight, i) for i in self.numbers}
@@ -216,25 +215,13 @@ class _ExternalView:
     def _plumes_at(self, chaser: int, time_s: float) -> Array:
         """Return nozzles and plume ends (K, 2, 3), CRF, of the thrusters that are open in the tick at a time."""
         history, thrusters = self._plumes[chaser], self.flight.scenario.chaser.thrusters
-        row = min(
-            max(0, int(np.searchsorted(history.edges_s, time_s + 1e-6)) - 1), len(history.thruster_duty) - 1
-        )
+        row = min(_row(history.edges_s, time_s), len(history.thruster_duty) - 1)
         lines = [
             (t.position_m, np.subtract(t.position_m, np.multiply(t.direction, _PLUME_M * (0.4 + 0.6 * duty))))
             for t, duty in zip(thrusters, history.thruster_duty[row], strict=True)
             if duty > 0.02
         ]
         return np.array(lines).reshape(-1, 2, 3)
-
-    def _nearest(self, time_s: float) -> int | None:
-        """Return the chaser nearest to the target among those in the last part of their way, or None."""
-        phases = {i: _phase(self.phases[i], time_s) for i in self.numbers}
-        near = [i for i, phase in phases.items() if phase in _CLOSE_PHASES]
-        return min(near, key=lambda i: self._distance_m(i, time_s), default=None)
-
-    def _distance_m(self, chaser: int, time_s: float) -> float:
-        times, away_m, _ = self.distances[chaser]
-        return float(away_m[min(max(0, int(np.searchsorted(times, time_s + 1e-6)) - 1), len(away_m) - 1)])
 
     def _close_up(
         self,
@@ -246,22 +233,21 @@ class _ExternalView:
         time_s: float,
     ) -> None:
         """Draw an enlarged view between the target and the chaser that is docking into the upper right corner."""
-        nearest = self._nearest(time_s)
+        close = {
+            i: position - at[0]
+            for i, (position, _) in chasers.items()
+            if _phase(self.phases[i], time_s) in _CLOSE_PHASES
+        }
         width = round(0.38 * self.size[0])
-        if nearest is None or width < 120:
+        if not close or width < 120:
             return
-        middle = (at[0] + chasers[nearest][0]) / 2.0
-        away = chasers[nearest][0] - at[0]
-        across_rad = (
-            math.atan2(away[1], away[0]) - math.pi / 2.0
-        )  # from the side: the gap between the bodies is visible
+        nearest = min(close, key=lambda i: float(np.linalg.norm(close[i])))
+        away = close[nearest]
+        # From the side: the gap between the bodies is visible.
+        across_rad = math.atan2(away[1], away[0]) - math.pi / 2.0
+        distance_m = 2.0 * float(np.linalg.norm(away))
         look = Viewpoint(
-            middle,
-            2.0 * self._distance_m(nearest, time_s),
-            across_rad,
-            _ELEVATION_RAD,
-            width,
-            round(0.75 * width),
+            at[0] + away / 2.0, distance_m, across_rad, _ELEVATION_RAD, width, round(0.75 * width)
         )
         view = draw(self.scene, look, self.sun, at, chasers, {}, seeing, plumes)
         h, w = view.shape[:2]
@@ -276,37 +262,18 @@ class _ExternalView:
         width, height = round(0.38 * self.size[0]), round(0.15 * self.size[1])
         if width < 160 or height < 40:
             return
-        x0, span_s = self.size[0] - width - _MARGIN_PX, max(self._end_s - self._begin_s, 1e-3)
-        for place, (column, label, factor) in enumerate(
-            ((1, "distance / m", 1.0), (2, "closing / mm/s", 1e3))
-        ):
+        x0 = self.size[0] - width - _MARGIN_PX
+        for place, graph in enumerate(self._graphs):
             y0 = self.size[1] - (2 - place) * (height + _MARGIN_PX)
-            part = [
-                c[column][(c[0] >= self._begin_s) & (c[0] <= self._end_s)] * factor
-                for c in self.distances.values()
-            ]
-            known = np.concatenate([p for p in part if len(p)] or [np.zeros(1)])
-            low, high = min(0.0, float(np.percentile(known, 1))), max(1e-3, float(np.percentile(known, 99)))
             cv2.line(image, (x0, y0 + height), (x0 + width, y0 + height), _DIM, 1)
-            cv2.putText(
-                image,
-                f"{label}, up to {high:.3g}",
-                (x0 + 4, y0 + 10),
-                cv2.FONT_HERSHEY_SIMPLEX,
-                0.36,
-                _INK,
-                1,
-                cv2.LINE_AA,
-            )
-            for i, columns in self.distances.items():
-                inside = (columns[0] >= self._begin_s) & (columns[0] <= time_s + 1e-6)
-                x = x0 + (columns[0][inside] - self._begin_s) / span_s * width
-                share = np.clip((columns[column][inside] * factor - low) / (high - low), 0.0, 1.0)
+            label = f"{graph.label}, up to {graph.high:.3g}"
+            cv2.putText(image, label, (x0 + 4, y0 + 10), cv2.FONT_HERSHEY_SIMPLEX, 0.36, _INK, 1, cv2.LINE_AA)
+            for i, (times_s, values) in graph.series.items():
+                until = times_s <= time_s + 1e-6
+                x = x0 + (times_s[until] - self._begin_s) / self._span_s * width
+                share = np.clip((values[until] - graph.low) / (graph.high - graph.low), 0.0, 1.0)
                 points = np.stack([x, y0 + height - share * (height - 14)], axis=1).round().astype(np.int32)
                 cv2.polylines(image, [points], False, tint(i).tolist(), 1, cv2.LINE_AA)
-
-    def _span(self) -> float:
-        return max(self._end_s - self._begin_s, 1e-3)
 
     def _write(self, image: BgrImage, time_s: float) -> None:
         def put(text: str, x: int, y: int, bgr: Any, size: float = 0.5) -> None:
@@ -314,18 +281,17 @@ class _ExternalView:
 
         put(f"{self.flight.scenario.name}", _MARGIN_PX + 4, 24, _INK, 0.6)
         put(f"t = {time_s:6.1f} s", _MARGIN_PX + 4, 48, _INK, 0.6)
-        if time_s - self._begin_s < _TITLE_SHARE * self._span():
+        if time_s - self._begin_s < _TITLE_SHARE * self._span_s:
             put(self.flight.scenario.description[: self.size[0] // 10], _MARGIN_PX + 4, 72, _INK, 0.5)
         if (
-            self._end_s - time_s < _TITLE_SHARE * self._span()
+            self._end_s - time_s < _TITLE_SHARE * self._span_s
             and self._end_s >= float(self.target.time_s[-1]) - 1e-6
         ):
             put(self._verdict, _MARGIN_PX + 4, 72, _INK, 0.8)
         for line, i in enumerate(self.numbers):
             phase = _phase(self.phases[i], time_s)
             times, position, _ = self.errors[i]
-            row = min(int(np.searchsorted(times, time_s + 1e-6)) - 1, len(times) - 1)
-            error = f"{1e3 * position[max(row, 0)]:7.2f} mm error" if len(times) else ""
+            error = f"{1e3 * position[_row(times, time_s)]:7.2f} mm error" if len(times) else ""
             y = self.size[1] - 14 - 20 * (len(self.numbers) - 1 - line)
             put(f"chaser {i}  {phase:<9}", _MARGIN_PX + 4, y, tint(i).tolist())
             put(error, _MARGIN_PX + 180, y, _INK)
@@ -343,20 +309,38 @@ def load_plumes(log: Path, flight: RecordedFlight) -> dict[int, ActuatorHistory]
     return {i: h for i, h in histories.items() if h.thruster_duty.shape[1]}
 
 
-def _row(track: Track, time_s: float) -> int:
-    return max(0, int(np.searchsorted(track.time_s, time_s + 1e-6)) - 1)
+@dataclass(frozen=True)
+class _Graph:
+    """Values of each chaser over the part of the flight that is shown (``series``: times (K,) s and values (K,)), and their scale."""
+
+    label: str
+    series: dict[int, tuple[Array, Array]]
+    low: float
+    high: float
+
+
+def _graph(label: str, series: dict[int, tuple[Array, Array]]) -> _Graph:
+    """Return a graph whose scale leaves out the extreme hundredths of the values."""
+    known = np.concatenate([values for _, values in series.values() if len(values)] or [np.zeros(1)])
+    low, high = min(0.0, float(np.percentile(known, 1))), max(1e-3, float(np.percentile(known, 99)))
+    return _Graph(label, series, low, high)
+
+
+def _row(times_s: Array, time_s: float) -> int:
+    """Return the row of the last of the times (K,) up to a time; the first before it."""
+    return max(0, int(np.searchsorted(times_s, time_s + 1e-6)) - 1)
 
 
 def _time_of(track: Track, time_s: float) -> float:
-    return float(track.time_s[_row(track, time_s)])
+    return float(track.time_s[_row(track.time_s, time_s)])
 
 
 def _pose(track: Track, time_s: float) -> BodyPose:
     """Return the pose at the last tick up to a time, as in an image of that time."""
-    row = _row(track, time_s)
+    row = _row(track.time_s, time_s)
     return track.position_m[row], track.q_wxyz[row]
 
 
 def _trail(track: Track, time_s: float) -> Any:
     first = int(np.searchsorted(track.time_s, time_s - _TRAIL_S))
-    return track.position_m[first : _row(track, time_s) + 1 : 3]
+    return track.position_m[first : _row(track.time_s, time_s) + 1 : 3]

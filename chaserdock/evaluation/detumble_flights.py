@@ -89,8 +89,10 @@ class StackMission(InProcessMission):
     ) -> None:
         super().__init__(scenario, perception)
         self._silent_from_s = silent_from_s
-        flight = flight_scenario(scenario)
-        self._damping = {i: LocalDamping(flight, i) for i in self.thrusters}
+        self._damping: dict[int, LocalDamping] = {}
+        if math.isfinite(silent_from_s):
+            flight = flight_scenario(scenario)
+            self._damping = {i: LocalDamping(flight, i) for i in self.thrusters}
         rng = np.random.default_rng([scenario.seed, 0x57A])
         target = self.physics.state(TARGET)
         for i in self.chasers:

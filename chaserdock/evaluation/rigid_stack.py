@@ -123,25 +123,21 @@ class RigidStack:
 def fly_silent(scenario: Scenario, duration_s: float = 120.0, rest_s: float = math.inf) -> SilentOutcome:
     """Let all chasers damp the scenario's tumble without a controller, for ``duration_s`` or until ``rest_s`` after it stopped."""
     stack, limits = RigidStack(scenario), scenario.detumble
-    impulses, inside, rate_hz = [], [], scenario.time.rate_hz
+    impulses, at_rest, rate_hz = [], 0, scenario.time.rate_hz  # at_rest: number of ticks in a row
     for _ in range(round(duration_s * rate_hz)):
         impulses.append(stack.step())
         speed, rate = stack.rates()
-        inside.append(speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s)
-        if (
-            math.isfinite(rest_s)
-            and len(inside) >= rest_s * rate_hz
-            and all(inside[-round(rest_s * rate_hz) :])
-        ):
+        at_rest = at_rest + 1 if speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s else 0
+        if at_rest and at_rest >= rest_s * rate_hz:
             break
-    since = len(inside) - next((k for k, x in enumerate(reversed(inside)) if not x), len(inside))
+    since = len(impulses) - at_rest
     speed, rate = stack.rates()
     period_s = 1.0 / rate_hz
     return SilentOutcome(
-        time_s=since * period_s if since < len(inside) else None,
+        time_s=since * period_s if at_rest else None,
         impulse_N_s=float(sum(impulses[:since])),
         held_N_s=float(sum(impulses[since:])),
-        held_s=(len(inside) - since) * period_s,
+        held_s=at_rest * period_s,
         final_rate_deg_s=math.degrees(rate),
         final_speed_m_s=speed,
     )

@@ -28,10 +28,11 @@ BARE_METAL = Material("bare metal", diffuse=0.38, specular=0.40, shininess=35.0)
 NOZZLE = Material("nozzle", diffuse=0.18, specular=0.25, shininess=18.0)
 BLACK_PAINT = Material("black paint", diffuse=0.06)
 
-_BOX_TRIANGLES = np.array(
+BOX_TRIANGLES = np.array(
     [[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4],
      [1, 5, 7], [1, 7, 3]]
 )  # fmt: skip
+"""Triangles (12, 3) of a cuboid's corners, in the order of `targets.cuboid_corners`."""
 
 
 def _rounded(vertices: Array) -> Array:
@@ -50,7 +51,7 @@ def box(
     """Return a cuboid, turned by the rotation vector ``turn_rad`` about its centre."""
     corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size_m
     vertices = rotations.rotate(rotations.exp(np.array(turn_rad)), corners) + np.array(centre_m)
-    return MeshPart(name, material, _rounded(vertices), _BOX_TRIANGLES, joint)
+    return MeshPart(name, material, _rounded(vertices), BOX_TRIANGLES, joint)
 
 
 def lathe(

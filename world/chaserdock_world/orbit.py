@@ -23,9 +23,11 @@ class TargetOrbit:
     def __init__(self, section: Orbit) -> None:
         self._section, self.j2 = section, section.zonal_coefficient
         self._grid = [state_of(section.elements)]
+        # Asked several times for one moment: by bodies, light and drag.
+        self.state_at = lru_cache(maxsize=4)(self._state_at)
         self.frame_at = lru_cache(maxsize=4)(self._frame_at)
 
-    def state_at(self, time_s: float) -> OrbitState:
+    def _state_at(self, time_s: float) -> OrbitState:
         """Return the state at a time of the mission. The same at every call, in any order of calls."""
         index = int(time_s / _GRID_S)
         while len(self._grid) <= index:

@@ -21,6 +21,7 @@ from .thrusters import check_pulses, thrusts_max
 
 if TYPE_CHECKING:
     from . import FlightScenario, Scenario
+    from .schema import TimelineEntry
 
 
 def check_flight(scenario: FlightScenario) -> None:
@@ -234,10 +235,13 @@ def _check_load_limits(scenario: Scenario) -> None:
                 )
 
 
+def _detumblings(scenario: FlightScenario) -> list[tuple[int, TimelineEntry]]:
+    """Return the commands to detumble with their places in the timeline."""
+    return [(k, entry) for k, entry in enumerate(scenario.timeline) if entry.command == "detumble"]
+
+
 def _check_detumble(scenario: FlightScenario) -> None:
-    for k, entry in enumerate(scenario.timeline):
-        if entry.command != "detumble":
-            continue
+    for k, entry in _detumblings(scenario):
         for i in entry.chasers:
             if scenario.docking.port_of(i) is None:
                 raise ValueError(f"timeline.{k}: chaser {i} has no port and cannot be latched to the target")
@@ -253,9 +257,7 @@ def _check_detumble(scenario: FlightScenario) -> None:
 
 def _check_stopping_time(scenario: Scenario) -> None:
     """Check that detumbling is not longer than allowed even if all thrusters could always push where it helps most."""
-    for k, entry in enumerate(scenario.timeline):
-        if entry.command != "detumble":
-            continue
+    for k, entry in _detumblings(scenario):
         linear, angular, force_N, torque_N_m, mass_kg = _momentum_and_thrust(scenario, set(entry.chasers))
         least_s = max(linear / force_N, angular / torque_N_m)
         if least_s > scenario.detumble.timeout_s:

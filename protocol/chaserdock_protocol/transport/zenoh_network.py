@@ -266,18 +266,10 @@ def _attachment(attachment: zenoh.ZBytes | None) -> bytes:
     return b"" if attachment is None else attachment.to_bytes()
 
 
-class AttachedQuery:
-    """A query with an attachment, and its only reply."""
-
+class _ReceivedQuery:
     def __init__(self, key: str, query: zenoh.Query) -> None:
         self._key, self._query = key, query
         self.payload = query.payload.to_bytes() if query.payload is not None else b""
-        self.attachment = _attachment(query.attachment)
-
-    def reply(self, payload: bytes, attachment: bytes) -> None:
-        """Send the reply and end the query."""
-        self._query.reply(self._key, payload, attachment=attachment)
-        self._query.drop()
 
     def refuse(self, text: str) -> None:
         """Reply with an error and end the query."""
@@ -285,16 +277,24 @@ class AttachedQuery:
         self._query.drop()
 
 
-class _ZenohQuery:
+class AttachedQuery(_ReceivedQuery):
+    """A query with an attachment, and its only reply."""
+
     def __init__(self, key: str, query: zenoh.Query) -> None:
-        self._key, self._query = key, query
-        self.payload = query.payload.to_bytes() if query.payload is not None else b""
+        super().__init__(key, query)
+        self.attachment = _attachment(query.attachment)
+
+    def reply(self, payload: bytes, attachment: bytes) -> None:
+        """Send the reply and end the query."""
+        self._query.reply(self._key, payload, attachment=attachment)
+        self._query.drop()
+
+
+class _ZenohQuery(_ReceivedQuery):
+    def __init__(self, key: str, query: zenoh.Query) -> None:
+        super().__init__(key, query)
         self.encoding = str(query.encoding)
 
     def reply(self, payload: bytes, encoding: str) -> None:
         self._query.reply(self._key, payload, encoding=encoding)
-        self._query.drop()
-
-    def refuse(self, text: str) -> None:
-        self._query.reply_err(text)
         self._query.drop()

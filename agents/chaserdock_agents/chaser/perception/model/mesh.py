@@ -11,6 +11,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
+from chaserdock_models.satellites import BOX_TRIANGLES
 from chaserdock_models.targets import Box, cuboid_corners
 from numpy.typing import NDArray
 
@@ -21,14 +22,6 @@ MAX_TRIANGLES = 200_000
 
 SCALE_SIGMA = 0.003
 """Standard deviation of the scale of a target's known shape."""
-
-_CUBOID = np.array(
-    [
-        *([0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1]),
-        *([2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3]),
-    ]
-)
-"""Triangles of a cuboid's corners, in the order of `cuboid_corners`."""
 
 
 class MeshError(ValueError):
@@ -70,8 +63,8 @@ class TrackerMesh:
         vertices = np.concatenate(
             [rotations.rotate(np.array(b.q_wxyz), cuboid_corners(b.size_m)) + b.position_m for b in boxes]
         )
-        triangles = np.concatenate([_CUBOID + 8 * i for i in range(len(boxes))])
-        shade = np.repeat([b.shade for b in boxes], len(_CUBOID))
+        triangles = np.concatenate([BOX_TRIANGLES + 8 * i for i in range(len(boxes))])
+        shade = np.repeat([b.shade for b in boxes], len(BOX_TRIANGLES))
         modes = np.array([scale_sigma * vertices] if scale_sigma > 0.0 else []).reshape(-1, len(vertices), 3)
         return cls(vertices, triangles, shade, modes)
 

@@ -96,7 +96,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     keys, runs = make_keys(tmp_path / "keys"), tmp_path / "runs"
     endpoint = f"tls/127.0.0.1:{free_port()}"
     reach = ["-e", endpoint, "--lease", "10"]
-    short = sets(*SHORT, "duration_s=30.0")  # long enough for `status` and for the restart of the router
+    short = sets(*SHORT, "duration_s=20.0")  # long enough for `status` and for the restart of the router
     processes: dict[str, subprocess.Popen[bytes]] = {}
 
     def start(name: str, *arguments: str) -> None:
@@ -157,7 +157,7 @@ def test_mission_over_a_router_with_rights(tmp_path: Path) -> None:
     assert "denied" not in said_by["router"]  # no process tries what it may not do
     summary = json.loads((logs[0].parent / "summary.json").read_text())
     assert summary["success"]
-    assert summary["sim_time_s"] == 30.0
+    assert summary["sim_time_s"] == 20.0
     assert "</html>" in (logs[0].parent / "report.html").read_text()
     ticks = [r.message for r in read_log(logs[0], ["world/tick"])]
     assert ticks[-1].chasers == (0, 1)

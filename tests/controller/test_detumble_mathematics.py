@@ -19,7 +19,7 @@ from chaserdock_models import rotations
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import wrench_matrix
 from detumble_cases import BODY, mounted, stack_of, stack_thrusters, target_alone, tumble
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import linprog
 
@@ -93,6 +93,7 @@ def test_a_stack_turned_and_shifted_in_trf_has_turned_wrenches(seed: int) -> Non
 
 @settings(deadline=None)
 @given(SETS, SEEDS)
+@example((0, 1), 467506)
 def test_allocation_solves_the_linear_programme(chasers: tuple[int, ...], seed: int) -> None:
     """Shortest time, and the least impulse within it, as by a simplex method."""
     body, wrenches, limits = stack_thrusters(chasers)
@@ -110,8 +111,13 @@ def test_allocation_solves_the_linear_programme(chasers: tuple[int, ...], seed: 
     if found is None:
         return
     assert found.time_s == pytest.approx(shortest.fun, rel=1e-3)
-    bounds = [(0.0, most * found.time_s * (1.0 + 1e-9)) for most in limits]
-    cheapest = linprog(np.ones(n), A_eq=wrenches, b_eq=-momentum, bounds=bounds)
+    within_s = max(found.time_s, shortest.fun) * (
+        1.0 + 1e-6
+    )  # the allocation's time may be shorter by its tolerance
+    cheapest = linprog(
+        np.ones(n), A_eq=wrenches, b_eq=-momentum, bounds=[(0.0, m * within_s) for m in limits]
+    )
+    assert cheapest.status == 0
     assert found.impulse_N_s == pytest.approx(cheapest.fun, rel=1e-3)
 
 

@@ -220,7 +220,7 @@ def test_realtime_chaser_survives_frozen_controller(tmp_path: Path) -> None:
     """The chaser enters fallback without commands, rejects stale ones and follows new ones."""
     out = tmp_path / "run"
     arguments = ("run", "single", "--mode", "realtime", "--out", str(out), "-q")
-    mission = chaserdock(*arguments, *sets(*SHORT, "duration_s=15.0"))
+    mission = chaserdock(*arguments, *sets(*SHORT, "duration_s=10.0"))
     try:
         wait_for_log(out / "mission.mcap", FLYING_BYTES)
         controller = find_child(mission, "controller")

@@ -106,8 +106,8 @@ def test_standby_keeps_leadership_after_controller_reconnects(tmp_path: Path) ->
 def test_resumed_controller_does_not_regain_leadership(tmp_path: Path) -> None:
     """Realtime mode; asserts only what does not depend on load."""
     out = tmp_path / "run"
-    fault = 'fault=[{kind="freeze", at_s=3.0, duration_s=1.2, process="controller"}]'
-    run(DRILL[0], out, *WITH_STANDBY, "duration_s=8.0", fault, arguments=["--mode", "realtime"])
+    fault = 'fault=[{kind="freeze", at_s=2.0, duration_s=1.2, process="controller"}]'
+    run(DRILL[0], out, *WITH_STANDBY, "duration_s=5.0", fault, arguments=["--mode", "realtime"])
     log = out / "mission.mcap"
     for i in range(4):
         terms = [

@@ -213,6 +213,26 @@ def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) 
     assert f"chaser 1: odometry {channel} used again" in [e.text for e in estimator.drain_events()]
 
 
+@pytest.mark.parametrize(("ticks", "follows"), [(1, False), (2, True)])
+def test_only_a_repeated_misfit_of_the_velocity_passes_for_a_force(ticks: int, follows: bool) -> None:
+    """A velocity 6 mm/s off in one tick is noise; in two ticks in a row it may be a stuck thruster."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 1, 4)
+    estimator = estimator_for(flight.errors, 1)
+    fly(estimator, flight, 5.0)
+    forces_N = []
+    for k in range(ticks + 3):
+        inputs = flight.inputs()
+        o = inputs.odometry[0]
+        if k < ticks:
+            o = msgspec.structs.replace(o, velocity_m_s=vector(np.add(o.velocity_m_s, [0.006, 0.0, 0.0])))
+        estimator.update(replace(inputs, odometry={0: o}))
+        flight.step()
+        assert estimator.state is not None
+        forces_N.append(float(np.linalg.norm(estimator.state.extra[0, :3])))
+    assert (max(forces_N) > 0.2) is follows
+    assert (max(forces_N) > 0.01) is follows
+
+
 def test_odometry_noisier_than_stated_is_reported() -> None:
     flight = SyntheticFlight(SCENARIO, navigation("lab"), 1, 2)
     estimator = estimator_for(flight.errors, 1)

@@ -2,8 +2,9 @@
 """Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel. Pure functions.
 
 A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
-until it has fitted as often: a jump or a constant error then changes nothing. A velocity or rate that suddenly does not fit, by no
-more than the thrusters can cause within a tick, is followed. When most cameras are rejected together, the
+until it has fitted as often: a jump or a constant error then changes nothing. A velocity or rate that does not fit in two ticks in a
+row, by no more than the thrusters can cause within a tick, is followed. Noise that exceeds the gate in a single tick, which
+happens in about every flight, must not pass for a force. When most cameras are rejected together, the
 target has moved in an unexpected way: its rates are widened, and if that does not help its pose is reinitialized.
 """
 
@@ -260,7 +261,7 @@ def _update_chaser(
     channels = _channels(odometry is not None, solution is not None, p)
     cross, s = covariance.innovation(i, z)
     state, fits = _gate(prior, i, channels, z.residual, s, p)
-    if not all(fits.get(k, True) for k in _RATES):
+    if any(not fits.get(k, True) and prior.rejections[i, k] for k in _RATES):
         variances = _unexpected_motion(i, cross.shape[1], p)
         covariance.widen(variances)
         wider_cross, wider_s = covariance.innovation(i, z)

@@ -16,11 +16,11 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
 
-from chaserdock_protocol import topics
+from chaserdock_protocol import codec, topics
 from chaserdock_protocol.scenario.simulation import Partition, SimulationSection
 from chaserdock_protocol.transport import RawSample
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
-from chaserdock_protocol.transport.network import Connection, Host, Query, Reply, Undo
+from chaserdock_protocol.transport.network import Connection, Host, Query, Reply, T, Undo
 
 from .scheduler import NEVER, Due, Killed, Scheduler, VirtualQueue
 
@@ -32,6 +32,12 @@ _RETRY_S = 0.2
 """Time after which a lost message that must not be lost is sent again."""
 _EPOCH_NS = 1_800_000_000 * 10**9
 """Wall-clock time at the begin of a simulation."""
+
+
+@lru_cache(maxsize=128)
+def decode_once(kind: type[T], payload: bytes, encoding: str) -> T:
+    """Decode as ``codec.decode``; the receivers of a message share the result, which cannot be changed."""
+    return codec.decode(kind, payload, encoding)
 
 
 @lru_cache(maxsize=4096)
@@ -347,6 +353,9 @@ class SimulatedConnection:
             self.network.publish(self, raw, qos, blocking)
 
         return send
+
+    def decode(self, kind: type[T], raw: RawSample) -> T:
+        return decode_once(kind, raw.payload, raw.encoding)
 
     def put(self, raw: RawSample) -> None:
         sent = RawSample(raw.key, raw.encoding, raw.payload, self.host.wall_ns(), self.source)

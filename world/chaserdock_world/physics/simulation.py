@@ -232,8 +232,7 @@ class Physics:
                     x, y, z = midpoint_torque_of_rates(inertia, pose[1], rates[1], last[1])
                 else:
                     x, y, z = midpoint_torque(inertia, pose[1], rates[1], torque, step_s)
-                if self.latches:
-                    before[body] = pose, rates
+                before[body] = pose, rates
                 if any(force):
                     force_on(body, -1, force, (0, 0, 0), frame, client)
                 torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
@@ -247,12 +246,16 @@ class Physics:
                 self._record_loads()
             # A bounce may last a single step, so contacts are checked after each.
             if contact_points(physicsClientId=client):
-                pairs, tips = self._find_contacts()
-                touched.update(pairs)
-                self._update_latches(tips)
+                touched.update(self._process_contacts())
             if moves and self.step_count % self._steps_per_target_update == 0:
                 self.place(TARGET, self.state(TARGET))
         return touched
+
+    def _process_contacts(self) -> tuple[tuple[str, str], ...]:
+        """Pass the contacts of the last step to the latches; return ``contacts``."""
+        pairs, tips = self._find_contacts()
+        self._update_latches(tips)
+        return pairs
 
     def _update_joints(self) -> set[int]:
         """Execute the latches' commands and faults that are due; return the bodies with a closed latch."""

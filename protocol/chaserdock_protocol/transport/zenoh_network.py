@@ -16,7 +16,7 @@ import zenoh
 
 from chaserdock_protocol import codec
 
-from .config import QUEUE_OPTIONS, Link, Tls, TransportError, is_unreachable, open_error
+from .config import QUEUE_OPTIONS, Link, NoRouterError, Tls, TransportError, is_unreachable, open_error
 from .network import Connection, Host, Machine, Query, RawSample, Reply, T, Undo
 
 _PRIORITY = {
@@ -108,7 +108,8 @@ class ZenohNetwork:
                 return _ZenohConnection(self._open_client(config)), Machine()
             return _ZenohConnection(zenoh.open(config)), Machine()
         except zenoh.ZError as error:
-            raise TransportError(open_error(error, self._link)) from None
+            kind = NoRouterError if is_unreachable(error) else TransportError
+            raise kind(open_error(error, self._link)) from None
 
     def _open_client(self, config: zenoh.Config) -> zenoh.Session:
         """Open a client session by attempts of limited duration. Raises ZError after the link's time.

@@ -38,6 +38,7 @@ from .container import is_listening
 from .json_events import Failed, JsonLine, Result, Start
 from .mission_address import MissionAddress, remove_address, write_address
 from .progress import ProgressReporter, Show, print_json_line
+from .signals import deferred_signals
 
 _START_TIMEOUT_S = 120
 _END_TIMEOUT_S = 30.0
@@ -91,7 +92,7 @@ class Fleet:
         """Start a process; it exits when this process ends for any reason (its standard input closes)."""
         output = folder / f"{name.replace('/', '-')}.txt"
         threads = {"ZENOH_RUNTIME": _ZENOH_THREADS} if name != ROUTER else {}
-        with output.open("wb") as out:
+        with output.open("wb") as out, deferred_signals():
             process = subprocess.Popen(
                 [sys.executable, "-m", "chaserdock", *arguments, "--watch-parent"],
                 stdin=subprocess.PIPE,
@@ -102,7 +103,8 @@ class Fleet:
                 # ("autogroup") whatever the processes' priorities, and the last one to wake up would wait longest.
                 process_group=0,
             )
-        self.children.append(Child(name, process, output))
+            # Before a signal handler can raise an exception, after which ``end`` ends the processes of the list.
+            self.children.append(Child(name, process, output))
 
     def running(self) -> list[Child]:
         """Return the processes that have not exited."""

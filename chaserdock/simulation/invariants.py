@@ -16,7 +16,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import relative_acceleration, relative_torque
-from chaserdock_protocol import codec, topics
+from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.leases import commander_of
 from chaserdock_protocol.messages import (
@@ -45,6 +45,7 @@ from chaserdock_world.orbit import TargetOrbit
 from chaserdock.analysis.criteria import nearest_allowed_m
 
 from .message_checks import defects_of
+from .network import decode_once
 
 SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate"})
 """Phases in which a chaser keeps its distance, if their reason is in the log."""
@@ -182,7 +183,7 @@ class Invariants:
         try:
             if found is None:
                 raise Rejected("key", f"unknown key {raw.key}")
-            message = codec.decode(found[0].kind, raw.payload, raw.encoding)
+            message = decode_once(found[0].kind, raw.payload, raw.encoding)
         except Rejected as refusal:
             self.violate("valid messages", sender, f"{raw.key}: {refusal}")
             return

@@ -49,7 +49,7 @@ def simulate(
     folder: Path,
     overrides: tuple[str, ...] = (),
     tap: Tap | None = None,
-    over: Callable[[], bool] = lambda: False,
+    over: Callable[[], bool] | None = None,
 ) -> SimulatedFlight:
     """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes to ``folder``.
 

@@ -14,12 +14,13 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import lru_cache
+from typing import Any
 
-from chaserdock_protocol import topics
+from chaserdock_protocol import codec, topics
 from chaserdock_protocol.scenario.simulation import Partition, SimulationSection
 from chaserdock_protocol.transport import RawSample
 from chaserdock_protocol.transport.bounded_queue import BoundedQueue
-from chaserdock_protocol.transport.network import Connection, Host, Query, Reply, Undo
+from chaserdock_protocol.transport.network import Connection, Host, Query, Reply, T, Undo
 
 from .scheduler import NEVER, Due, Killed, Scheduler, VirtualQueue
 
@@ -31,6 +32,12 @@ _RETRY_S = 0.2
 """Time after which a lost message that must not be lost is sent again."""
 _EPOCH_NS = 1_800_000_000 * 10**9
 """Wall-clock time at the begin of a simulation."""
+
+
+@lru_cache(maxsize=128)
+def decode_once(kind: type[T], payload: bytes, encoding: str) -> T:
+    """Decode as ``codec.decode``; the receivers of a message share the result, which cannot be changed."""
+    return codec.decode(kind, payload, encoding)
 
 
 @lru_cache(maxsize=4096)
@@ -65,6 +72,9 @@ class _Subscription:
     expression: str
     arrived: Callable[[RawSample], None]
     known_to: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self.records_all = self.owner.name == "recorder" and self.expression == "**"
 
 
 class SimulatedNetwork:
@@ -121,7 +131,7 @@ class SimulatedNetwork:
         self.tap(sender.name, raw)
         for subscription in self._route(raw.key):
             if subscription.owner is sender:
-                if sender.name == "recorder" and subscription.expression == "**":
+                if subscription.records_all:
                     self.traffic.recorded[raw.key] += 1
                 subscription.arrived(raw)
             elif sender.name in subscription.known_to:
@@ -136,31 +146,33 @@ class SimulatedNetwork:
         self, sender: SimulatedConnection, to: _Subscription, raw: RawSample, qos: str, blocking: bool
     ) -> None:
         link, size = self._link(sender.name, to.owner.name), len(raw.payload)
-        droppable = not blocking and not self.lockstep
-        copies, late_s = self._draw_faults(link, sender.name, to.owner.name, size, droppable)
+        copies, late_s = 1, 0.0
+        if not self.lockstep:
+            copies, late_s = self._draw_faults(link, sender.name, to.owner.name, size, not blocking)
         for _ in range(copies):
             link.bytes += size
-            self.traffic.most_bytes = max(self.traffic.most_bytes, link.bytes)
+            if link.bytes > self.traffic.most_bytes:
+                self.traffic.most_bytes = link.bytes
+            self.deliver(sender.name, to.owner.name, self._arrive, qos, late_s, (link, to, raw))
 
-            def deliver() -> None:
-                link.bytes -= size
-                if to.owner.closed:
-                    return
-                if to.owner.name == "recorder" and to.expression == "**":
-                    self.traffic.recorded[raw.key] += 1
-                to.arrived(raw)
-
-            self.deliver(sender.name, to.owner.name, deliver, qos, late_s)
+    def _arrive(self, link: _LinkState, to: _Subscription, raw: RawSample) -> None:
+        """Hand a sample that has crossed a link to the subscriber."""
+        link.bytes -= len(raw.payload)
+        if to.owner.closed:
+            return
+        if to.records_all:
+            self.traffic.recorded[raw.key] += 1
+        to.arrived(raw)
 
     def _draw_faults(
         self, link: _LinkState, sender: str, receiver: str, size: int, droppable: bool
     ) -> tuple[int, float]:
-        """Return how many copies of a message arrive, and the additional delay (s)."""
+        """Return how many copies of a message arrive in real time, and the additional delay (s)."""
         c, late_s = self.conditions, 0.0
         if droppable and (link.bytes + size > LINK_BYTES or self._cut_until_s(sender, receiver) > 0.0):
             self.traffic.lost += 1
             return 0, 0.0
-        if self.lockstep or self.mission_s < 0.0:
+        if self.first_tick_s is None:
             return 1, 0.0
         if c.loss and self._random.random() < c.loss:
             self.traffic.lost += droppable
@@ -171,34 +183,46 @@ class SimulatedNetwork:
         return copies, late_s
 
     def deliver(
-        self, sender: str, receiver: str, call: Callable[[], None], qos: str = "control", late_s: float = 0.0
-    ) -> float:
-        """Call ``call`` when a message arrives that is sent now, and return that time (s).
+        self,
+        sender: str,
+        receiver: str,
+        call: Callable[..., None],
+        qos: str = "control",
+        late_s: float = 0.0,
+        args: tuple[Any, ...] = (),
+    ) -> None:
+        """Call ``call(*args)`` when a message arrives that is sent now.
 
         It arrives after all earlier ones of its priority, unless ``late_s`` < 0, and after all declarations.
         """
-        c, link = self.conditions, self._link(sender, receiver)
+        c = self.conditions
         delay_s = c.latency_s + max(0.0, late_s)
         if c.jitter_s:
             delay_s += self._random.expovariate(1.0 / c.jitter_s)
         if late_s < 0.0:
             delay_s += 4.0 * (c.latency_s + c.jitter_s)
-        due_s = max(self.scheduler.now_s + delay_s, self._cut_until_s(sender, receiver))
+        due_s = self.scheduler.now_s + delay_s
+        if c.partition:
+            due_s = max(due_s, self._cut_until_s(sender, receiver))
         if late_s < 0.0:
-            return self.scheduler.call_at(due_s, call)[0]
-        after = max(link.last.get(qos, NEVER), link.last.get("control", NEVER))
-        link.last[qos] = self.scheduler.call_at(due_s, call, after)
-        return link.last[qos][0]
+            self.scheduler.call_at(due_s, call, args=args)
+            return
+        last = self._link(sender, receiver).last
+        after = max(last.get(qos, NEVER), last.get("control", NEVER))
+        last[qos] = self.scheduler.call_at(due_s, call, after, args)
 
     def _link(self, sender: str, receiver: str) -> _LinkState:
-        return self._links.setdefault((sender, receiver), _LinkState())
+        link = self._links.get((sender, receiver))
+        if link is None:
+            link = self._links[sender, receiver] = _LinkState()
+        return link
 
     # -- partitions and liveliness -------------------------------------------------------------------------------
 
     def _cut_until_s(self, sender: str, receiver: str) -> float:
         """Return the end of the partition between two processes (virtual time, s), 0 without one."""
         now_s, end_s = self.mission_s, 0.0
-        if now_s < 0.0 or not self.conditions.partition:
+        if now_s < 0.0:
             return 0.0
         for p in self.conditions.partition:
             if p.at_s <= now_s < p.at_s + p.duration_s and p.separates(sender, receiver):
@@ -329,6 +353,9 @@ class SimulatedConnection:
             self.network.publish(self, raw, qos, blocking)
 
         return send
+
+    def decode(self, kind: type[T], raw: RawSample) -> T:
+        return decode_once(kind, raw.payload, raw.encoding)
 
     def put(self, raw: RawSample) -> None:
         sent = RawSample(raw.key, raw.encoding, raw.payload, self.host.wall_ns(), self.source)

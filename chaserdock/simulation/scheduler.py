@@ -58,20 +58,25 @@ class Scheduler:
     def __init__(self, seed: int) -> None:
         self.now_s = 0.0
         self.tasks: list[Task] = []
-        self._random = random.Random(f"scheduler {seed}")
-        self._events: list[tuple[float, float, int, Callable[[], None]]] = []
+        self._draw = random.Random(f"scheduler {seed}").random
+        self._events: list[tuple[float, float, int, Callable[..., None], tuple[Any, ...]]] = []
         self._count = self._alive = 0
         self._hub: greenlet = getcurrent()
         self._running: Task | None = None
 
-    def call_at(self, time_s: float, call: Callable[[], None], after: Due = NEVER) -> Due:
-        """Call ``call``, which must not wait, at a time and after the call of ``after``; return when.
+    def call_at(
+        self, time_s: float, call: Callable[..., None], after: Due = NEVER, args: tuple[Any, ...] = ()
+    ) -> Due:
+        """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``; return when.
 
         At once if the time has passed.
         """
         self._count += 1
-        due = max((max(time_s, self.now_s), self._random.random()), after)
-        heapq.heappush(self._events, (*due, self._count, call))
+        now_s = self.now_s
+        due = (time_s if time_s > now_s else now_s, self._draw())
+        if after > due:
+            due = after
+        heapq.heappush(self._events, (due[0], due[1], self._count, call, args))
         return due
 
     def spawn(self, name: str, work: Callable[[], Any]) -> Task:
@@ -79,17 +84,18 @@ class Scheduler:
         task = Task(name, work)
         self.tasks.append(task)
         self._alive += 1
-        self.call_at(self.now_s, lambda: self._continue(task, 0))
+        self.call_at(self.now_s, self._continue, args=(task, 0))
         return task
 
-    def run(self, limit_s: float, over: Callable[[], bool] = lambda: False) -> bool:
+    def run(self, limit_s: float, over: Callable[[], bool] | None = None) -> bool:
         """Run until all tasks have ended; return False if they have not by ``limit_s``, or when ``over`` holds."""
         self._hub = getcurrent()
+        events = self._events
         while self._alive:
-            if over() or not self._events or self._events[0][0] > limit_s:
+            if not events or events[0][0] > limit_s or (over is not None and over()):
                 return False
-            self.now_s, _, _, call = heapq.heappop(self._events)
-            call()
+            self.now_s, _, _, call, args = heapq.heappop(events)
+            call(*args)
         return True
 
     def end(self) -> None:
@@ -108,13 +114,12 @@ class Scheduler:
         task.waits += 1
         stamp = task.waits
         if timeout_s is not None:
-            self.call_at(self.now_s + timeout_s, lambda: self._continue(task, stamp))
+            self.call_at(self.now_s + timeout_s, self._continue, args=(task, stamp))
         self._hub.switch()
 
     def wake(self, task: Task) -> None:
         """Continue a task that pauses, at the present time."""
-        stamp = task.waits
-        self.call_at(self.now_s, lambda: self._continue(task, stamp))
+        self.call_at(self.now_s, self._continue, args=(task, task.waits))
 
     def _task(self) -> Task:
         if self._running is None:
@@ -153,7 +158,8 @@ class VirtualQueue:
 
     def put(self, item: Any) -> None:
         self._items.append(item)
-        self.most = max(self.most, len(self._items))
+        if len(self._items) > self.most:
+            self.most = len(self._items)
         if self._waiting is not None:
             self._scheduler.wake(self._waiting)
             self._waiting = None

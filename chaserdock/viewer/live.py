@@ -14,7 +14,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 
 import viser
 from chaserdock_protocol import topics
@@ -22,7 +23,7 @@ from chaserdock_protocol.errors import ChaserdockError
 from chaserdock_protocol.messages import CommandReply, JoinReply, JoinRequest, OperatorCommand
 from chaserdock_protocol.process import StopSignal, print_status
 from chaserdock_protocol.scenario import flight_scenario_from_json
-from chaserdock_protocol.transport import Link, Node, ReceivedMessage
+from chaserdock_protocol.transport import Link, Node, NoRouterError, ReceivedMessage
 from chaserdock_protocol.transport.network import unique_id
 
 from .address import DEFAULT_HOST, page_token, url_of
@@ -38,6 +39,8 @@ _SILENCE_S = 3.0
 _JOIN_PERIOD_S = 2.0
 _RECONNECT_S = 10.0
 _DRAWING_NICE = 10
+_ATTEMPT_S = 2.0
+"""Longest time (s) of one attempt to connect to a router."""
 _WAITING = "no mission is running"
 
 
@@ -61,20 +64,47 @@ def view_live(link: Link, options: ViewOptions, watch_parent: bool = False) -> i
         os.nice(_DRAWING_NICE)
 
         def connect() -> Node:
-            return opener.submit(Node, "viewer", "viewer", link).result()
+            return opener.submit(
+                Node, "viewer", "viewer", replace(link, connect_timeout_s=_ATTEMPT_S)
+            ).result()
 
         with page_server(options.host, options.port, token) as server:
             print_status(
                 "viewer",
                 f"{url_of(options.host, server.get_port(), token)} shows the mission; Ctrl-C ends this",
             )
-            run_id = ""
-            while not stop():
-                mission = _next_mission(connect, server, run_id, stop)
-                if mission is not None:
-                    run_id = mission.run_id
-                    _MissionView(connect, server, mission, options).run(stop)
+            patient, run_id = _Patience(connect, stop), ""
+            with suppress(_Stopped):
+                while not stop():
+                    mission = _next_mission(patient, server, run_id, stop)
+                    if mission is not None:
+                        run_id = mission.run_id
+                        _MissionView(patient, server, mission, options).run(stop)
     return 0
+
+
+class _Stopped(Exception):
+    """The viewer was stopped while it waited for a router."""
+
+
+class _Patience:
+    """Opens a node as soon as a router accepts the connection; says once that none does.
+
+    Each attempt takes ``_ATTEMPT_S`` at most, in native code, where no signal is handled. Raises _Stopped.
+    """
+
+    def __init__(self, connect: Callable[[], Node], stop: Callable[[], bool]) -> None:
+        self._connect, self._stop, self._reported = connect, stop, False
+
+    def __call__(self) -> Node:
+        while not self._stop():
+            try:
+                return self._connect()
+            except NoRouterError as error:
+                if not self._reported:
+                    print_status("viewer", f"{error} The viewer waits for it.")
+                self._reported = True
+        raise _Stopped
 
 
 # One instance for all join requests: the world treats another instance as a replacement.

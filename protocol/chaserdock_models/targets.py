@@ -170,7 +170,6 @@ def mesh_boxes(mesh: TriangleMesh) -> tuple[Box, ...]:
     return tuple(box_around(part) for part in mesh.parts)
 
 
-@lru_cache
 def _of_satellite(name: str) -> TargetModel:
     """Return a shipped satellite without markers."""
     mesh = satellite(name)
@@ -193,6 +192,7 @@ def target_names() -> tuple[str, ...]:
     return tuple(sorted(_MODELS))
 
 
+@lru_cache
 def target_model(name: str) -> TargetModel:
     """Return the built-in target ``name``. Raises ValueError, listing the known names, for any other."""
     if name not in _MODELS:

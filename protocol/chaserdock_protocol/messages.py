@@ -639,6 +639,7 @@ def _encoding(kind: type[Struct], number: int) -> str:
     return f"application/msgpack;chaserdock.{kind.__name__}.v{number}"
 
 
+@cache
 def schema_of(kind: type[Struct]) -> bytes:
     """Return the JSON Schema of a message type, as stored in logs."""
     return msgspec.json.encode(msgspec.json.schema(kind))

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -28,6 +29,7 @@ import chaserdock as cd
 from chaserdock.analysis.criteria import judged_criteria
 from chaserdock.analysis.summary import summarize
 from chaserdock.api import override_texts
+from chaserdock.launch import launcher
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 CAPTURE = ROOT / "tests" / "golden" / "capture.mcap"
@@ -102,6 +104,29 @@ def test_keyboard_interrupt_ends_all_processes(tmp_path: Path) -> None:
     assert program.stdout.read().endswith("interrupted\n")
     assert program.wait(timeout=30) == 0
     assert not [child for child in children if child.is_running() and child.status() != "zombie"]
+
+
+def test_interrupt_while_a_process_starts_leaves_none_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The signal arrives when the process exists, but is not yet in the list of those to end."""
+
+    class Interrupted(subprocess.Popen[bytes]):
+        def __init__(self, *arguments: Any, **options: Any) -> None:
+            super().__init__(*arguments, **options)
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(launcher.subprocess, "Popen", Interrupted)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    fleet = launcher.Fleet()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            fleet.start("world", ["world", "single"], tmp_path)
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    finally:
+        signal.signal(signal.SIGINT, before)
+        fleet.end()
+    assert [child.process.poll() is not None for child in fleet.children] == [True]
 
 
 def test_errors_are_exceptions_with_the_text_of_the_command_line(tmp_path: Path) -> None:

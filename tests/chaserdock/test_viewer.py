@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import time
 import urllib.error
@@ -10,6 +11,7 @@ import urllib.request
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from subprocess import PIPE, STDOUT
 
 import msgspec
 import numpy as np
@@ -29,13 +31,14 @@ from chaserdock_protocol.messages import (
 from chaserdock_protocol.recording.log import LogError
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.transport import Link, Node
-from harness import ROOT, finished
+from harness import ROOT, chaserdock, finished
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mission_keys import client, make_keys, router_with_rights
 from websockets.frames import Frame, Opcode
 
 from chaserdock.cli.run import announce_viewer
+from chaserdock.launch.launcher import free_port as unused_port
 from chaserdock.viewer import plots, shapes
 from chaserdock.viewer import text as words
 from chaserdock.viewer.address import (
@@ -419,6 +422,21 @@ def test_token_is_random_or_that_of_the_environment(monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv(TOKEN_VARIABLE, "short/")
     with pytest.raises(ViewError, match=f"{TOKEN_VARIABLE}: give at least 16 letters"):
         page_token()
+
+
+def test_viewer_without_a_router_says_so_and_can_be_stopped() -> None:
+    endpoint = f"tcp/127.0.0.1:{unused_port()}"
+    process = chaserdock("view", "-m", "client", "-e", endpoint, stdout=PIPE, stderr=STDOUT, text=True)
+    try:
+        assert process.stdout is not None
+        assert process.stdout.readline().endswith("shows the mission; Ctrl-C ends this\n")
+        line = f"viewer: no router at {endpoint} accepts the connection; is it running? The viewer waits for it.\n"
+        assert process.stdout.readline() == line
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout.read() == ""
+        assert process.wait(timeout=60) == 0
+    finally:
+        process.kill()
 
 
 def test_occupied_port_is_reported_or_skipped() -> None:

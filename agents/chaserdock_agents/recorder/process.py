@@ -13,7 +13,7 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from chaserdock_protocol import codec, topics
+from chaserdock_protocol import topics
 from chaserdock_protocol.codec import Rejected
 from chaserdock_protocol.fault_injection import FaultLayer, create_fault_layer
 from chaserdock_protocol.messages import (
@@ -143,7 +143,7 @@ class Recorder:
         found, message = topics.topic_of_key(raw.key), None
         if found is not None and found[0] in _DECODED:
             with suppress(Rejected):
-                message = codec.decode(found[0].kind, raw.payload, raw.encoding)
+                message = self.node.decode(found[0].kind, raw)
         self.recording.write(raw, message)
         self._received[raw.key] = self._received.get(raw.key, 0) + 1
         self._process(raw.key, message)

@@ -15,7 +15,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -148,7 +147,7 @@ class LogWriter:
         self._sink: Any = _Sink(self._file)
         self._writer = create_writer(self._sink)
         with self._writing():
-            self._writer.start(profile="chaserdock", library=f"chaserdock {version('chaserdock')}")
+            self._writer.start(profile="chaserdock", library=f"chaserdock {provenance.version('chaserdock')}")
         self._flushed_s, self._flushed_ns = now_s(), 0
 
     @property
@@ -164,7 +163,7 @@ class LogWriter:
             (VERSIONS_ATTACHMENT, "application/json", provenance.versions_json()),
             (LOCK_ATTACHMENT, "application/gzip", provenance.lock_file_gz()),
         ]
-        versions = {f"version.{name}": version(name) for name in _PACKAGES}
+        versions = {f"version.{name}": provenance.version(name) for name in _PACKAGES}
         with self._writing():
             for name, kind, data in attached:
                 if data is not None:

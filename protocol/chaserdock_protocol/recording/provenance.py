@@ -6,7 +6,7 @@ from __future__ import annotations
 import gzip
 import json
 from functools import lru_cache
-from importlib.metadata import distributions
+from importlib import metadata
 from pathlib import Path
 
 import numpy  # noqa: F401 - loads its BLAS
@@ -19,8 +19,14 @@ _LOCK_FILE = Path(__file__).resolve().parents[3] / "uv.lock"
 @lru_cache
 def installed_versions() -> dict[str, str]:
     """Return the version of every installed distribution, by name."""
-    found = {d.metadata["Name"]: d.version for d in distributions() if d.metadata["Name"]}
+    found = {d.metadata["Name"]: d.version for d in metadata.distributions() if d.metadata["Name"]}
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
+
+
+@lru_cache
+def version(package: str) -> str:
+    """Return the version of an installed package."""
+    return metadata.version(package)
 
 
 def versions_json() -> bytes:

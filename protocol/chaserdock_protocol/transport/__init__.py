@@ -1,7 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Transport over Eclipse Zenoh: nodes, their configuration and access control."""
 
-from .config import DEFAULT_ENDPOINT, DEFAULT_NAMESPACE, Link, ReceivedMessage, Tls, TransportError
+from .config import (
+    DEFAULT_ENDPOINT,
+    DEFAULT_NAMESPACE,
+    Link,
+    NoRouterError,
+    ReceivedMessage,
+    Tls,
+    TransportError,
+)
 from .network import RawSample
 from .node import MessageFilter, Node, TrafficCounters
 
@@ -10,6 +18,7 @@ __all__ = [
     "DEFAULT_NAMESPACE",
     "Link",
     "MessageFilter",
+    "NoRouterError",
     "Node",
     "RawSample",
     "ReceivedMessage",

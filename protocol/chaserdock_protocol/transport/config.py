@@ -38,6 +38,10 @@ class TransportError(ChaserdockError):
     """The network cannot be used as configured. The text is one line."""
 
 
+class NoRouterError(TransportError):
+    """No router accepts a client's connection; one that starts later may."""
+
+
 @dataclass(frozen=True)
 class Tls:
     """PEM files for mutual TLS: certificate authority of the mission, certificate and private key of this process."""

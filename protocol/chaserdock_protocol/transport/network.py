@@ -17,12 +17,13 @@ import time
 import uuid
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from msgspec import Struct
 
 from .bounded_queue import BoundedQueue
 
+T = TypeVar("T", bound=Struct)
 Undo = Callable[[], None]
 """Ends what the call that returned it has begun."""
 
@@ -120,6 +121,10 @@ class Connection(Protocol):
 
     def put(self, raw: RawSample) -> None:
         """Send a payload on any key."""
+        ...
+
+    def decode(self, kind: type[T], raw: RawSample) -> T:
+        """Decode and validate a sample; raises Rejected as ``codec.decode`` does."""
         ...
 
     def subscribe(self, expression: str, arrived: Callable[[RawSample], None]) -> None: ...

@@ -23,7 +23,7 @@ from chaserdock_protocol.topics import Role, Topic
 
 from .bounded_queue import BoundedQueue
 from .config import Link, ReceivedMessage, TransportError
-from .network import Network, Query, RawSample, Undo
+from .network import Network, Query, RawSample, T, Undo
 from .zenoh_network import ZenohNetwork
 
 
@@ -263,11 +263,15 @@ class Node:
         self._ready.extend(ReceivedMessage(topic, place, m, raw.sent_ns, arrived_s) for m in delivered)
         return self._ready.popleft() if self._ready else None
 
+    def decode(self, kind: type[T], raw: RawSample) -> T:
+        """Decode and validate a sample; raises Rejected."""
+        return self._connection.decode(kind, raw)
+
     def _decode(
         self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float = 0.0
     ) -> ReceivedMessage | None:
         try:
-            message: Any = codec.decode(topic.kind, raw.payload, raw.encoding)
+            message: Any = self.decode(topic.kind, raw)
             if place is not None and str(getattr(message, "chaser", place)) != place:
                 raise Rejected("chaser", f"message of chaser {message.chaser} on {raw.key}")
         except Rejected as refusal:

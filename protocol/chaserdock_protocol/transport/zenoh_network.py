@@ -14,8 +14,10 @@ from typing import Any, Literal
 
 import zenoh
 
-from .config import QUEUE_OPTIONS, Link, Tls, TransportError, is_unreachable, open_error
-from .network import Connection, Host, Machine, Query, RawSample, Reply, Undo
+from chaserdock_protocol import codec
+
+from .config import QUEUE_OPTIONS, Link, NoRouterError, Tls, TransportError, is_unreachable, open_error
+from .network import Connection, Host, Machine, Query, RawSample, Reply, T, Undo
 
 _PRIORITY = {
     "bulk": zenoh.Priority.DATA,
@@ -106,7 +108,8 @@ class ZenohNetwork:
                 return _ZenohConnection(self._open_client(config)), Machine()
             return _ZenohConnection(zenoh.open(config)), Machine()
         except zenoh.ZError as error:
-            raise TransportError(open_error(error, self._link)) from None
+            kind = NoRouterError if is_unreachable(error) else TransportError
+            raise kind(open_error(error, self._link)) from None
 
     def _open_client(self, config: zenoh.Config) -> zenoh.Session:
         """Open a client session by attempts of limited duration. Raises ZError after the link's time.
@@ -185,6 +188,9 @@ class _ZenohConnection:
                 yield Reply(reply.ok.payload.to_bytes(), str(reply.ok.encoding))
             elif reply.err is not None and reply.err.payload.to_bytes() not in (b"Timeout", b""):
                 yield Reply(b"", "", reply.err.payload.to_string())
+
+    def decode(self, kind: type[T], raw: RawSample) -> T:
+        return codec.decode(kind, raw.payload, raw.encoding)
 
     def declare_liveliness(self, key: str) -> None:
         self._declared.append(self._session.liveliness().declare_token(key))

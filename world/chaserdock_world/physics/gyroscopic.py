@@ -38,13 +38,15 @@ def midpoint_torque(
     world axes, rad/s. Plain floats, as this runs for every body in every physics step.
     """
     a, b, c = _rotate_to_body(xyzw, omega_world)
-    gx, gy, gz = _gyroscopic_torque(inertia, a, b, c)
+    ia, ib, ic = inertia
+    # _gyroscopic_torque, twice, without the calls.
+    ab, bc, ca = ib - ia, ic - ib, ia - ic
+    gx, gy, gz = b * c * bc, c * a * ca, a * b * ab
     h = 0.5 * step_s
-    ma = a + h * (torque[0] - gx) / inertia[0]
-    mb = b + h * (torque[1] - gy) / inertia[1]
-    mc = c + h * (torque[2] - gz) / inertia[2]
-    nx, ny, nz = _gyroscopic_torque(inertia, ma, mb, mc)
-    return (gx - nx, gy - ny, gz - nz)
+    ma = a + h * (torque[0] - gx) / ia
+    mb = b + h * (torque[1] - gy) / ib
+    mc = c + h * (torque[2] - gz) / ic
+    return (gx - mb * mc * bc, gy - mc * ma * ca, gz - ma * mb * ab)
 
 
 def midpoint_torque_of_rates(

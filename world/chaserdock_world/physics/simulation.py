@@ -219,15 +219,11 @@ class Physics:
         frame, client = pybullet.LINK_FRAME, self._client
         force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
         pose_of, rates_of = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
-        before = self._before
+        step, contact_points = pybullet.stepSimulation, pybullet.getContactPoints
+        before, jointed = self._before, set[int]()
         for _ in range(steps):
-            for name, latch in self.latches.items():
-                if latch.apply_due_commands(self.step_count):
-                    self._detach(name)
-                if latch.faults and latch.latched:
-                    self._apply_latch_faults(name, latch)
-            attached = (*self._joints, *self._compliant)
-            jointed = {self._bodies[name] for name in (*attached, TARGET)} if attached else ()
+            if self.latches:
+                jointed = self._update_joints()
             # Bullet clears external forces after every step.
             for body, inertia, force, torque in loads:
                 pose, rates = pose_of(body, client), rates_of(body, client)
@@ -237,28 +233,42 @@ class Physics:
                 else:
                     x, y, z = midpoint_torque(inertia, pose[1], rates[1], torque, step_s)
                 before[body] = pose, rates
-                force_on(body, -1, force, (0, 0, 0), frame, client)
+                if any(force):
+                    force_on(body, -1, force, (0, 0, 0), frame, client)
                 torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
-                self._apply_orbital(body, pose, rates)
+                if self._orbital is not None:
+                    self._apply_orbital(self._orbital, body, pose, rates)
             if self._compliant:
                 self._apply_compliant_latches()
-            pybullet.stepSimulation(client)
+            step(client)
             self.step_count += 1
             if self._joints:
                 self._record_loads()
             # A bounce may last a single step, so contacts are checked after each.
-            if pybullet.getContactPoints(physicsClientId=client):
-                pairs, tips = self._find_contacts()
-                touched.update(pairs)
-                self._update_latches(tips)
+            if contact_points(physicsClientId=client):
+                touched.update(self._process_contacts())
             if moves and self.step_count % self._steps_per_target_update == 0:
                 self.place(TARGET, self.state(TARGET))
         return touched
 
-    def _apply_orbital(self, body: int, pose: Any, rates: Any) -> None:
-        """Apply the loads of the orbit to a body for one step; ``pose``, ``rates``: Bullet's. None in free space."""
-        if (orbital := self._orbital) is None:
-            return
+    def _process_contacts(self) -> tuple[tuple[str, str], ...]:
+        """Pass the contacts of the last step to the latches; return ``contacts``."""
+        pairs, tips = self._find_contacts()
+        self._update_latches(tips)
+        return pairs
+
+    def _update_joints(self) -> set[int]:
+        """Execute the latches' commands and faults that are due; return the bodies with a closed latch."""
+        for name, latch in self.latches.items():
+            if latch.apply_due_commands(self.step_count):
+                self._detach(name)
+            if latch.faults and latch.latched:
+                self._apply_latch_faults(name, latch)
+        attached = (*self._joints, *self._compliant)
+        return {self._bodies[name] for name in (*attached, TARGET)} if attached else set()
+
+    def _apply_orbital(self, orbital: OrbitalForces, body: int, pose: Any, rates: Any) -> None:
+        """Apply the loads of the orbit to a body for one step; ``pose``, ``rates``: Bullet's."""
         name = self._names[body]
         plant = self.plants[name]
         orbital.set_step(self.step_count)

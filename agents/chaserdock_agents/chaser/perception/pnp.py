@@ -12,7 +12,7 @@ import math
 import statistics
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import cv2
 import numpy as np
@@ -88,12 +88,13 @@ class MarkerTable:
         """Corners (4 m, 3), origins (m, 3) and normals (m, 3), to be rotated together."""
         return np.concatenate([self.corners.reshape(-1, 3), self.origins, self.normals])
 
-    @classmethod
-    def of(cls, model: TargetModel) -> MarkerTable:
-        """Return the table of a model's markers, in their order."""
+    @staticmethod
+    @lru_cache(maxsize=8)
+    def of(model: TargetModel) -> MarkerTable:
+        """Return the table of a model's markers, in their order; not to be written to, as it is shared."""
         markers = model.markers
         margins_m = np.array([clear_margin_m(model, m) for m in markers])
-        return cls(
+        return MarkerTable(
             np.array([m.id for m in markers], dtype=np.int64),
             np.array([m.corners_trf_m() for m in markers]).reshape(-1, 4, 3),
             np.array([m.position_trf_m for m in markers]).reshape(-1, 3),

@@ -26,6 +26,9 @@ Flags = NDArray[np.bool_]
 
 _MIN_GAIN = 20.0
 """Minimum log-likelihood ratio to the fault-free hypothesis: 1 in 5e8, at some thousand tests per minute and thruster."""
+_MIN_ENERGY = 1.9 * _MIN_GAIN
+"""Energy r'r of whitened residuals below which no hypothesis is accepted: none gains more than half of it (Cauchy-Schwarz),
+and the mismatch only reduces it. 5 % are left for rounding."""
 _MIN_MARGIN = 8.0
 """Minimum log-likelihood ratio to the second-best thruster."""
 _ON_WINDOWS = (2, 3, 4, 6, 8)
@@ -167,14 +170,17 @@ class ThrusterFaultDetector:
 
 
 def _totals(ticks: deque[Array], windows: tuple[int, ...]) -> Iterator[tuple[int, Array]]:
-    """Yield the sums over the last ticks, for each of the ``windows`` that is full."""
+    """Yield the sums over the last ticks, for each of the ``windows`` that is full and has enough energy for a fault."""
+    if sum([float(tick[0]) for tick in ticks]) < _MIN_ENERGY:
+        return
     total, first = np.zeros_like(ticks[-1]), len(ticks)
     for length in windows:
         if len(ticks) < length:
             return
         total = total + np.sum([ticks[k] for k in range(len(ticks) - length, first)], axis=0)
         first = len(ticks) - length
-        yield length, total
+        if total[0] >= _MIN_ENERGY:
+            yield length, total
 
 
 def _is_distinct(gain: Array, best: int) -> bool:

@@ -138,10 +138,33 @@ class _Estimate:
     biases: Array
 
 
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """``transition`` of the error state; ``pushed`` (6, u): change of velocity (WRF) and rate (TRF) by 1 N s of each thruster that
+    may fire; ``impulses_N_s`` (u,) that they were to give in ``step_s``."""
+
+    transition: Array
+    pushed: Array
+    impulses_N_s: Array
+    step_s: float
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """``matrix`` (K, size) of the measurement, ``gain`` (size, K), Cholesky ``factor`` of the residual's covariance as of SciPy,
+    ``residual`` (K,)."""
+
+    matrix: Array
+    gain: Array
+    factor: tuple[Array, bool]
+    residual: Array
+
+
 class CompositeIdentification:
     """Filter for the stack of ``chasers``; call ``predict`` with the pulses since the last tick, then ``update``.
 
-    ``prior``: mass properties of the stack, as from ``attach``. ``usable`` (n,) of every chaser: thrusters that may fire; the
+    ``prior``: mass properties of the stack, as from ``attach``. ``measured``: how many chasers, the first ones, have a measured
+    state; without it all. ``usable`` (n,) of every chaser: thrusters that may fire; the
     scale of the others is not estimated.
     """
 
@@ -154,6 +177,7 @@ class CompositeIdentification:
         usable: Mapping[int, Flags],
         errors: NavigationErrors,
         parameters: IdentificationParameters,
+        measured: int | None = None,
     ) -> None:
         self.chasers = tuple(chasers)
         self._thrusters, self._n = wrench_matrix(thrusters), len(thrusters)
@@ -161,7 +185,8 @@ class CompositeIdentification:
         self._errors, self._parameters = errors, parameters
         mounts_m = np.array([c.position_m for c in chasers.values()])
         mounts_wxyz = np.array([c.q_wxyz for c in chasers.values()])
-        self._estimate = _start(prior.body, mounts_m, mounts_wxyz, [states[i] for i in self.chasers], self._n)
+        first = [states[i] for i in self.chasers[:measured]]
+        self._estimate = _start(prior.body, mounts_m, mounts_wxyz, first, self._n)
         self.covariance = self._prior_covariance(prior, len(self.chasers))
         self.ticks = 0
         self.nis = 0.0
@@ -215,25 +240,28 @@ class CompositeIdentification:
 
     # -- prediction ------------------------------------------------------------------------------------------
 
-    def predict(self, impulses_N_s: Mapping[int, Array], step_s: float) -> Array:
+    def predict(
+        self, impulses_N_s: Mapping[int, Array], step_s: float, unknown: Mapping[int, Array] | None = None
+    ) -> Prediction:
         """Advance by ``step_s`` with the impulses (n,) that the thrusters of every chaser were to give since the last tick.
 
-        Half of the impulse acts at the begin and half at the end. Return the transition matrix.
+        Half of the impulse acts at the begin and half at the end. ``unknown`` (n,): standard deviations of further impulses
+        by chaser, whose thrusters were not reported.
         """
         x, p = self._estimate, self._parameters
-        stated = np.concatenate([impulses_N_s.get(i, np.zeros(self._n)) for i in self.chasers])
+        stated = self._of_all(impulses_N_s)
         impulses = stated * (1.0 + x.thrusts)
         wrenches = self._wrenches()
         total = wrenches @ impulses
         rotation = rotations.to_matrix(x.q_wxyz)
-        inverse = np.linalg.inv(x.body.inertia_kg_m2)
+        inverse = _inverse(x.body.inertia_kg_m2)
         kick, turn = rotation @ total[:3] / x.body.mass_kg, inverse @ total[3:]
         omega = x.omega_rad_s + turn / 2.0
         qs, omegas, alphas = free_rotation(x.q_wxyz, omega, x.body.inertia_kg_m2, step_s, 2)
         transition = self._transition(rotation, inverse, omega, alphas[0], stated, impulses, step_s)
         pushed = np.concatenate([rotation @ wrenches[:3] / x.body.mass_kg, inverse @ wrenches[3:]])
         rows = [3, 4, 5, 9, 10, 11]
-        noise = pushed * (p.scatter_share * impulses)
+        noise = pushed * np.hypot(p.scatter_share * impulses, self._of_all(unknown or {}))
         self.covariance = transition @ self.covariance @ transition.T
         self.covariance[np.ix_(rows, rows)] += noise @ noise.T
         floors = np.repeat([p.floor_velocity_m_s, p.floor_omega_rad_s], 3) ** 2
@@ -245,7 +273,11 @@ class CompositeIdentification:
             q_wxyz=qs[1],
             omega_rad_s=omegas[1] + turn / 2.0,
         )
-        return transition
+        return Prediction(transition, pushed[:, self._usable], stated[self._usable], step_s)
+
+    def _of_all(self, by_chaser: Mapping[int, Array]) -> Array:
+        """Return the figures of all thrusters (N n,), zero where a chaser has none."""
+        return np.concatenate([by_chaser.get(i, np.zeros(self._n)) for i in self.chasers])
 
     def _wrenches(self) -> Array:
         """Return the wrenches (6, N n) about the centre of mass of 1 N of every thruster, TRF axes."""
@@ -310,12 +342,12 @@ class CompositeIdentification:
 
     # -- update ----------------------------------------------------------------------------------------------
 
-    def update(self, states: Mapping[int, BodyState]) -> None:
-        """Take the measured states of the chasers at this tick."""
+    def update(self, states: Mapping[int, BodyState]) -> Innovation | None:
+        """Take the measured states of the chasers at this tick; return the innovation, None without any state."""
         self.ticks += 1
         rows = [row for row, chaser in enumerate(self.chasers) if chaser in states]
         if not rows:
-            return
+            return None
         parts = [self._measurement(row, states[self.chasers[row]]) for row in rows]
         h, residual = np.concatenate([m for m, _ in parts]), np.concatenate([r for _, r in parts])
         noise = np.tile(self._noise, len(rows))
@@ -330,6 +362,42 @@ class CompositeIdentification:
         kept = kept - (kept @ h.T) @ gain.T + (gain * noise) @ gain.T
         self.covariance = (kept + kept.T) / 2.0
         self._estimate = self._corrected(self._estimate, correction)
+        return Innovation(h, gain, factor, residual)
+
+    def correct(self, shift: Array, sigma_share: float) -> None:
+        """Shift the error state by ``shift`` (size,), known up to ``sigma_share`` of it."""
+        self._estimate = self._corrected(self._estimate, shift)
+        self.covariance = self.covariance + sigma_share**2 * np.outer(shift, shift)
+
+    def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None:
+        """Widen the motion by an unknown shock with these standard deviations per axis."""
+        for part, sigma in ((VELOCITY, velocity_m_s), (RATE, omega_rad_s)):
+            self.covariance[part, part] += sigma**2 * np.eye(3)
+
+    def pulse_gains(self, impulse_N_s: float, noise: Array, scale: Array) -> Array:
+        """Return how much a pulse of each thruster that may fire reduces the variances of the mass properties, in units of
+        ``scale`` (10,), if the change of velocity and rate is then measured with standard deviations ``noise`` (6,)."""
+        x = self._estimate
+        rotation, inverse = rotations.to_matrix(x.q_wxyz), _inverse(x.body.inertia_kg_m2)
+        rows = [*range(3, 6), *range(9, 12)]
+        none = np.zeros(self._n * len(self.chasers))
+        rest = self._transition(rotation, inverse, x.omega_rad_s, np.zeros(3), none, none, 0.0)[rows]
+        unit = scale.copy()
+        unit[0] /= x.body.mass_kg
+        gains = []
+        for k in self._usable:
+            stated = none.copy()
+            stated[k] = impulse_N_s
+            given = stated * (1.0 + x.thrusts)
+            effect = (
+                self._transition(rotation, inverse, x.omega_rad_s, np.zeros(3), stated, given, 0.0)[rows]
+                - rest
+            )
+            cross = effect @ self.covariance
+            spread = cross @ effect.T + np.diag(noise**2)
+            shared = cross[:, PROPERTIES] / unit
+            gains.append(float(np.sum(shared * np.linalg.solve(spread, shared))))
+        return np.array(gains)
 
     def _measurement(self, row: int, measured: BodyState) -> tuple[Array, Array]:
         """Return the matrix (12, size) of a chaser's odometry, and its residual: position, velocity, attitude, rate."""
@@ -387,6 +455,11 @@ class CompositeIdentification:
     # -- results ---------------------------------------------------------------------------------------------
 
     @property
+    def usable(self) -> list[tuple[int, int]]:
+        """Return chaser and number of the thrusters that may fire, in the order of ``Prediction``."""
+        return [(self.chasers[k // self._n], int(k % self._n)) for k in self._usable]
+
+    @property
     def stack(self) -> MassProperties:
         """Return the mass properties of the stack."""
         scale = np.ones(10)
@@ -418,15 +491,19 @@ class CompositeIdentification:
         return dict(zip(self.chasers, rows, strict=True))
 
 
+def _inverse(matrix: Array) -> Array:
+    return np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+
+
 def _start(
     body: TargetBody, mounts_m: Array, mounts_wxyz: Array, states: Sequence[BodyState], thrusters: int
 ) -> _Estimate:
     """Return the state of the filter by the first measurements."""
     q = rotations.multiply(states[0].q_wxyz, rotations.conjugate(mounts_wxyz[0]))
     omega = np.mean(
-        [rotations.rotate(m, s.omega_rad_s) for m, s in zip(mounts_wxyz, states, strict=True)], axis=0
+        [rotations.rotate(m, s.omega_rad_s) for m, s in zip(mounts_wxyz, states, strict=False)], axis=0
     )
-    arms = mounts_m - body.centre_trf_m
+    arms = mounts_m[: len(states)] - body.centre_trf_m
     places = [s.position_m - rotations.rotate(q, arm) for s, arm in zip(states, arms, strict=True)]
     velocities = [
         s.velocity_m_s - rotations.rotate(q, rotations.cross(omega, arm))
@@ -440,6 +517,6 @@ def _start(
         body,
         mounts_m,
         mounts_wxyz,
-        np.zeros(thrusters * len(states)),
-        np.zeros((len(states), 3)),
+        np.zeros(thrusters * len(mounts_m)),
+        np.zeros((len(mounts_m), 3)),
     )

@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
 from scipy.optimize import linprog
-from scipy.sparse import csr_matrix, hstack, kron
-from scipy.sparse import eye as sparse_eye
+from scipy.sparse import csr_array, eye_array, hstack, kron
 
 from .allocation import units_of
+
+Indices = NDArray[np.intp]
 
 _PENALTY = 30.0
 """Price of a remaining momentum over that of the impulse that would remove it in the thrusters' best direction."""
@@ -39,7 +42,7 @@ class StackProblem:
     inertia_kg_m2: Array
     wrenches: Array
     limits_N: Array
-    groups: Array
+    groups: Indices
     at_once: int | None = None
 
 
@@ -126,7 +129,7 @@ def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
     return _Flight(np.concatenate([p, h]), middles, rates, momenta, bodies)
 
 
-def _sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Array) -> Array:
+def _sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Indices) -> Array:
     """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters ``able`` at every step."""
     inverse = np.linalg.inv(problem.inertia_kg_m2)
     own = problem.wrenches[:, able]
@@ -143,8 +146,10 @@ def _sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Ar
         total[3:] = np.eye(3)
         # By the attitude in the middle of the step, and by the rate in it.
         by_rate = step_s * by_turn
-        middle = pushed + by_spin @ pushed[3:] + by_rate @ inverse @ (
-            rotations.skew(h) - half * rotations.skew(torque)
+        middle = (
+            pushed
+            + by_spin @ pushed[3:]
+            + by_rate @ inverse @ (rotations.skew(h) - half * rotations.skew(torque))
         )
         direct = np.concatenate([r @ own[:3], r @ own[3:]]) * step_s
         rows[k] = direct + by_spin @ direct[3:] + by_rate @ inverse @ (half * own[3:])
@@ -155,7 +160,7 @@ def _sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Ar
     return rows.transpose(1, 0, 2).reshape(6, -1)
 
 
-def _price(problem: StackProblem, able: Array) -> Array:
+def _price(problem: StackProblem, able: Indices) -> Array:
     """Return the penalty (6,) per N s and N m s of remaining momentum."""
     force, torque = units_of(problem.wrenches[:, able], problem.limits_N[able])
     thrust = float(problem.limits_N[able].max())
@@ -171,7 +176,7 @@ def _linear_step(
     flight: _Flight,
     thrusts_N: Array,
     step_s: float,
-    able: Array,
+    able: Indices,
     price: Array,
     radius: float,
 ) -> tuple[Array, float]:
@@ -206,12 +211,12 @@ def _linear_step(
     return step, float(found.fun)
 
 
-def _sequencing(problem: StackProblem, able: Array, count: int) -> tuple[csr_matrix | None, Array | None]:
-    """Return the rows that let at most ``at_once`` thrusters of a chaser fire in a step."""
+def _sequencing(problem: StackProblem, able: Indices, count: int) -> tuple[Any, Array | None]:
+    """Return the rows (sparse) that let at most ``at_once`` thrusters of a chaser fire in a step; None without a limit."""
     if problem.at_once is None:
         return None, None
     groups = problem.groups[able]
-    own = np.array([groups == g for g in np.unique(groups)], dtype=float)
-    rows = kron(sparse_eye(count), csr_matrix(own))
-    rows = hstack([rows, csr_matrix((rows.shape[0], 12))], format="csr")
-    return rows, np.full(rows.shape[0], float(problem.at_once))
+    own = csr_array(np.array([groups == g for g in np.unique(groups)], dtype=float))
+    number = count * len(np.unique(groups))
+    rows = hstack([kron(eye_array(count), own), csr_array((number, 12))], format="csr")
+    return rows, np.full(number, float(problem.at_once))

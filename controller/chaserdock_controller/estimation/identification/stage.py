@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification in a mission: runs the filter of the stack while chasers are latched, and its fault detection."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.mounting import nominal_mounting, plume_free_thrusters
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+
+from chaserdock_controller.estimation.composite_body import pose_in_target, target_body
+from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
+
+from .composite import CompositeIdentification, IdentificationParameters, attach, prior_of
+from .faults import StackFault, StackFaultDetector, apply_fault
+
+_SHOCK = (0.01, 0.02)
+"""One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
+_PULSE_S = 0.3
+_WATCH_S = 1.0
+"""Time over which a pulse's effect is thought to be measured when pulses are compared."""
+_PULSES_EVERY_S = 0.5
+_GOOD = (0.02, 0.005, 0.05)
+"""Accuracy that is worth the same of mass (share), centre (m) and inertia (share of the largest moment)."""
+_SETTLED_TICKS = 10
+
+
+def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
+    """Return the filter's parameters."""
+    s = scenario.detumble.identification
+    return IdentificationParameters(
+        mass_share=s.mass_share,
+        inertia_share=s.inertia_share,
+        centre_m=s.centre_of_mass_m,
+        thrust_share=s.thrust_share,
+        scatter_share=s.pulse_scatter_share,
+    )
+
+
+class StackIdentification:
+    """The filter of the stack that is latched now. ``target``: what is known of the target alone, kept when chasers come and go."""
+
+    def __init__(self, scenario: FlightScenario) -> None:
+        self._scenario, self._parameters = scenario, parameters_of(scenario)
+        self._period_s = 1.0 / scenario.time.rate_hz
+        self._full_N = thrusts_max(scenario.chaser.thrusters)
+        self.target = prior_of(target_body(scenario), self._parameters)
+        self.failed: dict[int, tuple[int, ...]] = {}
+        self._filter: CompositeIdentification | None = None
+        self._detector: StackFaultDetector | None = None
+        self._usable: Mapping[int, Array] = {}
+        self._informative: tuple[tuple[int, int], ...] = ()
+        self._events: list[LogEntry] = []
+
+    def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
+        """Take a tick's odometry and pulses; return None while nothing is latched or the target is unknown."""
+        latched = estimation.latched
+        if not latched or not estimation.known or not latched & observation.odometry.keys():
+            self._filter = None
+            return None
+        states = {
+            i: body_state(observation.odometry[i]) for i in sorted(latched & observation.odometry.keys())
+        }
+        if self._filter is None or set(self._filter.chasers) != latched:
+            self._begin(estimation, states)
+        else:
+            self._predict(observation)
+        assert self._filter is not None
+        innovation = self._filter.update(states)
+        if innovation is not None and self._detector is not None:
+            suspects = np.array([t not in self.failed.get(i, ()) for i, t in self._filter.usable], dtype=bool)
+            found = self._detector.update(innovation, suspects)
+            if found is not None:
+                self._add_fault(*found)
+        self.target = self._filter.target(self._scenario.chaser)
+        if self._filter.ticks % max(1, round(_PULSES_EVERY_S / self._period_s)) == 1:
+            self._informative = self._by_information()
+        return IdentifiedStack(
+            stack=self._filter.stack,
+            target=self.target,
+            chasers=self._filter.mounted,
+            motion=self._filter.motion,
+            thrust_factors=self._filter.thrust_factors,
+            failed=dict(self.failed),
+            informative=self._informative,
+        )
+
+    def identified(self, observation: Observation, estimation: TargetEstimation) -> TargetEstimation:
+        """Return the estimation with the identified stack and its events."""
+        stack = self.run(observation, estimation)
+        events, self._events = self._events, []
+        return replace(estimation, stack=stack, events=(*estimation.events, *events))
+
+    def _begin(self, estimation: TargetEstimation, states: Mapping[int, BodyState]) -> None:
+        s, chasers = self._scenario, {}
+        for i in sorted(estimation.latched):
+            own = estimation.own.get(i)
+            chasers[i] = (
+                nominal_mounting(s, i)
+                if own is None
+                else MountedChaser(*pose_in_target(estimation.target, own))
+            )
+        # The measured ones first: the filter starts from them.
+        chasers = {i: chasers[i] for i in sorted(chasers, key=lambda i: (i not in states, i))}
+        usable = plume_free_thrusters(s, estimation.latched)
+        prior = attach(self.target, chasers, s.chaser)
+        errors = s.navigation.errors()
+        self._filter = CompositeIdentification(
+            prior, chasers, states, s.chaser.thrusters, usable, errors, self._parameters, len(states)
+        )
+        full = np.array([self._full_N[t] for _, t in self._filter.usable])
+        self._detector = StackFaultDetector(self._filter.usable, len(self._filter.covariance), full)
+
+    def _predict(self, observation: Observation) -> None:
+        assert self._filter is not None
+        assert self._detector is not None
+        given = {i: j for i, j in observation.thruster_impulses.items() if i in self._filter.chasers}
+        # A chaser with odometry whose report is lost may have fired; one without any is dead.
+        silent = [i for i in self._filter.chasers if i in observation.odometry and i not in given]
+        unknown = dict.fromkeys(silent, self._full_N * self._period_s)
+        self._detector.predict(self._filter.predict(given, self._period_s, unknown))
+        if any(d.contact and not d.latched for d in observation.docking.values()):
+            self._filter.disturb(*_SHOCK)
+
+    def _add_fault(self, fault: StackFault, effect: Array) -> None:
+        assert self._filter is not None
+        apply_fault(self._filter, effect)
+        self.failed[fault.chaser] = tuple(sorted({*self.failed.get(fault.chaser, ()), fault.thruster}))
+        kind = fault.kind.replace("_", " ")
+        text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
+        self._events.append(("warning", text))
+
+    def _by_information(self) -> tuple[tuple[int, int], ...]:
+        """Return the thrusters by what a pulse tells about the mass properties, the best first."""
+        assert self._filter is not None
+        errors, stack = self._scenario.navigation.errors(), self._filter.stack
+        count = len(self._filter.chasers) * _WATCH_S / self._period_s
+        noise = (
+            np.repeat([errors.velocity_noise_m_s, errors.omega_noise_rad_s], 3) * math.sqrt(2.0 / count)
+            + 1e-7
+        )
+        largest = float(np.linalg.eigvalsh(stack.body.inertia_kg_m2)[-1])
+        scale = np.array([_GOOD[0] * stack.body.mass_kg, *[_GOOD[1]] * 3, *[_GOOD[2] * largest] * 6])
+        gains = self._filter.pulse_gains(float(self._full_N.max()) * _PULSE_S, noise, scale)
+        usable = self._filter.usable
+        order = np.argsort(-gains, kind="stable")
+        return tuple(usable[k] for k in order if usable[k][1] not in self.failed.get(usable[k][0], ()))
+
+
+def body_state(o: Odometry) -> BodyState:
+    """Return the state in an odometry message."""
+    return BodyState(
+        np.array(o.position_m), np.array(o.velocity_m_s), np.array(o.q_wxyz), np.array(o.omega_rad_s)
+    )

@@ -19,7 +19,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
 from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.messages import Odometry, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.mounting import nominal_mounting
 from chaserdock_protocol.scenario.thrusters import thrusts_max
@@ -48,10 +48,12 @@ class SilentOutcome:
 
 @dataclass(frozen=True, eq=False)
 class StackStep:
-    """One tick of a stack: impulse of all thrusters (N s), and by chaser the impulses (n,) that its thrusters should give."""
+    """One tick of a stack: impulse of all thrusters (N s), and by chaser the impulses (n,) that its thrusters should have given,
+    and the impulse (6,), body axes, that they should give until the next command acts."""
 
     used_N_s: float
     stated_N_s: Mapping[int, Array]
+    coming: Mapping[int, Array]
 
 
 class RigidStack:
@@ -78,7 +80,7 @@ class RigidStack:
         self._flight = flight
         self._damping: dict[int, LocalDamping] = {}
         thrusters = scenario.chaser.thrusters
-        self._full_N = thrusts_max(thrusters)
+        self._full_N, self._own = thrusts_max(thrusters), wrench_matrix(thrusters)
         self._modulators = {
             i: Modulator(thrusters, scenario.chaser.modulation, scenario.timing) for i in self.mounted
         }
@@ -93,6 +95,7 @@ class RigidStack:
                     failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor
                 )
             self._wrenches[i] = chaser.wrench_to_stack(wrench_matrix(true), self.body.centre_trf_m)
+        self._shortest_ns = [round(t.min_on_s * 1e9) for t in thrusters]
         self._sensor = OdometrySensor(scenario)
 
     def rates(self) -> tuple[float, float]:
@@ -121,24 +124,28 @@ class RigidStack:
             self._damping = {i: LocalDamping(self._flight, i) for i in self.mounted}
         return {i: damping.thrusts_N(self.measure(i)) for i, damping in self._damping.items()}
 
-    def step(self, thrusts_N: Mapping[int, Array]) -> StackStep:
-        """Fly one tick with commanded thrusts (n,) by chaser."""
+    def step(
+        self, thrusts_N: Mapping[int, Array], shut: Mapping[int, tuple[int, ...]] | None = None
+    ) -> StackStep:
+        """Fly one tick with commanded thrusts (n,) by chaser; ``shut``: thrusters whose shut-off valve is closed."""
         timing = self.scenario.timing
         begin_ns, end_ns = timing.tick_time_ns(self.tick), timing.tick_time_ns(self.tick + 1)
         edges_ns = np.linspace(begin_ns, end_ns, _SUBSTEPS + 1).astype(int)
         impulses = np.zeros((_SUBSTEPS, 6))
-        used_N_s, stated = 0.0, {}
+        used_N_s, stated, coming = 0.0, {}, {}
+        next_ns = timing.effective_ns(self.tick + 1)
         for i, modulator in self._modulators.items():
             if i in thrusts_N:
-                span_ns = timing.effective_ns(self.tick), timing.effective_ns(self.tick + 1)
+                span_ns = timing.effective_ns(self.tick), next_ns
+                for valves in (self._valves[i], self._stated_valves[i]):
+                    valves.set_shut((shut or {}).get(i, ()), span_ns[0])
                 for p in modulator.pulses(thrusts_N[i], self._full_N, *span_ns):
-                    scatter = 1.0
-                    if self._errors[i].scatter_share:
-                        scatter = float(self._errors[i].scatter(p.thruster, p.open_ns, 1)[0])
-                    close_ns = p.open_ns + round(scatter * (p.close_ns - p.open_ns))
+                    close_ns = p.open_ns + self._width_ns(i, p)
                     self._valves[i].pulse(p.thruster, p.open_ns, close_ns)
                     self._stated_valves[i].pulse(p.thruster, p.open_ns, p.close_ns)
             given = self._valves[i].impulses(edges_ns)
+            ahead = self._stated_valves[i].impulses(np.array([end_ns, next_ns + 1_000_000_000]))[0]
+            coming[i] = self._own @ (ahead - modulator.advance_N_s(next_ns))
             stated[i] = self._stated_valves[i].impulses(edges_ns[[0, -1]])[0]
             for valves in (self._valves[i], self._stated_valves[i]):
                 valves.forget_before(begin_ns)
@@ -147,7 +154,15 @@ class RigidStack:
         for impulse in impulses:
             self._advance(impulse, (end_ns - begin_ns) * 1e-9 / _SUBSTEPS)
         self.tick += 1
-        return StackStep(used_N_s, stated)
+        return StackStep(used_N_s, stated, coming)
+
+    def _width_ns(self, chaser: int, pulse: ThrusterPulse) -> int:
+        """Return how long a pulse opens its valve: as commanded, up to scatter, but not below the minimum on-time."""
+        errors, width = self._errors[chaser], pulse.close_ns - pulse.open_ns
+        if not errors.scatter_share:
+            return width
+        scattered = round(width * float(errors.scatter(pulse.thruster, pulse.open_ns, 1)[0]))
+        return max(scattered, min(width, self._shortest_ns[pulse.thruster]))
 
     def _advance(self, impulse: Array, step_s: float) -> None:
         """Advance by ``step_s`` with an impulse (6,), TRF axes, half of it before and half after a free rotation."""

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -113,8 +113,8 @@ class IdentifiedStack:
     """Mass properties of the stack and of the target alone, as identified until now.
 
     ``chasers``: where they are fixed. ``motion``: of the centre of mass (WRF) and the target's axes. ``thrust_factors`` (n,):
-    estimated over stated thrust, by chaser. ``failed``: thrusters found stuck, by chaser. ``informative``: thrusters (chaser,
-    number) whose pulses would tell most about the mass properties, the best first.
+    estimated over stated thrust, by chaser. ``failed``: thrusters found stuck, by chaser. ``informative`` returns the
+    thrusters (chaser, number) whose pulses would tell most about the mass properties, the best first.
     """
 
     stack: MassProperties
@@ -123,7 +123,7 @@ class IdentifiedStack:
     motion: BodyState
     thrust_factors: Mapping[int, Array]
     failed: Mapping[int, tuple[int, ...]]
-    informative: tuple[tuple[int, int], ...]
+    informative: Callable[[], tuple[tuple[int, int], ...]]
 
 
 @dataclass(frozen=True)

@@ -27,10 +27,8 @@ _SHOCK = (0.01, 0.02)
 _PULSE_S = 0.3
 _WATCH_S = 1.0
 """Time over which a pulse's effect is thought to be measured when pulses are compared."""
-_PULSES_EVERY_S = 0.5
 _GOOD = (0.02, 0.005, 0.05)
 """Accuracy that is worth the same of mass (share), centre (m) and inertia (share of the largest moment)."""
-_SETTLED_TICKS = 10
 
 
 def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
@@ -56,8 +54,6 @@ class StackIdentification:
         self.failed: dict[int, tuple[int, ...]] = {}
         self._filter: CompositeIdentification | None = None
         self._detector: StackFaultDetector | None = None
-        self._usable: Mapping[int, Array] = {}
-        self._informative: tuple[tuple[int, int], ...] = ()
         self._events: list[LogEntry] = []
 
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
@@ -81,8 +77,6 @@ class StackIdentification:
             if found is not None:
                 self._add_fault(*found)
         self.target = self._filter.target(self._scenario.chaser)
-        if self._filter.ticks % max(1, round(_PULSES_EVERY_S / self._period_s)) == 1:
-            self._informative = self._by_information()
         return IdentifiedStack(
             stack=self._filter.stack,
             target=self.target,
@@ -90,7 +84,7 @@ class StackIdentification:
             motion=self._filter.motion,
             thrust_factors=self._filter.thrust_factors,
             failed=dict(self.failed),
-            informative=self._informative,
+            informative=self._by_information,
         )
 
     def identified(self, observation: Observation, estimation: TargetEstimation) -> TargetEstimation:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from functools import lru_cache, partial
@@ -64,7 +64,7 @@ class StackState:
     q_wxyz: Array
     thrust_factors: Mapping[int, Array] = field(default_factory=dict)
     failed: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
-    informative: tuple[tuple[int, int], ...] = ()
+    informative: Callable[[], tuple[tuple[int, int], ...]] = tuple
 
     @property
     def omega_rad_s(self) -> Array:
@@ -75,7 +75,8 @@ class StackState:
 
 @dataclass(frozen=True, eq=False)
 class _Thrusters:
-    """Thrusters of the active ``chasers``: ``wrenches`` (6, n) of 1 N commanded, ``limits_N`` (n,); ``groups`` (n,): row of the chaser."""
+    """Thrusters of the active ``chasers``: ``wrenches`` (6, n) of 1 N commanded and ``limits_N`` (n,); ``groups`` (n,): row of
+    the chaser."""
 
     chasers: tuple[int, ...]
     wrenches: Array
@@ -100,6 +101,7 @@ class DetumbleControl:
         self.planner = None if plan_s is None else StackPlanner(plan_s)
         self.sequencer = Sequencer(scenario)
         self._judged: tuple[object, str] = (None, "")
+        self._pulse: tuple[int, int | None] = (-1, None)
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
         """Return the stack's state; None while the target is unknown or no latched chaser has odometry."""
@@ -200,21 +202,28 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum - wanted, thrusters)
 
     def _informative(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
-        """Return pulses of the thruster that tells most about the mass properties, of those that damp the motion."""
+        """Return a pulse of the thruster that tells most about the mass properties, of those that damp the motion."""
         thrusts = np.zeros(len(thrusters.limits_N))
+        number = now_ns // _PULSE_PERIOD_NS
         if now_ns % _PULSE_PERIOD_NS >= _PULSE_NS:
             return thrusts
-        count = len(self._full_N)
+        if self._pulse[0] != number:
+            self._pulse = number, self._best_pulse(state, thrusters)
+        k = self._pulse[1]
+        if k is not None and k < len(thrusts):
+            thrusts[k] = thrusters.limits_N[k]
+        return thrusts
+
+    def _best_pulse(self, state: StackState, thrusters: _Thrusters) -> int | None:
         velocity = state.motion.linear_N_s / state.body.mass_kg
         rates = np.concatenate([velocity, state.omega_rad_s])
-        for chaser, thruster in state.informative:
+        for chaser, thruster in state.informative():
             if chaser not in thrusters.chasers:
                 continue
-            k = thrusters.chasers.index(chaser) * count + thruster
+            k = thrusters.chasers.index(chaser) * len(self._full_N) + thruster
             if thrusters.limits_N[k] > 0.0 and float(thrusters.wrenches[:, k] @ rates) < 0.0:
-                thrusts[k] = thrusters.limits_N[k]
-                break
-        return thrusts
+                return k
+        return None
 
     def _feedback(self, momentum: Array, thrusters: _Thrusters) -> Array:
         return feedback(thrusters.wrenches, momentum, thrusters.limits_N, self._settings.response_s).thrusts_N

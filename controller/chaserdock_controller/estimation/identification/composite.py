@@ -369,6 +369,12 @@ class CompositeIdentification:
         self._estimate = self._corrected(self._estimate, shift)
         self.covariance = self.covariance + sigma_share**2 * np.outer(shift, shift)
 
+    def widen(self, factor: float) -> None:
+        """Multiply the standard deviations of the mass properties."""
+        scale = np.ones(len(self.covariance))
+        scale[PROPERTIES] = factor
+        self.covariance = self.covariance * np.outer(scale, scale)
+
     def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None:
         """Widen the motion by an unknown shock with these standard deviations per axis."""
         for part, sigma in ((VELOCITY, velocity_m_s), (RATE, omega_rad_s)):

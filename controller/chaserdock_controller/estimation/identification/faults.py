@@ -24,6 +24,8 @@ _LEAST_MARGIN = 6.0
 """Least difference to the best hypothesis about another thruster."""
 _CORRECTION_SIGMA = 0.2
 """Standard deviation of the effect of a detected failure so far, as a share of it."""
+_DOUBT = 3.0
+"""Factor of the standard deviations of the mass properties after a failure: what it did before its signature began is not known."""
 
 
 @dataclass(frozen=True)
@@ -77,3 +79,4 @@ class StackFaultDetector:
 def apply_fault(identification: CompositeIdentification, effect: Array) -> None:
     """Remove the effect of a failure that was not known from the state of the filter."""
     identification.correct(effect, _CORRECTION_SIGMA)
+    identification.widen(_DOUBT)

@@ -129,7 +129,7 @@ def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
     return _Flight(np.concatenate([p, h]), middles, rates, momenta, bodies)
 
 
-def _sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Indices) -> Array:
+def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Indices) -> Array:
     """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters ``able`` at every step."""
     inverse = np.linalg.inv(problem.inertia_kg_m2)
     own = problem.wrenches[:, able]
@@ -182,7 +182,7 @@ def _linear_step(
 ) -> tuple[Array, float]:
     """Return the change of the thrusts (K, n) that the linear programme gives, and the merit that it predicts."""
     count, a = len(thrusts_N), len(able)
-    jacobian = _sensitivity(problem, flight, step_s, able)
+    jacobian = sensitivity(problem, flight, step_s, able)
     now = thrusts_N[:, able].reshape(-1)
     limits = np.tile(problem.limits_N[able], count)
     lower, upper = np.maximum(0.0, now - radius * limits), np.minimum(limits, now + radius * limits)

@@ -188,9 +188,6 @@ def test_a_dead_thruster_is_named_and_its_effect_removed() -> None:
     dead = (3, int(np.flatnonzero(FREE)[2]))
     found, _, faults = run(stack, wrong_target(), 12.0, dead)
     assert [(f.chaser, f.thruster, f.kind) for _, f in faults] == [(*dead, "stuck_off")]
-    motion = found.motion
-    assert motion.omega_rad_s == pytest.approx(stack.omega, abs=2e-4)
-    assert motion.velocity_m_s == pytest.approx(stack.velocity, abs=3e-4)
     error = found.stack.values - properties_of(stack.body)
     assert abs(error[0]) < 0.1 * stack.body.mass_kg
     assert np.linalg.norm(error[1:4]) < 0.01

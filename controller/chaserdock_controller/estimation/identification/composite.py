@@ -24,7 +24,7 @@ from chaserdock_models.rigid_body import BodyState, RigidBody, free_rotation
 from chaserdock_models.wrench_set import ThrusterMount, wrench_matrix
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
 
@@ -350,19 +350,44 @@ class CompositeIdentification:
             return None
         parts = [self._measurement(row, states[self.chasers[row]]) for row in rows]
         h, residual = np.concatenate([m for m, _ in parts]), np.concatenate([r for _, r in parts])
-        noise = np.tile(self._noise, len(rows))
+        return self._update(h, residual, np.diag(np.tile(self._noise, len(rows))))
+
+    def update_poses(self, poses: Mapping[int, tuple[BodyState, Array]]) -> Innovation | None:
+        """Take measured poses, by chaser, with their covariances (6, 6): position (WRF) and attitude (axes of the measured body).
+
+        The rates in the states are not used. None without any pose.
+        """
+        self.ticks += 1
+        used = [*range(3), *range(6, 9)]
+        parts = []
+        for row, chaser in enumerate(self.chasers):
+            if chaser in poses:
+                h, residual = self._measurement(row, poses[chaser][0])
+                parts.append((h[used], residual[used], poses[chaser][1]))
+        if not parts:
+            return None
+        noise = block_diag(*(r for _, _, r in parts))
+        return self._update(
+            np.concatenate([h for h, _, _ in parts]), np.concatenate([r for _, r, _ in parts]), noise
+        )
+
+    def _update(self, h: Array, residual: Array, noise: Array) -> Innovation:
         projected = h @ self.covariance
-        innovation = projected @ h.T + np.diag(noise)
-        factor = cho_factor(innovation, lower=True)
+        factor = cho_factor(projected @ h.T + noise, lower=True)
         self.nis = float(residual @ cho_solve(factor, residual)) / len(residual)
         gain = cho_solve(factor, projected).T
-        correction = gain @ residual
-        # Joseph's form for a gain that is optimal up to rounding.
+        # Joseph's form, which stays positive definite under rounding.
         kept = self.covariance - gain @ projected
-        kept = kept - (kept @ h.T) @ gain.T + (gain * noise) @ gain.T
+        kept = kept - (kept @ h.T) @ gain.T + gain @ noise @ gain.T
         self.covariance = (kept + kept.T) / 2.0
-        self._estimate = self._corrected(self._estimate, correction)
+        self._estimate = self._corrected(self._estimate, gain @ residual)
         return Innovation(h, gain, factor, residual)
+
+    def loosen_mounts(self, position_m: float, attitude_rad: float) -> None:
+        """Let the poses of the chasers in TRF walk by these standard deviations per axis."""
+        for row in range(len(self.chasers)):
+            k = self._mount(row)
+            self.covariance[k, k] += np.diag(np.repeat([position_m**2, attitude_rad**2], 3))
 
     def correct(self, shift: Array, sigma_share: float) -> None:
         """Shift the error state by ``shift`` (size,), known up to ``sigma_share`` of it."""

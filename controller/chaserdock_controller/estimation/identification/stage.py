@@ -17,13 +17,16 @@ from chaserdock_protocol.scenario.mounting import nominal_mounting, plume_free_t
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
 from chaserdock_controller.estimation.composite_body import pose_in_target, target_body
+from chaserdock_controller.estimation.measurements import SightingConverter
 from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
 
 from .composite import CompositeIdentification, IdentificationParameters, attach, prior_of
 from .faults import StackFault, StackFaultDetector, apply_fault
+from .free_tumble import TumbleIdentification
 
 _SHOCK = (0.01, 0.02)
 """One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
+_SETTLED_RAD_S = 0.01
 _PULSE_S = 0.3
 _WATCH_S = 1.0
 """Time over which a pulse's effect is thought to be measured when pulses are compared."""
@@ -52,6 +55,8 @@ class StackIdentification:
         self._full_N = thrusts_max(scenario.chaser.thrusters)
         self.target = prior_of(target_body(scenario), self._parameters)
         self.failed: dict[int, tuple[int, ...]] = {}
+        self._converter = SightingConverter(scenario.camera_model())
+        self._tumble: TumbleIdentification | None = None
         self._filter: CompositeIdentification | None = None
         self._detector: StackFaultDetector | None = None
         self._events: list[LogEntry] = []
@@ -59,7 +64,11 @@ class StackIdentification:
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
         """Take a tick's odometry and pulses; return None while nothing is latched or the target is unknown."""
         latched = estimation.latched
-        if not latched or not estimation.known or not latched & observation.odometry.keys():
+        if not latched:
+            self._filter = None
+            return self._run_free(observation, estimation)
+        self._tumble = None
+        if not estimation.known or not latched & observation.odometry.keys():
             self._filter = None
             return None
         states = {
@@ -86,6 +95,29 @@ class StackIdentification:
             failed=dict(self.failed),
             informative=self._by_information,
         )
+
+    def _run_free(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
+        """Take a tick's sightings of the free target; return None while it is not tracked."""
+        target, first = estimation.target, False
+        if target.status != "tracking":
+            self._tumble = None
+            return None
+        if self._tumble is None:
+            if float(target.covariance[9:, 9:].trace()) > _SETTLED_RAD_S**2:
+                return None
+            motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+            cameras = range(len(self._scenario.chasers))
+            errors = self._scenario.navigation.errors()
+            self._tumble = TumbleIdentification(self.target, cameras, motion, errors, self._parameters)
+            first = True
+        self._converter.add_odometry(observation.odometry, observation.time_ns)
+        found = self._converter.measurements(observation.sightings)
+        self._tumble.step([m for m in found if m.time_ns == observation.time_ns], self._period_s, first)
+        if any(d.contact for d in observation.docking.values()):
+            self._tumble.disturb(*_SHOCK)
+        self.target = self._tumble.target
+        motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+        return IdentifiedStack(self.target, self.target, {}, motion, {}, {}, tuple)
 
     def identified(self, observation: Observation, estimation: TargetEstimation) -> TargetEstimation:
         """Return the estimation with the identified stack and its events."""

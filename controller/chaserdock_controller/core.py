@@ -50,6 +50,9 @@ class ControllerCore:
         estimation = self.estimation.run(observation)
         if self.identification is not None:
             estimation = self.identification.identified(observation, estimation)
+            refined = self.identification.refined_target(observation)
+            if refined is not None:
+                self.estimation.composite.refine_target(refined)
         failures = self.planning.monitor.failures(observation.time_ns)
         guidance = self.guidance.run(observation, estimation, failures)
         plan = self.planning.run(observation, estimation, guidance)

@@ -23,6 +23,8 @@ from .composite import CompositeIdentification, IdentificationParameters, MassPr
 
 _WALK_M, _WALK_RAD = 1e-4, 1e-4
 """Random walk of a camera's error per square root of a second."""
+_FLOOR_RAD_S = 5e-6
+"""Standard deviation of the change of the rate per tick, which covers the linearization over the first half turn."""
 _GATE = 25.0
 """Largest squared distance of the better of two ambiguous poses in units of its covariance."""
 
@@ -40,7 +42,7 @@ class TumbleIdentification:
     ) -> None:
         mount_m = math.hypot(0.002, errors.camera_shift_m, 1.5 * errors.camera_turn_rad)
         mount_rad = math.hypot(0.002, errors.camera_turn_rad)
-        parameters = replace(parameters, mount_m=mount_m, mount_rad=mount_rad)
+        parameters = replace(parameters, mount_m=mount_m, mount_rad=mount_rad, floor_omega_rad_s=_FLOOR_RAD_S)
         place = MountedChaser(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
         self._filter = CompositeIdentification(
             prior,
@@ -51,7 +53,7 @@ class TumbleIdentification:
             replace(errors, gyro_bias_rad_s=0.0),
             parameters,
         )
-        self._errors = errors
+        self._errors, self._share = errors, parameters.inertia_share
         self.nis = 0.0
 
     def step(self, measurements: Sequence[Measurement], step_s: float, first: bool = False) -> None:
@@ -73,8 +75,12 @@ class TumbleIdentification:
 
     @property
     def target(self) -> MassProperties:
-        """Return the mass properties of the target; the scale of the inertia and the mass are those of the prior."""
-        return self._filter.stack
+        """Return the mass properties of the target. Mass and scale of the inertia are those of the prior, as uncertain as in it:
+        what the linearization seems to tell of the scale is removed."""
+        found = self._filter.stack
+        scale = np.concatenate([np.zeros(4), found.values[4:]])
+        doubt = self._share**2 * np.outer(scale, scale)
+        return MassProperties(found.body, found.covariance + doubt)
 
     @property
     def ratios(self) -> tuple[Array, Array]:

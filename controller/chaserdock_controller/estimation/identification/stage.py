@@ -18,15 +18,17 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 
 from chaserdock_controller.estimation.composite_body import pose_in_target, target_body
 from chaserdock_controller.estimation.measurements import SightingConverter
+from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
 
 from .composite import CompositeIdentification, IdentificationParameters, attach, prior_of
 from .faults import StackFault, StackFaultDetector, apply_fault
-from .free_tumble import TumbleIdentification
+from .free_tumble import TumbleIdentification, inertia_ratios
 
 _SHOCK = (0.01, 0.02)
 """One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
 _SETTLED_RAD_S = 0.01
+_REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
 _PULSE_S = 0.3
 _WATCH_S = 1.0
 """Time over which a pulse's effect is thought to be measured when pulses are compared."""
@@ -124,6 +126,14 @@ class StackIdentification:
         stack = self.run(observation, estimation)
         events, self._events = self._events, []
         return replace(estimation, stack=stack, events=(*estimation.events, *events))
+
+    def refined_target(self, observation: Observation) -> TargetBody | None:
+        """Return the target's mass properties for the estimator of its motion, now and then, once they are known well enough."""
+        if observation.tick % max(1, round(_REFINE_S / self._period_s)):
+            return None
+        ratios = math.sqrt(float(np.trace(inertia_ratios(self.target)[1])))
+        centre_m = math.sqrt(float(np.trace(self.target.covariance[1:4, 1:4])))
+        return self.target.body if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
 
     def _begin(self, estimation: TargetEstimation, states: Mapping[int, BodyState]) -> None:
         s, chasers = self._scenario, {}

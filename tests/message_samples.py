@@ -52,7 +52,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         closing_impulse_N_s=0.125,
     ),
     m.StackEstimate(
-        **HEAD, chasers=(0, 3), stack=MASS, target=MASS, thrust_factors=((0.875, 1.0), ()), failed=((1,), ())
+        **HEAD, chasers=(0, 3), stack=MASS, target=MASS, thrust_factors=(0.875, 1.0), failed=((1,), ())
     ),
     m.Sighting(
         **HEAD,

@@ -349,8 +349,8 @@ class MassEstimate(Struct, frozen=True, kw_only=True):
 class StackEstimate(Message, frozen=True, kw_only=True):
     """Identified mass properties at ``sim_time_ns``: of the ``stack`` of the target and ``chasers``, and of the ``target`` alone.
 
-    ``thrust_factors``: estimated over stated thrust of every thruster of each chaser. ``failed``: for each chaser the thrusters
-    that the motion of the stack shows to be stuck.
+    ``thrust_factors``: estimated over stated thrust of every thruster, chaser after chaser. ``failed``: for each chaser the
+    thrusters that the motion of the stack shows to be stuck. Without chasers both bodies are the freely tumbling target.
     """
 
     chasers: ChaserIds

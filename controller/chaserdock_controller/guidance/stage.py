@@ -43,6 +43,7 @@ class GuidanceStage:
         self.thrusters = ThrusterCommandHandler(scenario)
         self.search = TargetSearch(scenario.chaser, scenario.camera_model())
         self.detumble = DetumbleControl(scenario)
+        self._waits = False
         self.references = ReferenceBuilder(scenario, self.machine)
 
     @property
@@ -90,7 +91,9 @@ class GuidanceStage:
                 reference=references.get(i),
                 direct=thrusts.get(i) or self._direct_command(i, observation, estimation, i in attached),
             )
-        return GuidanceResult(directives, horizon, tuple(replies), tuple(self._events(estimation)))
+        return GuidanceResult(
+            directives, horizon, tuple(replies), (*self._events(estimation), *self._report_waiting())
+        )
 
     def _follow_estimate(self, observation: Observation, estimation: TargetEstimation) -> None:
         target, now_s = estimation.target, observation.time_s
@@ -148,11 +151,33 @@ class GuidanceStage:
             self.detumble.reset()
             return {}
         task = StackTask.STOP
-        if not detumbling:
+        if self._leaving():
+            task = StackTask.WAIT
+        elif not detumbling:
             task = StackTask.IDENTIFY
         elif all(self.chasers[i].phase is Phase.STACK_HOLD for i in active):
             task = StackTask.HOLD
         return self.detumble.commands(stack, active, observation.isolated, task, observation)
+
+    def _leaving(self) -> list[int]:
+        """Return the chasers that back out of their corridor: the stack must not turn under them by thrust."""
+        out = (Phase.RETREAT, Phase.ABORT)
+        return [
+            i
+            for i, c in enumerate(self.chasers)
+            if c.phase in out and not c.stuck and self.machine.is_free(i) and self.machine.in_corridor(i)
+        ]
+
+    def _report_waiting(self) -> list[LogEntry]:
+        """Return an event when the stack begins to wait for chasers that back out, or goes on."""
+        leaving = self._leaving() if self.machine.thrusting() else []
+        waits = bool(leaving)
+        if waits == self._waits:
+            return []
+        self._waits = waits
+        if not waits:
+            return [("info", "no chaser backs out any more: the stack is no longer coasting")]
+        return [("info", f"the stack coasts while chaser {leaving[0]} backs out")]
 
     def _update_stack(self, observation: Observation, stack: StackState | None) -> None:
         """Advance the phases of detumbling chasers; close their thrusters if those that are left cannot stop the stack."""

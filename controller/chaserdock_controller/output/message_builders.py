@@ -80,7 +80,7 @@ def stack_message(observation: Observation, stack: IdentifiedStack) -> StackEsti
         chasers=tuple(stack.chasers),
         stack=_mass_estimate(stack.stack),
         target=_mass_estimate(stack.target),
-        thrust_factors=tuple(vector(stack.thrust_factors[i]) for i in stack.chasers),
+        thrust_factors=tuple(f for i in stack.chasers for f in vector(stack.thrust_factors[i])),
         failed=tuple(stack.failed.get(i, ()) for i in stack.chasers),
     )
 

@@ -366,7 +366,7 @@ class CompositeIdentification:
                 parts.append((h[used], residual[used], poses[chaser][1]))
         if not parts:
             return None
-        noise = block_diag(*(r for _, _, r in parts))
+        noise = np.asarray(block_diag(*(r for _, _, r in parts)), dtype=np.float64)
         return self._update(
             np.concatenate([h for h, _, _ in parts]), np.concatenate([r for _, r, _ in parts]), noise
         )

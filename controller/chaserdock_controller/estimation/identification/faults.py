@@ -45,6 +45,10 @@ class StackFaultDetector:
         self._signatures = np.zeros((size, 2 * len(self._thrusters)))
         self.gains = np.zeros(2 * len(self._thrusters))
 
+    def reset(self) -> None:
+        """Begin all tests again."""
+        self._signatures[:], self.gains[:] = 0.0, 0.0
+
     def predict(self, prediction: Prediction) -> None:
         """Propagate the signatures over a tick."""
         count = len(self._thrusters)
@@ -72,7 +76,7 @@ class StackFaultDetector:
         chaser, thruster = self._thrusters[best % count]
         fault = StackFault(chaser, thruster, "stuck_off" if best < count else "stuck_on")
         effect = self._signatures[:, best].copy()
-        self.gains[:], self._signatures[:] = 0.0, 0.0
+        self.reset()
         return fault, effect
 
 

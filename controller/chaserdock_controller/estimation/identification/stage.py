@@ -27,6 +27,8 @@ from .free_tumble import TumbleIdentification, inertia_ratios
 
 _SHOCK = (0.01, 0.02)
 """One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
+_SILENT_S, _SILENT_SHARE = 1.0, 0.02
+"""Thrusters of a chaser that reports none are unknown for this long, and later up to this share of their thrust."""
 _SETTLED_RAD_S = 0.01
 _REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
 _PULSE_S = 0.3
@@ -61,6 +63,8 @@ class StackIdentification:
         self._tumble: TumbleIdentification | None = None
         self._filter: CompositeIdentification | None = None
         self._detector: StackFaultDetector | None = None
+        self._reporting: set[int] = set()
+        self._silent_ticks: dict[int, int] = {}
         self._events: list[LogEntry] = []
 
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
@@ -83,7 +87,13 @@ class StackIdentification:
         assert self._filter is not None
         innovation = self._filter.update(states)
         if innovation is not None and self._detector is not None:
-            suspects = np.array([t not in self.failed.get(i, ()) for i, t in self._filter.usable], dtype=bool)
+            suspects = np.array(
+                [
+                    t not in self.failed.get(i, ()) and self._silent_ticks.get(i, 0) == 0
+                    for i, t in self._filter.usable
+                ],
+                dtype=bool,
+            )
             found = self._detector.update(innovation, suspects)
             if found is not None:
                 self._add_fault(*found)
@@ -159,9 +169,16 @@ class StackIdentification:
         assert self._filter is not None
         assert self._detector is not None
         given = {i: j for i, j in observation.thruster_impulses.items() if i in self._filter.chasers}
-        # A chaser with odometry whose report is lost may have fired; one without any is dead.
-        silent = [i for i in self._filter.chasers if i in observation.odometry and i not in given]
-        unknown = dict.fromkeys(silent, self._full_N * self._period_s)
+        if given.keys() != self._reporting:
+            self._detector.reset()
+        self._reporting = set(given)
+        unknown = {}
+        for i in self._filter.chasers:
+            self._silent_ticks[i] = 0 if i in given else self._silent_ticks.get(i, 0) + 1
+            # What was commanded before, or is fired without the controller, is not reported.
+            if i not in given:
+                early = self._silent_ticks[i] * self._period_s <= _SILENT_S
+                unknown[i] = self._full_N * (self._period_s if early else _SILENT_SHARE * self._period_s)
         self._detector.predict(self._filter.predict(given, self._period_s, unknown))
         if any(d.contact and not d.latched for d in observation.docking.values()):
             self._filter.disturb(*_SHOCK)

@@ -48,6 +48,7 @@ class StackTask(Enum):
     STOP = auto()
     HOLD = auto()
     IDENTIFY = auto()
+    WAIT = auto()
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +173,9 @@ class DetumbleControl:
                 thrusts = self._hold(state, thrusters)
             case StackTask.IDENTIFY:
                 thrusts = self._informative(state, thrusters, observation.effective_ns)
+            case StackTask.WAIT:
+                self.reset()
+                thrusts = np.zeros(len(thrusters.limits_N))
         if self.sequencer.limited:
             model = self._load_model(state, thrusters)
             thrusts = self.sequencer.in_turn(model, thrusts, thrusters.limits_N, observation.tick)
@@ -194,7 +198,7 @@ class DetumbleControl:
         """Return the thrusts that turn a stopped stack to the commanded attitude; none without one, or close to it."""
         none = np.zeros(len(thrusters.limits_N))
         reference = self._slew_rate(state)
-        if reference is None or self.share_of_limits(state) <= _DEADBAND_SHARE:
+        if reference is None or self.share_of_limits(state, slewing=True) <= _DEADBAND_SHARE:
             return none
         if not spans_all_directions(thrusters.wrenches, thrusters.limits_N):
             return none

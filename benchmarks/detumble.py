@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N] [--first SEED]
-[--sets 0123 013 03] [--silent] [--set KEY=VALUE] [--results FILE]``.
+[--sets 0123 013 03] [--silent | --rigid CASE] [--set KEY=VALUE] [--results FILE]``.
 
 Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one process with the
 scenario's sensors and statistical perception. Tumbles of 5 to 10 degrees/s and attitudes are drawn from the seed. Five
@@ -12,6 +12,12 @@ those of the linear programme: the shortest time, and the least impulse in that 
 ``--silent``: nobody commands; each chaser damps the stack by its own odometry for at most 120 s, until 10 s after it stopped. The
 stack is then one rigid body (``chaserdock.evaluation.rigid_stack``), not the physics engine's.
 
+``--rigid CASE``: identification and plan in closed loop with one rigid body (``chaserdock.evaluation.rigid_control``). The stated
+mass and inertia are 30 % wrong, the stated centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (14 s;
+one chaser 75 s), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck`` (a thruster
+drawn from the seed is stuck off from the start, not reported), ``lost`` (a chaser dies at a random moment), ``limited`` (at most 2.5
+N and 0.9 N m at a port).
+
 ``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it.
 """
 
@@ -22,10 +28,12 @@ import sys
 from pathlib import Path
 
 import msgspec
+import numpy as np
 from common import Figures, append_line, make_parser, percentiles, print_figures, read_lines, write_json
 
 from chaserdock.evaluation.detumble_flights import DetumbleOutcome, fly_stack, stack_scenario
 from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.evaluation.rigid_control import StackFlight, fly_controlled, wrong_knowledge
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 
@@ -126,9 +134,102 @@ def fly_sets_silent(o: argparse.Namespace, seeds: range) -> Figures:
     return figures
 
 
+class RigidRow(msgspec.Struct, frozen=True):
+    """One flight of a rigid stack in the results file."""
+
+    chasers: str
+    case: str
+    flight: StackFlight
+
+
+def fly_rigid(case: str, chasers: str, seed: int, changes: list[str]) -> StackFlight:
+    """Fly one case."""
+    numbers, one = [int(c) for c in chasers], len(chasers) == 1
+    settings = [*wrong_knowledge(seed), *changes]
+    if case != "fast":
+        settings.append(f"detumble.plan_s={75.0 if one else 14.0}")
+    if one:
+        settings += ["detumble.timeout_s=120", "detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002"]
+    rng, loss = np.random.default_rng([seed, 0xFA]), None
+    if case == "stuck":
+        settings.append(stuck_thruster(rng, len(numbers)))
+    if case == "lost":
+        loss = (float(rng.uniform(0.5, 10.0)), int(rng.integers(len(numbers))))
+    scenario = stack_scenario(seed, numbers, settings)
+    if case == "limited":
+        ports = [
+            p.model_copy(update={"force_limit_N": 2.5, "torque_limit_N_m": 0.9})
+            for p in scenario.docking.ports
+        ]
+        docking = scenario.docking.model_copy(update={"ports": tuple(ports)})
+        scenario = scenario.model_copy(update={"docking": docking})
+    identify_s = 10.0 if case == "identify" else 0.0
+    duration_s = 90.0 if one else 20.0 if case in ("plan", "identify", "fast") else 40.0
+    return fly_controlled(scenario, duration_s, identify_s, loss)
+
+
+def stuck_thruster(rng: np.random.Generator, chasers: int) -> str:
+    """Return the override that lets one of the thrusters that may fire fail: those that push their chaser towards the port."""
+    scenario = stack_scenario(0, list(range(chasers)))
+    able = [k for k, t in enumerate(scenario.chaser.thrusters) if t.direction[0] > 0.0]
+    chaser, thruster = int(rng.integers(chasers)), int(rng.choice(able))
+    return f"thruster_failure=[{{chaser={chaser},thruster={thruster},at_s=0.0,kind='stuck_off'}}]"
+
+
+def rigid_figures(name: str, flights: list[StackFlight]) -> Figures:
+    """Return the figures of a set of chasers in a case."""
+    stopped = [f for f in flights if f.time_s is not None]
+    out: Figures = {
+        f"{name}_flights": len(flights),
+        f"{name}_stopped": len(stopped),
+        f"{name}_refused": sum(bool(f.refused) for f in flights),
+        f"{name}_thrusters_isolated": sum(bool(f.failed) for f in flights),
+    }
+    least = [(f, f.least) for f in stopped if f.least is not None]
+    for key, unit, values in (
+        ("time", "s", [f.time_s for f in stopped if f.time_s is not None]),
+        ("impulse", "N_s", [f.impulse_N_s for f in stopped]),
+        ("lp_time", "s", [x.time_s for _, x in least]),
+        ("impulse_over_lp", "ratio", [f.impulse_N_s / x.impulse_N_s for f, x in least]),
+        ("time_over_lp", "ratio", [f.time_s / x.time_s for f, x in least if f.time_s is not None]),
+        ("final_rate", "deg_s", [f.final_rate_deg_s for f in stopped]),
+        ("final_speed", "m_s", [f.final_speed_m_s for f in stopped]),
+        ("mass_error", "share", [f.mass_share for f in flights if not f.refused]),
+        ("centre_error", "m", [f.centre_m for f in flights if not f.refused]),
+        ("inertia_error", "share", [f.inertia_share for f in flights if not f.refused]),
+        ("nees", "ratio", [f.nees for f in flights if not f.refused]),
+    ):
+        if values:
+            out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
+    return out
+
+
+def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
+    """Fly a case with every set of chasers; return the figures."""
+    case, figures = f"{o.rigid} set={sorted(o.set)}", {}
+    known = {
+        (row["chasers"], row["case"], row["flight"]["seed"]): msgspec.convert(row, RigidRow).flight
+        for row in read_lines(o.results)
+    }
+    for chasers in o.sets:
+        flights = []
+        for seed in seeds:
+            flight = known.get((chasers, case, seed))
+            if flight is None:
+                flight = fly_rigid(o.rigid, chasers, seed, o.set)
+                append_line(o.results, msgspec.to_builtins(RigidRow(chasers, case, flight)))
+                print(f"{o.rigid} {chasers}: {flight}", file=sys.stderr, flush=True)
+            flights.append(flight)
+        figures |= (part := rigid_figures(f"{o.rigid}_{chasers}", flights))
+        print_figures(part)
+    return figures
+
+
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--silent", action="store_true", help="without a controller")
+    cases = ("plan", "identify", "fast", "stuck", "lost", "limited")
+    parser.add_argument("--rigid", choices=cases, help="identification and plan, on one rigid body")
     parser.add_argument("--tumbles", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sets", nargs="+", default=["0123", "013", "03"], metavar="CHASERS")
@@ -139,6 +240,9 @@ def main() -> None:
     number = 2 if o.quick else o.tumbles
     if o.silent:
         write_json(o.json, fly_sets_silent(o, range(o.first, o.first + number)))
+        return
+    if o.rigid:
+        write_json(o.json, fly_sets_rigid(o, range(o.first, o.first + number)))
         return
     settings = f"duration={o.duration:g} set={sorted(o.set)}"
     rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results) if row["settings"] == settings]

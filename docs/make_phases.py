@@ -36,6 +36,7 @@ MEANING = {
     Phase.LATCHED: "is latched, and tests the latch by a pull",
     Phase.VERIFIED: "is latched, and the latch has passed the test",
     Phase.DETUMBLE: "is latched, and stops the target together with the others that were commanded to",
+    Phase.IDENTIFY: "is latched, and fires pulses that show the mass properties of the stack",
     Phase.STACK_HOLD: "is latched to the stopped target, and keeps it at rest",
 }
 

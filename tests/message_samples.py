@@ -13,6 +13,12 @@ EYE6 = tuple(1.0 if i % 7 == 0 else 0.0 for i in range(36))
 V, Q = (0.25, -1.5, 3.0), (0.5, -0.5, 0.5, -0.5)
 HEAD: dict[str, Any] = {"seq": 7, "tick": 12, "sim_time_ns": 800_000_000}
 SOLUTION = m.PoseSolution(position_m=V, q_wxyz=Q, covariance=EYE6, reprojection_rms_px=0.125)
+MASS = m.MassEstimate(
+    mass_kg=150.5,
+    centre_of_mass_m=V,
+    inertia_kg_m2=(1.5, 2.5, 3.5, 0.25, -0.5, 0.125),
+    covariance=(0.25,) * 100,
+)
 
 SAMPLES: tuple[msgspec.Struct, ...] = (
     m.Tick(
@@ -44,6 +50,9 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         peak_shear_N=3.5,
         peak_bending_N_m=3.25,
         closing_impulse_N_s=0.125,
+    ),
+    m.StackEstimate(
+        **HEAD, chasers=(0, 3), stack=MASS, target=MASS, thrust_factors=(0.875, 1.0), failed=((1,), ())
     ),
     m.Sighting(
         **HEAD,

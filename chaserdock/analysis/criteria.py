@@ -13,7 +13,7 @@ from chaserdock_protocol.scenario import Scenario
 from .flight import LoadHistory, RecordedFlight
 
 _CONTACT_SLACK_M = 0.02
-_VERIFIED = ("verified", "detumble", "stack_hold")
+_VERIFIED = ("verified", "identify", "detumble", "stack_hold")
 """Phases of a chaser whose latch has passed the test."""
 
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_agents.chaser.command_gate import damping_command
 from chaserdock_agents.chaser.local_damping import LocalDamping
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime, minimum_time
 from chaserdock_controller.guidance.detumble.stack import (
@@ -35,12 +35,12 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.rendering.cameras import States
 
 from .in_process import InProcessMission, TickRecord
+from .latched_stack import attach_plants, body_of_plant, with_port_error
 from .perception import PerceptionModel
 from .transfers import load_shipped
 
 COMMAND_AT_S = 5.0
 """Until then the estimator settles."""
-_PORT_ERROR_M, _PORT_ERROR_RAD = 0.002, math.radians(0.3)
 
 
 def stack_scenario(seed: int, chasers: Sequence[int], changes: Sequence[str] = ()) -> Scenario:
@@ -93,14 +93,11 @@ class StackMission(InProcessMission):
         if math.isfinite(silent_from_s):
             flight = flight_scenario(scenario)
             self._damping = {i: LocalDamping(flight, i) for i in self.thrusters}
-        rng = np.random.default_rng([scenario.seed, 0x57A])
         target = self.physics.state(TARGET)
         for i in self.chasers:
-            nominal = nominal_mounting(scenario, i)
-            place, q = nominal.position_m, nominal.q_wxyz
-            place = place + rng.uniform(-_PORT_ERROR_M, _PORT_ERROR_M, 3)
-            turn = rotations.exp(rng.uniform(-_PORT_ERROR_RAD, _PORT_ERROR_RAD, 3))
-            self.physics.place(f"chaser/{i}", moving_with(target, place, rotations.multiply(q, turn)))
+            own = with_port_error(scenario, i, nominal_mounting(scenario, i))
+            place = own.position_m
+            self.physics.place(f"chaser/{i}", moving_with(target, place, own.q_wxyz))
             self.physics.close_latch(i)
             verified = ChaserGuidance(Phase.VERIFIED, 0.0, stay(place, 0.0))
             self.controller.guidance.machine.chasers[i] = verified
@@ -131,14 +128,9 @@ class StackMission(InProcessMission):
 
     def true_body(self, mounted: dict[int, MountedChaser]) -> TargetBody:
         """Return the true mass properties of the target with the mounted chasers."""
-        plants, parts = self.physics.plants, []
-        for i, chaser in mounted.items():
-            plant, q = plants[f"chaser/{i}"], chaser.q_wxyz
-            centre = chaser.position_m + rotations.rotate(q, plant.centre_of_mass_m)
-            axes = q if plant.frame is None else rotations.multiply(q, plant.frame.q_wxyz)
-            parts.append((plant.mass_kg, np.array(plant.moments_kg_m2), centre, axes))
-        alone = plants[TARGET]
-        return attach_bodies(TargetBody(alone.mass_kg, alone.inertia_kg_m2, alone.centre_of_mass_m), parts)
+        plants = self.physics.plants
+        chasers = {i: plants[f"chaser/{i}"] for i in mounted}
+        return attach_plants(body_of_plant(plants[TARGET]), chasers, mounted)
 
 
 def moving_with(target: BodyState, place_m: Array, q_wxyz: Array) -> BodyState:

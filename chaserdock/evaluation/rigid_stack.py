@@ -8,23 +8,27 @@ are those of the simulator; ``tests/chaserdock/test_silent_controller.py`` compa
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_agents.chaser.local_damping import LocalDamping
 from chaserdock_agents.chaser.thrusters.modulation import Modulator
-from chaserdock_controller.estimation.composite_body import target_body
-from chaserdock_controller.estimation.target_body import attach_bodies
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
 from chaserdock_models.thruster_model import Valves
 from chaserdock_models.wrench_set import wrench_matrix
+from chaserdock_protocol.messages import Odometry, ThrusterPulse
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.mounting import nominal_mounting
 from chaserdock_protocol.scenario.thrusters import thrusts_max
+from chaserdock_world.actuators.thrusters import true_thrusters
+from chaserdock_world.plant import actuation_errors, chaser_plant, target_plant
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import odometry_of
+
+from .latched_stack import attach_plants, body_of_plant, with_port_error
 
 _SUBSTEPS = 4
 
@@ -42,34 +46,57 @@ class SilentOutcome:
     final_speed_m_s: float
 
 
-class RigidStack:
-    """All chasers of a scenario at their ports, and the target's start state. One ``step`` per tick."""
+@dataclass(frozen=True, eq=False)
+class StackStep:
+    """One tick of a stack: impulse of all thrusters (N s), and by chaser the impulses (n,) that its thrusters should have given,
+    and the impulse (6,), body axes, that they should give until the next command acts."""
 
-    def __init__(self, scenario: Scenario) -> None:
+    used_N_s: float
+    stated_N_s: Mapping[int, Array]
+    coming: Mapping[int, Array]
+
+
+class RigidStack:
+    """All chasers of a scenario at their ports, with its true bodies and thrusters, and the target's start state.
+
+    One ``step`` per tick. ``port_errors``: whether the chasers are latched with seeded errors of a few millimetres.
+    """
+
+    def __init__(self, scenario: Scenario, port_errors: bool = False) -> None:
         self.scenario = scenario
         flight, target = flight_scenario(scenario), scenario.target
-        self._mounted = {i: nominal_mounting(flight, i) for i in range(len(scenario.chasers))}
-        parts = [
-            (scenario.chaser.mass_kg, np.asarray(scenario.chaser.inertia), c.position_m, c.q_wxyz)
-            for c in self._mounted.values()
-        ]
-        self.body = attach_bodies(target_body(flight), parts)
+        self.mounted = {i: nominal_mounting(flight, i) for i in range(len(scenario.chasers))}
+        if port_errors:
+            self.mounted = {i: with_port_error(scenario, i, c) for i, c in self.mounted.items()}
+        self.target = body_of_plant(target_plant(scenario))
+        plants = {i: chaser_plant(scenario, i) for i in self.mounted}
+        self.body = attach_plants(self.target, plants, self.mounted)
         self.q_wxyz = np.array(target.q_wxyz)
         self.omega_rad_s = np.array(target.omega_rad_s)
         arm = rotations.rotate(self.q_wxyz, rotations.cross(self.omega_rad_s, self.body.centre_trf_m))
         self.velocity_m_s = np.array(target.velocity_m_s) + arm
         self.centre_m = rotations.rotate(self.q_wxyz, self.body.centre_trf_m)
         self.tick = 0
-        self._damping = {i: LocalDamping(flight, i) for i in self._mounted}
+        self._flight = flight
+        self._damping: dict[int, LocalDamping] = {}
         thrusters = scenario.chaser.thrusters
-        self._full_N = thrusts_max(thrusters)
+        self._full_N, self._own = thrusts_max(thrusters), wrench_matrix(thrusters)
         self._modulators = {
-            i: Modulator(thrusters, scenario.chaser.modulation, scenario.timing) for i in self._mounted
+            i: Modulator(thrusters, scenario.chaser.modulation, scenario.timing) for i in self.mounted
         }
-        self._valves = {i: Valves(thrusters) for i in self._mounted}
+        self._errors = {i: actuation_errors(scenario, i) for i in self.mounted}
+        self._valves, self._stated_valves = {}, {i: Valves(thrusters) for i in self.mounted}
+        self._wrenches = {}
+        for i, chaser in self.mounted.items():
+            true = true_thrusters(thrusters, self._errors[i])
+            self._valves[i] = Valves(true)
+            for failure in (f for f in scenario.thruster_failure if f.chaser == i):
+                self._valves[i].fail(
+                    failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor
+                )
+            self._wrenches[i] = chaser.wrench_to_stack(wrench_matrix(true), self.body.centre_trf_m)
+        self._shortest_ns = [round(t.min_on_s * 1e9) for t in thrusters]
         self._sensor = OdometrySensor(scenario)
-        own = wrench_matrix(thrusters)
-        self._wrenches = {i: c.wrench_to_stack(own, self.body.centre_trf_m) for i, c in self._mounted.items()}
 
     def rates(self) -> tuple[float, float]:
         """Return the speed of the centre of mass (m/s) and the angular rate (rad/s)."""
@@ -77,7 +104,7 @@ class RigidStack:
 
     def state(self, chaser: int) -> BodyState:
         """Return the true state of a chaser."""
-        mounted = self._mounted[chaser]
+        mounted = self.mounted[chaser]
         arm = mounted.position_m - self.body.centre_trf_m
         return BodyState(
             self.centre_m + rotations.rotate(self.q_wxyz, arm),
@@ -86,28 +113,56 @@ class RigidStack:
             rotations.rotate_inverse(mounted.q_wxyz, self.omega_rad_s),
         )
 
-    def step(self, damping: bool = True) -> float:
-        """Fly one tick, in which all chasers damp the stack or none; return the impulse of all thrusters (N s)."""
+    def measure(self, chaser: int) -> Odometry:
+        """Return the odometry of a chaser now."""
+        time_ns = self.scenario.timing.tick_time_ns(self.tick)
+        return odometry_of(self._sensor, chaser, self.state(chaser), self.tick, time_ns)
+
+    def damping(self) -> dict[int, Array]:
+        """Return the thrusts (n,) with which every chaser damps the stack by its own odometry."""
+        if not self._damping:
+            self._damping = {i: LocalDamping(self._flight, i) for i in self.mounted}
+        return {i: damping.thrusts_N(self.measure(i)) for i, damping in self._damping.items()}
+
+    def step(
+        self, thrusts_N: Mapping[int, Array], shut: Mapping[int, tuple[int, ...]] | None = None
+    ) -> StackStep:
+        """Fly one tick with commanded thrusts (n,) by chaser; ``shut``: thrusters whose shut-off valve is closed."""
         timing = self.scenario.timing
         begin_ns, end_ns = timing.tick_time_ns(self.tick), timing.tick_time_ns(self.tick + 1)
         edges_ns = np.linspace(begin_ns, end_ns, _SUBSTEPS + 1).astype(int)
         impulses = np.zeros((_SUBSTEPS, 6))
-        used_N_s = 0.0
+        used_N_s, stated, coming = 0.0, {}, {}
+        next_ns = timing.effective_ns(self.tick + 1)
         for i, modulator in self._modulators.items():
-            if damping:
-                odometry = odometry_of(self._sensor, i, self.state(i), self.tick, begin_ns)
-                thrusts_N = self._damping[i].thrusts_N(odometry)
-                span_ns = timing.effective_ns(self.tick), timing.effective_ns(self.tick + 1)
-                for p in modulator.pulses(thrusts_N, self._full_N, *span_ns):
-                    self._valves[i].pulse(p.thruster, p.open_ns, p.close_ns)
+            if i in thrusts_N:
+                span_ns = timing.effective_ns(self.tick), next_ns
+                for valves in (self._valves[i], self._stated_valves[i]):
+                    valves.set_shut((shut or {}).get(i, ()), span_ns[0])
+                for p in modulator.pulses(thrusts_N[i], self._full_N, *span_ns):
+                    close_ns = p.open_ns + self._width_ns(i, p)
+                    self._valves[i].pulse(p.thruster, p.open_ns, close_ns)
+                    self._stated_valves[i].pulse(p.thruster, p.open_ns, p.close_ns)
             given = self._valves[i].impulses(edges_ns)
-            self._valves[i].forget_before(begin_ns)
+            ahead = self._stated_valves[i].impulses(np.array([end_ns, next_ns + 1_000_000_000]))[0]
+            coming[i] = self._own @ (ahead - modulator.advance_N_s(next_ns))
+            stated[i] = self._stated_valves[i].impulses(edges_ns[[0, -1]])[0]
+            for valves in (self._valves[i], self._stated_valves[i]):
+                valves.forget_before(begin_ns)
             impulses += given @ self._wrenches[i].T
             used_N_s += float(given.sum())
         for impulse in impulses:
             self._advance(impulse, (end_ns - begin_ns) * 1e-9 / _SUBSTEPS)
         self.tick += 1
-        return used_N_s
+        return StackStep(used_N_s, stated, coming)
+
+    def _width_ns(self, chaser: int, pulse: ThrusterPulse) -> int:
+        """Return how long a pulse opens its valve: as commanded, up to scatter, but not below the minimum on-time."""
+        errors, width = self._errors[chaser], pulse.close_ns - pulse.open_ns
+        if not errors.scatter_share:
+            return width
+        scattered = round(width * float(errors.scatter(pulse.thruster, pulse.open_ns, 1)[0]))
+        return max(scattered, min(width, self._shortest_ns[pulse.thruster]))
 
     def _advance(self, impulse: Array, step_s: float) -> None:
         """Advance by ``step_s`` with an impulse (6,), TRF axes, half of it before and half after a free rotation."""
@@ -125,7 +180,7 @@ def fly_silent(scenario: Scenario, duration_s: float = 120.0, rest_s: float = ma
     stack, limits = RigidStack(scenario), scenario.detumble
     impulses, at_rest, rate_hz = [], 0, scenario.time.rate_hz  # at_rest: number of ticks in a row
     for _ in range(round(duration_s * rate_hz)):
-        impulses.append(stack.step())
+        impulses.append(stack.step(stack.damping()).used_N_s)
         speed, rate = stack.rates()
         at_rest = at_rest + 1 if speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s else 0
         if at_rest and at_rest >= rest_s * rate_hz:

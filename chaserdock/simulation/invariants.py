@@ -57,9 +57,9 @@ TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 SETTLING_S = 15.0
 """Longest time (s) after the last warning or command until a chaser has docked or is safe."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
-ATTACHED = frozenset({"latched", "verified", "detumble", "stack_hold"})
+ATTACHED = frozenset({"latched", "verified", "identify", "detumble", "stack_hold"})
 DOCKED = ATTACHED | {"docked"}
-DETUMBLING = frozenset({"detumble", "stack_hold"})
+DETUMBLING = frozenset({"identify", "detumble", "stack_hold"})
 _TUMBLE_SHARE, _TUMBLE_FLOOR_N_M_S = 0.05, 0.02
 """By how much the angular momentum of a stack may rise above its least while it is stopped: share of its first value, floor."""
 _POSE = (0, 1, 2, 6, 7, 8)

@@ -3,11 +3,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import (
     CameraCalibration,
     CommandReply,
@@ -21,11 +23,13 @@ from chaserdock_protocol.messages import (
     Reference,
     Sighting,
     SolverStatus,
+    StackEstimate,
     TargetEstimate,
     ThrusterReport,
     WrenchCommand,
 )
 
+from .estimation.identification.composite import MassProperties
 from .estimation.target_body import TargetBody
 from .estimation.types import RelativePose, TargetState
 from .guidance.phases import Phase
@@ -55,6 +59,7 @@ class TickOutputs:
     """Messages that a tick produces; dictionaries by chaser."""
 
     target: TargetEstimate
+    stack: StackEstimate | None = None
     wrenches: dict[int, WrenchCommand] = field(default_factory=dict)
     references: dict[int, Reference] = field(default_factory=dict)
     plans: dict[int, Plan] = field(default_factory=dict)
@@ -77,7 +82,8 @@ class Observation:
     ``effective_ns``: when this tick's commands take effect. ``odometry``: valid states; ``invalid``: why a state is not.
     ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
     ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
-    ``isolated``: thrusters that chasers report as closed.
+    ``isolated``: thrusters that chasers report as closed. ``thruster_impulses``: of the thrusters (n,) since the tick before, N s,
+    as chasers report them.
     """
 
     tick: int
@@ -90,6 +96,7 @@ class Observation:
     commands: tuple[OperatorCommand, ...]
     docking: Mapping[int, DockingStatus]
     impulses: Mapping[int, AppliedImpulse]
+    thruster_impulses: Mapping[int, Array]
     ahead: Mapping[int, tuple[tuple[float, Array], ...]]
     input_limits: Mapping[int, Array]
     isolated: Mapping[int, tuple[int, ...]]
@@ -101,6 +108,24 @@ class Observation:
         return self.time_ns / 1e9
 
 
+@dataclass(frozen=True, eq=False)
+class IdentifiedStack:
+    """Mass properties of the stack and of the target alone, as identified until now.
+
+    ``chasers``: where they are fixed. ``motion``: of the centre of mass (WRF) and the target's axes. ``thrust_factors`` (n,):
+    estimated over stated thrust, by chaser. ``failed``: thrusters found stuck, by chaser. ``informative`` returns the
+    thrusters (chaser, number) whose pulses would tell most about the mass properties, the best first.
+    """
+
+    stack: MassProperties
+    target: MassProperties
+    chasers: Mapping[int, MountedChaser]
+    motion: BodyState
+    thrust_factors: Mapping[int, Array]
+    failed: Mapping[int, tuple[int, ...]]
+    informative: Callable[[], tuple[tuple[int, int], ...]]
+
+
 @dataclass(frozen=True)
 class TargetEstimation:
     """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose is known.
@@ -110,7 +135,7 @@ class TargetEstimation:
     ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, if passive safety is monitored.
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
-    target and these chasers as one rigid body.
+    target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are.
     """
 
     target: TargetState
@@ -125,6 +150,7 @@ class TargetEstimation:
     latched: frozenset[int]
     body: TargetBody
     events: tuple[LogEntry, ...]
+    stack: IdentifiedStack | None = None
 
     @property
     def known(self) -> bool:

@@ -111,7 +111,14 @@ class ControllerProcess:
         node = self.node
         self.standby.join(instance)
         self._on_network = True
-        for topic in (topics.TARGET, topics.SOLVER, topics.COMMAND, topics.OPERATED, topics.STATE):
+        for topic in (
+            topics.TARGET,
+            topics.STACK,
+            topics.SOLVER,
+            topics.COMMAND,
+            topics.OPERATED,
+            topics.STATE,
+        ):
             node.advertise(topic)
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
@@ -246,6 +253,8 @@ class ControllerProcess:
             # Before the wrenches: once a tick is answered, the standby knows the commands that it was answered with.
             self._publish_state(tick, operated=operated)
         node.publish(topics.TARGET, out.target)
+        if out.stack is not None:
+            node.publish(topics.STACK, out.stack)
         for i, wrench in out.wrenches.items():
             if i in out.plans:
                 node.publish(topics.PLAN, out.plans[i], i)

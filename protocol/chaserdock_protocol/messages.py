@@ -34,7 +34,7 @@ ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
 Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
 Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
 OperatorCommandName = Literal[
-    "approach", "hold", "retreat", "abort", "goto", "calibrate", "detumble", "isolate", "restore"
+    "approach", "hold", "retreat", "abort", "goto", "calibrate", "identify", "detumble", "isolate", "restore"
 ]
 Level = Literal["info", "warning", "error"]
 Square3 = Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)]
@@ -58,6 +58,7 @@ PhaseName = Literal[
     "contact",
     "latched",
     "verified",
+    "identify",
     "detumble",
     "stack_hold",
 ]
@@ -333,6 +334,34 @@ class TargetEstimate(Message, frozen=True, kw_only=True):
     relative: Annotated[tuple[RelativeEstimate, ...], Meta(max_length=256)] = ()
 
 
+class MassEstimate(Struct, frozen=True, kw_only=True):
+    """Estimated mass properties of a body: centre of mass and inertia about it in TRF axes, the latter as xx, yy, zz, xy, xz, yz.
+
+    ``covariance`` is row-major (10, 10) over (mass, centre of mass, inertia).
+    """
+
+    mass_kg: float
+    centre_of_mass_m: Vector3
+    inertia_kg_m2: Annotated[tuple[float, ...], Meta(min_length=6, max_length=6)]
+    covariance: Annotated[tuple[float, ...], Meta(min_length=100, max_length=100)]
+
+
+class StackEstimate(Message, frozen=True, kw_only=True):
+    """Identified mass properties at ``sim_time_ns``: of the ``stack`` of the target and ``chasers``, and of the ``target`` alone.
+
+    ``thrust_factors``: estimated over stated thrust of every thruster, chaser after chaser. ``failed``: for each chaser the
+    thrusters that the motion of the stack shows to be stuck. Without chasers both bodies are the freely tumbling target.
+    """
+
+    chasers: ChaserIds
+    stack: MassEstimate
+    target: MassEstimate
+    thrust_factors: Annotated[
+        tuple[Annotated[tuple[float, ...], Meta(max_length=255)], ...], Meta(max_length=256)
+    ]
+    failed: Annotated[tuple[Thrusters, ...], Meta(max_length=256)] = ()
+
+
 class Reference(Message, frozen=True, kw_only=True):
     """Reference pose of a chaser at ``sim_time_ns``, and its phase.
 
@@ -447,7 +476,7 @@ class ThrusterReport(Message, frozen=True, kw_only=True):
 
     ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``: remaining impulse (body
     axes) of commanded pulses, without the part that belongs to the next command. ``given_*``: expected impulse of the
-    thrusters since the previous report.
+    thrusters since the previous report; ``given_thrusters_N_s``: of each.
     """
 
     chaser: ChaserId
@@ -459,6 +488,7 @@ class ThrusterReport(Message, frozen=True, kw_only=True):
     isolated: Thrusters = ()
     given_impulse_N_s: Vector3 = (0.0, 0.0, 0.0)
     given_angular_impulse_N_m_s: Vector3 = (0.0, 0.0, 0.0)
+    given_thrusters_N_s: Annotated[tuple[float, ...], Meta(max_length=255)] = ()
 
 
 class Event(Message, frozen=True, kw_only=True):
@@ -605,6 +635,7 @@ VERSION: dict[type[Struct], int] = {
     DrawnTruth: 1,
     Sighting: 2,
     TargetEstimate: 1,
+    StackEstimate: 1,
     Reference: 1,
     WrenchCommand: 1,
     Plan: 1,

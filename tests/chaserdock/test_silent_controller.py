@@ -41,14 +41,14 @@ def test_the_rigid_stack_keeps_its_momentum_and_moves_as_in_the_physics_engine()
     stack = RigidStack(scenario)
     before = stack.body.inertia_kg_m2 @ stack.omega_rad_s
     for _ in range(30):
-        stack.step(damping=False)
+        stack.step({})
     after = stack.body.inertia_kg_m2 @ stack.omega_rad_s
     assert math.isclose(float(np.linalg.norm(after)), float(np.linalg.norm(before)), rel_tol=1e-9)
     stack = RigidStack(scenario)
     with StackMission(scenario, no_sight, silent_from_s=0.0) as mission:
         start = stack.rates()
         for _ in range(45):
-            stack.step()
+            stack.step(stack.damping())
             mission.step()
         body, _, motion = mission.truth(mission.states())
         speed, rate = motion.rates(body)

@@ -88,10 +88,15 @@ class CompositeBody:
             sigmas[1] = math.hypot(sigmas[1], turned)
         self._estimator.disturb(Shock(sigmas[0], sigmas[1], velocity, omega))
 
-    def update_body(self, target: TargetState, odometry: Mapping[int, Odometry]) -> None:
-        """Recompute the body after a latch change, after a tick's sightings.
+    def refine_target(self, body: TargetBody) -> None:
+        """Replace the target's mass properties by identified ones, from the next update on."""
+        self._target_alone = body
+        self._changed = True
 
-        Masses are the scenario's; the poses of the latched chasers are estimated.
+    def update_body(self, target: TargetState, odometry: Mapping[int, Odometry]) -> None:
+        """Recompute the body after a latch change or a better knowledge of the target, after a tick's sightings.
+
+        The chasers' masses are the scenario's; the poses of the latched chasers are estimated.
         """
         if not self._changed or not self.latched <= odometry.keys():
             return

@@ -77,3 +77,12 @@ def superseded_by(done: OperatorCommand) -> CommandResult:
     """Refuse a command because ``done`` came first in the same tick."""
     operator = f" by {done.operator}" if done.operator else ""
     return CommandResult(False, f"{done.command}{operator} came first in this tick")
+
+
+def why_not_identify(scenario: FlightScenario) -> str:
+    """Return why the stack cannot be identified, or an empty string."""
+    if not scenario.detumble.identification.enabled:
+        return "detumble.identification.enabled is false"
+    if not scenario.chaser.thrusters or scenario.chaser.actuation != "thrusters":
+        return 'this mission\'s chasers fly without thrusters (chaser.actuation = "ideal")'
+    return ""

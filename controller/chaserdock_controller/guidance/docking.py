@@ -193,6 +193,7 @@ _CHECKS: dict[Phase, Callable[[Docking, PhaseProgress, DockingObservation], Trig
     Phase.CONTACT: _check_contact,
     Phase.LATCHED: _check_latched,
     Phase.VERIFIED: _check_latched,
+    Phase.IDENTIFY: _check_latched,
     Phase.DETUMBLE: _check_latched,
     Phase.STACK_HOLD: _check_latched,
 }

@@ -193,7 +193,7 @@ class PhaseMachine:
         match trigger:
             case Trigger.COMMAND_RETREAT | Trigger.COMMAND_ABORT:
                 self._back_out(i, trigger, now_s)
-            case Trigger.COMMAND_DETUMBLE:
+            case Trigger.COMMAND_DETUMBLE | Trigger.COMMAND_IDENTIFY:
                 self._transition(i, trigger, now_s, c.move)
             case Trigger.COMMAND_HOLD if self.in_corridor(i):
                 self._transition(i, trigger, now_s, stay(self._observed[i].offset_m, now_s))
@@ -227,6 +227,8 @@ class PhaseMachine:
             return f"in phase {c.phase} permitted: {', '.join(permitted_commands(c.phase, by_capture))}"
         if command.command == "detumble":
             return self._detumble_refusal
+        if command.command == "identify":
+            return validation.why_not_identify(self._scenario)
         if command.command == "approach":
             offset_m = c.move.at(np.array([now_s]))[0][0]
             return (
@@ -254,6 +256,22 @@ class PhaseMachine:
     def detumbling(self) -> frozenset[int]:
         """Return the chasers that stop the stack or keep it at rest."""
         return frozenset(i for i, c in enumerate(self.chasers) if c.phase in DETUMBLING)
+
+    def identifying(self) -> frozenset[int]:
+        """Return the chasers that fire pulses which identify the stack."""
+        return frozenset(i for i, c in enumerate(self.chasers) if c.phase is Phase.IDENTIFY)
+
+    def thrusting(self) -> frozenset[int]:
+        """Return the chasers whose thrusters the controller commands one by one."""
+        return self.detumbling() | self.identifying()
+
+    def update_identification(self, now_s: float) -> None:
+        """End the manoeuvre of chasers that have fired identifying pulses for long enough."""
+        duration_s = self._scenario.detumble.identification.duration_s
+        for i in sorted(self.identifying()):
+            c = self.chasers[i]
+            if now_s - c.since_s >= duration_s:
+                self._transition(i, Trigger.IDENTIFIED, now_s, c.move)
 
     def set_detumble_refusal(self, reason: str) -> None:
         """Set why this tick's commands to detumble are refused; empty if they are accepted."""

@@ -28,6 +28,7 @@ class Phase(StrEnum):
     CONTACT = "contact"
     LATCHED = "latched"
     VERIFIED = "verified"
+    IDENTIFY = "identify"
     DETUMBLE = "detumble"
     STACK_HOLD = "stack_hold"
 
@@ -48,6 +49,7 @@ class Trigger(StrEnum):
     COMMAND_GOTO = "command goto"
     COMMAND_RETREAT = "command retreat"
     COMMAND_ABORT = "command abort"
+    COMMAND_IDENTIFY = "command identify"
     COMMAND_DETUMBLE = "command detumble"
     CALIBRATION_COMPLETE = "calibration complete"
     MOVE_COMPLETE = "move complete"
@@ -60,6 +62,7 @@ class Trigger(StrEnum):
     TIP_CONTACT = "tip in contact"
     LATCH_CLOSED = "latch closed"
     PULL_WITHSTOOD = "pull test passed"
+    IDENTIFIED = "manoeuvre complete"
     STACK_STOPPED = "stack at rest"
     STACK_MOVED = "stack moves again"
     DETUMBLE_FAILED = "stack cannot be stopped"
@@ -82,7 +85,7 @@ CORRIDOR = (_P.ALIGN, _P.APPROACH, _P.FINAL, _P.CONTACT)
 """Phases of an approach to a port before the latch has closed."""
 DETUMBLING = (_P.DETUMBLE, _P.STACK_HOLD)
 """Phases in which the controller commands the thrusters of a latched chaser one by one."""
-ATTACHED = (_P.LATCHED, _P.VERIFIED, *DETUMBLING)
+ATTACHED = (_P.LATCHED, _P.VERIFIED, _P.IDENTIFY, *DETUMBLING)
 """Phases of a chaser whose latch holds the target."""
 APPROACHING = (_P.WAIT, *CORRIDOR, *ATTACHED, _P.DOCKED)
 """Phases that an ``approach`` command leads through."""
@@ -125,10 +128,12 @@ TRANSITIONS = (
     Transition((_P.FINAL,), _T.TIP_CONTACT, _P.CONTACT, by_capture=True),
     Transition(CORRIDOR, _T.LATCH_CLOSED, _P.LATCHED, by_capture=True),
     Transition((_P.LATCHED,), _T.PULL_WITHSTOOD, _P.VERIFIED, by_capture=True),
-    Transition((_P.VERIFIED,), _T.COMMAND_DETUMBLE, _P.DETUMBLE, by_capture=True),
+    Transition((_P.VERIFIED,), _T.COMMAND_IDENTIFY, _P.IDENTIFY, by_capture=True),
+    Transition((_P.IDENTIFY,), _T.IDENTIFIED, _P.VERIFIED, by_capture=True),
+    Transition((_P.VERIFIED, _P.IDENTIFY), _T.COMMAND_DETUMBLE, _P.DETUMBLE, by_capture=True),
     Transition((_P.DETUMBLE,), _T.STACK_STOPPED, _P.STACK_HOLD, by_capture=True),
     Transition((_P.STACK_HOLD,), _T.STACK_MOVED, _P.DETUMBLE, by_capture=True),
-    Transition(DETUMBLING, _T.COMMAND_HOLD, _P.VERIFIED, by_capture=True),
+    Transition((_P.IDENTIFY, *DETUMBLING), _T.COMMAND_HOLD, _P.VERIFIED, by_capture=True),
     Transition(DETUMBLING, _T.DETUMBLE_FAILED, _P.VERIFIED, by_capture=True),
     Transition((*CORRIDOR, *ATTACHED), _T.ATTEMPT_FAILED, _P.RETREAT, by_capture=True),
     Transition((_P.RETREAT,), _T.NEXT_ATTEMPT, _P.ALIGN, by_capture=True),
@@ -151,6 +156,7 @@ _COMMANDS = {
     "goto": Trigger.COMMAND_GOTO,
     "retreat": Trigger.COMMAND_RETREAT,
     "abort": Trigger.COMMAND_ABORT,
+    "identify": Trigger.COMMAND_IDENTIFY,
     "detumble": Trigger.COMMAND_DETUMBLE,
 }
 

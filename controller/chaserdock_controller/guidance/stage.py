@@ -25,7 +25,7 @@ from chaserdock_controller.interfaces import (
 from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from .chaser_state import ChaserGuidance
-from .detumble.control import DetumbleControl, StackState
+from .detumble.control import DetumbleControl, StackState, StackTask
 from .docking import DockingObservation
 from .horizon import ReferenceBuilder
 from .phase_machine import PhaseMachine
@@ -43,6 +43,7 @@ class GuidanceStage:
         self.thrusters = ThrusterCommandHandler(scenario)
         self.search = TargetSearch(scenario.chaser, scenario.camera_model())
         self.detumble = DetumbleControl(scenario)
+        self._waits = False
         self.references = ReferenceBuilder(scenario, self.machine)
 
     @property
@@ -61,7 +62,7 @@ class GuidanceStage:
         self.machine.update_planning(observation.time_s, failures)
         commands = (*self.machine.due_commands(observation.time_s), *observation.commands)
         stack = None
-        if self.machine.detumbling() or any(c.command == "detumble" for c in commands):
+        if self.machine.thrusting() or any(c.command in ("detumble", "identify") for c in commands):
             stack = self.detumble.state(observation, estimation)
         replies = self._apply_commands(commands, observation, stack)
         references: dict[int, ReferencePose] = {}
@@ -85,12 +86,14 @@ class GuidanceStage:
                 phase_time_s=observation.time_s - c.since_s,
                 latch=self.machine.latch(i),
                 free=self.machine.is_free(i),
-                isolated=self.thrusters.isolated(i),
+                isolated=self._isolated(i, estimation),
                 trusted=self.thrusters.trusted(i),
                 reference=references.get(i),
                 direct=thrusts.get(i) or self._direct_command(i, observation, estimation, i in attached),
             )
-        return GuidanceResult(directives, horizon, tuple(replies), tuple(self._events(estimation)))
+        return GuidanceResult(
+            directives, horizon, tuple(replies), (*self._events(estimation), *self._report_waiting())
+        )
 
     def _follow_estimate(self, observation: Observation, estimation: TargetEstimation) -> None:
         target, now_s = estimation.target, observation.time_s
@@ -141,15 +144,44 @@ class GuidanceStage:
     def _detumble_commands(
         self, observation: Observation, stack: StackState | None
     ) -> Mapping[int, DirectCommand]:
-        """Return the commands of detumbling chasers, by chaser. While the stack is at rest no thruster fires."""
-        active = self.machine.detumbling() & observation.odometry.keys()
+        """Return the commands of chasers that move the stack, by chaser. Pulses that identify it wait while it is stopped."""
+        detumbling = self.machine.detumbling() & observation.odometry.keys()
+        active = detumbling or self.machine.identifying() & observation.odometry.keys()
         if stack is None or not active:
+            self.detumble.reset()
             return {}
-        hold = all(self.chasers[i].phase is Phase.STACK_HOLD for i in active)
-        return self.detumble.commands(stack, active, observation.isolated, hold)
+        task = StackTask.STOP
+        if self._leaving():
+            task = StackTask.WAIT
+        elif not detumbling:
+            task = StackTask.IDENTIFY
+        elif all(self.chasers[i].phase is Phase.STACK_HOLD for i in active):
+            task = StackTask.HOLD
+        return self.detumble.commands(stack, active, observation.isolated, task, observation)
+
+    def _leaving(self) -> list[int]:
+        """Return the chasers that back out of their corridor: the stack must not turn under them by thrust."""
+        out = (Phase.RETREAT, Phase.ABORT)
+        return [
+            i
+            for i, c in enumerate(self.chasers)
+            if c.phase in out and not c.stuck and self.machine.is_free(i) and self.machine.in_corridor(i)
+        ]
+
+    def _report_waiting(self) -> list[LogEntry]:
+        """Return an event when the stack begins to wait for chasers that back out, or goes on."""
+        leaving = self._leaving() if self.machine.thrusting() else []
+        waits = bool(leaving)
+        if waits == self._waits:
+            return []
+        self._waits = waits
+        if not waits:
+            return [("info", "no chaser backs out any more: the stack is no longer coasting")]
+        return [("info", f"the stack coasts while chaser {leaving[0]} backs out")]
 
     def _update_stack(self, observation: Observation, stack: StackState | None) -> None:
         """Advance the phases of detumbling chasers; close their thrusters if those that are left cannot stop the stack."""
+        self.machine.update_identification(observation.time_s)
         active = self.machine.detumbling()
         if not active or stack is None:
             return
@@ -157,8 +189,9 @@ class GuidanceStage:
         if present and (reason := self.detumble.why_not(stack, present, observation.isolated)):
             self.machine.detumble_failed(observation.time_s, reason)
             return
-        stopped, share = self.detumble.is_stopped(stack), self.detumble.share_of_limits(stack)
-        self.machine.update_stack(observation.time_s, stopped, share > 1.0)
+        self.machine.update_stack(
+            observation.time_s, self.detumble.is_stopped(stack), self.detumble.moves_again(stack)
+        )
 
     def _update_chaser(self, i: int, observation: Observation, estimation: TargetEstimation) -> ReferencePose:
         """Advance a chaser's phase by its errors and its docking sensor; return its reference at the start of the tick."""
@@ -172,6 +205,12 @@ class GuidanceStage:
         if observed is not None:
             self.machine.update_docking(i, now_s, observed)
         return self.references.reference(i, pose)
+
+    def _isolated(self, i: int, estimation: TargetEstimation) -> tuple[int, ...]:
+        """Return the thrusters that an operator or the motion of the stack has isolated."""
+        failed = () if estimation.stack is None else estimation.stack.failed.get(i, ())
+        trusted = self.thrusters.trusted(i)
+        return tuple(sorted({*self.thrusters.isolated(i), *(k for k in failed if k not in trusted)}))
 
     def _observe_docking(
         self, i: int, odometry: Odometry, observation: Observation, estimation: TargetEstimation

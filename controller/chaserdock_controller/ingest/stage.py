@@ -45,6 +45,7 @@ class IngestStage:
             commands=inputs.commands,
             docking=inputs.docking,
             impulses=self._impulses(odometry, inputs, history),
+            thruster_impulses=self.thrusters.given_by_thruster(inputs.tick),
             ahead={i: self._ahead(i, inputs, effective_ns, history) for i in odometry},
             input_limits={i: self.thrusters.limits(i) for i in inputs.odometry},
             isolated=self.thrusters.isolated(),

@@ -47,3 +47,11 @@ class ThrusterReports:
             for i, r in self._reports.items()
             if r.tick == tick
         }
+
+    def given_by_thruster(self, tick: int) -> dict[int, Array]:
+        """Return the impulses (n,) of every chaser's thrusters between the tick before and ``tick``, as reported."""
+        return {
+            i: np.array(r.given_thrusters_N_s)
+            for i, r in self._reports.items()
+            if r.tick == tick and r.given_thrusters_N_s
+        }

@@ -7,16 +7,25 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     Event,
     Level,
+    MassEstimate,
     Plan,
     Reference,
     RelativeEstimate,
     SolverStatus,
+    StackEstimate,
     TargetEstimate,
     Tick,
     WrenchCommand,
 )
 
-from chaserdock_controller.interfaces import Directive, Observation, PlanResult, TargetEstimation
+from chaserdock_controller.estimation.identification.composite import MassProperties
+from chaserdock_controller.interfaces import (
+    Directive,
+    IdentifiedStack,
+    Observation,
+    PlanResult,
+    TargetEstimation,
+)
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan
 
 
@@ -60,6 +69,29 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
             for r in estimation.relative
             if r.chaser in estimation.disturbances
         ),
+    )
+
+
+def stack_message(observation: Observation, stack: IdentifiedStack) -> StackEstimate:
+    """Return the identified mass properties."""
+    return StackEstimate(
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        chasers=tuple(stack.chasers),
+        stack=_mass_estimate(stack.stack),
+        target=_mass_estimate(stack.target),
+        thrust_factors=tuple(f for i in stack.chasers for f in vector(stack.thrust_factors[i])),
+        failed=tuple(stack.failed.get(i, ()) for i in stack.chasers),
+    )
+
+
+def _mass_estimate(properties: MassProperties) -> MassEstimate:
+    values = properties.values
+    return MassEstimate(
+        mass_kg=float(values[0]),
+        centre_of_mass_m=vector(values[1:4]),
+        inertia_kg_m2=vector(values[4:]),
+        covariance=vector(properties.covariance),
     )
 
 

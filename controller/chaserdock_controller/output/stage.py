@@ -30,6 +30,7 @@ from .message_builders import (
     plan_message,
     reference_message,
     solver_message,
+    stack_message,
     target_message,
 )
 from .quantization import COMMAND_STEP, in_steps
@@ -52,6 +53,8 @@ class OutputStage:
     ) -> TickOutputs:
         """Return all messages of a tick."""
         out = TickOutputs(target=target_message(observation, estimation), replies=list(guidance.replies))
+        if estimation.stack is not None and observation.tick % self._scenario.time.rate_hz == 0:
+            out.stack = stack_message(observation, estimation.stack)
         events = [*observation.events, *estimation.events, *guidance.events, *result.events]
         for i in sorted(observation.odometry):
             directive = guidance.directives[i]

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from .fields import Positive, Section
+from .fields import NotNegative, Positive, Section, UnitQuaternion
 
 
 class RestLimits(Section):
@@ -13,6 +13,32 @@ class RestLimits(Section):
 
     rate_deg_s: Positive = Field(default=0.05, description="Angular rate, degrees/s.")
     speed_m_s: Positive = Field(default=0.001, description="Speed of the common centre of mass (WRF), m/s.")
+
+
+class Identification(Section):
+    """Mass properties of the stack, identified in flight from the odometry of latched chasers and their pulses. The other keys are
+    standard deviations of what is not known before."""
+
+    enabled: bool = Field(
+        default=False,
+        description="Whether mass, centre of mass and inertia are identified, and used by the control of the stack. Without it "
+        "those of `[target]` are taken as exact.",
+    )
+    duration_s: Positive = Field(
+        default=10.0, description="Length of the manoeuvre that the command `identify` begins, s."
+    )
+    mass_share: Positive = Field(
+        default=0.3, description="Of the target's mass, as a share of `target.mass_kg`."
+    )
+    inertia_share: Positive = Field(
+        default=0.3,
+        description="Of each element of its inertia, as a share of the mean moment of `[target]`.",
+    )
+    centre_of_mass_m: Positive = Field(default=0.1, description="Of its centre of mass per axis, m.")
+    thrust_share: Positive = Field(
+        default=0.05, description="Of each thruster's thrust, constant in a mission."
+    )
+    pulse_scatter_share: NotNegative = Field(default=0.03, description="Of each pulse's impulse.")
 
 
 class Detumble(RestLimits):
@@ -33,3 +59,14 @@ class Detumble(RestLimits):
         description="Half angle of a thruster's plume, degrees. A thruster whose plume hits the target, a port or a latched "
         "chaser does not fire.",
     )
+    plan_s: Positive | None = Field(
+        default=None,
+        description="Time in which a plan of least propellant stops the stack, s. Without it the feedback stops it as fast as it can.",
+    )
+    attitude_wxyz: UnitQuaternion | None = Field(
+        default=None,
+        description="Attitude that the stopped stack turns to and keeps, TRF to WRF: unit quaternion, scalar first. Without it the "
+        "stack keeps the attitude in which it stopped, within the limits of its rate.",
+    )
+    slew_deg_s: Positive = Field(default=1.0, description="Largest rate of that turn, degrees/s.")
+    identification: Identification = Identification()

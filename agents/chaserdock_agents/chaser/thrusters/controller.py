@@ -112,7 +112,7 @@ class ThrusterController:
         if now_ns - self._pruned_ns > _HISTORY_NS:
             self._pruned_ns = now_ns
             self._valves.forget_before(now_ns - _HISTORY_NS)
-        return self._report(odometry, self._matrix @ given)
+        return self._report(odometry, given)
 
     def report_failure(self, thruster: int, kind: FailureKind, factor: float, at_ns: int) -> None:
         """Take over a failure that the hardware reports; ``factor``: remaining share of the thrust."""
@@ -171,6 +171,7 @@ class ThrusterController:
         # Pulses that extend beyond the effective time of the next command, less the part that belongs to that command.
         pulses_N_s = self._impulses(odometry.sim_time_ns, effective_ns + _MAX_PERIOD_NS)
         coming = self._matrix @ (pulses_N_s - self._modulator.advance_N_s(effective_ns))
+        total = self._matrix @ given
         kinds: list[ThrusterState] = ["healthy"] * len(self._full_N)
         for thruster, fault in self._failed.items():
             kinds[thruster] = fault.kind
@@ -184,8 +185,9 @@ class ThrusterController:
             coming_angular_impulse_N_m_s=vector(coming[3:]),
             thrusters=tuple(kinds),
             isolated=self.isolated,
-            given_impulse_N_s=vector(given[:3]),
-            given_angular_impulse_N_m_s=vector(given[3:]),
+            given_impulse_N_s=vector(total[:3]),
+            given_angular_impulse_N_m_s=vector(total[3:]),
+            given_thrusters_N_s=vector(given),
         )
 
     def apply_command(self, command: WrenchCommand) -> None:

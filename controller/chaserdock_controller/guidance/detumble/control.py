@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Detumbling control: the motion of the stack from the estimates, thrusts that stop it, and why it cannot be stopped.
-
-The same inputs give the same thrusts: there is no state from tick to tick.
-"""
+"""Detumbling control: the motion of the stack from the estimates, thrusts that stop it, and why it cannot be stopped."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Set
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from enum import Enum, auto
 from functools import lru_cache, partial
 
 import numpy as np
@@ -24,28 +22,74 @@ from chaserdock_protocol.scenario.thrusters import thrusts_max
 from chaserdock_controller.estimation.composite_body import pose_in_target
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import TargetState
-from chaserdock_controller.interfaces import DirectCommand, Observation, TargetEstimation
+from chaserdock_controller.interfaces import DirectCommand, IdentifiedStack, Observation, TargetEstimation
 
 from .allocation import feedback, minimum_time, spans_all_directions
+from .planner import StackPlanner
+from .planning import Indices, StackProblem
+from .port_loads import LoadModel, load_model
+from .sequencer import Sequencer
 from .stack import StackMotion, thruster_wrenches
 
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
 _STOPPED_SHARE = 0.6
 """Share of the rest limits below which the stack counts as stopped; above the limits it moves again."""
+_SLEW_SHARE = 20.0
+"""Share of the rest limits beyond which a stack that turns to its commanded attitude counts as moving."""
+_ATTITUDE_DEADBAND_RAD = math.radians(0.3)
+_ATTITUDE_TIME_S = 5.0
+_PULSE_PERIOD_NS, _PULSE_NS = 600_000_000, 300_000_000
+
+
+class StackTask(Enum):
+    """What the thrusters of the stack are to do."""
+
+    STOP = auto()
+    HOLD = auto()
+    IDENTIFY = auto()
+    WAIT = auto()
 
 
 @dataclass(frozen=True, eq=False)
 class StackState:
-    """The stack as estimated for the time at which the commands take effect; ``chasers``: those latched, by number."""
+    """The stack as estimated for the time at which the commands take effect; ``chasers``: those latched, by number.
+
+    ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if estimated. ``failed``: thrusters
+    found stuck. ``informative``: see ``IdentifiedStack``.
+    """
 
     body: TargetBody
     chasers: Mapping[int, MountedChaser]
     motion: StackMotion
+    q_wxyz: Array
+    thrust_factors: Mapping[int, Array] = field(default_factory=dict)
+    failed: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
+    informative: Callable[[], tuple[tuple[int, int], ...]] = tuple
+
+    @property
+    def omega_rad_s(self) -> Array:
+        """Return the angular rate (3,), TRF axes."""
+        omega = np.linalg.solve(self.body.inertia_kg_m2, self.motion.angular_N_m_s)
+        return np.asarray(omega, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class _Thrusters:
+    """Thrusters of the active ``chasers``: ``wrenches`` (6, n) of 1 N commanded and ``limits_N`` (n,); ``groups`` (n,): row of
+    the chaser."""
+
+    chasers: tuple[int, ...]
+    wrenches: Array
+    limits_N: Array
+    groups: Indices
 
 
 class DetumbleControl:
-    """Feedback on the momentum of the stack for a scenario; no thruster fires whose plume would hit something."""
+    """Control of the stack for a scenario; no thruster fires whose plume would hit something.
+
+    A plan of least propellant, if the scenario gives it time, and feedback on the momentum, which needs no memory.
+    """
 
     def __init__(self, scenario: FlightScenario) -> None:
         self._scenario, self._settings = scenario, scenario.detumble
@@ -54,17 +98,21 @@ class DetumbleControl:
         self._own = wrench_matrix(self._thrusters)
         self._target = scenario.target_model()
         self._plume_free = lru_cache(maxsize=32)(partial(plume_free_thrusters, scenario))
+        plan_s = self._settings.plan_s
+        self.planner = None if plan_s is None else StackPlanner(plan_s)
+        self.sequencer = Sequencer(scenario)
+        self._judged: tuple[object, str] = (None, "")
+        self._pulse: tuple[int, int | None] = (-1, None)
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
         """Return the stack's state; None while the target is unknown or no latched chaser has odometry."""
         known = sorted(estimation.latched & estimation.own.keys())
         if estimation.at_effect is None or not known:
             return None
+        if estimation.stack is not None:
+            return self._identified_state(observation, estimation.stack, known)
         chasers = {i: MountedChaser(*pose_in_target(estimation.target, estimation.own[i])) for i in known}
-        ahead = np.zeros(6)
-        for i, chaser in chasers.items():
-            impulse = sum((duration_s * wrench for duration_s, wrench in observation.ahead[i]), np.zeros(6))
-            ahead = ahead + chaser.wrench_to_stack(impulse, estimation.body.centre_trf_m)
+        ahead = _impulse_ahead(observation, chasers, estimation.body)
         own = {i: estimation.own[i] for i in known}
         motion = observed_motion(estimation.body, estimation.target, own, self._variances(len(known)))
         turn = rotations.multiply(rotations.conjugate(estimation.at_effect.q_wxyz), estimation.target.q_wxyz)
@@ -72,7 +120,24 @@ class DetumbleControl:
             rotations.rotate(turn, part + ahead[k : k + 3])
             for k, part in ((0, motion.linear_N_s), (3, motion.angular_N_m_s))
         ]
-        return StackState(estimation.body, chasers, StackMotion(*parts))
+        return StackState(estimation.body, chasers, StackMotion(*parts), estimation.at_effect.q_wxyz)
+
+    def _identified_state(
+        self, observation: Observation, identified: IdentifiedStack, known: Sequence[int]
+    ) -> StackState:
+        """Return the state by the identified mass properties and the motion that was estimated with them."""
+        body, motion = identified.stack.body, identified.motion
+        chasers = {i: identified.chasers[i] for i in known}
+        ahead = _impulse_ahead(observation, chasers, body)
+        linear = body.mass_kg * rotations.rotate_inverse(motion.q_wxyz, motion.velocity_m_s) + ahead[:3]
+        angular = body.inertia_kg_m2 @ motion.omega_rad_s + ahead[3:]
+        latency_s = (observation.effective_ns - observation.time_ns) / 1e9
+        omega = np.linalg.solve(body.inertia_kg_m2, angular - ahead[3:] / 2.0)
+        turn = rotations.exp(omega * latency_s)
+        parts = StackMotion(rotations.rotate_inverse(turn, linear), rotations.rotate_inverse(turn, angular))
+        q = rotations.multiply(motion.q_wxyz, turn)
+        factors = {i: identified.thrust_factors[i] for i in known}
+        return StackState(body, chasers, parts, q, factors, identified.failed, identified.informative)
 
     def _variances(self, chasers: int) -> tuple[float, float]:
         """Return the variances per axis of velocity and rate of the stack by the odometry of so many chasers."""
@@ -82,29 +147,122 @@ class DetumbleControl:
         omega = errors.omega_noise_rad_s**2
         return velocity / chasers + 1e-12, omega / chasers + errors.gyro_bias_rad_s**2 + 1e-12
 
+    def reset(self) -> None:
+        """Forget plan and pulses that wait: no chaser stops the stack."""
+        if self.planner is not None:
+            self.planner.reset()
+        self.sequencer.reset()
+
     def commands(
-        self, state: StackState, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]], hold: bool
+        self,
+        state: StackState,
+        chasers: Set[int],
+        isolated: Mapping[int, tuple[int, ...]],
+        task: StackTask,
+        observation: Observation,
     ) -> dict[int, DirectCommand]:
-        """Return the commands of ``chasers`` that stop the stack; with ``hold`` none fires. ``isolated``: closed thrusters."""
+        """Return the commands of ``chasers`` for the task. ``isolated``: closed thrusters."""
         active = {i: state.chasers[i] for i in sorted(chasers & state.chasers.keys())}
         if not active:
             return {}
-        limits = self._limits(active, frozenset(state.chasers), isolated)
-        thrusts = np.zeros(len(limits))
-        if not hold and self.share_of_limits(state) > _DEADBAND_SHARE:
-            wrenches = thruster_wrenches(state.body, active, self._thrusters)
-            thrusts = feedback(wrenches, state.motion.momentum, limits, self._settings.response_s).thrusts_N
+        thrusters = self._thrusters_of(state, active, isolated)
+        match task:
+            case StackTask.STOP:
+                thrusts = self._stop(state, thrusters, observation.effective_ns)
+            case StackTask.HOLD:
+                thrusts = self._hold(state, thrusters)
+            case StackTask.IDENTIFY:
+                thrusts = self._informative(state, thrusters, observation.effective_ns)
+            case StackTask.WAIT:
+                self.reset()
+                thrusts = np.zeros(len(thrusters.limits_N))
+        if self.sequencer.limited:
+            model = self._load_model(state, thrusters)
+            thrusts = self.sequencer.in_turn(model, thrusts, thrusters.limits_N, observation.tick)
         rows = dict(zip(active, thrusts.reshape(len(active), -1), strict=True))
         return {i: DirectCommand("detumble", self._own @ row, row) for i, row in rows.items()}
 
-    def share_of_limits(self, state: StackState) -> float:
-        """Return the larger of speed and angular rate of the stack, as share of the rest limits."""
-        speed, rate = state.motion.rates(state.body)
+    # -- tasks -----------------------------------------------------------------------------------------------
+
+    def _stop(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
+        if self.share_of_limits(state) <= _DEADBAND_SHARE:
+            return np.zeros(len(thrusters.limits_N))
+        if self.planner is not None:
+            can = spans_all_directions(thrusters.wrenches, thrusters.limits_N)
+            planned = self.planner.thrusts(self._problem(state, thrusters), now_ns, can)
+            if planned is not None:
+                return planned
+        return self._feedback(state.motion.momentum, thrusters)
+
+    def _hold(self, state: StackState, thrusters: _Thrusters) -> Array:
+        """Return the thrusts that turn a stopped stack to the commanded attitude; none without one, or close to it."""
+        none = np.zeros(len(thrusters.limits_N))
+        reference = self._slew_rate(state)
+        if reference is None or self.share_of_limits(state, slewing=True) <= _DEADBAND_SHARE:
+            return none
+        if not spans_all_directions(thrusters.wrenches, thrusters.limits_N):
+            return none
+        wanted = np.concatenate([np.zeros(3), state.body.inertia_kg_m2 @ reference])
+        return self._feedback(state.motion.momentum - wanted, thrusters)
+
+    def _informative(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
+        """Return a pulse of the thruster that tells most about the mass properties, of those that damp the motion."""
+        thrusts = np.zeros(len(thrusters.limits_N))
+        number = now_ns // _PULSE_PERIOD_NS
+        if now_ns % _PULSE_PERIOD_NS >= _PULSE_NS:
+            return thrusts
+        if self._pulse[0] != number:
+            self._pulse = number, self._best_pulse(state, thrusters)
+        k = self._pulse[1]
+        if k is not None and k < len(thrusts):
+            thrusts[k] = thrusters.limits_N[k]
+        return thrusts
+
+    def _best_pulse(self, state: StackState, thrusters: _Thrusters) -> int | None:
+        velocity = state.motion.linear_N_s / state.body.mass_kg
+        rates = np.concatenate([velocity, state.omega_rad_s])
+        for chaser, thruster in state.informative():
+            if chaser not in thrusters.chasers:
+                continue
+            k = thrusters.chasers.index(chaser) * len(self._full_N) + thruster
+            if thrusters.limits_N[k] > 0.0 and float(thrusters.wrenches[:, k] @ rates) < 0.0:
+                return k
+        return None
+
+    def _feedback(self, momentum: Array, thrusters: _Thrusters) -> Array:
+        return feedback(thrusters.wrenches, momentum, thrusters.limits_N, self._settings.response_s).thrusts_N
+
+    def _slew_rate(self, state: StackState) -> Array | None:
+        """Return the rate (3,), TRF axes, towards the commanded attitude; None if there is none."""
+        wanted = self._settings.attitude_wxyz
+        if wanted is None:
+            return None
+        turn = rotations.log(rotations.multiply(rotations.conjugate(state.q_wxyz), np.array(wanted)))
+        angle = float(np.linalg.norm(turn))
+        if angle < _ATTITUDE_DEADBAND_RAD:
+            return np.zeros(3)
+        return turn * min(1.0 / _ATTITUDE_TIME_S, math.radians(self._settings.slew_deg_s) / angle)
+
+    # -- judgement -------------------------------------------------------------------------------------------
+
+    def share_of_limits(self, state: StackState, slewing: bool = False) -> float:
+        """Return the larger of speed and angular rate of the stack, as share of the rest limits. ``slewing``: the rate counts from
+        the one that turns the stack to its commanded attitude."""
+        speed, _ = state.motion.rates(state.body)
+        reference = self._slew_rate(state) if slewing else None
+        omega = state.omega_rad_s - (np.zeros(3) if reference is None else reference)
+        rate = float(np.linalg.norm(omega))
         return max(speed / self._settings.speed_m_s, rate / math.radians(self._settings.rate_deg_s))
 
     def is_stopped(self, state: StackState) -> bool:
         """Return whether the stack has stopped."""
         return self.share_of_limits(state) < _STOPPED_SHARE
+
+    def moves_again(self, state: StackState) -> bool:
+        """Return whether a stack at rest moves: faster than the limits, beside the turn to its commanded attitude."""
+        share = self.share_of_limits(state, slewing=True)
+        slews = self._slew_rate(state) is not None
+        return share > (_SLEW_SHARE if slews else 1.0)
 
     def why_not(
         self, state: StackState | None, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
@@ -117,33 +275,91 @@ class DetumbleControl:
         if missing := sorted(chasers - state.chasers.keys()):
             return f"chaser {missing[0]} is not latched, or its state is not known"
         active = {i: state.chasers[i] for i in sorted(chasers)}
-        wrenches = thruster_wrenches(state.body, active, self._thrusters)
-        limits = self._limits(active, frozenset(state.chasers), isolated)
-        if not spans_all_directions(wrenches, limits):
+        thrusters = self._thrusters_of(state, active, isolated)
+        limits = thrusters.limits_N
+        if not spans_all_directions(thrusters.wrenches, limits):
             usable = ", ".join(
                 f"{(row > 0.0).sum()} of {len(row)} of chaser {i}"
                 for i, row in zip(active, limits.reshape(len(active), -1), strict=True)
             )
-            return f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
-        least = minimum_time(wrenches, state.motion.momentum, limits)
+            reason = f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
+            return self._why_no_plan(state, thrusters, reason)
+        least = minimum_time(thrusters.wrenches, state.motion.momentum, limits)
         if least is None or least.time_s > self._settings.timeout_s:
             time = "without end" if least is None else f"at least {least.time_s:.0f} s"
             return f"stopping the stack takes {time}; detumble.timeout_s is {self._settings.timeout_s:g} s"
         return ""
 
-    def _limits(
-        self,
-        active: Mapping[int, MountedChaser],
-        latched: frozenset[int],
-        isolated: Mapping[int, tuple[int, ...]],
-    ) -> Array:
-        """Return the largest thrusts (N n,) of the active chasers: zero where a plume is not free or the thruster is closed."""
-        rows = []
+    def _why_no_plan(self, state: StackState, thrusters: _Thrusters, reason: str) -> str:
+        """Return why these thrusters cannot stop the stack even by a plan that uses its rotation. Judged once for each set."""
+        if self.planner is None:
+            return reason
+        key = (thrusters.chasers, tuple((thrusters.limits_N > 0.0).tolist()))
+        if self._judged[0] != key:
+            plan = self.planner.trial(self._problem(state, thrusters))
+            left = StackMotion(plan.remaining[:3], rotations.rotate_inverse(state.q_wxyz, plan.remaining[3:]))
+            speed, rate = left.rates(state.body)
+            stops = speed < self._settings.speed_m_s and math.degrees(rate) < self._settings.rate_deg_s
+            left_over = (
+                f"{reason}, and a plan of {plan.duration_s:.0f} s (detumble.plan_s) leaves {speed * 1e3:.2g} mm/s and "
+                f"{math.degrees(rate):.2g} degrees/s"
+            )
+            self._judged = key, "" if stops else left_over
+        return self._judged[1]
+
+    # -- models ----------------------------------------------------------------------------------------------
+
+    def _problem(self, state: StackState, thrusters: _Thrusters) -> StackProblem:
+        momentum = [
+            rotations.rotate(state.q_wxyz, p) for p in (state.motion.linear_N_s, state.motion.angular_N_m_s)
+        ]
+        return StackProblem(
+            np.concatenate(momentum),
+            state.q_wxyz,
+            state.body.inertia_kg_m2,
+            thrusters.wrenches,
+            thrusters.limits_N,
+            thrusters.groups,
+            1 if self.sequencer.limited else None,
+        )
+
+    def _thrusters_of(
+        self, state: StackState, active: Mapping[int, MountedChaser], isolated: Mapping[int, tuple[int, ...]]
+    ) -> _Thrusters:
+        """Return the thrusters of the active chasers: the limit is zero where a plume is not free or the thruster is closed."""
+        latched, rows = frozenset(state.chasers), []
         for i in active:
             row = np.where(self._plume_free(latched)[i], self._full_N, 0.0)
-            row[list(isolated.get(i, ()))] = 0.0
+            row[[*isolated.get(i, ()), *state.failed.get(i, ())]] = 0.0
             rows.append(row)
-        return np.concatenate(rows)
+        wrenches = thruster_wrenches(state.body, active, self._thrusters)
+        if state.thrust_factors:
+            wrenches = wrenches * np.concatenate([state.thrust_factors[i] for i in active])
+        groups = np.repeat(np.arange(len(active)), len(self._full_N))
+        return _Thrusters(tuple(active), wrenches, np.concatenate(rows), groups)
+
+    def _load_model(self, state: StackState, thrusters: _Thrusters) -> LoadModel:
+        count = len(self._full_N)
+        own = {i: (slice(k * count, (k + 1) * count), self._own) for k, i in enumerate(thrusters.chasers)}
+        return load_model(
+            state.body,
+            state.omega_rad_s,
+            thrusters.wrenches,
+            state.chasers,
+            own,
+            self._scenario.chaser,
+            self.sequencer.tips_m,
+            self.sequencer.limits,
+        )
+
+
+def _impulse_ahead(observation: Observation, chasers: Mapping[int, MountedChaser], body: TargetBody) -> Array:
+    """Return the impulse (6,), TRF axes, of all that acts until the commands take effect."""
+    ahead = np.zeros(6)
+    for i, chaser in chasers.items():
+        impulse = sum((duration_s * wrench for duration_s, wrench in observation.ahead[i]), np.zeros(6))
+        ahead = ahead + chaser.wrench_to_stack(impulse, body.centre_trf_m)
+    return ahead
 
 
 def observed_motion(

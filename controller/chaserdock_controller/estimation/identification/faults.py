@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Thrusters of latched chasers that are stuck off or on, detected on the motion of the whole stack. No I/O.
+
+Generalized likelihood ratio on the innovations of the identification filter (A. S. Willsky and H. L. Jones, IEEE Trans. Automatic
+Control 21, 1976): for every thruster and kind of failure the signature of the failure in the filter's state is propagated, and the
+log-likelihood ratio to the fault-free hypothesis is summed. A sum that falls below zero starts again, as in a CUSUM test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from scipy.linalg import cho_solve
+
+from .composite import RATE, VELOCITY, CompositeIdentification, Flags, Innovation, Prediction
+
+_LEAST_GAIN = 25.0
+"""Least log-likelihood ratio to the fault-free hypothesis."""
+_LEAST_MARGIN = 6.0
+"""Least difference to the best hypothesis about another thruster."""
+_CORRECTION_SIGMA = 0.2
+"""Standard deviation of the effect of a detected failure so far, as a share of it."""
+_DOUBT = 3.0
+"""Factor of the standard deviations of the mass properties after a failure: what it did before its signature began is not known."""
+
+
+@dataclass(frozen=True)
+class StackFault:
+    """A failed thruster of a latched chaser."""
+
+    chaser: int
+    thruster: int
+    kind: Literal["stuck_off", "stuck_on"]
+
+
+class StackFaultDetector:
+    """Signatures (size, 2 u) and log-likelihood ratios (2 u,) of all thrusters that may fire: first stuck off, then stuck on."""
+
+    def __init__(self, thrusters: Sequence[tuple[int, int]], size: int, full_N: Array) -> None:
+        self._thrusters, self._full_N = tuple(thrusters), full_N
+        self._signatures = np.zeros((size, 2 * len(self._thrusters)))
+        self.gains = np.zeros(2 * len(self._thrusters))
+
+    def reset(self) -> None:
+        """Begin all tests again."""
+        self._signatures[:], self.gains[:] = 0.0, 0.0
+
+    def predict(self, prediction: Prediction) -> None:
+        """Propagate the signatures over a tick."""
+        count = len(self._thrusters)
+        self._signatures = prediction.transition @ self._signatures
+        missing = -prediction.pushed * prediction.impulses_N_s
+        full = self._full_N * prediction.step_s
+        beyond = prediction.pushed * np.maximum(full - prediction.impulses_N_s, 0.0)
+        for part, rows in ((VELOCITY, slice(0, 3)), (RATE, slice(3, 6))):
+            self._signatures[part, :count] += missing[rows]
+            self._signatures[part, count:] += beyond[rows]
+
+    def update(self, innovation: Innovation, suspects: Flags) -> tuple[StackFault, Array] | None:
+        """Return a failure that the innovations prove, with its effect on the state; ``suspects`` (u,): thrusters in question."""
+        shift = innovation.matrix @ self._signatures
+        weighted = cho_solve(innovation.factor, shift)
+        self.gains += innovation.residual @ weighted - 0.5 * np.sum(shift * weighted, axis=0)
+        self._signatures = self._signatures - innovation.gain @ shift
+        again = (self.gains < 0.0) | np.tile(~suspects, 2)
+        self.gains[again], self._signatures[:, again] = 0.0, 0.0
+        best = int(np.argmax(self.gains))
+        count = len(self._thrusters)
+        other = np.delete(self.gains, [best % count, best % count + count])
+        if self.gains[best] < _LEAST_GAIN or self.gains[best] - other.max(initial=0.0) < _LEAST_MARGIN:
+            return None
+        chaser, thruster = self._thrusters[best % count]
+        fault = StackFault(chaser, thruster, "stuck_off" if best < count else "stuck_on")
+        effect = self._signatures[:, best].copy()
+        self.reset()
+        return fault, effect
+
+
+def apply_fault(identification: CompositeIdentification, effect: Array) -> None:
+    """Remove the effect of a failure that was not known from the state of the filter."""
+    identification.correct(effect, _CORRECTION_SIGMA)
+    identification.widen(_DOUBT)

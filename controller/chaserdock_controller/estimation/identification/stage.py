@@ -1,0 +1,215 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Identification in a mission: runs the filter of the stack while chasers are latched, and its fault detection."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
+from chaserdock_models.rigid_body import BodyState
+from chaserdock_protocol.messages import Odometry
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.mounting import nominal_mounting, plume_free_thrusters
+from chaserdock_protocol.scenario.thrusters import thrusts_max
+
+from chaserdock_controller.estimation.composite_body import pose_in_target, target_body
+from chaserdock_controller.estimation.measurements import SightingConverter
+from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
+
+from .composite import CompositeIdentification, IdentificationParameters, attach, prior_of
+from .faults import StackFault, StackFaultDetector, apply_fault
+from .free_tumble import TumbleIdentification, inertia_ratios
+
+_SHOCK = (0.01, 0.02)
+"""One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
+_SILENT_S, _SILENT_SHARE = 1.0, 0.02
+"""Thrusters of a chaser that reports none are unknown for this long, and later up to this share of their thrust."""
+_SETTLED_RAD_S = 0.01
+_REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
+_PULSE_S = 0.3
+_WATCH_S = 1.0
+"""Time over which a pulse's effect is thought to be measured when pulses are compared."""
+_GOOD = (0.02, 0.005, 0.05)
+"""Accuracy that is worth the same of mass (share), centre (m) and inertia (share of the largest moment)."""
+
+
+def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
+    """Return the filter's parameters."""
+    s = scenario.detumble.identification
+    return IdentificationParameters(
+        mass_share=s.mass_share,
+        inertia_share=s.inertia_share,
+        centre_m=s.centre_of_mass_m,
+        thrust_share=s.thrust_share,
+        scatter_share=s.pulse_scatter_share,
+    )
+
+
+class StackIdentification:
+    """The filter of the stack that is latched now. ``target``: what is known of the target alone, kept when chasers come and go."""
+
+    def __init__(self, scenario: FlightScenario) -> None:
+        self._scenario, self._parameters = scenario, parameters_of(scenario)
+        self._period_s = 1.0 / scenario.time.rate_hz
+        self._full_N = thrusts_max(scenario.chaser.thrusters)
+        self.target = prior_of(target_body(scenario), self._parameters)
+        self.failed: dict[int, tuple[int, ...]] = {}
+        self._converter = SightingConverter(scenario.camera_model())
+        self._tumble: TumbleIdentification | None = None
+        self._filter: CompositeIdentification | None = None
+        self._detector: StackFaultDetector | None = None
+        self._reporting: set[int] = set()
+        self._silent_ticks: dict[int, int] = {}
+        self._events: list[LogEntry] = []
+
+    def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
+        """Take a tick's odometry and pulses; return None while nothing is latched or the target is unknown."""
+        latched = estimation.latched
+        if not latched:
+            self._filter = None
+            return self._run_free(observation, estimation)
+        self._tumble = None
+        if not estimation.known or not latched & observation.odometry.keys():
+            self._filter = None
+            return None
+        states = {
+            i: body_state(observation.odometry[i]) for i in sorted(latched & observation.odometry.keys())
+        }
+        if self._filter is None or set(self._filter.chasers) != latched:
+            self._begin(estimation, states)
+        else:
+            self._predict(observation)
+        assert self._filter is not None
+        innovation = self._filter.update(states)
+        if innovation is not None and self._detector is not None:
+            suspects = np.array(
+                [
+                    t not in self.failed.get(i, ()) and self._silent_ticks.get(i, 0) == 0
+                    for i, t in self._filter.usable
+                ],
+                dtype=bool,
+            )
+            found = self._detector.update(innovation, suspects)
+            if found is not None:
+                self._add_fault(*found)
+        self.target = self._filter.target(self._scenario.chaser)
+        return IdentifiedStack(
+            stack=self._filter.stack,
+            target=self.target,
+            chasers=self._filter.mounted,
+            motion=self._filter.motion,
+            thrust_factors=self._filter.thrust_factors,
+            failed=dict(self.failed),
+            informative=self._by_information,
+        )
+
+    def _run_free(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
+        """Take a tick's sightings of the free target; return None while it is not tracked."""
+        target, first = estimation.target, False
+        if target.status != "tracking":
+            self._tumble = None
+            return None
+        if self._tumble is None:
+            if float(target.covariance[9:, 9:].trace()) > _SETTLED_RAD_S**2:
+                return None
+            motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+            cameras = range(len(self._scenario.chasers))
+            errors = self._scenario.navigation.errors()
+            self._tumble = TumbleIdentification(self.target, cameras, motion, errors, self._parameters)
+            first = True
+        self._converter.add_odometry(observation.odometry, observation.time_ns)
+        found = self._converter.measurements(observation.sightings)
+        self._tumble.step([m for m in found if m.time_ns == observation.time_ns], self._period_s, first)
+        if any(d.contact for d in observation.docking.values()):
+            self._tumble.disturb(*_SHOCK)
+        self.target = self._tumble.target
+        motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+        return IdentifiedStack(self.target, self.target, {}, motion, {}, {}, tuple)
+
+    def identified(self, observation: Observation, estimation: TargetEstimation) -> TargetEstimation:
+        """Return the estimation with the identified stack and its events."""
+        stack = self.run(observation, estimation)
+        events, self._events = self._events, []
+        return replace(estimation, stack=stack, events=(*estimation.events, *events))
+
+    def refined_target(self, observation: Observation) -> TargetBody | None:
+        """Return the target's mass properties for the estimator of its motion, now and then, once they are known well enough."""
+        if observation.tick % max(1, round(_REFINE_S / self._period_s)):
+            return None
+        ratios = math.sqrt(float(np.trace(inertia_ratios(self.target)[1])))
+        centre_m = math.sqrt(float(np.trace(self.target.covariance[1:4, 1:4])))
+        return self.target.body if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
+
+    def _begin(self, estimation: TargetEstimation, states: Mapping[int, BodyState]) -> None:
+        s, chasers = self._scenario, {}
+        for i in sorted(estimation.latched):
+            own = estimation.own.get(i)
+            chasers[i] = (
+                nominal_mounting(s, i)
+                if own is None
+                else MountedChaser(*pose_in_target(estimation.target, own))
+            )
+        # The measured ones first: the filter starts from them.
+        chasers = {i: chasers[i] for i in sorted(chasers, key=lambda i: (i not in states, i))}
+        usable = plume_free_thrusters(s, estimation.latched)
+        prior = attach(self.target, chasers, s.chaser)
+        errors = s.navigation.errors()
+        self._filter = CompositeIdentification(
+            prior, chasers, states, s.chaser.thrusters, usable, errors, self._parameters, len(states)
+        )
+        full = np.array([self._full_N[t] for _, t in self._filter.usable])
+        self._detector = StackFaultDetector(self._filter.usable, len(self._filter.covariance), full)
+
+    def _predict(self, observation: Observation) -> None:
+        assert self._filter is not None
+        assert self._detector is not None
+        given = {i: j for i, j in observation.thruster_impulses.items() if i in self._filter.chasers}
+        if given.keys() != self._reporting:
+            self._detector.reset()
+        self._reporting = set(given)
+        unknown = {}
+        for i in self._filter.chasers:
+            self._silent_ticks[i] = 0 if i in given else self._silent_ticks.get(i, 0) + 1
+            # What was commanded before, or is fired without the controller, is not reported.
+            if i not in given:
+                early = self._silent_ticks[i] * self._period_s <= _SILENT_S
+                unknown[i] = self._full_N * (self._period_s if early else _SILENT_SHARE * self._period_s)
+        self._detector.predict(self._filter.predict(given, self._period_s, unknown))
+        if any(d.contact and not d.latched for d in observation.docking.values()):
+            self._filter.disturb(*_SHOCK)
+
+    def _add_fault(self, fault: StackFault, effect: Array) -> None:
+        assert self._filter is not None
+        apply_fault(self._filter, effect)
+        self.failed[fault.chaser] = tuple(sorted({*self.failed.get(fault.chaser, ()), fault.thruster}))
+        kind = fault.kind.replace("_", " ")
+        text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
+        self._events.append(("warning", text))
+
+    def _by_information(self) -> tuple[tuple[int, int], ...]:
+        """Return the thrusters by what a pulse tells about the mass properties, the best first."""
+        assert self._filter is not None
+        errors, stack = self._scenario.navigation.errors(), self._filter.stack
+        count = len(self._filter.chasers) * _WATCH_S / self._period_s
+        noise = (
+            np.repeat([errors.velocity_noise_m_s, errors.omega_noise_rad_s], 3) * math.sqrt(2.0 / count)
+            + 1e-7
+        )
+        largest = float(np.linalg.eigvalsh(stack.body.inertia_kg_m2)[-1])
+        scale = np.array([_GOOD[0] * stack.body.mass_kg, *[_GOOD[1]] * 3, *[_GOOD[2] * largest] * 6])
+        gains = self._filter.pulse_gains(float(self._full_N.max()) * _PULSE_S, noise, scale)
+        usable = self._filter.usable
+        order = np.argsort(-gains, kind="stable")
+        return tuple(usable[k] for k in order if usable[k][1] not in self.failed.get(usable[k][0], ()))
+
+
+def body_state(o: Odometry) -> BodyState:
+    """Return the state in an odometry message."""
+    return BodyState(
+        np.array(o.position_m), np.array(o.velocity_m_s), np.array(o.q_wxyz), np.array(o.omega_rad_s)
+    )

@@ -1,0 +1,222 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Least-propellant plans that stop a stack within a time, while it turns. Pure functions.
+
+States: momentum P, angular momentum H about the centre of mass (WRF) and attitude q; inputs: thrusts f >= 0 of all thrusters,
+constant over each step. P' = R F, H' = R T, q' = q (0, w) / 2 with w = I^-1 R' H, and (F, T) = B f in TRF axes. The sum of all
+impulses is minimized, with an exact penalty on P and H at the end. Sequential linear programming with a trust region (S l1 LP;
+Nocedal and Wright, "Numerical Optimization", section 18.5): each programme is linearized about the flight of the last thrusts.
+Its solutions are vertices: nearly all thrusters are off or fully on, as pulses need.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from numpy.typing import NDArray
+from scipy.optimize import linprog
+from scipy.sparse import csr_array, eye_array, hstack, kron
+
+from .allocation import units_of
+
+Indices = NDArray[np.intp]
+
+_PENALTY = 30.0
+"""Price of a remaining momentum over that of the impulse that would remove it in the thrusters' best direction."""
+_LEAST_RADIUS = 0.002
+_ACCEPT = 0.05
+"""Share of a predicted improvement that must be real for a step to be taken."""
+
+
+@dataclass(frozen=True, eq=False)
+class StackProblem:
+    """A stack to stop. ``momentum`` (6,): P and H, WRF axes. ``wrenches`` (6, n) of 1 N of each thruster, TRF axes. ``groups``:
+    for each thruster the number of its chaser; ``at_once``: how many thrusters of a chaser may fire at the same time, or None."""
+
+    momentum: Array
+    q_wxyz: Array
+    inertia_kg_m2: Array
+    wrenches: Array
+    limits_N: Array
+    groups: Indices
+    at_once: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class StackPlan:
+    """``thrusts_N`` (K, n) for K steps of ``step_s``. ``remaining`` (6,): momentum at the end, WRF axes, by the plan's own model;
+    ``impulse_N_s`` of all thrusters."""
+
+    thrusts_N: Array
+    step_s: float
+    remaining: Array
+
+    @property
+    def impulse_N_s(self) -> float:
+        return float(self.thrusts_N.sum()) * self.step_s
+
+    @property
+    def duration_s(self) -> float:
+        return len(self.thrusts_N) * self.step_s
+
+
+@dataclass(frozen=True, eq=False)
+class _Flight:
+    """States at the begin of every step, and at its middle rotation and rate."""
+
+    end: Array
+    rotations: Array
+    rates: Array
+    momenta: Array
+    turned: Array
+
+
+def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: int) -> StackPlan:
+    """Return the plan after at most so many linear programmes, begun with ``guess_N`` (K, n).
+
+    Raises ValueError for numbers that are not finite or a step that is not positive.
+    """
+    if not (step_s > 0.0 and math.isfinite(step_s)):
+        raise ValueError(f"step_s must be positive, not {step_s!r}")
+    if not (np.isfinite(problem.momentum).all() and np.isfinite(problem.wrenches).all()):
+        raise ValueError("momentum and wrenches must be finite")
+    able = np.flatnonzero(problem.limits_N > 0.0)
+    if not len(able):
+        return StackPlan(np.zeros_like(guess_N), step_s, problem.momentum.copy())
+    thrusts = np.clip(guess_N, 0.0, problem.limits_N)
+    price = _price(problem, able)
+    flight = fly(problem, thrusts, step_s)
+    merit = _merit(flight, thrusts, step_s, price)
+    radius = 1.0
+    for _ in range(iterations):
+        step, predicted = _linear_step(problem, flight, thrusts, step_s, able, price, radius)
+        gain = merit - predicted
+        if gain <= 1e-4 * (1.0 + abs(merit)):
+            break
+        tried = np.clip(thrusts + step, 0.0, problem.limits_N)
+        tried_flight = fly(problem, tried, step_s)
+        tried_merit = _merit(tried_flight, tried, step_s, price)
+        ratio = (merit - tried_merit) / gain
+        if ratio > _ACCEPT:
+            thrusts, flight, merit = tried, tried_flight, tried_merit
+        radius = min(1.0, 2.0 * radius) if ratio > 0.75 else radius if ratio > 0.3 else radius / 3.0
+        if radius < _LEAST_RADIUS:
+            break
+    return StackPlan(thrusts, step_s, flight.end)
+
+
+def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
+    """Return the flight of a stack under thrusts (K, n), by the midpoint rule."""
+    inverse = np.linalg.inv(problem.inertia_kg_m2)
+    bodies = thrusts_N @ problem.wrenches.T  # force and torque (K, 6), TRF axes
+    p, h, q = problem.momentum[:3].copy(), problem.momentum[3:].copy(), problem.q_wxyz
+    count = len(thrusts_N)
+    middles, rates, momenta = np.empty((count, 3, 3)), np.empty((count, 3)), np.empty((count, 3))
+    for k in range(count):
+        omega = inverse @ rotations.rotate_inverse(q, h)
+        middle = rotations.to_matrix(rotations.multiply(q, rotations.exp(omega * (step_s / 2.0))))
+        torque = middle @ bodies[k, 3:]
+        own = middle.T @ (h + torque * (step_s / 2.0))
+        omega = inverse @ own
+        middles[k], rates[k], momenta[k] = middle, omega, own
+        p = p + step_s * (middle @ bodies[k, :3])
+        h = h + step_s * torque
+        q = rotations.multiply(q, rotations.exp(omega * step_s))
+    return _Flight(np.concatenate([p, h]), middles, rates, momenta, bodies)
+
+
+def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Indices) -> Array:
+    """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters ``able`` at every step."""
+    inverse = np.linalg.inv(problem.inertia_kg_m2)
+    own = problem.wrenches[:, able]
+    count, half = len(flight.rates), step_s / 2.0
+    rows = np.empty((count, 6, len(able)))
+    # Of the momentum at the end: by that at the begin of a step it is the same, by the attitude (TRF axes) ``by_turn`` and, through
+    # the rate, by the angular momentum ``by_spin``.
+    by_turn, by_spin = np.zeros((6, 3)), np.zeros((6, 3))
+    for k in range(count - 1, -1, -1):
+        r, omega, h = flight.rotations[k], flight.rates[k], flight.momenta[k]
+        force, torque = flight.turned[k, :3], flight.turned[k, 3:]
+        pushed = np.concatenate([-r @ rotations.skew(force), -r @ rotations.skew(torque)]) * step_s
+        total = np.zeros((6, 3))
+        total[3:] = np.eye(3)
+        # By the attitude in the middle of the step, and by the rate in it.
+        by_rate = step_s * by_turn
+        middle = (
+            pushed
+            + by_spin @ pushed[3:]
+            + by_rate @ inverse @ (rotations.skew(h) - half * rotations.skew(torque))
+        )
+        direct = np.concatenate([r @ own[:3], r @ own[3:]]) * step_s
+        rows[k] = direct + by_spin @ direct[3:] + by_rate @ inverse @ (half * own[3:])
+        back = rotations.to_matrix(rotations.exp(-omega * half))
+        spin = inverse @ r.T
+        by_spin = by_spin + by_rate @ spin + middle @ (half * spin)
+        by_turn = by_turn @ back @ back + middle @ back
+    return rows.transpose(1, 0, 2).reshape(6, -1)
+
+
+def _price(problem: StackProblem, able: Indices) -> Array:
+    """Return the penalty (6,) per N s and N m s of remaining momentum."""
+    force, torque = units_of(problem.wrenches[:, able], problem.limits_N[able])
+    thrust = float(problem.limits_N[able].max())
+    return _PENALTY * thrust / np.repeat([force, torque], 3)
+
+
+def _merit(flight: _Flight, thrusts_N: Array, step_s: float, price: Array) -> float:
+    return float(thrusts_N.sum()) * step_s + float(price @ np.abs(flight.end))
+
+
+def _linear_step(
+    problem: StackProblem,
+    flight: _Flight,
+    thrusts_N: Array,
+    step_s: float,
+    able: Indices,
+    price: Array,
+    radius: float,
+) -> tuple[Array, float]:
+    """Return the change of the thrusts (K, n) that the linear programme gives, and the merit that it predicts."""
+    count, a = len(thrusts_N), len(able)
+    jacobian = sensitivity(problem, flight, step_s, able)
+    now = thrusts_N[:, able].reshape(-1)
+    limits = np.tile(problem.limits_N[able], count)
+    lower, upper = np.maximum(0.0, now - radius * limits), np.minimum(limits, now + radius * limits)
+    # In shares of full thrust and of the price, all numbers are near one.
+    rows = jacobian * limits * price[:, None]
+    right = price * (jacobian @ now - flight.end)
+    cost = np.concatenate([step_s * limits, np.ones(12)])
+    slack = np.hstack([-np.eye(6), np.eye(6)])
+    bounds = np.concatenate(
+        [np.stack([lower / limits, upper / limits], axis=1), np.tile([0.0, np.inf], (12, 1))]
+    )
+    sequencing, most = _sequencing(problem, able, count)
+    found = linprog(
+        cost,
+        A_ub=sequencing,
+        b_ub=most,
+        A_eq=np.hstack([rows, slack]),
+        b_eq=right,
+        bounds=bounds,
+        method="highs-ds",
+    )
+    if found.status != 0:
+        return np.zeros_like(thrusts_N), math.inf
+    step = np.zeros_like(thrusts_N)
+    step[:, able] = (found.x[: count * a] * limits - now).reshape(count, a)
+    return step, float(found.fun)
+
+
+def _sequencing(problem: StackProblem, able: Indices, count: int) -> tuple[Any, Array | None]:
+    """Return the rows (sparse) that let at most ``at_once`` thrusters of a chaser fire in a step; None without a limit."""
+    if problem.at_once is None:
+        return None, None
+    groups = problem.groups[able]
+    own = csr_array(np.array([groups == g for g in np.unique(groups)], dtype=float))
+    number = count * len(np.unique(groups))
+    rows = hstack([kron(eye_array(count), own), csr_array((number, 12))], format="csr")
+    return rows, np.full(number, float(problem.at_once))

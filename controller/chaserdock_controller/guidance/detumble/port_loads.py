@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loads that latched chasers exert on their ports, and which thrusters may fire together so that no load exceeds its limit.
+
+Scaling the thrusts does not lower the peaks, because every pulse is fully on; only firing one after the other does. Pure functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
+from chaserdock_models.rigid_body import RigidBody
+
+from chaserdock_controller.estimation.target_body import TargetBody
+
+_MARGIN = 0.9
+"""Share of the limits that is used: model errors and the joint's vibrations have the rest."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadModel:
+    """Loads at P ports: ``constant`` (P, 6) plus ``by_thrust`` (P, 6, n) times the thrusts; force and torque about the tip, TRF axes.
+    ``limits`` (P, 2): of their magnitudes, infinite without one."""
+
+    constant: Array
+    by_thrust: Array
+    limits: Array
+
+    def within(self, thrusts_N: Array) -> bool:
+        """Return whether no port exceeds its limits under thrusts (n,) of open valves."""
+        loads = self.constant + self.by_thrust @ thrusts_N
+        magnitudes = np.stack(
+            [np.linalg.norm(loads[:, :3], axis=1), np.linalg.norm(loads[:, 3:], axis=1)], axis=1
+        )
+        return bool((magnitudes <= _MARGIN * self.limits).all())
+
+
+def load_model(
+    body: TargetBody,
+    omega_rad_s: Array,
+    wrenches: Array,
+    chasers: Mapping[int, MountedChaser],
+    own: Mapping[int, tuple[slice, Array]],
+    chaser: RigidBody,
+    tips_m: Mapping[int, Array],
+    limits: Mapping[int, tuple[float, float]],
+) -> LoadModel:
+    """Return the loads at the ports of ``chasers``.
+
+    ``wrenches`` (6, n) of 1 N of every thruster about the stack's centre of mass, TRF axes; ``own``: which of them are a chaser's,
+    and their wrenches about its centre in its axes. ``tips_m``: points of the ports (TRF); ``limits``: force and torque.
+    """
+    inverse = np.linalg.inv(body.inertia_kg_m2)
+    free = -inverse @ rotations.cross(omega_rad_s, body.inertia_kg_m2 @ omega_rad_s)
+    constants, by_thrusts, bounds = [], [], []
+    spin = rotations.skew(omega_rad_s)
+    for i, mounted in chasers.items():
+        turn = rotations.to_matrix(mounted.q_wxyz)
+        inertia = turn @ np.diag(chaser.inertia) @ turn.T
+        arm = mounted.position_m - body.centre_trf_m
+        at_tip = rotations.skew(mounted.position_m - tips_m[i])
+        # What the body's acceleration needs is not exerted on the port.
+        linear = wrenches[:3] / body.mass_kg - rotations.skew(arm) @ inverse @ wrenches[3:]
+        force = -chaser.mass_kg * linear
+        torque = -inertia @ inverse @ wrenches[3:]
+        columns, unit = own.get(i, (slice(0, 0), np.zeros((6, 0))))
+        force[:, columns] += turn @ unit[:3]
+        torque[:, columns] += turn @ unit[3:]
+        centripetal = rotations.cross(free, arm) + spin @ spin @ arm
+        still = -chaser.mass_kg * centripetal
+        gyroscopic = -(inertia @ free + rotations.cross(omega_rad_s, inertia @ omega_rad_s))
+        constants.append(np.concatenate([still, gyroscopic + at_tip @ still]))
+        by_thrusts.append(np.concatenate([force, torque + at_tip @ force]))
+        bounds.append(limits.get(i, (np.inf, np.inf)))
+    return LoadModel(np.array(constants), np.array(by_thrusts), np.array(bounds))
+
+
+def fire_in_turn(model: LoadModel, wanted: Array, full_N: Array) -> Array:
+    """Return which thrusters (n,) of those ``wanted`` (n,) may fire together, the most wanted first, as a mask."""
+    chosen, thrusts = np.zeros(len(wanted), dtype=bool), np.zeros(len(wanted))
+    for k in np.argsort(-wanted, kind="stable"):
+        if wanted[k] <= 0.0:
+            break
+        thrusts[k] = full_N[k]
+        if model.within(thrusts):
+            chosen[k] = True
+        else:
+            thrusts[k] = 0.0
+    return chosen

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stack that loses a latch, a chaser or a thruster while it is stopped ends safe, with a named reason."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from chaserdock_controller.guidance.detumble.control import StackTask
+from chaserdock_models import rotations
+from chaserdock_protocol.messages import OperatorCommand
+
+from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario
+from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.evaluation.rigid_control import ControlledStack, fly_controlled, wrong_knowledge
+
+
+def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
+    fault = "fault=[{kind='latch_open',process='chaser/1',at_s=2.5,duration_s=1.0}]"
+    changes = [*wrong_knowledge(1), "truth.values=[]", "target.mass_kg=150.0", fault]
+    mission = StackMission(
+        stack_scenario(1, (0, 1, 3), changes), RenderedImages(stack_scenario(1, (0, 1, 3)))
+    )
+    while mission.time_s < 1.5:
+        mission.step()
+    mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(3)))
+    axis = np.array(mission.scenario.docking.ports[1].axis)
+    start = None
+    while mission.time_s < 6.0:
+        record = mission.step()
+        if record.outputs is not None and mission.phase(1) == "retreat":
+            target, own = record.states["target"], record.states["chaser/1"]
+            place = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
+            start = place if start is None else start
+    assert start is not None
+    moved = place - start
+    assert mission.retreats(1) == ["from detumble: the latch opened"]
+    assert float(moved @ axis) > 0.02
+    assert np.linalg.norm(moved - (moved @ axis) * axis) < 0.5 * float(moved @ axis)
+    assert not mission.physics.latches["chaser/1"].latched
+    # The other two, at opposite ports, go on.
+    assert {mission.phase(0), mission.phase(2)} <= {"detumble", "stack_hold"}
+    assert any(what == "the stack coasts while chaser 1 backs out" for _, _, what in mission.events)
+    mission.close()
+
+
+@pytest.mark.parametrize(("kind", "expected"), [("stuck_off", "stuck off"), ("stuck_on", "stuck on")])
+def test_a_stuck_thruster_is_found_on_the_stack_and_isolated(kind: str, expected: str) -> None:
+    failure = f"thruster_failure=[{{chaser=0,thruster=2,at_s=1.0,kind='{kind}'}}]"
+    flight = fly_controlled(stack_scenario(1, (0, 1, 2, 3), [*wrong_knowledge(1), failure]), 15.0)
+    assert flight.time_s is not None
+    assert flight.failed == f"chaser 0: thruster 2 {expected}, seen in the motion of the stack, isolated"
+
+
+def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
+    flight = fly_controlled(stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)), 15.0, loss=(1.0, 1))
+    assert flight.time_s is not None
+    assert flight.failed == ""
+
+
+def test_a_stopped_stack_turns_to_its_commanded_attitude_and_keeps_it() -> None:
+    q = rotations.exp(np.array([0.3, -0.2, 0.1]))
+    scenario = stack_scenario(1, (0, 3), wrong_knowledge(1, share=0.1))
+    start = np.array(scenario.target.q_wxyz)
+    wanted = rotations.multiply(start, q)
+    detumble = scenario.detumble.model_copy(
+        update={"attitude_wxyz": tuple(wanted.tolist()), "slew_deg_s": 2.0}
+    )
+    still = scenario.target.model_copy(
+        update={"omega_rad_s": (0.002, 0.0, -0.001), "velocity_m_s": (0.0, 0.002, 0.0)}
+    )
+    flight = scenario.model_copy(update={"detumble": detumble, "target": still})
+    stack = ControlledStack(flight)
+    hold(stack, 35.0)
+    assert math.degrees(float(rotations.angle_between(stack.stack.q_wxyz, wanted))) < 0.8
+    assert math.degrees(stack.stack.rates()[1]) < 0.1
+    assert stack.stack.rates()[0] < 0.001
+
+
+def hold(stack: ControlledStack, seconds: float) -> None:
+    """Stop a stack for three seconds, then hold it."""
+    rate_hz = stack.scenario.time.rate_hz
+    for k in range(round(seconds * rate_hz)):
+        observation, estimation = stack.estimate()
+        stack.step(StackTask.STOP if k < 3 * rate_hz else StackTask.HOLD, observation, estimation)

@@ -1,0 +1,141 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Plans of least propellant for a stack, and the loads on its ports."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from chaserdock_controller.guidance.detumble.allocation import minimum_time
+from chaserdock_controller.guidance.detumble.planner import StackPlanner
+from chaserdock_controller.guidance.detumble.planning import StackProblem, fly, plan_stop, sensitivity
+from chaserdock_controller.guidance.detumble.port_loads import fire_in_turn, load_model
+from chaserdock_models import rotations
+from chaserdock_models.wrench_set import wrench_matrix
+from detumble_cases import BODY, PORTS, mounted, stack_of, stack_thrusters, target_alone, tumble
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def problem(seed: int, chasers: tuple[int, ...], at_once: int | None = None) -> StackProblem:
+    body, wrenches, limits = stack_thrusters(chasers)
+    q = rotations.normalize(np.random.default_rng(seed).normal(size=4))
+    own = tumble(seed, body)
+    momentum = np.concatenate([rotations.rotate(q, own[:3]), rotations.rotate(q, own[3:])])
+    groups = np.repeat(np.arange(len(chasers)), 12)
+    return StackProblem(momentum, q, body.inertia_kg_m2, wrenches, limits, groups, at_once)
+
+
+@settings(deadline=None, max_examples=5)
+@given(SEEDS)
+def test_the_sensitivity_is_the_derivative_of_the_flight(seed: int) -> None:
+    p = problem(seed, (0, 3))
+    rng = np.random.default_rng(seed)
+    thrusts = np.where(p.limits_N > 0.0, rng.uniform(0.0, 0.3, (12, 24)), 0.0)
+    able = np.flatnonzero(p.limits_N > 0.0)
+    jacobian = sensitivity(p, fly(p, thrusts, 0.5), 0.5, able)
+    shift = np.zeros_like(thrusts)
+    shift[:, able] = rng.normal(size=(12, len(able))) * 1e-4
+    ends = [fly(p, thrusts + sign * shift, 0.5).end for sign in (1.0, -1.0)]
+    expected = jacobian @ shift[:, able].reshape(-1)
+    assert (ends[0] - ends[1]) / 2.0 == pytest.approx(expected, rel=0.02, abs=2e-6)
+
+
+@pytest.mark.parametrize(
+    ("chasers", "seconds"), [((0, 1, 2, 3), 13.0), ((0, 3), 14.0), ((0, 1), 40.0), ((2,), 75.0)]
+)
+def test_a_plan_stops_the_stack_cheaply_also_where_feedback_cannot(
+    chasers: tuple[int, ...], seconds: float
+) -> None:
+    p = problem(3, chasers)
+    plan = StackPlanner(seconds).trial(p)
+    assert plan.duration_s == pytest.approx(seconds)
+    assert np.all(plan.thrusts_N >= 0.0)
+    assert np.all(plan.thrusts_N <= p.limits_N)
+    exact = fly(p, np.repeat(plan.thrusts_N, 4, axis=0), plan.step_s / 4.0).end
+    assert np.linalg.norm(exact) < 0.02 * np.linalg.norm(p.momentum)
+    body, own = stack_of(mounted(chasers)), tumble(3, stack_of(mounted(chasers)))
+    least = minimum_time(p.wrenches, own, p.limits_N)
+    assert body.mass_kg > 0.0
+    if least is not None:
+        assert plan.impulse_N_s < 0.85 * least.impulse_N_s
+
+
+def test_a_plan_turns_with_the_world() -> None:
+    p = problem(1, (0, 3))
+    turn = rotations.normalize(np.array([0.3, -0.5, 0.2, 0.7]))
+    moved = StackProblem(
+        np.concatenate([rotations.rotate(turn, p.momentum[:3]), rotations.rotate(turn, p.momentum[3:])]),
+        rotations.multiply(turn, p.q_wxyz),
+        p.inertia_kg_m2,
+        p.wrenches,
+        p.limits_N,
+        p.groups,
+    )
+    guess = np.zeros((20, 24))
+    one, two = (plan_stop(x, guess, 0.5, 3) for x in (p, moved))
+    assert two.impulse_N_s == pytest.approx(one.impulse_N_s, rel=0.2)
+
+
+def test_thrusters_that_must_not_fire_together_share_their_time() -> None:
+    p = problem(2, (0, 1, 2, 3), at_once=1)
+    plan = plan_stop(p, np.zeros((28, 48)), 0.5, 30)
+    shares = (plan.thrusts_N / 1.5).reshape(28, 4, 12).sum(axis=2)
+    assert shares.max() <= 1.0 + 1e-9
+    assert np.linalg.norm(plan.remaining) < 0.02 * np.linalg.norm(p.momentum)
+
+
+def test_a_stack_at_rest_needs_no_plan_and_invalid_figures_are_refused() -> None:
+    p = problem(1, (0, 3))
+    rest = StackProblem(np.zeros(6), p.q_wxyz, p.inertia_kg_m2, p.wrenches, p.limits_N, p.groups)
+    assert plan_stop(rest, np.zeros((4, 24)), 0.5, 5).impulse_N_s == 0.0
+    with pytest.raises(ValueError, match="step_s"):
+        plan_stop(p, np.zeros((4, 24)), 0.0, 5)
+    nan = StackProblem(np.full(6, math.nan), p.q_wxyz, p.inertia_kg_m2, p.wrenches, p.limits_N, p.groups)
+    with pytest.raises(ValueError, match="finite"):
+        plan_stop(nan, np.zeros((4, 24)), 0.5, 5)
+
+
+def loads(seed: int, force_limit_N: float = np.inf):
+    chasers = mounted((0, 1, 3))
+    body, own = stack_of(chasers), wrench_matrix(BODY.thrusters)
+    wrenches = np.concatenate([c.wrench_to_stack(own, body.centre_trf_m) for c in chasers.values()], axis=1)
+    rows = {i: (slice(12 * k, 12 * k + 12), own) for k, i in enumerate(chasers)}
+    omega = np.random.default_rng(seed).normal(0.0, 0.1, 3)
+    tips = {i: np.array(PORTS[i][0]) for i in chasers}
+    limits = dict.fromkeys(chasers, (force_limit_N, np.inf))
+    return body, omega, wrenches, load_model(body, omega, wrenches, chasers, rows, BODY, tips, limits)
+
+
+@settings(deadline=None, max_examples=10)
+@given(SEEDS)
+def test_the_loads_of_all_ports_move_the_target(seed: int) -> None:
+    """Newton and Euler for the target alone, on which only the ports act."""
+    body, omega, wrenches, model = loads(seed)
+    thrusts = np.random.default_rng(seed).uniform(0.0, 1.5, 36)
+    port = model.constant + model.by_thrust @ thrusts
+    total = wrenches @ thrusts
+    alpha = np.linalg.solve(body.inertia_kg_m2, total[3:] - np.cross(omega, body.inertia_kg_m2 @ omega))
+    alone = target_alone()
+    arm = alone.centre_trf_m - body.centre_trf_m
+    acceleration = total[:3] / body.mass_kg + np.cross(alpha, arm) + np.cross(omega, np.cross(omega, arm))
+    assert port[:, :3].sum(axis=0) == pytest.approx(alone.mass_kg * acceleration, abs=1e-9)
+    torque = port[:, 3:].sum(axis=0)
+    for row, i in zip(port, (0, 1, 3), strict=True):
+        torque = torque + np.cross(np.array(PORTS[i][0]) - alone.centre_trf_m, row[:3])
+    needed = alone.inertia_kg_m2 @ alpha + np.cross(omega, alone.inertia_kg_m2 @ omega)
+    assert torque == pytest.approx(needed, abs=1e-9)
+
+
+def test_thrusters_fire_in_turn_within_the_limit_the_most_wanted_first() -> None:
+    _, _, _, model = loads(1, force_limit_N=2.2)
+    wanted = np.random.default_rng(4).uniform(0.1, 1.0, 36)
+    chosen = fire_in_turn(model, wanted, np.full(36, 1.5))
+    assert 0 < chosen.sum() < 36
+    assert chosen[np.argmax(wanted)]
+    assert model.within(np.where(chosen, 1.5, 0.0))
+    towards = np.tile([t.direction[0] > 0.0 for t in BODY.thrusters], 3)
+    assert not model.within(np.where(towards, 1.5, 0.0))

@@ -61,7 +61,7 @@ class Cameras:
         @cache
         def renderer(camera: Camera) -> Renderer | MeshRenderer | TinyRenderer:
             try:
-                if mesh is not None:
+                if mesh is not None and section.renderer == "exact":
                     return MeshRenderer(camera, mesh, background, effects.point_spread_px, substitutes)
                 kind = Renderer if section.renderer == "exact" else TinyRenderer
                 return kind(camera, self._target, background, effects.point_spread_px)

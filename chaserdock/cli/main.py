@@ -14,7 +14,7 @@ from typer.exceptions import TyperException
 
 from chaserdock.exit_codes import FAILED
 
-from . import logs, scenario
+from . import logs, mesh, scenario
 from .analysis import figures, report, snapshot, summary, video
 from .compare import check, compare, replay, reproduce, study
 from .help import HELP_OPTIONS, GroupedHelp, add_command
@@ -27,7 +27,7 @@ from .simulate import simulate
 
 GROUPS: dict[str, tuple[Any, ...]] = {
     "Fly": (run, campaign, simulate),
-    "Scenarios": (scenario.app,),
+    "Scenarios": (scenario.app, mesh.app),
     "Processes": (world, chaser, controller, record, router, ros2),
     "Operate": (command, thruster_fault, status, view, judge),
     "Look at a flight": (summary, report, figures, video, snapshot),

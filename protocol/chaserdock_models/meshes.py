@@ -168,12 +168,26 @@ def volume_m3(part: MeshPart) -> float:
 
 def open_edges(part: MeshPart) -> int:
     """Return the number of edges that are not shared by two triangles of opposite direction: 0 for a closed surface."""
-    edges: dict[tuple[int, int], int] = {}
-    for a, b, c in part.triangles.tolist():
-        for i, j in ((a, b), (b, c), (c, a)):
-            key = (min(i, j), max(i, j))
-            edges[key] = edges.get(key, 0) + (1 if i < j else -1)
-    return sum(abs(count) for count in edges.values())
+    return int(np.abs(_edge_balance(part)[1]).sum())
+
+
+def hole_m(part: MeshPart) -> Array | None:
+    """Return the middle (3,), body axes, of the first edge that is not shared by two triangles of opposite direction."""
+    edges, balance = _edge_balance(part)
+    open_ones = edges[balance != 0]
+    return part.vertices_m[open_ones[0]].mean(axis=0) if len(open_ones) else None
+
+
+def _edge_balance(part: MeshPart) -> tuple[IntArray, IntArray]:
+    """Return the edges (n, 2), lower vertex first, and how many more triangles (n,) use each upwards than downwards."""
+    ends = np.concatenate(
+        [part.triangles[:, [0, 1]], part.triangles[:, [1, 2]], part.triangles[:, [2, 0]]]
+    ).astype(np.int64)
+    upwards = ends[:, 0] < ends[:, 1]
+    keys = ends.min(axis=1) * len(part.vertices_m) + ends.max(axis=1)
+    unique, where = np.unique(keys, return_inverse=True)
+    balance = np.bincount(where, weights=np.where(upwards, 1.0, -1.0), minlength=len(unique)).astype(np.int64)
+    return np.stack(np.divmod(unique, len(part.vertices_m)), axis=1), balance
 
 
 def mass_properties(mesh: TriangleMesh, mass_kg: float) -> tuple[Array, Array]:

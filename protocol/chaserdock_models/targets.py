@@ -41,6 +41,10 @@ class Box:
     shade: float = 0.5
 
 
+DEFAULT_DICTIONARY = "DICT_4X4_50"
+"""Dictionary of targets without markers."""
+
+
 @lru_cache
 def cuboid_corners(size_m: Vector3) -> Array:
     """Return the corners (8, 3) of a cuboid about the origin, z changing fastest; read-only."""
@@ -75,8 +79,9 @@ class TargetModel:
 
     ``white_margin_m``: width of the white border printed around every marker, under its neighbours.
     ``mesh``: path of a file (OBJ, STL) that PyBullet's renderer draws instead of the boxes, scaled by ``mesh_scale``;
-    empty for none. Collisions always use the boxes.
-    ``satellite``: name of the shipped satellite whose mesh is drawn; then the boxes enclose its parts. Empty for none.
+    empty for none.
+    ``satellite``: name of the mesh that is drawn; empty for none. ``hulls``: whether the boxes enclose the parts of that mesh;
+    then collisions use convex pieces of these, otherwise the boxes.
     """
 
     name: str
@@ -88,6 +93,7 @@ class TargetModel:
     mesh: str = ""
     mesh_scale: float = 1.0
     satellite: str = ""
+    hulls: bool = False
 
     def marker(self, marker_id: int) -> Marker | None:
         """Return the marker with that id, or None."""
@@ -170,12 +176,18 @@ def mesh_boxes(mesh: TriangleMesh) -> tuple[Box, ...]:
     return tuple(box_around(part) for part in mesh.parts)
 
 
-def _of_satellite(name: str) -> TargetModel:
-    """Return a shipped satellite without markers."""
-    mesh = satellite(name)
+@lru_cache
+def mesh_target(mesh: TriangleMesh) -> TargetModel:
+    """Return a target without markers that is shaped like a mesh, and has its name."""
     low, high = mesh.bounds_m()
     x, y, z = (2.0 * np.maximum(-low, high)).tolist()
-    return TargetModel(name, mesh_boxes(mesh), (), "DICT_4X4_50", (x, y, z), 0.0, satellite=name)
+    return TargetModel(
+        mesh.name, mesh_boxes(mesh), (), DEFAULT_DICTIONARY, (x, y, z), 0.0, satellite=mesh.name, hulls=True
+    )
+
+
+def _of_satellite(name: str) -> TargetModel:
+    return mesh_target(satellite(name))
 
 
 _MODELS: dict[str, Callable[[], TargetModel]] = {

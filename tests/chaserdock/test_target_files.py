@@ -75,8 +75,6 @@ def test_mesh_target_is_rendered_by_pybullet_with_its_markers(tmp_path):
     )
     (tmp_path / "mine.toml").write_text(mesh)
     (tmp_path / "s.toml").write_text(SCENARIO)
-    with pytest.raises(ScenarioError, match=r"camera\.renderer"):
-        load_scenario(tmp_path / "s.toml")
     model = load_scenario(tmp_path / "s.toml", ("camera.renderer=pybullet",)).target_model()
     camera = Camera.from_hfov(640, 480, 1.0)
     q = rotations.multiply(FACING, rotations.exp([0.1, 0.2, -0.3]))

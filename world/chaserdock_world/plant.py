@@ -13,7 +13,6 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
 from chaserdock_models.rigid_body import BodyState
-from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Marker, TargetModel
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_protocol.scenario.truth import Mismatch, TruthValues
@@ -249,10 +248,9 @@ def true_mesh(scenario: Scenario) -> TriangleMesh | None:
 
     None for a target without a mesh.
     """
-    name, knowledge = scenario.target_model().satellite, scenario.target.knowledge
-    if not name:
+    mesh, knowledge = scenario.target.nominal_mesh(), scenario.target.knowledge
+    if mesh is None:
         return None
-    mesh = satellite(name)
     draw = _normal(scenario.seed, Stream.MESH, TARGET_KEY, 1 + 3 * len(mesh.joints))
     turns = np.radians(knowledge.panel_deg) * draw[1:].reshape(-1, 3)
     return with_geometry_errors(

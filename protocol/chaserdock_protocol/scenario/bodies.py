@@ -3,17 +3,20 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.decimation import simplified
 from chaserdock_models.meshes import TriangleMesh, mass_properties, without_parts
-from chaserdock_models.satellites import satellite
+from chaserdock_models.satellites import FINE_M, satellite
 from chaserdock_models.targets import TargetModel, target_model, target_names
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
 from .fields import Name, NotNegative, Oriented, Positive, PositiveVector, Section, UnitQuaternion, Vector
+from .surface import Surface
 from .target import Geometry
 from .thrusters import MAX_THRUSTERS, Modulation, Thruster, check_layout
 
@@ -23,7 +26,8 @@ class MeshKnowledge(Section):
     seed with these standard deviations."""
 
     simplification_m: Annotated[float, Field(ge=2e-4, le=0.02, allow_inf_nan=False)] = Field(
-        default=0.001, description="Largest deviation of the known mesh's facets from curved surfaces, m."
+        default=0.001,
+        description="Largest deviation of the known mesh's facets from curved surfaces, or from the surface of a file, m.",
     )
     panel_deg: Annotated[float, Field(ge=0, le=10, allow_inf_nan=False)] = Field(
         default=0.5,
@@ -46,8 +50,8 @@ class FlightTarget(Section):
     model: Name = Field(
         default="paper",
         description="Name of a known target: `paper`, `servicer`, `client` with markers, `geo_servicer`, `cubesat_12u` "
-        "without; or, in a file, the path of a target file (`….toml`) "
-        "relative to it. With `geometry`: the name of that geometry.",
+        "without; or, in a file, the path relative to it of a target file (`….toml`) or of a mesh (`….glb`, "
+        "`.gltf`, `.obj`, `.stl`, `.ply`). With `geometry`: the name of that geometry.",
     )
     geometry: Geometry | None = Field(
         default=None, description="Shape and markers, in place of those of a known `model`."
@@ -103,23 +107,28 @@ class FlightTarget(Section):
                     raise ValueError(f"knowledge.{key}: {self.model!r} has no mesh")
             return
         try:
-            self.known_mesh()
+            self._check_missing()
         except ValueError as error:
             raise ValueError(f"knowledge.missing: {error}") from None
+
+    def _check_missing(self) -> None:
+        mesh = self.nominal_mesh(self.knowledge.simplification_m)
+        if mesh is not None:
+            without_parts(mesh, self.knowledge.missing)
 
     @property
     def moments(self) -> tuple[float, float, float]:
         """Moments of inertia about the axes of TRF through the centre of mass, kg m^2."""
-        if self.inertia_kg_m2 is None and (name := self.shape().satellite):
-            x, y, z = np.diag(mass_properties(satellite(name), self.mass_kg)[1]).tolist()
+        if self.inertia_kg_m2 is None and (mesh := self.nominal_mesh()) is not None:
+            x, y, z = np.diag(mass_properties(mesh, self.mass_kg)[1]).tolist()
             return (x, y, z)
         return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.shape().size_m)
 
     @property
     def inertia_tensor(self) -> Array:
         """Inertia tensor (3, 3) about the centre of mass, TRF axes, kg m^2."""
-        if self.inertia_kg_m2 is None and (name := self.shape().satellite):
-            return mass_properties(satellite(name), self.mass_kg)[1]
+        if self.inertia_kg_m2 is None and (mesh := self.nominal_mesh()) is not None:
+            return mass_properties(mesh, self.mass_kg)[1]
         xy, xz, yz = self.inertia_products_kg_m2
         return np.diag(self.moments) + np.array([[0.0, xy, xz], [xy, 0.0, yz], [xz, yz, 0.0]])
 
@@ -127,15 +136,49 @@ class FlightTarget(Section):
         """Return geometry and markers."""
         return target_model(self.model) if self.geometry is None else self.geometry.model(self.model)
 
+    def nominal_mesh(self, tolerance_m: float = FINE_M) -> TriangleMesh | None:
+        """Return the target's mesh as it was designed; None without one."""
+        if self.geometry is not None:
+            return self.geometry.nominal_mesh(self.model, tolerance_m)
+        return satellite(self.model, tolerance_m) if self.shape().satellite else None
+
+    def as_known(self) -> FlightTarget:
+        """Return what the flight software knows: of a mesh from a file, only the simplified surface without missing parts."""
+        surface = None if self.geometry is None else self.geometry.surface
+        if self.geometry is None or surface is None or surface.known:
+            return self
+        mesh = self.known_mesh()
+        assert mesh is not None
+        known = Surface.of(
+            mesh, surface.file, surface.scale, surface.origin_m, surface.deviation_m, known=True
+        )
+        inertia = self.inertia_tensor
+        return self.model_copy(
+            update={
+                "geometry": self.geometry.model_copy(update={"surface": known}),
+                "knowledge": self.knowledge.model_copy(update={"missing": ()}),
+                # Of the nominal mesh, not of the simplified one.
+                "inertia_kg_m2": tuple(np.diag(inertia).tolist()),
+                "inertia_products_kg_m2": (float(inertia[0, 1]), float(inertia[0, 2]), float(inertia[1, 2])),
+            }
+        )
+
     def known_mesh(self) -> TriangleMesh | None:
         """Return the mesh that the flight software knows: simplified, and without the parts that are missing in it.
 
         None for a target without a mesh. Raises ValueError for a missing part that the mesh does not have.
         """
-        name = self.shape().satellite
-        if not name:
-            return None
-        return without_parts(satellite(name, self.knowledge.simplification_m), self.knowledge.missing)
+        tolerance_m, missing = self.knowledge.simplification_m, self.knowledge.missing
+        mesh = self.nominal_mesh(tolerance_m)
+        surface = None if self.geometry is None else self.geometry.surface
+        if mesh is None or (surface is not None and surface.known):
+            return mesh
+        return without_parts(mesh, missing) if surface is None else _simplified(mesh, missing, tolerance_m)
+
+
+@lru_cache(maxsize=8)
+def _simplified(mesh: TriangleMesh, missing: tuple[str, ...], tolerance_m: float) -> TriangleMesh:
+    return simplified(without_parts(mesh, missing), tolerance_m)
 
 
 class Target(FlightTarget, Oriented):

@@ -11,7 +11,9 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
+from chaserdock_models.meshes import mass_properties
 from chaserdock_models.port_load import CarriedBody, tumble_load
+from chaserdock_models.satellites import satellite_names
 from chaserdock_models.wrench_set import wrench_matrix
 
 from .faults import check_faults
@@ -22,6 +24,7 @@ from .thrusters import check_pulses, thrusts_max
 if TYPE_CHECKING:
     from . import FlightScenario, Scenario
     from .schema import TimelineEntry
+    from .target import Geometry
 
 
 def check_flight(scenario: FlightScenario) -> None:
@@ -109,19 +112,42 @@ def _check_references(scenario: FlightScenario) -> None:
 
 def _check_mesh(scenario: Scenario) -> None:
     geometry = scenario.target.geometry
-    if geometry is not None and geometry.mesh and scenario.camera.renderer != "pybullet":
-        raise ValueError('target.geometry.mesh: only camera.renderer = "pybullet" draws meshes')
+    if geometry is not None and geometry.mesh:
+        _check_mesh_file(scenario, geometry)
     if scenario.chaser.mesh and not scenario.target_model().satellite:
         raise ValueError(
             f"chaser.mesh: drawn only with a target that has a mesh; {scenario.target.model!r} has none"
         )
     if scenario.camera.renderer != "exact":
-        for key, name in (
-            ("target.model", scenario.target_model().satellite),
-            ("chaser.mesh", scenario.chaser.mesh),
-        ):
+        shipped = "" if geometry is not None else scenario.target_model().satellite
+        for key, name in (("target.model", shipped), ("chaser.mesh", scenario.chaser.mesh)):
             if name:
                 raise ValueError(f'{key}: only camera.renderer = "exact" draws the mesh {name!r}')
+
+
+def _check_mesh_file(scenario: Scenario, geometry: Geometry) -> None:
+    key, target = "target.geometry.mesh", scenario.target
+    if geometry.surface is None and geometry.mesh not in satellite_names():
+        raise ValueError(
+            f"{key}: {geometry.mesh!r} is read in scenario and target files only; "
+            f"shipped: {', '.join(satellite_names())}"
+        )
+    if scenario.camera.renderer == "pybullet":
+        if not geometry.mesh.lower().endswith((".obj", ".stl")):
+            raise ValueError(
+                f'{key}: camera.renderer = "pybullet" draws OBJ and STL files, not {geometry.mesh!r}'
+            )
+        if any(geometry.mesh_origin_m):
+            raise ValueError('target.geometry.mesh_origin_m: camera.renderer = "pybullet" needs (0, 0, 0)')
+    if target.motion == "torque_free" and target.inertia_kg_m2 is None and (mesh := target.nominal_mesh()):
+        low, high = mesh.bounds_m()
+        centre = mass_properties(mesh, target.mass_kg)[0]
+        if np.linalg.norm(centre - target.centre_of_mass_m) > 0.01 * np.linalg.norm(high - low):
+            at = ", ".join(f"{v:.4g}" for v in centre + geometry.mesh_origin_m)
+            raise ValueError(
+                f"target.centre_of_mass_m: that of the mesh is ({', '.join(f'{v:.4g}' for v in centre)}); state it, or move "
+                f"the origin there by target.geometry.mesh_origin_m = [{at}], or state inertia_kg_m2 too"
+            )
 
 
 def _check_perception(scenario: FlightScenario) -> None:

@@ -6,16 +6,24 @@ Their content becomes part of the scenario, because the world sends it to proces
 
 from __future__ import annotations
 
+import re
 import tomllib
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from chaserdock_models.targets import TargetModel, target_model
-from pydantic import ValidationError
+from chaserdock_models.satellites import satellite_names
+from chaserdock_models.targets import TargetModel, target_model, target_names
+from pydantic import TypeAdapter, ValidationError
 
 from .errors import ScenarioError, invalid
+from .fields import Positive, Vector
+from .surface import SUFFIXES
 from .target import Geometry
+
+_SCALE: TypeAdapter[float] = TypeAdapter(Positive)
+_ORIGIN: TypeAdapter[Vector] = TypeAdapter(Vector)
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -44,8 +52,12 @@ def resolve_files(values: dict[str, Any], folder: Path) -> None:
             path = folder / model
             target["geometry"] = _geometry_values(path)
             target["model"] = path.stem
+        elif isinstance(model, str) and Path(model).suffix.lower() in SUFFIXES:
+            target["geometry"] = {"mesh": model}
+            _read_mesh(target["geometry"], folder)
+            target["model"] = _name_of(Path(model))
         elif isinstance(target.get("geometry"), dict):
-            _absolute_mesh(target["geometry"], folder)
+            _read_mesh(target["geometry"], folder)
     if isinstance(camera, dict) and isinstance(camera.get("calibration"), str):
         camera["intrinsics"] = read_calibration(folder / camera.pop("calibration"))
 
@@ -56,27 +68,61 @@ def _geometry_values(path: Path) -> dict[str, Any]:
         Geometry.model_validate(values)
     except ValidationError as error:
         raise invalid(error, Geometry, path) from None
-    _absolute_mesh(values, path.parent)
+    _read_mesh(values, path.parent)
     return values
 
 
-def _absolute_mesh(geometry: dict[str, Any], folder: Path) -> None:
+def _name_of(path: Path) -> str:
+    """Return a name for a target from that of its mesh file."""
+    name = re.sub(r"[^A-Za-z0-9._-]", "_", path.stem).lstrip("._-")[:60] or "mesh"
+    return f"{name}_mesh" if name in target_names() else name
+
+
+def _read_mesh(geometry: dict[str, Any], folder: Path) -> None:
+    """Put the content of the mesh file that a geometry names into it, in place, unless it is there. Raises ScenarioError."""
     mesh = geometry.get("mesh")
-    if isinstance(mesh, str) and mesh:
-        path = (folder / mesh).resolve()
-        if not path.is_file():
-            raise ScenarioError(f"{path}: no such mesh file")
-        geometry["mesh"] = str(path)
+    if not isinstance(mesh, str) or not mesh or mesh in satellite_names():
+        if isinstance(mesh, str):
+            geometry.pop("surface", None)
+        return
+    path = (folder / mesh).resolve()
+    scale, origin = geometry.get("mesh_scale", 1.0), geometry.get("mesh_origin_m", (0.0, 0.0, 0.0))
+    try:
+        scale, origin = _SCALE.validate_python(scale), _ORIGIN.validate_python(tuple(origin))
+    except (ValidationError, TypeError):
+        return  # reported by the schema
+    held = geometry.get("surface")
+    if isinstance(held, dict) and (held.get("file"), held.get("scale"), tuple(held.get("origin_m", ()))) == (
+        str(path),
+        scale,
+        origin,
+    ):
+        return
+    geometry["mesh"] = str(path)
+    geometry["surface"] = _surface_values(
+        path, path.stat().st_mtime_ns if path.is_file() else 0, scale, origin
+    )
+
+
+@lru_cache(maxsize=4)
+def _surface_values(path: Path, changed_ns: int, scale: float, origin_m: Vector) -> dict[str, Any]:
+    from .mesh_files import read_surface  # needs trimesh, which is slow to import
+
+    return read_surface(path, scale, origin_m).model_dump(mode="json")
 
 
 def find_target(name: str) -> TargetModel:
-    """Return the target of a file (``….toml``) or of a known name. Raises ScenarioError."""
+    """Return the target of a file (``….toml``, a mesh) or of a known name. Raises ScenarioError."""
+    if Path(name).suffix.lower() in SUFFIXES:
+        values: dict[str, Any] = {"mesh": name}
+        _read_mesh(values, Path())
+        return Geometry.model_validate(values).model(_name_of(Path(name)))
     if name.endswith(".toml"):
         return Geometry.model_validate(_geometry_values(Path(name))).model(Path(name).stem)
     try:
         return target_model(name)
     except ValueError as error:
-        raise ScenarioError(f"{error}, or a file ….toml") from None
+        raise ScenarioError(f"{error}, or a file ….toml or ….glb") from None
 
 
 def read_calibration(path: Path) -> dict[str, Any]:

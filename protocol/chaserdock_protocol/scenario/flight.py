@@ -105,6 +105,9 @@ def flight_scenario(scenario: FlightScenario) -> FlightScenario:
 def flight_scenario_json(scenario: FlightScenario) -> str:
     """Return the JSON of the flight scenario of a scenario."""
     # Serialized by the declared types, which leaves out the fields of their subclasses.
+    known = scenario.target.as_known()
+    if known is not scenario.target:
+        scenario = scenario.model_copy(update={"target": known})
     return _FLIGHT.dump_json(scenario).decode()
 
 

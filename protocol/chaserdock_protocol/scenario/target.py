@@ -5,12 +5,23 @@ from __future__ import annotations
 
 import math
 import re
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
+from chaserdock_models.meshes import TriangleMesh
+from chaserdock_models.satellites import FINE_M, satellite, satellite_names
+from chaserdock_models.targets import (
+    DEFAULT_DICTIONARY,
+    Box,
+    Marker,
+    TargetModel,
+    face_extent,
+    face_rotation,
+    mesh_target,
+)
 from pydantic import AfterValidator, Field, model_validator
 
 from .fields import (
@@ -25,6 +36,7 @@ from .fields import (
     UnitQuaternion,
     Vector,
 )
+from .surface import Surface
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 _FAMILIES = {
@@ -111,26 +123,41 @@ class Geometry(Section):
     """Shape and markers of a custom target; also the content of a target file."""
 
     dictionary: Annotated[str, AfterValidator(_check_dictionary)] = Field(
-        description="OpenCV's name of the ArUco dictionary, such as `DICT_4X4_50`."
+        default=DEFAULT_DICTIONARY,
+        description="OpenCV's name of the ArUco dictionary, such as `DICT_4X4_50`. Needed with markers.",
     )
     white_margin_m: NotNegative = Field(
         default=0.005, description="Width of the white border around each marker, m."
     )
     cuboids: tuple[Cuboid, ...] = Field(
-        min_length=1, max_length=64, description="Body of the target; also used for collisions."
+        default=(),
+        max_length=64,
+        description="Body of the target; also used for collisions. Needed without a mesh; with one, collisions use convex "
+        "pieces of the mesh if there are none.",
     )
     markers: tuple[MarkerSection, ...] = Field(
-        min_length=1, max_length=1000, description="Markers, which may not overlap."
+        default=(), max_length=1000, description="Markers, which may not overlap. Needed without a mesh."
     )
     mesh: str = Field(
         default="",
-        description="Path of a mesh file, relative to the file that names it. The renderer `pybullet` draws it in place of "
-        "the cuboids.",
+        description="Mesh that is drawn in place of the cuboids: path of a file (GLB, glTF, OBJ, STL, PLY), relative to the "
+        "file that names it, or name of a shipped satellite.",
     )
     mesh_scale: Positive = Field(default=1.0, description="Factor from the mesh's unit of length to m.")
+    mesh_origin_m: Vector = Field(
+        default=(0.0, 0.0, 0.0), description="Point of the mesh, scaled, that becomes the origin of TRF, m."
+    )
+    surface: Surface | None = Field(
+        default=None, description="Content of the mesh file. Written by the program when it reads the file."
+    )
 
     @model_validator(mode="after")
     def _check_markers(self) -> Geometry:
+        for key in () if self.mesh else ("cuboids", "markers"):
+            if not getattr(self, key):
+                raise ValueError(f"{key}: is empty; only a target with a mesh needs none")
+        if self.markers and "dictionary" not in self.model_fields_set:
+            raise ValueError("dictionary: is missing; markers need it")
         size, last = dictionary_size(self.dictionary), len(self.cuboids) - 1
         first_use: dict[int, int] = {}
         for k, m in enumerate(self.markers):
@@ -139,10 +166,9 @@ class Geometry(Section):
             if m.id in first_use:
                 raise ValueError(f"markers.{k}.id: {m.id} is already used by markers.{first_use[m.id]}")
             first_use[m.id] = k
-            if m.cuboid > last:
-                raise ValueError(
-                    f"markers.{k}.cuboid: there is no cuboid {m.cuboid}; this target has 0 to {last}"
-                )
+            if m.face is not None and m.cuboid > last:
+                have = f"this target has 0 to {last}" if last >= 0 else "give position_m and q_wxyz"
+                raise ValueError(f"markers.{k}.cuboid: there is no cuboid {m.cuboid}; {have}")
             if not self.mesh:
                 _check_on_a_face(k, m.marker(self.cuboids), self.cuboids)
         _check_apart(tuple(m.marker(self.cuboids) for m in self.markers))
@@ -150,15 +176,36 @@ class Geometry(Section):
 
     def model(self, name: str) -> TargetModel:
         """Return the target model; its ``size_m`` is that of the smallest cuboid centred in TRF that contains it."""
-        boxes = tuple(c.box() for c in self.cuboids)
+        mesh = self.nominal_mesh(name)
+        boxes = tuple(c.box() for c in self.cuboids) or (() if mesh is None else mesh_target(mesh).boxes)
         markers = tuple(m.marker(self.cuboids) for m in self.markers)
         reach = np.max(
-            [_reach(b) for b in boxes] + [np.abs(m.corners_trf_m()).max(axis=0) for m in markers], axis=0
+            [_reach(b) for b in boxes]
+            + [np.abs(m.corners_trf_m()).max(axis=0) for m in markers]
+            + ([] if mesh is None else [np.abs(mesh.bounds_m()).max(axis=0)]),
+            axis=0,
         )
         x, y, z = (2.0 * reach).tolist()
         return TargetModel(
-            name, boxes, markers, self.dictionary, (x, y, z), self.white_margin_m, self.mesh, self.mesh_scale
+            name,
+            boxes,
+            markers,
+            self.dictionary,
+            (x, y, z),
+            self.white_margin_m,
+            self.mesh,
+            self.mesh_scale,
+            "" if mesh is None else name,
+            mesh is not None and not self.cuboids,
         )
+
+    def nominal_mesh(self, name: str, tolerance_m: float = FINE_M) -> TriangleMesh | None:
+        """Return the mesh as it was designed; None without one. ``tolerance_m``: of curved surfaces of a shipped satellite."""
+        if self.surface is not None:
+            return self.surface.mesh(name)
+        if self.mesh in satellite_names():
+            return replace(satellite(self.mesh, tolerance_m), name=name)
+        return None
 
 
 def _reach(box: Box) -> Array:

@@ -9,7 +9,9 @@ forces of an orbit are applied to every body (orbital_forces.py).
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,10 +24,11 @@ from chaserdock_protocol.messages import Latch
 from chaserdock_protocol.scenario import Scenario
 
 from chaserdock_world.orbit import TargetOrbit
-from chaserdock_world.plant import Plant, chaser_plant, target_plant
+from chaserdock_world.plant import Plant, chaser_plant, target_plant, true_mesh
 from chaserdock_world.random_draws import GaussMarkov, Stream
 
 from .bullet import connect, pybullet
+from .collision_hulls import collision_hulls, triangles_of
 from .compliant_latch import ENGAGED_M, CompliantLatch, Grip
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch, latch_faults
@@ -124,7 +127,9 @@ class Physics:
     def _add_target(self, scenario: Scenario) -> int:
         plant = self.plants[TARGET]
         mass = 0.0 if self._prescribed else plant.mass_kg
-        shape = self._box_shape(scenario.target_model(), plant)
+        model, mesh = scenario.target_model(), true_mesh(scenario)
+        hulls = collision_hulls(mesh) if model.hulls and mesh is not None else []
+        shape = self._hull_shape(hulls, plant) if hulls else self._box_shape(model, plant)
         return self._add(shape, plant, mass, prescribed_state(scenario, 0.0))
 
     def _box_shape(self, model: TargetModel, plant: Plant) -> int:
@@ -136,6 +141,21 @@ class Physics:
             collisionFramePositions=[position for position, _ in places],
             collisionFrameOrientations=[xyzw for _, xyzw in places],
         )
+
+    def _hull_shape(self, hulls: Sequence[Array], plant: Plant) -> int:
+        """Return a shape of convex pieces: Bullet makes one of every object of an OBJ file."""
+        lines, first = [], 1
+        for number, hull in enumerate(hulls):
+            vertices = hull if plant.frame is None else plant.frame.place(hull, rotations.IDENTITY)[0]
+            faces = triangles_of(hull)
+            lines.append(f"o piece_{number}")
+            lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
+            lines += [f"f {a} {b} {c}" for a, b, c in (faces + first).tolist()]
+            first += len(vertices)
+        with tempfile.TemporaryDirectory(prefix="chaserdock-") as folder:
+            path = Path(folder) / "hulls.obj"
+            path.write_text("\n".join(lines) + "\n")
+            return self._bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path))
 
     def _add_chaser(self, scenario: Scenario, i: int) -> int:
         body, plant = scenario.chaser, self.plants[f"chaser/{i}"]

@@ -29,6 +29,7 @@ from chaserdock_world.sensors.errors import true_camera
 from .background import Earth, Light
 from .effects import CameraEffects
 from .glare import Glare, is_occluded
+from .mesh_markers import with_markers
 from .mesh_renderer import MeshRenderer
 from .rasterizer import Renderer, chaser_boxes
 from .scene_geometry import Obstacle
@@ -53,6 +54,8 @@ class Cameras:
         background = None if disc is None else Earth(*disc)
         body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         mesh, substitutes = true_mesh(scenario), {}
+        if mesh is not None:
+            mesh = with_markers(mesh, self._target)
         if scenario.chaser.mesh:
             shape = satellite(scenario.chaser.mesh)
             low, high = shape.bounds_m()
@@ -61,7 +64,7 @@ class Cameras:
         @cache
         def renderer(camera: Camera) -> Renderer | MeshRenderer | TinyRenderer:
             try:
-                if mesh is not None:
+                if mesh is not None and section.renderer == "exact":
                     return MeshRenderer(camera, mesh, background, effects.point_spread_px, substitutes)
                 kind = Renderer if section.renderer == "exact" else TinyRenderer
                 return kind(camera, self._target, background, effects.point_spread_px)

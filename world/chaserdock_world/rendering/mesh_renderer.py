@@ -35,7 +35,7 @@ DAYLIGHT = Light()
 _TEXTURES = {"": 0.0, "insulation": 1.0, "cells": 2.0}
 _MAP_TEXELS = 2_000_000
 _TEXEL_PX = 0.7
-_BAND_ROWS, _SAMPLES = 8, 8  # native/mesh.c
+_BAND_ROWS, _SAMPLES, _GROUP = 8, 8, 32  # native/mesh.c
 _WRINKLES = 256
 
 # native/mesh.c: Illumination, ShadowMap; bytes of a BodyPose and of a Triangle.
@@ -95,6 +95,18 @@ def _texture_coordinates(part: MeshPart) -> Array:
     normal = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     others = np.array([(1, 2), (0, 2), (0, 1)])[np.argmax(normal, axis=1)]
     return np.ascontiguousarray(np.take_along_axis(corners, np.repeat(others[:, None], 3, axis=1), axis=2))
+
+
+@lru_cache(maxsize=64)
+def _joined(bodies: tuple[_Body, ...]) -> tuple[_Body, IntArray]:
+    """Return all triangles of several bodies, and the first one (n + 1,) of each body."""
+    rows = np.cumsum([0, *(len(b.surfaces) for b in bodies[:-1])])
+    corners, normals, uv, surfaces = (
+        np.concatenate([getattr(b, key) for b in bodies]) for key in ("corners", "normals", "uv", "surfaces")
+    )
+    surface = np.concatenate([b.surface + row for b, row in zip(bodies, rows, strict=True)])
+    first = np.cumsum([0, *(len(b.corners) for b in bodies)]).astype(np.int64)
+    return _Body(corners, normals, uv, surface, surfaces), first
 
 
 def mesh_of_boxes(boxes: Sequence[Box]) -> TriangleMesh:
@@ -182,21 +194,17 @@ class MeshRenderer:
     def _draw(
         self, canvas: NDArray[np.uint8], camera: Array, bodies: list[_Body], poses: Array, light: Light
     ) -> None:
-        counts = [len(b.corners) for b in bodies]
-        rows = np.cumsum([0, *(len(b.surfaces) for b in bodies[:-1])])
-        corners, normals, uv, surfaces = (
-            np.concatenate([getattr(b, key) for b in bodies])
-            for key in ("corners", "normals", "uv", "surfaces")
-        )
-        surface = np.concatenate([b.surface + row for b, row in zip(bodies, rows, strict=True)])
-        first = np.cumsum([0, *counts]).astype(np.int64)
+        scene, first = _joined(tuple(bodies))
+        corners, normals, uv, surface, surfaces = (
+            scene.corners, scene.normals, scene.uv, scene.surface, scene.surfaces
+        )  # fmt: skip
         illumination = self._illumination(camera[3:], light)
         maps, texels = self._shadow_maps(illumination, camera, bodies, poses)
         count = 6 * len(corners)
         depth = self._memory("depth", 4 * texels)
         placed = self._memory("placed", _POSE_BYTES * len(bodies))
         triangles = self._memory("triangles", _TRIANGLE_BYTES * count)
-        spans = self._memory("spans", 8 * count)
+        spans = self._memory("spans", 8 * (count + count // _GROUP + 1 + self._size[1] // _BAND_ROWS + 1))
         samples = self._memory("samples", _BAND_ROWS * self._size[0] * _SAMPLES * 8)
         wrinkles = _wrinkles()
         function("draw_meshes")(

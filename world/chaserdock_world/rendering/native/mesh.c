@@ -11,6 +11,7 @@ typedef int32_t i8x __attribute__((vector_size(32), aligned(4), may_alias));
 
 #define BAND 8
 #define SAMPLES 8
+#define GROUP 32 /* consecutive triangles, which are mostly near each other, are skipped together */
 #define PLANES 6 /* 1 / z; normal, u, v over z */
 #define SUN_FAR (-1e30f)
 
@@ -297,32 +298,28 @@ static f8 shade(const Shading *s, const int32_t *which, f8 x, f8 y) {
         diffuse = *(const f8 *)lane[PLANES + 3], specular = *(const f8 *)lane[PLANES + 4], footprint = *(const f8 *)lane[PLANES + 5];
         shiny = *(const i8x *)exponent, kind = *(const i8x *)texture;
     }
-    f8 z = 1.0f / value[0], n[3], at[3], view[3];
+    f8 z = 1.0f / value[0], n[3], at[3];
     at[0] = (x - s->cx) * (z / s->fx);
     at[1] = (y - s->cy) * (z / s->fy);
     at[2] = z;
     for (int k = 0; k < 3; k++) n[k] = value[1 + k] * z;
     if (any8(kind)) apply_textures(s, kind, value[4] * z, value[5] * z, footprint * z, normal, &diffuse, n);
-    f8 length = sqrt8(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]);
-    length = max8(length, all8(1e-12f));
-    f8 range = sqrt8(at[0] * at[0] + at[1] * at[1] + at[2] * at[2]);
-    f8 cosine = all8(0.0f), facing = all8(0.0f), to_lamp = all8(0.0f), half2 = all8(0.0f), half_n = all8(0.0f);
-    f8 map_x = all8(0.0f), map_y = all8(0.0f), towards = all8(0.0f);
+    f8 inverse = 1.0f / max8(sqrt8(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]), all8(1e-12f));
+    f8 square = at[0] * at[0] + at[1] * at[1] + at[2] * at[2], away = -1.0f / sqrt8(square);
+    f8 cosine = all8(0.0f), facing = all8(0.0f), to_lamp = all8(0.0f), view_sun = all8(0.0f), towards = all8(0.0f);
     for (int k = 0; k < 3; k++) {
-        n[k] = n[k] / length;
-        view[k] = -at[k] / range;
-        f8 half = view[k] + s->sun[k];
+        n[k] *= inverse;
         cosine += n[k] * s->sun[k];
         facing += normal[k] * s->sun[k];
-        to_lamp += n[k] * view[k];
-        half2 += half * half;
-        half_n += n[k] * half;
-        map_x += at[k] * s->across[k], map_y += at[k] * s->along[k];
+        to_lamp += n[k] * at[k];
         towards += at[k] * s->sun[k];
     }
-    f8 sun = all8(s->sun_share);
+    to_lamp *= away, view_sun = towards * away;
+    f8 level = s->white * s->ambient * diffuse;
     i8x lit = (cosine > 0.0f) & (facing > 0.0f);
     if (s->sun_share > 0.0f && any8(lit)) {
+        f8 sun = all8(s->sun_share * s->white), map_x = all8(0.0f), map_y = all8(0.0f);
+        for (int k = 0; k < 3; k++) map_x += at[k] * s->across[k], map_y += at[k] * s->along[k];
         const Triangle *t = s->triangles + which[0];
         int one = 1;
         for (int i = 1; i < 8; i++) one &= s->triangles[which[i]].body == t->body;
@@ -334,15 +331,21 @@ static f8 shade(const Shading *s, const int32_t *which, f8 x, f8 y) {
             if (one) sun *= share;
             else sun[i] *= share[i];
         }
+        sun = select8(lit, sun, all8(0.0f));
+        f8 reflected = diffuse * cosine;
+        if (any8(specular > 0.0f)) {
+            /* Blinn's half vector h = view + sun: n'h over its length, which is sqrt(2 + 2 view'sun). */
+            f8 gloss = max8(to_lamp + cosine, all8(0.0f)) / sqrt8(max8(2.0f + 2.0f * view_sun, all8(1e-6f))), power = all8(1.0f);
+            gloss = min8(gloss, all8(1.0f));
+            for (i8x left = shiny; any8(left > 0); left = left >> 1) {
+                power = select8((left & 1) == 1, power * gloss, power);
+                gloss = gloss * gloss;
+            }
+            reflected += specular * power;
+        }
+        level += sun * reflected;
     }
-    sun = select8(lit, sun, all8(0.0f));
-    f8 gloss = max8(half_n, all8(0.0f)) / sqrt8(max8(half2, all8(1e-12f))), power = all8(1.0f);
-    for (i8x left = shiny; any8(left > 0); left = left >> 1) {
-        power = select8((left & 1) == 1, power * gloss, power);
-        gloss = gloss * gloss;
-    }
-    f8 level = s->white * (diffuse * (s->ambient + sun * max8(cosine, all8(0.0f))) + specular * sun * power);
-    if (s->lamp > 0.0f) level += s->lamp * diffuse * max8(to_lamp, all8(0.0f)) / max8(range * range, all8(1e-6f));
+    if (s->lamp > 0.0f) level += s->lamp * diffuse * max8(to_lamp, all8(0.0f)) / max8(square, all8(1e-6f));
     return level;
 }
 
@@ -422,41 +425,65 @@ static void resolve(const Shading *s, const int32_t *owner, float *depth, int64_
     }
 }
 
+/* Rasterize pixels x0 to x1 of a row whose first sample is at ``depth`` and ``owner``. ``edges``: values of the three edge functions of
+ * the row's samples at x = 0; ``row_w``: of 1 / z. Without ``tested``, all samples are known to be inside the edges. */
+static inline __attribute__((always_inline)) void cover_pixels(const Triangle *t, int32_t number, int64_t x0, int64_t x1,
+                                                               const f8 *edges, f8 row_w, f8 sx, int tested, float *depth,
+                                                               int32_t *owner) {
+    for (int64_t x = x0; x < x1; x++) {
+        f8 column = (float)x + sx;
+        f8 w = t->plane[0][0] * column + row_w;
+        w = min8(max8(w, all8(t->far_w)), all8(t->near_w));
+        f8 *d = (f8 *)(depth + x * SAMPLES);
+        i8x *o = (i8x *)(owner + x * SAMPLES);
+        i8x in = w > *d;
+        if (tested) {
+            in &= (t->edge[0][0] * column + edges[0]) >= 0.0f;
+            in &= (t->edge[1][0] * column + edges[1]) >= 0.0f;
+            in &= (t->edge[2][0] * column + edges[2]) >= 0.0f;
+        }
+        if (!any8(in)) continue;
+        *d = max8(select8(in, w, all8(0.0f)), *d);
+        i8x kept = ~in & *o;
+        HIDE_ADDRESS(o);
+        *o = (in & number) | kept;
+    }
+}
+
 /* Rasterize a triangle into a band of rows from ``band`` on. */
 static void cover(const Triangle *t, int32_t number, int64_t band, int64_t rows, int64_t width, float *depth, int32_t *owner) {
     f8 sx, sy;
     for (int k = 0; k < 8; k++) sx[k] = SAMPLE_X[k] / 16.0f, sy[k] = SAMPLE_Y[k] / 16.0f;
     int64_t y0 = t->y0 > band ? t->y0 : band, y1 = t->y1 < band + rows ? t->y1 : band + rows;
     for (int64_t y = y0; y < y1; y++) {
-        float left = (float)t->x0, right = (float)t->x1;
-        f8 rows_of[3];
+        float left = (float)t->x0, right = (float)t->x1, from = left, to = right;
+        f8 edges[3];
         for (int e = 0; e < 3; e++) {
-            float a = t->edge[e][0], c = t->edge[e][1] * (float)y + t->edge[e][2];
-            rows_of[e] = t->edge[e][1] * ((float)y + sy) + t->edge[e][2];
+            float a = t->edge[e][0], b = t->edge[e][1], c = b * (float)y + t->edge[e][2];
+            edges[e] = b * ((float)y + sy) + t->edge[e][2];
             /* A pixel has samples inside only if its centre is less than a pixel outside. */
             if (a > 1e-3f && (-c - 1.0f) / a > left) left = (-c - 1.0f) / a;
             if (a < -1e-3f && (-c - 1.0f) / a + 1.0f < right) right = (-c - 1.0f) / a + 1.0f;
+            /* All samples are inside if the centre is a pixel inside; ``from`` and ``to``: such pixels. */
+            if (a > 1e-3f) from = (1.0f - c) / a + 1.0f > from ? (1.0f - c) / a + 1.0f : from;
+            else if (a < -1e-3f) to = (1.0f - c) / a < to ? (1.0f - c) / a : to;
+            else if (c < 1.5f + 2e-3f * (float)width) to = -1.0f;
         }
         if (!(left < right)) continue;
         f8 row_w = t->plane[0][1] * ((float)y + sy) + t->plane[0][2];
-        int64_t last = (int64_t)right < t->x1 ? (int64_t)right + 1 : t->x1;
+        float *d = depth + (y - band) * width * SAMPLES;
+        int32_t *o = owner + (y - band) * width * SAMPLES;
+        int64_t first = (int64_t)left, last = (int64_t)right < t->x1 ? (int64_t)right + 1 : t->x1;
         if (last > t->x1) last = t->x1;
-        for (int64_t x = (int64_t)left; x < last; x++) {
-            f8 column = (float)x + sx;
-            i8x in = (t->edge[0][0] * column + rows_of[0]) >= 0.0f;
-            in &= (t->edge[1][0] * column + rows_of[1]) >= 0.0f;
-            in &= (t->edge[2][0] * column + rows_of[2]) >= 0.0f;
-            f8 w = t->plane[0][0] * column + row_w;
-            w = min8(max8(w, all8(t->far_w)), all8(t->near_w));
-            f8 *d = (f8 *)(depth + ((y - band) * width + x) * SAMPLES);
-            i8x *o = (i8x *)(owner + ((y - band) * width + x) * SAMPLES);
-            in &= w > *d;
-            if (!any8(in)) continue;
-            *d = max8(select8(in, w, all8(0.0f)), *d);
-            i8x kept = ~in & *o;
-            HIDE_ADDRESS(o);
-            *o = (in & number) | kept;
+        int64_t inner = last, outer = last;
+        if (from < to) {
+            inner = (int64_t)from > first ? (int64_t)from : first;
+            outer = (int64_t)to < last ? (int64_t)to : last;
+            if (inner > outer) inner = outer = last;
         }
+        cover_pixels(t, number, first, inner, edges, row_w, sx, 1, d, o);
+        cover_pixels(t, number, inner, outer, edges, row_w, sx, 0, d, o);
+        cover_pixels(t, number, outer, last, edges, row_w, sx, 1, d, o);
     }
 }
 
@@ -539,7 +566,7 @@ static void fill_map(const ShadowMap *map, const Illumination *light, int64_t bo
  * WRF; ``first`` (bodies + 1): ranges of the triangles, whose ``corners`` and ``normals`` (m, 3, 3) are in body axes;
  * ``uv`` (m, 3, 2): texture coordinates, m; ``surface`` (m): their rows of ``surfaces``. ``wrinkles`` (n, n, 3): slopes and relative
  * reflectance of the insulation. ``maps`` (bodies) lie in ``depth``, whose rows are multiples of eight long.
- * Working memory: ``placed`` (bodies), ``triangles`` (6 m), ``spans`` (6 m, 2), ``samples`` (BAND * width * 16). A body at NaN is not drawn. */
+ * Working memory: ``placed`` (bodies), ``triangles`` (6 m), ``spans`` (6 m + groups + bands, 2), ``samples`` (BAND * width * 16). A body at NaN is not drawn. */
 EXPORT void NAME(draw_meshes)(const Frustum *f, int64_t width, int64_t height, const double *camera, int64_t bodies,
                               const double *poses, const int64_t *first, const double *corners, const double *normals,
                               const double *uv, const int64_t *surface, const Surface *surfaces, const Illumination *light,
@@ -560,7 +587,20 @@ EXPORT void NAME(draw_meshes)(const Frustum *f, int64_t width, int64_t height, c
     if (light->sun_share > 0.0)
         for (int64_t b = 0; b < bodies; b++)
             if (maps[b].used > 0.0) fill_map(maps + b, light, bodies, placed, first, corners, depth);
-    for (int64_t i = 0; i < count; i++) spans[2 * i] = triangles[i].y0, spans[2 * i + 1] = triangles[i].y1;
+    int32_t *groups = spans + 2 * count, *columns = groups + 2 * (count / GROUP + 1);
+    int64_t bands = (height + BAND - 1) / BAND;
+    for (int64_t b = 0; b < bands; b++) columns[2 * b] = (int32_t)width, columns[2 * b + 1] = 0;
+    for (int64_t i = 0; i < count; i++) {
+        const Triangle *t = triangles + i;
+        int32_t *group = groups + 2 * (i / GROUP);
+        spans[2 * i] = t->y0, spans[2 * i + 1] = t->y1;
+        if (i % GROUP == 0 || t->y0 < group[0]) group[0] = t->y0;
+        if (i % GROUP == 0 || t->y1 > group[1]) group[1] = t->y1;
+        for (int32_t b = t->y0 / BAND; b <= (t->y1 - 1) / BAND; b++) {
+            if (t->x0 < columns[2 * b]) columns[2 * b] = t->x0;
+            if (t->x1 > columns[2 * b + 1]) columns[2 * b + 1] = t->x1;
+        }
+    }
     Shading s = {.surfaces = surfaces, .maps = maps, .depth = depth, .wrinkles = wrinkles, .wrinkle_size = wrinkle_size,
                  .triangles = triangles, .fx = (float)f->fx, .fy = (float)f->fy, .cx = (float)(f->cx - f->origin[0]),
                  .cy = (float)(f->cy - f->origin[1]), .sun_share = (float)light->sun_share, .ambient = (float)light->ambient,
@@ -569,17 +609,15 @@ EXPORT void NAME(draw_meshes)(const Frustum *f, int64_t width, int64_t height, c
         s.sun[k] = (float)light->sun[k], s.across[k] = (float)light->across[k], s.along[k] = (float)light->along[k];
     int32_t *owner = (int32_t *)(samples + BAND * width * SAMPLES);
     for (int64_t y = 0; y < height; y += BAND) {
-        int64_t rows = height - y < BAND ? height - y : BAND, x0 = width, x1 = 0;
-        for (int64_t i = 0; i < count; i++)
-            if (spans[2 * i] < y + rows && spans[2 * i + 1] > y) {
-                if (triangles[i].x0 < x0) x0 = triangles[i].x0;
-                if (triangles[i].x1 > x1) x1 = triangles[i].x1;
-            }
+        int64_t rows = height - y < BAND ? height - y : BAND, x0 = columns[2 * (y / BAND)], x1 = columns[2 * (y / BAND) + 1];
         if (x0 >= x1) continue;
         for (int64_t r = 0; r < rows; r++)
             for (int64_t k = (r * width + x0) * SAMPLES; k < (r * width + x1) * SAMPLES; k++) samples[k] = 0.0f, owner[k] = -1;
-        for (int64_t i = 0; i < count; i++)
-            if (spans[2 * i] < y + rows && spans[2 * i + 1] > y) cover(triangles + i, (int32_t)i, y, rows, width, samples, owner);
+        for (int64_t g = 0; g < count; g += GROUP) {
+            if (groups[2 * (g / GROUP)] >= y + rows || groups[2 * (g / GROUP) + 1] <= y) continue;
+            for (int64_t i = g; i < g + GROUP && i < count; i++)
+                if (spans[2 * i] < y + rows && spans[2 * i + 1] > y) cover(triangles + i, (int32_t)i, y, rows, width, samples, owner);
+        }
         resolve(&s, owner, samples, y, rows, width, x0, x1, canvas);
     }
 }

@@ -22,7 +22,15 @@ from common import ROOT, Figures, make_parser, write_json
 
 PATCHES = sorted((ROOT / "tests" / "planted_bugs").glob("*.patch"))
 SOURCES = ("agents", "chaserdock", "controller", "protocol", "world")
-COPIED = (*SOURCES, "scenarios", "tests/planted_bugs", "pyproject.toml", "build_hook.py")
+COPIED = (
+    *SOURCES,
+    "scenarios",
+    "tests/planted_bugs",
+    "pyproject.toml",
+    "build_hook.py",
+    "release",
+    "CITATION.cff",
+)
 _BUILD = "protocol/chaserdock_models/native/build.py"
 _FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,-]+?)(?: at [\d.]+ s)?: (.*)")
 

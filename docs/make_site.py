@@ -2,13 +2,18 @@
 """Build the documentation as a self-contained site: ``python docs/make_site.py [OUT]`` (default: ``site/``).
 
 Needs the packages of requirements-dev.txt. The pages are written for GitHub. Here their mathematics becomes MathML, and files outside
-docs/ that they link to become pages, so that every link is checked. A warning is an error.
+docs/ that they link to become pages, so that every link is checked; notebooks are shown with their stored outputs. A warning is an
+error. Every page names the version. ``--releases`` adds the documentation of each tag vX.Y.Z in a folder of that name, each built by
+its own make_site.py, and the page ``versions.html``.
 """
 
 from __future__ import annotations
 
+import base64
+import json
 import posixpath
 import re
+import runpy
 import shutil
 import subprocess
 import sys
@@ -56,6 +61,28 @@ def _inline(text: str) -> str:
     return _INLINE_MATH.sub(lambda found: convert(found[1]), text)
 
 
+def notebook_page(file: Path, images: Path) -> str:
+    """Return a notebook with its stored outputs as Markdown; its figures are written into the folder ``images``."""
+    parts = []
+    for number, cell in enumerate(json.loads(file.read_text(encoding="utf-8"))["cells"]):
+        source = "".join(cell["source"]).rstrip()
+        if cell["cell_type"] == "markdown":
+            parts.append(source)
+            continue
+        parts.append(f"```python\n{source}\n```")
+        for k, output in enumerate(cell["outputs"]):
+            data = output.get("data", {})
+            if "image/png" in data:
+                images.mkdir(parents=True, exist_ok=True)
+                name = f"{file.stem}-{number}-{k}.png"
+                (images / name).write_bytes(base64.b64decode("".join(data["image/png"])))
+                parts.append(f"![output of the cell above]({name})")
+            else:
+                text = "".join(data.get("text/plain") or output.get("text", "")).rstrip()
+                parts.append(f"````text\n{text}\n````")
+    return "\n\n".join(parts) + "\n"
+
+
 class Stage:
     """The pages of the site, collected in ``folder``; ``add`` copies a page with everything it links to."""
 
@@ -80,6 +107,9 @@ class Stage:
         if file.suffix == ".md":
             text = self.with_links(file.read_text(encoding="utf-8"), file)
             place.write_text(with_mathematics(text), encoding="utf-8")
+        elif file.suffix == ".ipynb":
+            text = self.with_links(notebook_page(file, place.parent), file)
+            place.write_text(text, encoding="utf-8")
         elif place.suffix == ".md":
             code = file.read_text(encoding="utf-8").rstrip()
             language = _LANGUAGES.get(file.suffix, "text")
@@ -93,6 +123,8 @@ class Stage:
         here = posixpath.dirname(self.place_of(page))
 
         def link(found: re.Match[str]) -> str:
+            if page.suffix == ".ipynb" and (self.folder / here / found[2]).is_file():
+                return found[0]  # a figure of the notebook
             file = (page.parent / found[2]).resolve()
             file = file / "README.md" if file.is_dir() else file
             if not (file.is_file() and file.is_relative_to(ROOT)):
@@ -134,6 +166,40 @@ def configuration(stage: Path) -> str:
     return re.sub(r"^ *# MORE.*$", lambda _: "\n".join(more), text, flags=re.M)
 
 
+def version() -> str:
+    """Return the version that the pages describe."""
+    return runpy.run_path(str(ROOT / "release" / "version.py"))["version"]()
+
+
+def build_releases(out: Path) -> list[str]:
+    """Build the documentation of each release into a folder of ``out``, newest first; return their tags. Raises SiteError."""
+    listed = subprocess.run(
+        ["git", "tag", "--list", "v[0-9]*.[0-9]*.[0-9]*", "--sort=-v:refname"],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    if listed.returncode != 0:
+        raise SiteError(f"--releases needs a clone with its tags: {listed.stderr.strip()}")
+    tags = listed.stdout.split()
+    for tag in tags:
+        with tempfile.TemporaryDirectory(prefix="chaserdock-docs-") as name:
+            for command in (
+                ["git", "worktree", "add", "--detach", f"{name}/tree", tag],
+                [sys.executable, f"{name}/tree/docs/make_site.py", str(out / tag)],
+                ["git", "worktree", "remove", "--force", f"{name}/tree"],
+            ):
+                done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+                if done.returncode != 0:
+                    raise SiteError(f"{tag}: {' '.join(command)}: {done.stdout}{done.stderr}")
+    items = "".join(f'<li><a href="{tag}/index.html">{tag}</a></li>' for tag in tags)
+    (out / "versions.html").write_text(
+        '<!doctype html><html lang="en"><meta charset="utf-8"><meta name="viewport" content="width=device-width">'
+        f'<title>chaserdock: versions</title><h1>chaserdock: versions</h1><ul><li><a href="index.html">{version()}</a>'
+        f" (this build)</li>{items}</ul></html>\n",
+        encoding="utf-8",
+    )
+    return tags
+
+
 def build(out: Path) -> None:
     """Build the site into ``out``, which is replaced. Raises SiteError with the output of the site generator."""
     with tempfile.TemporaryDirectory(prefix="chaserdock-docs-") as name:
@@ -141,7 +207,10 @@ def build(out: Path) -> None:
         stage = Stage(work / "pages")
         for page in sorted(DOCS.glob("*.md")):
             stage.add(page)
-        (work / "zensical.toml").write_text(configuration(stage.folder), encoding="utf-8")
+        for notebook in sorted((ROOT / "examples").glob("*.ipynb")):
+            stage.add(notebook)
+        text = configuration(stage.folder).replace('"chaserdock"', f'"chaserdock {version()}"', 1)
+        (work / "zensical.toml").write_text(text, encoding="utf-8")
         done = subprocess.run(
             [str(Path(sys.executable).with_name("zensical")), "build", "--strict"],
             cwd=work,
@@ -157,12 +226,15 @@ def build(out: Path) -> None:
 
 
 def main() -> int:
-    out = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "site"
+    places = [argument for argument in sys.argv[1:] if argument != "--releases"]
+    out = Path(places[0]) if places else ROOT / "site"
     if out.exists() and not (out / "sitemap.xml").is_file():
         print(f"make_site: {out} exists and is not a site; it would be replaced", file=sys.stderr)
         return 2
     try:
         build(out)
+        if "--releases" in sys.argv:
+            build_releases(out.resolve())
     except SiteError as error:
         print(f"make_site: {error}", file=sys.stderr)
         return 1

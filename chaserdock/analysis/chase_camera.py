@@ -127,7 +127,9 @@ def draw(
             away = eye - corners.mean(axis=0)
             if normal @ away > 0.0:
                 light = 0.45 + 0.55 * max(0.0, float(normal @ sun))
-                visible.append((float(np.linalg.norm(away)), position, attitude, face, corners, light, hue))
+                visible.append(
+                    (float(np.linalg.norm(away)) - face.lift_m, position, attitude, face, corners, light, hue)
+                )
     visible.sort(key=lambda item: -item[0])
     for _, position, attitude, face, corners, light, hue in visible:
         px, depth = view.project(corners)

@@ -44,6 +44,7 @@ def _faces(faces: tuple[Face, ...]) -> list[dict[str, Any]]:
             "c": _numbers(f.corners_m, 4),
             "n": _numbers(f.normal, 4),
             "g": f.grey,
+            "l": f.lift_m,
             "d": [[_numbers(quad, 4), grey] for quad, grey in f.decals],
         }
         for f in faces

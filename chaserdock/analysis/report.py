@@ -245,9 +245,8 @@ def _drawn(flight: RecordedFlight) -> str:
     stated = {"target": flight.scenario.target.mass_kg} | {
         f"chaser/{i}": flight.scenario.chaser.mass_kg for i in range(len(flight.scenario.chasers))
     }
-    rows = [
+    columns = [
         (
-            b.body,
             f"{b.mass_kg:.4g} ({stated.get(b.body, math.nan):.4g})",
             _numbers_text(b.inertia_kg_m2[::4], 1.0),
             _numbers_text(b.centre_of_mass_m, 1e3),
@@ -261,11 +260,14 @@ def _drawn(flight: RecordedFlight) -> str:
         )
         for b in flight.drawn
     ]
-    head = (
-        "body", "mass, kg (stated)", "inertia xx, yy, zz, kg m²", "centre of mass, mm", "force, mN", "torque, mN m",
+    quantities = (
+        "mass, kg (stated)", "inertia xx, yy, zz, kg m²", "centre of mass, mm", "force, mN", "torque, mN m",
         "thrust, %", "camera turn, deg", "camera shift, mm", "focal length, %", "gyro bias, deg/s",
     )  # fmt: skip
-    return f'<h2 id="drawn">True bodies and sensors</h2>{table(head, rows)}' if rows else ""
+    # One column per body: with one per quantity, even a wide screen would cut the table off.
+    rows = list(zip(quantities, *columns, strict=True))
+    head = ("", *(b.body for b in flight.drawn))
+    return f'<h2 id="drawn">True bodies and sensors</h2>{table(head, rows)}' if columns else ""
 
 
 def _numbers_text(values: Iterable[float], factor: float) -> str:
@@ -344,5 +346,5 @@ def _details(flight: RecordedFlight, result: dict[str, Any]) -> str:
         + (f"<h3>Rejected on receipt</h3>{table(('reason', 'count'), refused)}" if refused else "")
         + "</details>"
         f"<details><summary>Summary as JSON</summary><pre>{escape(json.dumps(result, indent=2))}</pre></details>"
-        f'<h2 id="versions">Run and versions</h2>{table(("", ""), [*run, *versions])}'
+        f'<h2 id="versions">Run and versions</h2>{table(("", ""), [*run, *versions], text=True)}'
     )

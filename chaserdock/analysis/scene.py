@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.meshes import TriangleMesh
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box, Marker, TargetModel, face_extent, face_rotation
 from chaserdock_protocol.scenario import FlightScenario
 
@@ -18,16 +20,26 @@ Grey = int
 _PROBE_WIDTH_M = 0.012
 # A long thin box is divided, so that ordering faces by the depth of their centres is correct.
 _LONGEST_PIECE_M = 0.06
+_LONGEST_EDGE_M = 0.12
+_PLATE_M = 0.03
+_LIFT_M = 0.08
+_FACET_M = 0.02
+"""Largest deviation of the drawn facets of a satellite from its curved surfaces."""
 
 
 @dataclass(frozen=True)
 class Face:
-    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``; ``decals`` are painted on it in order."""
+    """A flat quadrangle ``corners_m`` (4, 3) in body axes with outward ``normal``; ``decals`` are painted on it in order.
+
+    A triangle has its last corner twice. ``lift_m``: by how much nearer than it is the face counts when faces are ordered by
+    depth: a thin part on a larger face must not be hidden by it.
+    """
 
     corners_m: Array
     normal: Array
     grey: Grey
     decals: tuple[tuple[Array, Grey], ...] = ()
+    lift_m: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -84,6 +96,43 @@ def box_faces(box: Box, model: TargetModel | None = None) -> list[Face]:
     return out
 
 
+def _divided(triangles: Array) -> Array:
+    """Divide triangles (N, 3, 3) at the middle of their longest edge until none is longer than _LONGEST_EDGE_M."""
+    done = []
+    while len(triangles):
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        short = edges.max(axis=1) <= _LONGEST_EDGE_M
+        done.append(triangles[short])
+        # Turn each of the others so that its longest edge is between its first two corners.
+        first = edges[~short].argmax(axis=1)[:, None]
+        a, b, c = np.moveaxis(
+            np.take_along_axis(triangles[~short], ((first + np.arange(3)) % 3)[..., None], axis=1), 1, 0
+        )
+        middle = 0.5 * (a + b)
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate(done)
+
+
+def mesh_faces(mesh: TriangleMesh) -> list[Face]:
+    """Return the triangles of a mesh as faces."""
+    out = []
+    for part in mesh.parts:
+        extent_m = np.ptp(part.vertices_m, axis=0)
+        thin = int(extent_m.argmin())
+        plate = extent_m[thin] < _PLATE_M
+        corners = _divided(part.vertices_m[part.triangles])
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        doubled_areas = np.linalg.norm(normals, axis=1)
+        # Dark materials shine: their diffuse part alone would be black on black space.
+        material = part.material
+        grey = round(255 * min(1.0, 0.15 + material.diffuse + 0.3 * material.specular))
+        for three, normal, area in zip(corners, normals, doubled_areas, strict=True):
+            if area > 0.0:
+                broad = plate and abs(normal[thin]) > 0.9 * area
+                out.append(Face(three[[0, 1, 2, 2]], normal / area, grey, lift_m=_LIFT_M if broad else 0.0))
+    return out
+
+
 def _probe(front_m: float, reach_m: float) -> list[Face]:
     pieces = max(1, round((reach_m - front_m) / _LONGEST_PIECE_M))
     length = (reach_m - front_m) / pieces
@@ -100,7 +149,13 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
     model = scenario.target_model()
     body = scenario.chaser
     front = body.size_m[0] / 2.0
-    chaser = box_faces(Box(body.size_m, shade=0.42))
+    chaser = (
+        mesh_faces(satellite(body.mesh, _FACET_M)) if body.mesh else box_faces(Box(body.size_m, shade=0.42))
+    )
+    if model.satellite:
+        target = mesh_faces(satellite(model.satellite, _FACET_M))
+    else:
+        target = [face for box in model.boxes for face in box_faces(box, model)]
     if body.probe_reach_m > front:
         chaser += _probe(front, body.probe_reach_m)
     camera = scenario.camera_model()
@@ -112,7 +167,7 @@ def scene_of(scenario: FlightScenario, view_m: float = 0.22) -> Scene:
     origin = np.array(camera.position_crf_m)
     corners = rotations.rotate(camera.q_crf_irf_wxyz, np.array(rays)) + origin
     return Scene(
-        target=tuple(face for box in model.boxes for face in box_faces(box, model)),
+        target=tuple(target),
         chaser=tuple(chaser),
         camera_origin_m=origin,
         camera_corners_m=corners,

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
-from chaserdock_protocol.errors import ChaserdockError
+from chaserdock_protocol.errors import ChaserdockError, require_extra
 from chaserdock_protocol.recording.scan import LOG_NAME
 
 from .plan import Campaign, Run
@@ -132,11 +132,13 @@ def fly_locally(
 def fly_on_cluster(
     runs: list[Run], keep: Keep, folder: Path, address: str, stop: threading.Event
 ) -> Iterator[tuple[Run, FinishedRun]]:
-    """Fly runs on the workers of the Dask scheduler at ``address``; yield each as it ends. Raise CampaignError."""
-    try:
-        from distributed import Client, as_completed
-    except ImportError:
-        raise CampaignError('--cluster needs Dask: pip install "chaserdock[cluster]"') from None
+    """Fly runs on the workers of the Dask scheduler at ``address``; yield each as it ends.
+
+    Raise CampaignError, and MissingPackageError without Dask.
+    """
+    require_extra("distributed", "cluster")
+    from distributed import Client, as_completed
+
     try:
         client = Client(address, timeout=5)
     except (OSError, ValueError, TimeoutError) as error:

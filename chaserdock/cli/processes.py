@@ -37,19 +37,7 @@ def start_process(name: str, options: ProcessOptions) -> None:
     installed = [e for e in entry_points(group="chaserdock.processes") if e.name == name]
     if not installed:
         raise fail(f"no process {name!r} is installed")
-    try:
-        process = installed[0].load()
-    except ImportError as error:
-        if "pybullet" in str(error):
-            python = f"{sys.version_info.major}.{sys.version_info.minor}"
-            raise fail(
-                f"the world needs PyBullet, which has no wheels for Python {python}; use Python 3.11, "
-                "e.g. uv run --python 3.11 chaserdock world …"
-            ) from None
-        if error.name is not None and error.name.startswith("rosbags"):
-            raise fail("rosbags is not installed; install chaserdock[ros2]") from None
-        raise
-    sys.exit(process(options))
+    sys.exit(installed[0].load()(options))
 
 
 @with_link_options()

@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 from chaserdock_protocol import topics
-from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.errors import errors_of_writing, require_extra
 from chaserdock_protocol.recording.log import LogError, LogSource
 
 from .reader import open_log
@@ -25,16 +25,14 @@ def export_bag(log: LogSource, folder: Path, images: bool = False) -> dict[str, 
     ``images``: include images (decoded) and camera calibrations.
 
     A message's time in the bag is its simulated time, that of an image its exposure; a bag is in order of arrival, as the log
-    is. Raises LogError when the log or the bag cannot be used or rosbags is not installed.
+    is. Raises LogError when the log or the bag cannot be used, MissingPackageError without rosbags.
     """
-    try:
-        from rosbags.interfaces import Connection
-        from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer, WriterError
-        from rosbags.rosbag2.enums import CompressionFormat
-    except ImportError as error:
-        raise LogError(f"{error.name} is not installed; install chaserdock[ros2]") from None
+    require_extra("rosbags", "ros2")
     from chaserdock_agents.ros2.conversion import Converter, InvalidImage
     from chaserdock_agents.ros2.types import TYPES
+    from rosbags.interfaces import Connection
+    from rosbags.rosbag2 import CompressionMode, StoragePlugin, Writer, WriterError
+    from rosbags.rosbag2.enums import CompressionFormat
 
     opened = open_log(log)
     converter = Converter(opened.scenario)

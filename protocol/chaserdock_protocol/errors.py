@@ -3,11 +3,25 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from pathlib import Path
 
 
 class ChaserdockError(Exception):
     """A request cannot be carried out. The text states what failed, where, and what is valid."""
+
+
+class MissingPackageError(ChaserdockError, ImportError):
+    """A package that this part of chaserdock needs is not installed. The text states how to install it."""
+
+
+def require_extra(package: str, extra: str) -> None:
+    """Raise MissingPackageError unless ``package``, which chaserdock[extra] installs, can be imported."""
+    if find_spec(package) is None:
+        raise MissingPackageError(
+            f"{package} is not installed; install chaserdock[{extra}]: pip install 'chaserdock[{extra}]'",
+            name=package,
+        )
 
 
 @contextmanager

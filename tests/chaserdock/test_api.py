@@ -240,15 +240,18 @@ def test_packages_are_typed() -> None:
     assert all((package / "py.typed").exists() for package in packages)
 
 
-def test_notebook_runs(tmp_path: Path) -> None:
-    """The notebook in examples/ executes, and its stored outputs contain no absolute path."""
+@pytest.mark.parametrize("name", ["quickstart", "logs"])
+def test_notebook_runs(name: str, tmp_path: Path) -> None:
+    """A notebook in examples/ executes, and its stored outputs contain no absolute path."""
     nbclient, nbformat = pytest.importorskip("nbclient"), pytest.importorskip("nbformat")
-    path = ROOT / "examples" / "quickstart.ipynb"
+    path = ROOT / "examples" / f"{name}.ipynb"
     notebook = nbformat.read(path, as_version=4)
     assert all(cell.outputs for cell in notebook.cells if cell.cell_type == "code" and cell.source[-1] != ";")
     assert str(Path.home()) not in path.read_text()
     assert "/work" not in path.read_text()
     assert os.stat(path).st_size < 400_000
-    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    # The second one reads a log of the clone and writes nothing.
+    folder = tmp_path if name == "quickstart" else path.parent
+    nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(folder)}}).execute()
     outputs = [o for cell in notebook.cells if cell.cell_type == "code" for o in cell.outputs]
     assert not [o for o in outputs if o.output_type == "error" or o.get("name") == "stderr"]

@@ -31,6 +31,7 @@ def _module(name: str) -> ModuleType:
 
 
 make_site: Any = _module("make_site")
+make_api: Any = _module("make_api")
 
 
 class Requests(HTMLParser):
@@ -80,6 +81,47 @@ def test_mathematics_is_in_the_page_itself(site: Path) -> None:
         seen.feed(text)
         assert seen.equations >= least
         assert "\\begin" not in re.sub(r"<annotation.*?</annotation>", "", text, flags=re.S)
+
+
+def test_the_site_shows_notebooks_names_its_version_and_can_be_searched(site: Path) -> None:
+    page = (site / "source" / "examples" / "logs.ipynb.html").read_text(encoding="utf-8")
+    assert "controller: initialised by chaser 1" in page  # a stored output
+    assert page.count("<img") >= 1
+    assert f"chaserdock {make_site.version()}" in (site / "index.html").read_text(encoding="utf-8")
+    index = (site / "search.json").read_text(encoding="utf-8")
+    assert "logs.ipynb.html" in index
+    assert "api.html" in index
+
+
+def test_api_page_is_up_to_date() -> None:
+    assert make_api.page() == (DOCS / "api.md").read_text(encoding="utf-8")
+
+
+def test_documentation_of_releases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each tag's own make_site.py builds it into a folder with its name; versions.html lists them, newest first."""
+    clone = tmp_path / "clone"
+    (clone / "docs").mkdir(parents=True)
+    script = (
+        "import pathlib, sys; p = pathlib.Path(sys.argv[1]); p.mkdir(); (p / 'index.html').write_text('x')\n"
+    )
+    (clone / "docs" / "make_site.py").write_text(script)
+    own = ("-c", "user.name=test", "-c", "user.email=test@example.org")
+    for command in (
+        ["init", "-q"],
+        ["add", "."],
+        ["commit", "-qm", "x"],
+        ["tag", "v0.9.0"],
+        ["tag", "v0.10.0"],
+    ):
+        subprocess.run(["git", *own, *command], cwd=clone, check=True)
+    monkeypatch.setattr(make_site, "ROOT", clone)
+    monkeypatch.setattr(make_site, "version", lambda: "0.11.0.dev1")
+    out = tmp_path / "site"
+    out.mkdir()
+    assert make_site.build_releases(out) == ["v0.10.0", "v0.9.0"]
+    assert (out / "v0.9.0" / "index.html").is_file()
+    listed = re.findall(r'href="([^"]+)"', (out / "versions.html").read_text(encoding="utf-8"))
+    assert listed == ["index.html", "v0.10.0/index.html", "v0.9.0/index.html"]
 
 
 def test_a_link_to_nowhere_is_an_error(tmp_path: Path) -> None:

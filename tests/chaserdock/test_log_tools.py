@@ -98,6 +98,8 @@ def test_viewer_layer_has_schemas_images_and_frames(tmp_path: Path) -> None:
         assert len(seen[f"/viewer/chaser/{i}/calibration foxglove.CameraCalibration"]) == 18
         assert len(seen[f"/viewer/chaser/{i}/measurement foxglove.PoseInFrame"]) == 18
         assert len(seen[f"/viewer/chaser/{i}/detections foxglove.ImageAnnotations"]) == 18
+        assert len(seen[f"/viewer/chaser/{i}/corners foxglove.PointCloud"]) == 18
+        assert len(seen[f"/viewer/chaser/{i}/points foxglove.PointCloud"]) == 1
     frames = Counter(
         name
         for message in seen["/viewer/tf foxglove.FrameTransform"]
@@ -106,6 +108,7 @@ def test_viewer_layer_has_schemas_images_and_frames(tmp_path: Path) -> None:
     )
     assert frames == {b"target": 19, b"chaser/1": 19, b"target/estimate": 18, b"chaser/0/camera": 1}
     assert len(seen["/viewer/scene foxglove.SceneUpdate"]) == 1
+    assert len(seen["/viewer/target/points foxglove.PointCloud"]) == 1
 
 
 # -- rotation ---------------------------------------------------------------------------------------------

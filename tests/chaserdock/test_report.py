@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 import pytest
 from chaserdock_models import rotations
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import target_model
 from chaserdock_protocol import messages as m
 from chaserdock_protocol import topics
@@ -403,6 +404,28 @@ def test_drawn_target_shows_its_markers(model: str, azimuth: float, elevation: f
         assert marker is not None
         expected, _ = view.project(marker.corners_trf_m())
         np.testing.assert_allclose(np.reshape(found, (4, 2)), expected, atol=2.0)
+
+
+def test_a_satellite_is_drawn_as_its_mesh() -> None:
+    """With its panels beyond the body, and with its radiator before the wall that bears it."""
+    flown = scenario(
+        target={"model": "geo_servicer"}, perception={"name": "model"}, chaser={"mesh": "chaser_body"}
+    )
+    scene = scene_of(flown)
+    corners = np.concatenate([face.corners_m for face in scene.target])
+    np.testing.assert_allclose([corners[:, 1].min(), corners[:, 1].max()], [-0.6387, 0.6393], atol=1e-3)
+    assert len(scene.chaser) > 100
+    view = Viewpoint(np.zeros(3), 2.6, np.radians(-70.0), np.radians(35.0), 480, 400)
+    pose = (np.zeros(3), rotations.IDENTITY)
+    image = draw(scene, view, view.axes()[2], pose, {}, {}, frozenset()).astype(int)
+    radiator = next(p for p in satellite("geo_servicer").parts if p.name == "radiator_south")
+    centre, extent = radiator.vertices_m.mean(axis=0), 0.35 * np.ptp(radiator.vertices_m, axis=0)
+    points = [
+        centre + np.array([sx * extent[0], -0.002, sz * extent[2]]) for sx in (-1, 0.5) for sz in (-1, 1)
+    ]
+    px, _ = view.project(np.array(points))
+    levels = [image[round(y), round(x), 0] for x, y in px]
+    assert min(levels) > 190, levels  # white paint; the wall is grey
 
 
 def test_external_view_shows_plumes_and_the_simulated_stars(tmp_path: Path) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from chaserdock_agents.ros2.conversion import Converter
 from chaserdock_protocol import topics
+from chaserdock_protocol.errors import MissingPackageError
 from chaserdock_protocol.recording.log import LogError
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -92,6 +93,6 @@ def test_existing_folder_and_missing_extra_are_one_clear_error(
 ) -> None:
     with pytest.raises(LogError, match="already exists; export into a new folder"):
         export_bag(GOLDEN, tmp_path)
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(LogError, match=r"rosbags\.rosbag2 is not installed; install chaserdock\[ros2\]"):
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(MissingPackageError, match=r"rosbags is not installed; install chaserdock\[ros2\]"):
         export_bag(GOLDEN, tmp_path / "new")

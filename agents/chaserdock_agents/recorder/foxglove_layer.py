@@ -8,14 +8,22 @@ Channels (all under ``/viewer/``); times are simulated:
 - ``chaser/N/image``, ``chaser/N/calibration``, ``chaser/N/detections``: image, camera, used corners
 - ``chaser/N/measurement`` (in the camera's frame), ``chaser/N/reference``, ``target/estimate`` (in WRF): poses
 - ``scene``: the bodies as boxes in their true frames; ``events``: events of all processes
+- ``target/points``, ``chaser/N/points``: the same bodies as points on their edges or mesh, and ``chaser/N/corners``: the used
+  corners as points in the camera's frame, at the measured distance, where they cover those of the image. Rerun maps neither
+  ``SceneUpdate`` nor ``ImageAnnotations``, but point clouds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import foxglove.messages as fox
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.satellites import satellite
+from chaserdock_models.targets import Box, cuboid_corners
 from chaserdock_protocol import topics
 from chaserdock_protocol.messages import (
     BodyTruth,
@@ -44,6 +52,12 @@ _LEVELS = {"info": fox.LogLevel.Info, "warning": fox.LogLevel.Warning, "error": 
 _CAMERA_COLOUR = fox.Color(r=0.35, g=0.86, b=0.35, a=1.0)
 _TARGET_COLOUR = fox.Color(r=0.85, g=0.65, b=0.25, a=0.9)
 _CHASER_COLOUR = fox.Color(r=0.35, g=0.55, b=0.85, a=0.6)
+_SPACING_M = 0.01
+"""Distance of the points on the edges of a body."""
+_POINT_FIELDS = [
+    fox.PackedElementField(name=name, offset=4 * k, type=fox.PackedElementFieldNumericType.Float32)
+    for k, name in enumerate("xyz")
+]
 
 
 class ViewerLayer:
@@ -56,6 +70,7 @@ class ViewerLayer:
         camera = scenario.camera_model()
         self._camera_pose = (camera.position_crf_m, camera.q_crf_irf_wxyz)
         matrix = [float(x) for x in camera.matrix().ravel()]
+        self._inverse_matrix = np.linalg.inv(camera.matrix())
         self._calibration: dict[str, Any] = {
             "width": camera.width_px,
             "height": camera.height_px,
@@ -103,6 +118,13 @@ class ViewerLayer:
             for frame, size_m, colour in shapes
         ]
         self._put("scene", fox.SceneUpdate(entities=entities), time_ns)
+        body = self._scenario.chaser
+        chaser = _mesh_points(body.mesh) if body.mesh else _outline([Box(body.size_m)])
+        model = self._scenario.target_model()
+        target = _mesh_points(model.satellite) if model.satellite else _outline(model.boxes)
+        self._put("target/points", _cloud(stamp, "target", target), time_ns)
+        for i in range(len(self._scenario.chasers)):
+            self._put(f"chaser/{i}/points", _cloud(stamp, f"chaser/{i}", chaser), time_ns)
 
     def _views(self, message: Any, stamp: fox.Timestamp) -> Iterator[tuple[str, Any]]:
         match message:
@@ -123,6 +145,8 @@ class ViewerLayer:
                     frame = f"chaser/{message.chaser}/camera"
                     measured = _pose_in(stamp, frame, best.position_m, best.q_wxyz)
                     yield f"chaser/{message.chaser}/measurement", measured
+                    corners = self._corners(message.corners_px, best.position_m[2])
+                    yield f"chaser/{message.chaser}/corners", _cloud(stamp, frame, corners)
             case Reference():
                 reference = _pose_in(stamp, "world", message.position_m, message.q_wxyz)
                 yield f"chaser/{message.chaser}/reference", reference
@@ -130,6 +154,45 @@ class ViewerLayer:
                 text = f"{message.what}: {message.detail}" if message.detail else message.what
                 level = _LEVELS[message.level]
                 yield "events", fox.Log(timestamp=stamp, level=level, message=text, name=message.process)
+
+    def _corners(self, corners_px: Sequence[float], depth_m: float) -> Array:
+        """Return corners as points (N, 3) at one depth in the camera's frame (IRF); a viewer draws no lens distortion."""
+        pixels = np.reshape(corners_px, (-1, 2))
+        return depth_m * np.column_stack([pixels, np.ones(len(pixels))]) @ self._inverse_matrix.T
+
+
+def _outline(boxes: Iterable[Box]) -> Array:
+    """Return points (N, 3) on the edges of boxes, in the axes of their body."""
+    points = []
+    for box in boxes:
+        corners = cuboid_corners(box.size_m)
+        pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if (a ^ b).bit_count() == 1]
+        for begin, end in ((corners[a], corners[b]) for a, b in pairs):
+            count = 2 + int(np.linalg.norm(end - begin) / _SPACING_M)
+            along = np.linspace(begin, end, count)
+            points.append(rotations.rotate(box.q_wxyz, along) + box.position_m)
+    return np.concatenate(points)
+
+
+def _mesh_points(name: str) -> Array:
+    """Return points (N, 3) on a satellite: along the edges of its triangles."""
+    parts = satellite(name, _SPACING_M).parts
+    corners = np.concatenate([part.vertices_m[part.triangles] for part in parts])
+    ends = np.roll(corners, -1, axis=1)
+    shares = np.linspace(0.0, 1.0, 6)[:-1, None, None, None]
+    points = ((1.0 - shares) * corners + shares * ends).reshape(-1, 3)
+    return np.unique(np.round(points, 4), axis=0)
+
+
+def _cloud(stamp: fox.Timestamp, frame: str, points: Array) -> fox.PointCloud:
+    return fox.PointCloud(
+        timestamp=stamp,
+        frame_id=frame,
+        pose=_NO_POSE,
+        point_stride=12,
+        fields=_POINT_FIELDS,
+        data=points.astype("<f4").tobytes(),
+    )
 
 
 def _time(time_ns: int) -> fox.Timestamp:

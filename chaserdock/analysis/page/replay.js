@@ -125,7 +125,7 @@
         const toEye = [eye[0] * reach - from[0], eye[1] * reach - from[1], eye[2] * reach - from[2]];
         if (dot(apply(turn, normal), toEye) <= 0) continue;
         const lit = 0.5 + 0.5 * Math.max(0, dot(normal, light));
-        faces.push({ depth: Math.hypot(...toEye), body, face, corners, lit, tint });
+        faces.push({ depth: Math.hypot(...toEye) - face.l, body, face, corners, lit, tint });
       }
     }
     const poses = data.chasers.map((c) => pose(c, time));

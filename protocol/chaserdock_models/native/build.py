@@ -2,7 +2,7 @@
 """Compile the kernels: ``python protocol/chaserdock_models/native/build.py``. Building the package does this as well.
 
 The compiler is zig's Clang from the wheel ``ziglang``; no system compiler is needed. The result does not depend on the
-build machine: its headers, C library and processor type are not used.
+build machine: its headers, C library and processor type are not used. So it can be compiled for another one (TARGETS).
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ import os
 import platform
 import subprocess
 import sys
+import sysconfig
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -35,6 +37,48 @@ FLAGS = (
 # One copy of the kernels for each instruction set, numbered as `level` in dispatch.c.
 X86_64 = ((2, "-mcpu=x86_64_v2"), (3, "-mcpu=x86_64_v3"))
 OTHER = ((0, "-mcpu=baseline"),)
+# On Linux a library needs no other.
+_FREESTANDING = ("-nostdlib", "-s", "-Wl,-z,defs")
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of machine: its instruction sets, zig's flags for compiling and linking, and the platform tag of its wheel."""
+
+    levels: tuple[tuple[int, str], ...]
+    compile_flags: tuple[str, ...]
+    link_flags: tuple[str, ...]
+    tag: str
+
+
+def _linux(machine: str, levels: tuple[tuple[int, str], ...]) -> Target:
+    # glibc 2.17 is the oldest that a package index accepts wheels for; the kernels use none.
+    flags = ("-target", f"{machine}-linux-gnu.2.17", "-fPIC")
+    return Target(levels, flags, _FREESTANDING, f"manylinux_2_17_{machine}")
+
+
+TARGETS = {
+    "x86_64-linux": _linux("x86_64", X86_64),
+    "aarch64-linux": _linux("aarch64", OTHER),
+    "arm64-macos": Target(
+        OTHER,
+        ("-target", "aarch64-macos.11.0"),
+        ("-s", f"-Wl,-install_name,@rpath/{LIBRARY_NAME}"),
+        "macosx_11_0_arm64",
+    ),
+}
+
+
+def this_machine() -> Target:
+    """Return the target of this machine; one outside TARGETS has the platform tag that Python reports."""
+    system = {"linux": "linux", "darwin": "macos"}.get(sys.platform, sys.platform)
+    machine = platform.machine().lower()
+    tag = sysconfig.get_platform().replace("-", "_").replace(".", "_")
+    if f"{machine}-{system}" in TARGETS:
+        return TARGETS[f"{machine}-{system}"]
+    if system == "linux":
+        return _linux(machine, OTHER)
+    return Target(X86_64 if machine in ("x86_64", "amd64") else OTHER, (), (), tag)
 
 
 def source_digest(folder: Path) -> str:
@@ -46,14 +90,14 @@ def source_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def compile_kernels(folder: Path) -> Path:
-    """Compile ``kernels.c`` of ``folder`` into its shared library and return its path.
+def compile_kernels(folder: Path, target: Target | None = None, library: Path | None = None) -> Path:
+    """Compile ``kernels.c`` of ``folder`` for ``target`` (default: this machine) into a shared library and return its path.
 
-    Raises RuntimeError with the compiler's output if compilation fails.
+    ``library``: the path to write, by default LIBRARY_NAME in ``folder``. Raises RuntimeError with the compiler's output if
+    compilation fails.
     """
-    library = folder / LIBRARY_NAME
-    levels = X86_64 if platform.machine().lower() in ("x86_64", "amd64") else OTHER
-    target = ["-target", f"{platform.machine()}-linux-gnu.2.17", "-fPIC"] if sys.platform == "linux" else []
+    target = target or this_machine()
+    library = library or folder / LIBRARY_NAME
     with tempfile.TemporaryDirectory(prefix="chaserdock-kernels-") as name:
         temporary = Path(name)
         environment = os.environ | {
@@ -62,7 +106,7 @@ def compile_kernels(folder: Path) -> Path:
         }
 
         def zig(*arguments: str) -> None:
-            command = [sys.executable, "-m", "ziglang", "cc", *target, *arguments]
+            command = [sys.executable, "-m", "ziglang", "cc", *target.compile_flags, *arguments]
             completed = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
             if completed.returncode:
                 raise RuntimeError(
@@ -71,15 +115,14 @@ def compile_kernels(folder: Path) -> Path:
 
         include = f"-I{HERE}"
         objects = []
-        for level, processor in levels:
+        for level, processor in target.levels:
             objects.append(str(temporary / f"v{level}.o"))
             zig(*FLAGS, include, processor, f"-DLEVEL=v{level}_", "-c", "kernels.c", "-o", objects[-1])
         objects.append(str(temporary / "dispatch.o"))
         digest = f'-DSOURCE_DIGEST="{source_digest(folder)}"'
-        zig(*FLAGS, levels[0][1], digest, "-c", str(HERE / "dispatch.c"), "-o", objects[-1])
+        zig(*FLAGS, target.levels[0][1], digest, "-c", str(HERE / "dispatch.c"), "-o", objects[-1])
         linked = temporary / LIBRARY_NAME
-        freestanding = ["-nostdlib", "-s", "-Wl,-z,defs"] if sys.platform == "linux" else []
-        zig("-shared", *freestanding, *objects, "-o", str(linked))
+        zig("-shared", *target.link_flags, *objects, "-o", str(linked))
         # Replace atomically: a process may have the old library loaded.
         beside = library.with_suffix(".new")
         beside.write_bytes(linked.read_bytes())
@@ -91,6 +134,17 @@ def compile_kernels(folder: Path) -> Path:
 def compile_all(root: Path) -> list[Path]:
     """Compile the libraries of all packages below ``root``, the source tree, and return their paths."""
     return [compile_kernels(root / folder) for folder in NATIVE_FOLDERS]
+
+
+def compile_into(out: Path, root: Path, target: Target) -> dict[Path, str]:
+    """Compile all libraries for ``target`` into ``out``; return each one's file, with its place among the packages."""
+    libraries = {}
+    for folder in NATIVE_FOLDERS:
+        place = Path(folder).relative_to(Path(folder).parts[0]) / LIBRARY_NAME
+        file = out / place
+        file.parent.mkdir(parents=True)
+        libraries[compile_kernels(root / folder, target, file)] = place.as_posix()
+    return libraries
 
 
 if __name__ == "__main__":

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Without a package that only some commands need, these say in one line what is missing; the others work."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tomllib
+
+import pytest
+from harness import ROOT
+from packaging.requirements import Requirement
+
+GOLDEN = str(ROOT / "tests" / "golden" / "capture.mcap")
+# Start the program where a package cannot be imported, as if it were not installed.
+_WITHOUT = """
+import sys
+sys.modules[sys.argv[1]] = None
+sys.argv[:2] = ["chaserdock"]
+from chaserdock.cli.main import main
+main()
+"""
+
+
+def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", _WITHOUT, package, *command], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("command", [("world", "single"), ("simulate", "single", "--images")])
+def test_the_world_without_pybullet_says_where_it_runs(command: tuple[str, ...]) -> None:
+    done = without("pybullet", *command)
+    assert done.returncode == 2
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("chaserdock: the world needs PyBullet, which is not installed; it has wheels for")
+    assert "Python 3.11 on Linux x86_64 only" in line
+
+
+def test_other_commands_need_no_pybullet() -> None:
+    for command in (("scenario", "list"), ("log", "info", GOLDEN)):
+        done = without("pybullet", *command)
+        assert (done.returncode, done.stderr) == (0, ""), command
+
+
+@pytest.mark.parametrize(
+    ("package", "extra", "command"),
+    [
+        ("rosbags", "ros2", ("ros2",)),
+        ("rosbags", "ros2", ("ros2", "--control")),
+        ("rosbags", "ros2", ("log", "export", GOLDEN, "--out", "never-made", "--format", "rosbag2")),
+    ],
+)
+def test_a_command_without_its_extra_names_it(package: str, extra: str, command: tuple[str, ...]) -> None:
+    done = without(package, *command)
+    assert done.returncode == 2
+    assert done.stderr == (
+        f"chaserdock: {package} is not installed; install chaserdock[{extra}]: pip install 'chaserdock[{extra}]'\n"
+    )
+
+
+def test_pybullet_is_required_where_it_has_a_wheel_and_nowhere_else() -> None:
+    """Elsewhere pip would compile it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (pybullet,) = (r for r in map(Requirement, project["dependencies"]) if r.name == "pybullet")
+    assert pybullet.marker is not None
+    here = {"sys_platform": "linux", "platform_machine": "x86_64", "python_version": "3.11"}
+    assert pybullet.marker.evaluate(here)
+    for other in ({"sys_platform": "darwin"}, {"platform_machine": "aarch64"}, {"python_version": "3.12"}):
+        assert not pybullet.marker.evaluate(here | other)

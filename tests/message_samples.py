@@ -91,6 +91,17 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         **HEAD, chaser=0, effective_time_ns=9, expires_ns=10, mode="nmpc", force_N=V, torque_N_m=V
     ),
     m.Plan(**HEAD, chaser=0, step_s=0.1, positions_m=V * 2, quaternions_wxyz=Q * 2, inputs=V * 2),
+    m.PassiveSafety(
+        **HEAD,
+        chaser=0,
+        margin_sigmas=4.5,
+        distance_m=1.5,
+        time_s=120.0,
+        loss_s=3.0,
+        safe=True,
+        enforced=True,
+        abort_margin_sigmas=9.0,
+    ),
     m.SolverStatus(
         **HEAD,
         solver="rti",

@@ -31,7 +31,7 @@ from .criteria import (
     rest_failures,
     stack_rest,
 )
-from .flight import RecordedFlight, Track, load_flight
+from .flight import RecordedFlight, SafetyHistory, Track, load_flight
 
 _BLOCK = 1 << 14  # rows processed at a time
 
@@ -203,6 +203,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         }
         if (capture := capture_of(flight, i)) is not None:
             chasers[str(i)]["capture"] = capture
+        if i in flight.safety:
+            chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
     between = [
         float(flight.truth[f"chaser/{i}"].distance_to(flight.truth[f"chaser/{j}"]).min())
         for i, j in combinations(flight.flown, 2)
@@ -253,6 +255,16 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
     return result
+
+
+def _passive_safety(history: SafetyHistory) -> dict[str, float]:
+    worst = int(np.argmin(history.margin_sigmas))
+    return {
+        "min_margin_sigmas": float(history.margin_sigmas[worst]),
+        "min_margin_time_s": float(history.time_s[worst]),
+        "distance_m": float(history.distance_m[worst]),
+        "safe_share": float(np.mean(history.safe)),
+    }
 
 
 def _events(flight: RecordedFlight) -> list[dict[str, Any]]:

@@ -391,6 +391,25 @@ class Plan(Message, frozen=True, kw_only=True):
     inputs: Annotated[tuple[float, ...], Meta(max_length=6 * 2000)]
 
 
+class PassiveSafety(Message, frozen=True, kw_only=True):
+    """Certificate of one chaser: the coasts after a loss of all thrust at any state of its newest plan (``limits.passive_safety``).
+
+    ``margin_sigmas``: smallest distance of a coast from the keep-out over its standard deviation; negative inside.
+    ``distance_m``: a lower bound on the distance from the target there, ``time_s`` after the loss of thrust, which is
+    ``loss_s`` after the plan's beginning. ``safe``: the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: the
+    chaser aborts while it is not. ``abort_margin_sigmas``: the same margin of the best abort from here; None where none is sought.
+    """
+
+    chaser: ChaserId
+    margin_sigmas: float
+    distance_m: float
+    time_s: float
+    loss_s: float
+    safe: bool
+    enforced: bool
+    abort_margin_sigmas: float | None = None
+
+
 class SolverStatus(Message, frozen=True, kw_only=True):
     """Result of the controller's solve in this tick, one entry per planned chaser."""
 
@@ -608,6 +627,7 @@ VERSION: dict[type[Struct], int] = {
     Reference: 1,
     WrenchCommand: 1,
     Plan: 1,
+    PassiveSafety: 1,
     SolverStatus: 1,
     ActuatorCommand: 2,
     Lease: 1,

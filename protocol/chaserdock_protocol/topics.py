@@ -85,6 +85,7 @@ REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "control
 # Same priority as the command, and sent before it; it may still arrive after the command.
 PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "command")
 TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "command")
+SAFETY = _topic("controller/chaser/{chaser}/safety", m.PassiveSafety, "controller", set(), "tick", "state")
 SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
 COMMAND = _topic("controller/command", m.CommandReply, "controller", set(), "event", "event")
 STATE = _topic("controller/state", m.ControllerState, "controller", {"controller"}, "tick", "command")
@@ -113,6 +114,7 @@ TOPICS: tuple[Topic, ...] = (
     REFERENCE,
     PLAN,
     TARGET,
+    SAFETY,
     SOLVER,
     COMMAND,
     OPERATED,

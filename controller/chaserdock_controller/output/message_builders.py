@@ -7,6 +7,7 @@ from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     Event,
     Level,
+    PassiveSafety,
     Plan,
     Reference,
     RelativeEstimate,
@@ -16,7 +17,14 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 
-from chaserdock_controller.interfaces import Directive, Observation, PlanResult, TargetEstimation
+from chaserdock_controller.interfaces import (
+    Directive,
+    GuidanceResult,
+    Observation,
+    PlanResult,
+    TargetEstimation,
+)
+from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan
 
 
@@ -102,6 +110,25 @@ def solver_message(observation: Observation, solver: str, result: PlanResult) ->
         cost=vector(plan.cost[:n]),
         max_violation_m=vector(plan.max_violation_m[:n]),
         wall_solve_s=result.wall_s,
+    )
+
+
+def safety_message(
+    chaser: int, observation: Observation, monitor: PassiveSafetyMonitor, guidance: GuidanceResult
+) -> PassiveSafety:
+    """Return the certificate of a chaser's newest plan, which must have one."""
+    found = monitor.certificates[chaser]
+    return PassiveSafety(
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        chaser=chaser,
+        margin_sigmas=found.margin_sigmas,
+        distance_m=found.distance_m,
+        time_s=found.time_s,
+        loss_s=monitor.loss_s(found),
+        safe=monitor.is_safe(found),
+        enforced=chaser in guidance.abort_margins,
+        abort_margin_sigmas=guidance.abort_margins.get(chaser),
     )
 
 

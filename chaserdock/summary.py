@@ -131,6 +131,14 @@ class MessageCount(Struct, frozen=True, kw_only=True):
     lost: int
 
 
+class PlumeSummary(Struct, frozen=True, kw_only=True):
+    """What the plumes of thrusters gave a body: sums of the magnitudes of the impulses per tick, and the largest force."""
+
+    impulse_N_s: float
+    angular_impulse_N_m_s: float
+    peak_force_N: float
+
+
 class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The summary of a flight, as in summary.json; ``chasers`` by chaser number."""
 
@@ -159,6 +167,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     cpu_s: dict[str, float] | None = None
     drawn: list[DrawnBody] = []
     stack: StackRest | None = None
+    plumes: dict[str, PlumeSummary] = {}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Summary:

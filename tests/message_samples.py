@@ -33,6 +33,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         bodies=(m.DrawnBody(body="chaser/0", mass_kg=12.5, inertia_kg_m2=(0.25,) * 9, centre_of_mass_m=V),),
     ),
     m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
+    m.PlumeLoad(**HEAD, body="target", impulse_N_s=V, angular_impulse_N_m_s=V, peak_force_N=0.5),
     m.PortLoad(
         **HEAD,
         chaser=1,

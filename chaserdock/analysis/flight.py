@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,6 +23,7 @@ from chaserdock_protocol.messages import (
     Event,
     Health,
     PassiveSafety,
+    PlumeLoad,
     PortLoad,
     ProbeTouch,
     Reference,
@@ -171,6 +173,20 @@ class SafetyHistory:
 
 
 @dataclass
+class PlumeTotals:
+    """What plumes gave a body: sums of the magnitudes of the impulses per tick, N s and N m s, and the largest force, N."""
+
+    impulse_N_s: float = 0.0
+    angular_impulse_N_m_s: float = 0.0
+    peak_force_N: float = 0.0
+
+    def add(self, message: PlumeLoad) -> None:
+        self.impulse_N_s += math.hypot(*message.impulse_N_s)
+        self.angular_impulse_N_m_s += math.hypot(*message.angular_impulse_N_m_s)
+        self.peak_force_N = max(self.peak_force_N, message.peak_force_N)
+
+
+@dataclass
 class RecordedFlight:
     """Content of a log without the images. Mappings by body name or chaser.
 
@@ -191,6 +207,7 @@ class RecordedFlight:
     sightings: dict[int, SightingHistory]
     loads: dict[int, LoadHistory]
     safety: dict[int, SafetyHistory]
+    plumes: dict[str, PlumeTotals]
     solves: SolverHistory
     world: WorldHistory
     drawn: tuple[DrawnBody, ...]
@@ -276,6 +293,7 @@ class _Collector:
     sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
     loads: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(7)))
     safety: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
+    plumes: dict[str, PlumeTotals] = field(default_factory=lambda: defaultdict(PlumeTotals))
     solves: Columns = field(default_factory=lambda: Columns(3))
     statuses: Counter[str] = field(default_factory=Counter)
     solver: str | None = None
@@ -319,7 +337,7 @@ class _Collector:
                 self.world.add(message)
             case Sighting() | PortLoad() | PassiveSafety():
                 self._add_of_chaser(message)
-            case Event() | CommandReply() | Health() | DrawnTruth():
+            case Event() | CommandReply() | Health() | DrawnTruth() | PlumeLoad():
                 self._add_report(message)
 
     def _add_of_chaser(self, message: Sighting | PortLoad | PassiveSafety) -> None:
@@ -336,8 +354,10 @@ class _Collector:
                     (time_s, message.margin_sigmas, message.distance_m, message.safe)
                 )
 
-    def _add_report(self, message: Event | CommandReply | Health | DrawnTruth) -> None:
+    def _add_report(self, message: Event | CommandReply | Health | DrawnTruth | PlumeLoad) -> None:
         match message:
+            case PlumeLoad():
+                self.plumes[message.body].add(message)
             case DrawnTruth():
                 self.drawn = message.bodies
             case Event():
@@ -431,6 +451,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         references={i: collector.finish() for i, collector in c.references.items()},
         sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
         loads={i: _load_history(columns) for i, columns in c.loads.items()},
+        plumes=dict(c.plumes),
         safety={i: _safety_history(columns) for i, columns in c.safety.items()},
         solves=SolverHistory(
             c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses

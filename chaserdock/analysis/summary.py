@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -249,6 +250,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "rejected": flight.rejected,
         "digest": flight.digest,
     }
+    if flight.plumes:
+        result["plumes"] = {body: asdict(totals) for body, totals in sorted(flight.plumes.items())}
     if (stack := stack_rest(flight)) is not None:
         result["stack"] = stack
     judged, result["not_judged"] = judged_criteria(s)

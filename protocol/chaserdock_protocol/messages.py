@@ -262,6 +262,18 @@ class PortLoad(Message, frozen=True, kw_only=True):
     closing_impulse_N_s: float = 0.0
 
 
+class PlumeLoad(Message, frozen=True, kw_only=True):
+    """Ground truth of what the plumes of the chasers' thrusters gave a body since the last tick, with ``[plume]``.
+
+    ``impulse_N_s``, ``angular_impulse_N_m_s``: about the body's origin, in its axes. ``peak_force_N``: largest force.
+    """
+
+    body: Text
+    impulse_N_s: Vector3
+    angular_impulse_N_m_s: Vector3
+    peak_force_N: float
+
+
 class DrawnBody(Struct, frozen=True, kw_only=True):
     """What the scenario drew for one body (``target`` or ``chaser/0``), body axes unless stated otherwise.
 
@@ -621,6 +633,7 @@ VERSION: dict[type[Struct], int] = {
     BodyTruth: 2,
     WorldTruth: 1,
     PortLoad: 1,
+    PlumeLoad: 1,
     DrawnTruth: 1,
     Sighting: 2,
     TargetEstimate: 1,

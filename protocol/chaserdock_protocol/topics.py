@@ -73,6 +73,7 @@ DOCKING = _topic(
 TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_LOAD = Topic("truth/chaser/{chaser}/load", m.PortLoad, "world", _TRUTH_READERS, "tick", "state")
+TRUTH_PLUME = Topic("truth/plume/{process}", m.PlumeLoad, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event", "state")
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
@@ -105,6 +106,7 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH_BODY,
     TRUTH_WORLD,
     TRUTH_LOAD,
+    TRUTH_PLUME,
     TRUTH_DRAWN,
     SIGHTING,
     ACTUATORS,

@@ -16,7 +16,6 @@ from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
 from chaserdock_world.physics.simulation import Physics
 
-
 CORNERS = [(x, y, z) for x in (-0.15, 0.15) for y in (-0.15, 0.15) for z in (-0.15, 0.15)]
 THRUSTERS = [
     {

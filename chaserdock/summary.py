@@ -45,6 +45,16 @@ class Capture(Struct, frozen=True, kw_only=True):
     port_load: PortLoadPeaks | None = None
 
 
+class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
+    """Smallest margin of the coasts after a loss of thrust, when it occurred, the closest approach of that coast, and the share
+    of the plans that were safe."""
+
+    min_margin_sigmas: float
+    min_margin_time_s: float
+    distance_m: float
+    safe_share: float
+
+
 class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Results of one chaser, measured on ground truth."""
 
@@ -59,6 +69,7 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     thruster_impulse_N_s: float
     propellant_kg: float
     capture: Capture | None = None
+    passive_safety: PassiveSafetySummary | None = None
 
 
 class TargetEstimateErrors(Struct, frozen=True, kw_only=True):
@@ -120,6 +131,14 @@ class MessageCount(Struct, frozen=True, kw_only=True):
     lost: int
 
 
+class PlumeSummary(Struct, frozen=True, kw_only=True):
+    """What the plumes of thrusters gave a body: sums of the magnitudes of the impulses per tick, and the largest force."""
+
+    impulse_N_s: float
+    angular_impulse_N_m_s: float
+    peak_force_N: float
+
+
 class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """The summary of a flight, as in summary.json; ``chasers`` by chaser number."""
 
@@ -148,6 +167,7 @@ class Summary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     cpu_s: dict[str, float] | None = None
     drawn: list[DrawnBody] = []
     stack: StackRest | None = None
+    plumes: dict[str, PlumeSummary] = {}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Summary:

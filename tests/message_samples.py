@@ -39,6 +39,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         bodies=(m.DrawnBody(body="chaser/0", mass_kg=12.5, inertia_kg_m2=(0.25,) * 9, centre_of_mass_m=V),),
     ),
     m.WorldTruth(**HEAD, contacts=(("chaser/0", "target"),), saturated=(1,), late_commands=2),
+    m.PlumeLoad(**HEAD, body="target", impulse_N_s=V, angular_impulse_N_m_s=V, peak_force_N=0.5),
     m.PortLoad(
         **HEAD,
         chaser=1,
@@ -100,6 +101,17 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         **HEAD, chaser=0, effective_time_ns=9, expires_ns=10, mode="nmpc", force_N=V, torque_N_m=V
     ),
     m.Plan(**HEAD, chaser=0, step_s=0.1, positions_m=V * 2, quaternions_wxyz=Q * 2, inputs=V * 2),
+    m.PassiveSafety(
+        **HEAD,
+        chaser=0,
+        margin_sigmas=4.5,
+        distance_m=1.5,
+        time_s=120.0,
+        loss_s=3.0,
+        safe=True,
+        enforced=True,
+        abort_margin_sigmas=9.0,
+    ),
     m.SolverStatus(
         **HEAD,
         solver="rti",

@@ -331,6 +331,31 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
     return figure
 
 
+@_figure(
+    "Passive safety",
+    "Margin of the coasts after a loss of all thrust at any state of the newest plan, in standard deviations; dashed: the margin "
+    "of a plan that counts as passively safe.",
+)
+def passive_safety(flight: RecordedFlight, _: Traces) -> Figure:
+    if not flight.safety:
+        raise MissingData("passive safety was not monitored")
+    figure, (axes,) = new_figure(1)
+    for i, history in flight.safety.items():
+        d = decimated(len(history.time_s))
+        axes.plot(
+            history.time_s[d],
+            history.margin_sigmas[d],
+            color=colour(i),
+            linestyle=dashes(i),
+            label=f"chaser {i}",
+        )
+    least = flight.scenario.limits.estimate_margin_sigmas
+    limit_line(axes, least, f"limit {least:g}")
+    axes.set(xlabel="time / s", ylabel="margin / sigmas", yscale="symlog")
+    legend_above(axes)
+    return figure
+
+
 @_figure("Separation of the chasers", "Distance between the centres of each pair of chasers.")
 def separation(flight: RecordedFlight, _: Traces) -> Figure:
     numbers = flown(flight)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -21,6 +22,8 @@ from chaserdock_protocol.messages import (
     DrawnTruth,
     Event,
     Health,
+    PassiveSafety,
+    PlumeLoad,
     PortLoad,
     ProbeTouch,
     Reference,
@@ -159,6 +162,31 @@ class LoadHistory:
 
 
 @dataclass
+class SafetyHistory:
+    """Certificates of passive safety of a chaser: times (K,) s, margins (K,) in sigmas, distances (K,) m of closest approach,
+    whether the plan was safe (K,)."""
+
+    time_s: Array
+    margin_sigmas: Array
+    distance_m: Array
+    safe: NDArray[np.bool_]
+
+
+@dataclass
+class PlumeTotals:
+    """What plumes gave a body: sums of the magnitudes of the impulses per tick, N s and N m s, and the largest force, N."""
+
+    impulse_N_s: float = 0.0
+    angular_impulse_N_m_s: float = 0.0
+    peak_force_N: float = 0.0
+
+    def add(self, message: PlumeLoad) -> None:
+        self.impulse_N_s += math.hypot(*message.impulse_N_s)
+        self.angular_impulse_N_m_s += math.hypot(*message.angular_impulse_N_m_s)
+        self.peak_force_N = max(self.peak_force_N, message.peak_force_N)
+
+
+@dataclass
 class RecordedFlight:
     """Content of a log without the images. Mappings by body name or chaser.
 
@@ -178,6 +206,8 @@ class RecordedFlight:
     references: dict[int, ReferenceHistory]
     sightings: dict[int, SightingHistory]
     loads: dict[int, LoadHistory]
+    safety: dict[int, SafetyHistory]
+    plumes: dict[str, PlumeTotals]
     solves: SolverHistory
     world: WorldHistory
     drawn: tuple[DrawnBody, ...]
@@ -262,6 +292,8 @@ class _Collector:
     )
     sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
     loads: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(7)))
+    safety: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
+    plumes: dict[str, PlumeTotals] = field(default_factory=lambda: defaultdict(PlumeTotals))
     solves: Columns = field(default_factory=lambda: Columns(3))
     statuses: Counter[str] = field(default_factory=Counter)
     solver: str | None = None
@@ -303,12 +335,12 @@ class _Collector:
                 self._add_solve(message)
             case WorldTruth():
                 self.world.add(message)
-            case Sighting() | PortLoad():
+            case Sighting() | PortLoad() | PassiveSafety():
                 self._add_of_chaser(message)
-            case Event() | CommandReply() | Health() | DrawnTruth():
+            case Event() | CommandReply() | Health() | DrawnTruth() | PlumeLoad():
                 self._add_report(message)
 
-    def _add_of_chaser(self, message: Sighting | PortLoad) -> None:
+    def _add_of_chaser(self, message: Sighting | PortLoad | PassiveSafety) -> None:
         time_s = message.sim_time_ns / 1e9
         match message:
             case Sighting():
@@ -317,9 +349,15 @@ class _Collector:
             case PortLoad():
                 values = (getattr(message, name) for name in LOAD_QUANTITIES)
                 self.loads[message.chaser].add((time_s,), values)
+            case PassiveSafety():
+                self.safety[message.chaser].add(
+                    (time_s, message.margin_sigmas, message.distance_m, message.safe)
+                )
 
-    def _add_report(self, message: Event | CommandReply | Health | DrawnTruth) -> None:
+    def _add_report(self, message: Event | CommandReply | Health | DrawnTruth | PlumeLoad) -> None:
         match message:
+            case PlumeLoad():
+                self.plumes[message.body].add(message)
             case DrawnTruth():
                 self.drawn = message.bodies
             case Event():
@@ -382,6 +420,11 @@ def _load_history(columns: Columns) -> LoadHistory:
     return LoadHistory(t[:, 0].copy(), t[:, 1:])
 
 
+def _safety_history(columns: Columns) -> SafetyHistory:
+    t = columns.table()
+    return SafetyHistory(t[:, 0].copy(), t[:, 1].copy(), t[:, 2].copy(), t[:, 3] > 0.0)
+
+
 def load_flight(log: LogSource) -> RecordedFlight:
     """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by chaserdock."""
     scenario, run = logged_scenario(log)
@@ -408,6 +451,8 @@ def load_flight(log: LogSource) -> RecordedFlight:
         references={i: collector.finish() for i, collector in c.references.items()},
         sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
         loads={i: _load_history(columns) for i, columns in c.loads.items()},
+        plumes=dict(c.plumes),
+        safety={i: _safety_history(columns) for i, columns in c.safety.items()},
         solves=SolverHistory(
             c.solver, solves[:, 0].copy(), solves[:, 1].copy(), solves[:, 2] > 0.0, c.statuses
         ),

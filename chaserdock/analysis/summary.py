@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Iterator
+from dataclasses import asdict
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from .criteria import (
     rest_failures,
     stack_rest,
 )
-from .flight import RecordedFlight, Track, load_flight
+from .flight import RecordedFlight, SafetyHistory, Track, load_flight
 
 _BLOCK = 1 << 14  # rows processed at a time
 
@@ -203,6 +204,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         }
         if (capture := capture_of(flight, i)) is not None:
             chasers[str(i)]["capture"] = capture
+        if i in flight.safety:
+            chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
     between = [
         float(flight.truth[f"chaser/{i}"].distance_to(flight.truth[f"chaser/{j}"]).min())
         for i, j in combinations(flight.flown, 2)
@@ -247,12 +250,24 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "rejected": flight.rejected,
         "digest": flight.digest,
     }
+    if flight.plumes:
+        result["plumes"] = {body: asdict(totals) for body, totals in sorted(flight.plumes.items())}
     if (stack := stack_rest(flight)) is not None:
         result["stack"] = stack
     judged, result["not_judged"] = judged_criteria(s)
     result["failures"] = failures_of(result, judged)
     result["success"] = not result["failures"]
     return result
+
+
+def _passive_safety(history: SafetyHistory) -> dict[str, float]:
+    worst = int(np.argmin(history.margin_sigmas))
+    return {
+        "min_margin_sigmas": float(history.margin_sigmas[worst]),
+        "min_margin_time_s": float(history.time_s[worst]),
+        "distance_m": float(history.distance_m[worst]),
+        "safe_share": float(np.mean(history.safe)),
+    }
 
 
 def _events(flight: RecordedFlight) -> list[dict[str, Any]]:

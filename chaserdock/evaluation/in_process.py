@@ -23,7 +23,14 @@ from chaserdock_controller.ingest.odometry_validation import OdometryValidation
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_models import rotations
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import ActuatorCommand, Odometry, OperatorCommand, ProbeTouch, Sighting
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    Odometry,
+    OperatorCommand,
+    ProbeTouch,
+    Sighting,
+    TargetEstimate,
+)
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_protocol.scenario.faults import faults_of
 from chaserdock_world.actuators.ideal import ActuatorOutput, fly_to
@@ -105,6 +112,7 @@ class InProcessMission:
         self.propellant_kg = 0.0
         self._gain, self._solve_delay_s = actuator_gain, solve_delay_s
         self._busy_until_ns = 0
+        self._known_target: TargetEstimate | None = None
         self._odometry_sensor = OdometrySensor(scenario)
         self._validation = OdometryValidation(flight)
 
@@ -228,6 +236,7 @@ class InProcessMission:
         for i, wrench in outputs.wrenches.items():
             command = passed_on(wrench)
             if i in self.thrusters:
+                self.thrusters[i].avoid_plumes(self._known_target)
                 self.thrusters[i].apply_command(wrench)
                 thrusts_N = np.array(wrench.thrusts_N) if wrench.thrusts_N else None
                 command = self.thrusters[i].add_pulses(command, thrusts_N)
@@ -238,6 +247,7 @@ class InProcessMission:
                     torque_N_m=vector(self._gain * np.array(command.torque_N_m)),
                 )
             commands[i] = command
+        self._known_target = outputs.target
         if self._solve_delay_s is None:
             return commands
         took_s = 0.0 if outputs.solver is None else outputs.solver.wall_solve_s

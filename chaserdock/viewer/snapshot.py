@@ -18,6 +18,7 @@ from chaserdock_protocol.messages import (
     Image,
     MissionEnd,
     Odometry,
+    PassiveSafety,
     Plan,
     Reference,
     Sighting,
@@ -40,6 +41,7 @@ OF_CHASERS = (
     topics.THRUSTERS,
     topics.REFERENCE,
     topics.PLAN,
+    topics.SAFETY,
 )
 OF_ALL = (topics.TICK, topics.TARGET, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
@@ -49,6 +51,7 @@ _FIELDS = {
     Odometry: "odometry",
     Reference: "reference",
     Plan: "plan",
+    PassiveSafety: "safety",
     DockingStatus: "docking",
     Image: "image",
     Sighting: "sighting",
@@ -79,6 +82,7 @@ class ChaserState:
     odometry: Odometry | None = None
     reference: Reference | None = None
     plan: Plan | None = None
+    safety: PassiveSafety | None = None
     docking: DockingStatus | None = None
     image: Image | None = None
     sighting: Sighting | None = None

@@ -16,7 +16,7 @@ from .guidance.stage import GuidanceStage
 from .ingest.stage import IngestStage
 from .interfaces import TickInputs, TickOutputs
 from .nmpc.stage import PlanningStage
-from .output.message_builders import target_message
+from .output.message_builders import safety_message, target_message
 from .output.stage import OutputStage
 from .parameters import estimator_of, nmpc_parameters
 
@@ -54,9 +54,13 @@ class ControllerCore:
             if refined is not None:
                 self.estimation.composite.refine_target(refined)
         failures = self.planning.monitor.failures(observation.time_ns)
-        guidance = self.guidance.run(observation, estimation, failures)
+        unsafe = self.planning.unsafe(observation.time_ns)
+        guidance = self.guidance.run(observation, estimation, failures, unsafe)
         plan = self.planning.run(observation, estimation, guidance)
-        return self.output.run(observation, estimation, guidance, plan)
+        out = self.output.run(observation, estimation, guidance, plan)
+        if (monitor := self.planning.passive_safety) is not None:
+            out.safety = {i: safety_message(i, observation, monitor, guidance) for i in monitor.certificates}
+        return out
 
     def estimate(self, inputs: TickInputs) -> TargetEstimate:
         """Run ingest and estimation only, in place of ``step``."""

@@ -19,6 +19,7 @@ from chaserdock_protocol.messages import (
     Level,
     Odometry,
     OperatorCommand,
+    PassiveSafety,
     Plan,
     Reference,
     Sighting,
@@ -63,6 +64,7 @@ class TickOutputs:
     wrenches: dict[int, WrenchCommand] = field(default_factory=dict)
     references: dict[int, Reference] = field(default_factory=dict)
     plans: dict[int, Plan] = field(default_factory=dict)
+    safety: dict[int, PassiveSafety] = field(default_factory=dict)
     solver: SolverStatus | None = None
     replies: list[CommandReply] = field(default_factory=list)
     events: list[Event] = field(default_factory=list)
@@ -132,7 +134,7 @@ class TargetEstimation:
 
     ``own``: estimated states of the chasers with valid odometry; ``own_at_effect``: the same at ``Observation.effective_ns``,
     (13,): p, v (WRF), q_wxyz, omega (body). ``disturbances``: estimated force and torque (6,) on a chaser, body axes.
-    ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, if passive safety is monitored.
+    ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, unless passive safety is off.
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
     target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are.
@@ -211,12 +213,14 @@ class HorizonReference:
 
 @dataclass(frozen=True)
 class GuidanceResult:
-    """Result of guidance. ``horizon`` is None when no chaser is planned for."""
+    """Result of guidance. ``horizon`` is None when no chaser is planned for. ``abort_margins``: margin in sigmas of the best abort
+    of each chaser whose passive safety is enforced now."""
 
     directives: Mapping[int, Directive]
     horizon: HorizonReference | None
     replies: tuple[CommandReply, ...]
     events: tuple[LogEntry, ...]
+    abort_margins: Mapping[int, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

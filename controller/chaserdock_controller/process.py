@@ -123,6 +123,8 @@ class ControllerProcess:
         for i in range(len(self.scenario.chasers)):
             for topic in (topics.WRENCH, topics.REFERENCE, topics.PLAN):
                 node.advertise(topic, i)
+            if self.scenario.limits.passive_safety != "off":
+                node.advertise(topics.SAFETY, i)
         inputs = (topics.ODOMETRY, topics.DOCKING, topics.SIGHTING, topics.THRUSTERS)
         for topic in (topics.TICK, topics.END, *inputs, topics.LEASE, topics.STATE):
             node.subscribe(topic)
@@ -261,6 +263,8 @@ class ControllerProcess:
             self._publish_wrench(wrench)
         for i, reference in out.references.items():
             node.publish(topics.REFERENCE, reference, i)
+        for i, safety in out.safety.items():
+            node.publish(topics.SAFETY, safety, i)
         for reply in out.replies:
             node.publish(topics.COMMAND, reply)
         for event in out.events:

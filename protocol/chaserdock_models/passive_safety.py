@@ -36,25 +36,48 @@ class CoastCertificate:
     loss: int
 
 
-class CoastModel:
-    """Transition matrices of a coast of ``duration_s`` on an orbit with this mean motion; without one, of free motion."""
+@dataclass(frozen=True)
+class ClosestApproaches:
+    """Closest approach of the coast from each of M states: ``margin_sigmas``, ``distance_m`` and ``time_s`` (M,), as in
+    ``CoastCertificate``."""
 
-    def __init__(self, mean_motion_rad_s: float, duration_s: float) -> None:
-        self._step_s = duration_s / max(1, math.ceil(duration_s / STEP_S))
+    margin_sigmas: Array
+    distance_m: Array
+    time_s: Array
+
+
+class CoastModel:
+    """Transition matrices of a coast of ``duration_s`` on an orbit with this mean motion; without one, of free motion.
+
+    The coast is sampled every ``step_s``. A longer step is faster, and its lower bound on the distance lower.
+    """
+
+    def __init__(self, mean_motion_rad_s: float, duration_s: float, step_s: float = STEP_S) -> None:
+        self._step_s = duration_s / max(1, math.ceil(duration_s / step_s))
         self._times_s = np.arange(round(duration_s / self._step_s) + 1) * self._step_s
         self._transitions = cw_transition(mean_motion_rad_s, self._times_s)
+        # The acceleration of a coast turns with the orbit: in a step it changes by less than n dt of itself.
+        self._sagitta_share = max(_SAGITTA_SHARE, (1.0 + mean_motion_rad_s * self._step_s) / 8.0)
 
     def certify(self, states: Array, covariance: Array, keep_out_m: float) -> CoastCertificate:
         """Return the certificate of the states (M, 6) of a plan: position and velocity relative to the target, WRF.
 
         ``covariance`` (6, 6): of a state's error, the same for all states of the plan.
         """
+        found = self.closest(states, covariance, keep_out_m)
+        loss = int(np.argmin(found.margin_sigmas))
+        return CoastCertificate(
+            float(found.margin_sigmas[loss]), float(found.distance_m[loss]), float(found.time_s[loss]), loss
+        )
+
+    def closest(self, states: Array, covariance: Array, keep_out_m: float) -> ClosestApproaches:
+        """Return the approach with the smallest margin of the coast from each of the states (M, 6); arguments as in ``certify``."""
         coasts = np.einsum("kij,mj->mki", self._transitions, states)
         here, step = coasts[:, :-1, :3], np.diff(coasts[:, :, :3], axis=1)
         length2 = np.maximum(np.einsum("mki,mki->mk", step, step), 1e-30)
         share = np.clip(-np.einsum("mki,mki->mk", here, step) / length2, 0.0, 1.0)
         nearest = here + share[..., None] * step
-        bulge = _SAGITTA_SHARE * self._step_s * np.linalg.norm(np.diff(coasts[:, :, 3:], axis=1), axis=2)
+        bulge = self._sagitta_share * self._step_s * np.linalg.norm(np.diff(coasts[:, :, 3:], axis=1), axis=2)
         chord = np.linalg.norm(nearest, axis=2)
         away = np.maximum(chord - bulge, 0.0)
         rows = self._transitions[:, :3]
@@ -63,6 +86,6 @@ class CoastModel:
         ends = (np.einsum("mki,kij,mkj->mk", line, part, line) for part in (spread[:-1], spread[1:]))
         sigma = np.sqrt(np.maximum(np.maximum(*ends), 1e-18))
         margins = (away - keep_out_m) / sigma
-        loss, k = np.unravel_index(int(np.argmin(margins)), margins.shape)
-        time_s = float(self._times_s[k] + share[loss, k] * self._step_s)
-        return CoastCertificate(float(margins[loss, k]), float(away[loss, k]), time_s, int(loss))
+        every, k = np.arange(len(states)), np.argmin(margins, axis=1)
+        times_s = self._times_s[k] + share[every, k] * self._step_s
+        return ClosestApproaches(margins[every, k], away[every, k], times_s)

@@ -1,11 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which boxes and points the plume of a thruster hits. The plume is a cone without end. Pure functions; SI units, radians."""
+"""Plumes of thrusters: which boxes and points they hit, and what they exert. Pure functions; SI units, radians.
+
+For the question of a hit the plume is a cone without end. Its momentum flux is that of Simons: A cos^m(pi theta / 2 theta_limit) / r^2
+at the angle theta from the axis and the distance r, and none beyond theta_limit (G. A. Simons, Effect of Nozzle Boundary Layers on
+Rocket Exhaust Plumes, AIAA Journal 10, 1972; there m = 2 / (gamma - 1), which is 5 for a cold gas with gamma = 1.4).
+"""
 
 from __future__ import annotations
 
 import itertools
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -81,3 +88,81 @@ def plume_hits(
     return any(angle_to_box(nozzle_m, axis, box) < half_angle_rad for box in boxes) or any(
         angle_to_point(nozzle_m, axis, point) < half_angle_rad for point in points_m
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Panels:
+    """Flat parts of a body's surface in its axes: centres (P, 3), outward normals (P, 3), areas (P,)."""
+
+    centres_m: Array
+    normals: Array
+    areas_m2: Array
+
+
+def panels_of(boxes: Sequence[Box], parts: int = 6) -> Panels:
+    """Return the faces of boxes, each divided into ``parts`` x ``parts`` panels."""
+    middles = (np.arange(parts) + 0.5) / parts - 0.5
+    u, v = (grid.ravel() for grid in np.meshgrid(middles, middles))
+    centres, normals, areas = [], [], []
+    for box in boxes:
+        size = np.asarray(box.size_m)
+        for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
+            one, two = (axis + 1) % 3, (axis + 2) % 3
+            local = np.zeros((len(u), 3))
+            local[:, axis], local[:, one], local[:, two] = (
+                sign * size[axis] / 2.0,
+                u * size[one],
+                v * size[two],
+            )
+            normal = np.zeros(3)
+            normal[axis] = sign
+            centres.append(np.asarray(box.position_m) + rotations.rotate(box.q_wxyz, local))
+            normals.append(np.tile(rotations.rotate(box.q_wxyz, normal), (len(u), 1)))
+            areas.append(np.full(len(u), size[one] * size[two] / parts**2))
+    return Panels(np.concatenate(centres), np.concatenate(normals), np.concatenate(areas))
+
+
+@dataclass(frozen=True)
+class PlumeFlux:
+    """Momentum flux of a plume per newton of thrust: ``limit_rad`` (below pi / 2) and ``exponent`` as in the module's docstring."""
+
+    limit_rad: float
+    exponent: float
+
+    @cached_property
+    def axial(self) -> float:
+        """Factor A: the flux through any surface that closes the cone carries the thrust along the axis."""
+        nodes, weights = np.polynomial.legendre.leggauss(64)
+        theta = 0.5 * self.limit_rad * (nodes + 1.0)
+        shape = np.cos(0.5 * math.pi * theta / self.limit_rad) ** self.exponent
+        carried = float((weights * shape * np.cos(theta) * np.sin(theta)).sum()) * 0.5 * self.limit_rad
+        return 1.0 / (2.0 * math.pi * carried)
+
+    def at(self, cosines: Array) -> Array:
+        """Return the flux times the square of the distance, 1/sr, at angles with these cosines (...)."""
+        theta = np.arccos(np.clip(cosines, -1.0, 1.0))
+        shape = np.cos(0.5 * math.pi * np.minimum(theta / self.limit_rad, 1.0)) ** self.exponent
+        return np.where(theta < self.limit_rad, self.axial * shape, 0.0)
+
+
+def plume_wrench(
+    flux: PlumeFlux, panels: Panels, nozzles_m: Array, forces: Array, thrusts_N: Array, reach_m: float
+) -> Array:
+    """Return force and torque (6,) about the origin, in the axes of the panels, that the plumes of thrusters exert on them.
+
+    ``nozzles_m``, ``forces`` (n, 3): nozzles and unit directions of the thrusters' forces; the plumes go the opposite way.
+    Each panel that faces a nozzle within ``reach_m`` takes up the whole momentum of the flux through it; panels do not shade
+    others.
+    """
+    firing = thrusts_N > 0.0
+    if not firing.any():
+        return np.zeros(6)
+    away = panels.centres_m - nozzles_m[firing, None]
+    distance = np.maximum(np.linalg.norm(away, axis=2), 1e-3)
+    along = away / distance[..., None]
+    facing = -np.einsum("npi,pi->np", along, panels.normals)
+    cosines = -np.einsum("npi,ni->np", along, forces[firing])
+    share = np.where((facing > 0.0) & (distance <= reach_m), flux.at(cosines) * facing / distance**2, 0.0)
+    force = (thrusts_N[firing, None] * share * panels.areas_m2)[..., None] * along
+    torque = np.cross(panels.centres_m, force)
+    return np.concatenate([force.sum(axis=(0, 1)), torque.sum(axis=(0, 1))])

@@ -263,6 +263,18 @@ class PortLoad(Message, frozen=True, kw_only=True):
     closing_impulse_N_s: float = 0.0
 
 
+class PlumeLoad(Message, frozen=True, kw_only=True):
+    """Ground truth of what the plumes of the chasers' thrusters gave a body since the last tick, with ``[plume]``.
+
+    ``impulse_N_s``, ``angular_impulse_N_m_s``: about the body's origin, in its axes. ``peak_force_N``: largest force.
+    """
+
+    body: Text
+    impulse_N_s: Vector3
+    angular_impulse_N_m_s: Vector3
+    peak_force_N: float
+
+
 class DrawnBody(Struct, frozen=True, kw_only=True):
     """What the scenario drew for one body (``target`` or ``chaser/0``), body axes unless stated otherwise.
 
@@ -418,6 +430,25 @@ class Plan(Message, frozen=True, kw_only=True):
     positions_m: Annotated[tuple[float, ...], Meta(max_length=3 * 2001)]
     quaternions_wxyz: Annotated[tuple[float, ...], Meta(max_length=4 * 2001)]
     inputs: Annotated[tuple[float, ...], Meta(max_length=6 * 2000)]
+
+
+class PassiveSafety(Message, frozen=True, kw_only=True):
+    """Certificate of one chaser: the coasts after a loss of all thrust at any state of its newest plan (``limits.passive_safety``).
+
+    ``margin_sigmas``: smallest distance of a coast from the keep-out over its standard deviation; negative inside.
+    ``distance_m``: a lower bound on the distance from the target there, ``time_s`` after the loss of thrust, which is
+    ``loss_s`` after the plan's beginning. ``safe``: the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: the
+    chaser aborts while it is not. ``abort_margin_sigmas``: the same margin of the best abort from here; None where none is sought.
+    """
+
+    chaser: ChaserId
+    margin_sigmas: float
+    distance_m: float
+    time_s: float
+    loss_s: float
+    safe: bool
+    enforced: bool
+    abort_margin_sigmas: float | None = None
 
 
 class SolverStatus(Message, frozen=True, kw_only=True):
@@ -632,6 +663,7 @@ VERSION: dict[type[Struct], int] = {
     BodyTruth: 2,
     WorldTruth: 1,
     PortLoad: 1,
+    PlumeLoad: 1,
     DrawnTruth: 1,
     Sighting: 2,
     TargetEstimate: 1,
@@ -639,6 +671,7 @@ VERSION: dict[type[Struct], int] = {
     Reference: 1,
     WrenchCommand: 1,
     Plan: 1,
+    PassiveSafety: 1,
     SolverStatus: 1,
     ActuatorCommand: 2,
     Lease: 1,

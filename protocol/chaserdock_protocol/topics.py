@@ -73,6 +73,7 @@ DOCKING = _topic(
 TRUTH_BODY = Topic("truth/body/{process}", m.BodyTruth, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_WORLD = Topic("truth/world", m.WorldTruth, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_LOAD = Topic("truth/chaser/{chaser}/load", m.PortLoad, "world", _TRUTH_READERS, "tick", "state")
+TRUTH_PLUME = Topic("truth/plume/{process}", m.PlumeLoad, "world", _TRUTH_READERS, "tick", "state")
 TRUTH_DRAWN = Topic("truth/drawn", m.DrawnTruth, "world", _TRUTH_READERS, "event", "state")
 SIGHTING = _topic("chaser/{chaser}/sighting", m.Sighting, "chaser", {"controller"}, "image", "state")
 ACTUATORS = _topic("chaser/{chaser}/actuators", m.ActuatorCommand, "chaser", {"world"}, "tick", "command")
@@ -86,6 +87,7 @@ REFERENCE = _topic("controller/chaser/{chaser}/reference", m.Reference, "control
 PLAN = _topic("controller/chaser/{chaser}/plan", m.Plan, "controller", {"chaser"}, "tick", "command")
 TARGET = _topic("controller/target", m.TargetEstimate, "controller", {"chaser"}, "tick", "command")
 STACK = _topic("controller/stack", m.StackEstimate, "controller", set(), "second", "state")
+SAFETY = _topic("controller/chaser/{chaser}/safety", m.PassiveSafety, "controller", set(), "tick", "state")
 SOLVER = _topic("controller/solver", m.SolverStatus, "controller", set(), "tick", "state")
 COMMAND = _topic("controller/command", m.CommandReply, "controller", set(), "event", "event")
 STATE = _topic("controller/state", m.ControllerState, "controller", {"controller"}, "tick", "command")
@@ -105,6 +107,7 @@ TOPICS: tuple[Topic, ...] = (
     TRUTH_BODY,
     TRUTH_WORLD,
     TRUTH_LOAD,
+    TRUTH_PLUME,
     TRUTH_DRAWN,
     SIGHTING,
     ACTUATORS,
@@ -115,6 +118,7 @@ TOPICS: tuple[Topic, ...] = (
     PLAN,
     TARGET,
     STACK,
+    SAFETY,
     SOLVER,
     COMMAND,
     OPERATED,

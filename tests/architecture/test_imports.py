@@ -131,7 +131,7 @@ def node(request: pytest.FixtureRequest) -> Iterator[Node]:
 
 
 def test_there_is_a_truth_to_keep_away_from() -> None:
-    assert {"TRUTH_BODY", "TRUTH_WORLD", "TRUTH_LOAD", "TRUTH_DRAWN"} == TRUTHS
+    assert {"TRUTH_BODY", "TRUTH_WORLD", "TRUTH_LOAD", "TRUTH_PLUME", "TRUTH_DRAWN"} == TRUTHS
 
 
 @pytest.mark.parametrize("name", sorted(TRUTHS))

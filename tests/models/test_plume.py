@@ -8,7 +8,15 @@ import math
 import numpy as np
 import pytest
 from chaserdock_models import rotations
-from chaserdock_models.plume import angle_to_box, angle_to_point, plume_hits
+from chaserdock_models.plume import (
+    Panels,
+    PlumeFlux,
+    angle_to_box,
+    angle_to_point,
+    panels_of,
+    plume_hits,
+    plume_wrench,
+)
 from chaserdock_models.targets import Box
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -78,3 +86,46 @@ def test_a_plume_is_opposite_to_the_force() -> None:
     assert plume_hits(nozzle, np.array([-1.0, 0.0, 0.0]), half, [], [np.array([3.0, 0.3, 0.0])])
     assert not plume_hits(nozzle, np.array([-1.0, 0.0, 0.0]), half, [], [np.array([3.0, 0.4, 0.0])])
     assert angle_to_point(nozzle, np.array([1.0, 0.0, 0.0]), nozzle) == 0.0
+
+
+def test_plate_across_the_whole_cone_takes_up_the_thrust() -> None:
+    """Through any surface that closes the cone flows the whole axial momentum, whatever its distance."""
+    flux = PlumeFlux(math.radians(40.0), 5.0)
+    for distance in (0.5, 2.0):
+        plate = panels_of([Box((0.01, 4.0, 4.0), (distance + 0.005, 0.0, 0.0))], parts=160)
+        wrench = plume_wrench(flux, plate, np.zeros((1, 3)), np.array([[-1.0, 0, 0]]), np.array([0.7]), 10.0)
+        assert wrench[0] == pytest.approx(0.7, rel=5e-3)
+        np.testing.assert_allclose(wrench[1:], 0.0, atol=1e-9)
+
+
+def test_plume_pushes_what_it_faces_and_only_within_its_limits() -> None:
+    flux = PlumeFlux(math.radians(40.0), 5.0)
+    box = panels_of([Box((0.4, 0.4, 0.4))])
+    at, force, thrust = np.array([[-1.0, 0.1, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.array([1.0])
+    wrench = plume_wrench(flux, box, at, force, thrust, 10.0)
+    assert 0.02 < wrench[0] < 0.7
+    assert wrench[5] < 0.0  # above the middle: a torque about -Z
+    assert not plume_wrench(flux, box, at, -force, thrust, 10.0).any()
+    assert not plume_wrench(flux, box, at, force, 0.0 * thrust, 10.0).any()
+    assert not plume_wrench(flux, box, at, force, thrust, 0.7).any()
+    beside = np.array([[-1.0, 1.4, 0.0]])  # 45 degrees off the nearest corner
+    assert not plume_wrench(flux, box, beside, force, thrust, 10.0).any()
+
+
+@settings(derandomize=True, deadline=None, max_examples=20)
+@given(SEEDS)
+def test_plume_wrench_turns_with_the_bodies(seed: int) -> None:
+    nozzle, axis, box = random_case(seed)
+    q = rotations.normalize(np.random.default_rng(seed).normal(size=4))
+    flux = PlumeFlux(math.radians(70.0), 3.0)
+    panels = panels_of([box], parts=3)
+    turned = Panels(
+        rotations.rotate(q, panels.centres_m), rotations.rotate(q, panels.normals), panels.areas_m2
+    )
+    thrust, reach_m = np.array([1.0]), 20.0
+    plain = plume_wrench(flux, panels, nozzle[None], axis[None], thrust, reach_m)
+    other = plume_wrench(
+        flux, turned, rotations.rotate(q, nozzle)[None], rotations.rotate(q, axis)[None], thrust, reach_m
+    )
+    np.testing.assert_allclose(rotations.rotate(q, plain[:3]), other[:3], rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(rotations.rotate(q, plain[3:]), other[3:], rtol=1e-7, atol=1e-9)

@@ -116,13 +116,14 @@ def test_nobody_who_flies_may_read_the_truth() -> None:
         "truth/body/{process}",
         "truth/world",
         "truth/chaser/{chaser}/load",
+        "truth/plume/{process}",
         "truth/drawn",
     }
     for topic in truths:
         assert topic.writer == "world"
         assert [r for r in ROLES if topics.may_read(r, topic)] == ["recorder", "analysis", "viewer"]
     # Nor by another name: the types of the truth travel on its own branch alone.
-    assert {t.kind for t in truths} == {m.BodyTruth, m.WorldTruth, m.PortLoad, m.DrawnTruth}
+    assert {t.kind for t in truths} == {m.BodyTruth, m.WorldTruth, m.PortLoad, m.PlumeLoad, m.DrawnTruth}
     assert not any(t.kind in (m.BodyTruth, m.WorldTruth, m.DrawnTruth) for t in TOPICS if t not in truths)
     assert {"chaser", "controller"} == FLYING
 

@@ -38,6 +38,7 @@ from chaserdock_world.sensors.publish import (
     drawn_truth,
     publish_docking,
     publish_odometry,
+    publish_plume_loads,
     publish_port_loads,
     publish_truth,
 )
@@ -127,6 +128,9 @@ class World:
                 node.advertise(topics.DOCKING, i)
                 node.advertise(topics.TRUTH_LOAD, i)
             node.advertise(topics.IMAGE, i)
+        if self._physics.plumes is not None:
+            for name in self._physics.plumes.bodies:
+                node.advertise(topics.TRUTH_PLUME, name)
         heartbeat = Heartbeat(node, membership.instance)
         node.declare_liveliness()
         node.declare_queryable(topics.THRUSTER_FAULT_KEY, ThrusterFaultCommand, self._faults.submit)
@@ -183,6 +187,7 @@ class World:
         publish_docking(node, physics.latches, tick, timing)  # first, as the ground truth takes the touches
         publish_truth(node, states, tick, timing, self._actuators, self._contacts, physics.latches)
         publish_port_loads(node, physics, tick, timing)
+        publish_plume_loads(node, physics, tick, timing)
         publish_odometry(node, states, tick, timing, self._odometry)
         return states
 

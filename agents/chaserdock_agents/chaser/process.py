@@ -369,9 +369,12 @@ class ChaserProcess:
             )
         self._refused = 0
         self._reported_missing = self._reported_refusal = self._reported_stale = False
+        # The estimate of the command before: that of this one may arrive later.
+        known = self._last.target
         self._remember(command)
         self._was_detumbling = command.mode == "detumble"
         if self._thrusters is not None:
+            self._thrusters.avoid_plumes(known)
             self._thrusters.apply_command(command)
         self._reply(passed_on(command), np.array(command.thrusts_N) if command.thrusts_N else None)
 

@@ -19,6 +19,7 @@ class NextMove(StrEnum):
     NONE = ""
     NOMINAL = "nominal"
     ATTEMPT = "attempt"
+    ESCAPE = "escape"
 
 
 @dataclass(frozen=True)

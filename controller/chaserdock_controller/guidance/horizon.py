@@ -18,6 +18,7 @@ from chaserdock_controller.interfaces import HorizonReference, ReferencePose
 from . import reference
 from .approach_cone import corridor_rows
 from .phase_machine import PhaseMachine
+from .trajectories import Escape
 
 _GREATEST_MARGIN_M = 0.1
 
@@ -49,7 +50,10 @@ class ReferenceBuilder:
 
     def pose(self, i: int, target: TargetState, now_s: float) -> tuple[Array, Array, Array]:
         """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in TRF."""
-        offset = self._machine.chasers[i].move.at(np.array([now_s]))[0][0]
+        move = self._machine.chasers[i].move
+        offset = move.at(np.array([now_s]))[0][0]
+        if isinstance(move, Escape):
+            offset = rotations.rotate_inverse(target.q_wxyz, offset)
         position = target.position_m + rotations.rotate(target.q_wxyz, offset)
         q_off = self._attitudes(i, offset[None], np.array([now_s])).reshape(4)
         return position, rotations.multiply(target.q_wxyz, q_off), offset
@@ -74,10 +78,10 @@ class ReferenceBuilder:
         torque_free = s.target.motion == "torque_free"
         nodes, middles = target_path(body, torque_free, start, step_s, self._stages)
         times_s = start.time_ns / 1e9 + np.arange(self._stages + 1, dtype=float) * step_s
-        (offsets, _, _), q_off = self._offsets(chasers, times_s)
+        (offsets, _, _), q_off = self._offsets(chasers, times_s, nodes)
         u_ref = np.zeros((len(chasers), self._stages, 6))
         if s.controller.feed_forward:
-            motion, q_middle = self._offsets(chasers, times_s[:-1] + step_s / 2)
+            motion, q_middle = self._offsets(chasers, times_s[:-1] + step_s / 2, middles)
             u_ref = reference.feed_forward(
                 middles.omega_rad_s,
                 *motion,
@@ -102,15 +106,23 @@ class ReferenceBuilder:
             attached=attached,
         )
 
-    def _offsets(self, chasers: tuple[int, ...], times_s: Array) -> tuple[tuple[Array, Array, Array], Array]:
+    def _offsets(
+        self, chasers: tuple[int, ...], times_s: Array, target: TargetPath
+    ) -> tuple[tuple[Array, Array, Array], Array]:
         """Return offsets, their velocities and accelerations in TRF, each (N, K, 3), and attitudes, body to TRF,
-        (N, K, 4), at times (K,)."""
-        moves = [self._machine.chasers[i].move.at(times_s) for i in chasers]
+        (N, K, 4), at times (K,), at which the target moves as ``target``."""
+        moves = [self._motion(i, times_s, target) for i in chasers]
         q_off = np.empty((len(chasers), len(times_s), 4))
         for row, i in enumerate(chasers):
             q_off[row] = rotations.normalize(self._attitudes(i, moves[row][0], times_s))
         positions, velocities, accelerations = (np.array(part) for part in zip(*moves, strict=True))
         return (positions, velocities, accelerations), q_off
+
+    def _motion(self, i: int, times_s: Array, target: TargetPath) -> tuple[Array, Array, Array]:
+        """Return a chaser's offsets, velocities and accelerations (K, 3) in TRF at times (K,)."""
+        move = self._machine.chasers[i].move
+        motion = move.at(times_s)
+        return reference.seen_from(target, *motion) if isinstance(move, Escape) else motion
 
     def _attitudes(self, i: int, offsets: Array, times_s: Array) -> Array:
         """Return reference attitudes, body to TRF, at offsets (K, 3) and times (K,): (K, 4), or (4,) if constant."""

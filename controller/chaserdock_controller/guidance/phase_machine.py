@@ -31,6 +31,7 @@ from .docking import (
     pull_N,
     why_not_approach,
 )
+from .escape import EscapePlanner
 from .phases import (
     APPROACHING,
     ATTACHED,
@@ -42,7 +43,7 @@ from .phases import (
     trigger_of,
 )
 from .pointing import CALIBRATION_S, calibration_turns
-from .trajectories import Motion, glide, move_to, stay, stop
+from .trajectories import Escape, Motion, glide, move_to, stay, stop
 
 _ABORT_SPEED_FACTOR = 2.0
 _GOTO_SPEED_FACTOR = 2.0
@@ -77,6 +78,10 @@ class PhaseMachine:
         self._interrupted: set[int] = set()
         self._planning_failures: dict[int, PlanningFailure] = {}
         self._detumble_refusal = ""
+        self.escapes: EscapePlanner | None = None
+        if scenario.limits.passive_safety == "enforce":
+            speed = scenario.approach.max_speed_m_s * _ABORT_SPEED_FACTOR
+            self.escapes = EscapePlanner(scenario, speed)
 
     # -- the target's estimate -------------------------------------------------------------------------------
 
@@ -109,13 +114,15 @@ class PhaseMachine:
         """Interrupt approaches to a target that no chaser has seen for a while, and resume them afterwards."""
         self._seen_s = now_s if visible or self._seen_s is None else self._seen_s
         unseen_s = now_s - self._seen_s
-        for i, c in enumerate(self.chasers):
+        for i in range(len(self.chasers)):
             if unseen_s >= _SIGHT_LOSS_S:
                 reason = f"no chaser has seen the target for {_SIGHT_LOSS_S:g} s"
                 if self._stop_or_back_out(i, Trigger.SIGHT_LOST, now_s, reason) is Phase.HOLD:
                     self._interrupted.add(i)
             elif i in self._interrupted and unseen_s == 0.0 and self._permits(i, Trigger.SIGHT_REGAINED):
-                move = move_to(c.move, self.dock_offset(i), now_s, self._scenario.approach.max_speed_m_s)
+                move = move_to(
+                    self._in_trf(i, now_s), self.dock_offset(i), now_s, self._scenario.approach.max_speed_m_s
+                )
                 self._transition(i, Trigger.SIGHT_REGAINED, now_s, move, "the target is in sight again")
             if self.chasers[i].phase is not Phase.HOLD:
                 self._interrupted.discard(i)
@@ -127,7 +134,7 @@ class PhaseMachine:
         elif phase is not None:
             # TARGET_LOST is an event of its own in the log; the phase change needs no reason.
             why = reason if trigger is Trigger.SIGHT_LOST else ""
-            self._transition(i, trigger, now_s, stop(self.chasers[i].move, now_s), why)
+            self._transition(i, trigger, now_s, stop(self._in_trf(i, now_s), now_s), why)
         return phase
 
     # -- planning ------------------------------------------------------------------------------------------------
@@ -138,6 +145,60 @@ class PhaseMachine:
             if i not in self._planning_failures and self._permits(i, Trigger.PLANNING_FAILED):
                 self._back_out(i, Trigger.PLANNING_FAILED, now_s, failure.text())
         self._planning_failures = dict(failures)
+
+    # -- passive safety ------------------------------------------------------------------------------------------
+
+    def update_safety(self, now_s: float, unsafe: Mapping[int, str]) -> None:
+        """Let every chaser abort whose passive safety is enforced, but whose plans are ``unsafe``, with the reasons."""
+        for i, reason in unsafe.items():
+            if self.enforces_safety(i) and self._permits(i, Trigger.SAFETY_LOST):
+                self._back_out(i, Trigger.SAFETY_LOST, now_s, reason)
+
+    def enforces_safety(self, i: int) -> bool:
+        """Return whether the passive safety of a chaser is enforced now: outside the final corridor."""
+        position = self._positions.get(i)
+        if self.escapes is None or position is None or i not in self.escapes.relative:
+            return False
+        final = self.escapes.is_final(position) or self.in_corridor(i) or self.corridor(i) is not None
+        return not (final or self._is_held(i))
+
+    def _in_trf(self, i: int, now_s: float) -> Motion:
+        """Return a chaser's motion in TRF: in place of an abort's, which is in WRF, rest at the estimated position."""
+        move = self.chasers[i].move
+        return stay(self._positions[i], now_s) if isinstance(move, Escape) else move
+
+    def _move(self, i: int, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
+        """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced, as slow as it needs."""
+        found = self._safe_move(i, goal_m, now_s, speed_m_s)
+        return found or move_to(self._in_trf(i, now_s), goal_m, now_s, speed_m_s)
+
+    def _safe_move(self, i: int, goal_m: Array, now_s: float, speed_m_s: float) -> Motion | None:
+        start = self._in_trf(i, now_s)
+        if self.escapes is None:
+            return move_to(start, goal_m, now_s, speed_m_s)
+        return self.escapes.limited(i, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s)
+
+    def _escape(self, i: int, now_s: float) -> Escape | None:
+        """Return the abort onto a safe coast if passive safety is enforced; log one whose coast is not safe."""
+        found = self.escapes.escape(i, now_s) if self.escapes is not None else None
+        if self.escapes is None or found is None:
+            return None
+        move, margin = found
+        speed = float(np.linalg.norm(move.acceleration_m_s2)) * move.burn_s
+        text = f"abort by {speed:.3f} m/s onto a coast with a margin of {margin:.1f} sigmas"
+        level = "info" if margin >= self.escapes.sigmas else "warning"
+        self._changes.append(PhaseChange(i, Phase.ABORT, text, level))
+        return move
+
+    def _why_not_safe(self, i: int, goal_m: Array, now_s: float) -> str:
+        """Return why no move to a goal (3,), TRF, is passively safe, or an empty string."""
+        speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED_FACTOR
+        if self._safe_move(i, goal_m, now_s, speed) is not None:
+            return ""
+        return (
+            "no speed makes the move passively safe: the coast after a loss of thrust comes within "
+            f"{self._scenario.limits.min_distance_target_m:g} m of the target (limits.passive_safety)"
+        )
 
     # -- commands --------------------------------------------------------------------------------------------
 
@@ -198,21 +259,24 @@ class PhaseMachine:
             case Trigger.COMMAND_HOLD if self.in_corridor(i):
                 self._transition(i, trigger, now_s, stay(self._observed[i].offset_m, now_s))
             case Trigger.COMMAND_HOLD:
-                self._transition(i, trigger, now_s, stop(c.move, now_s))
+                self._transition(i, trigger, now_s, stop(self._in_trf(i, now_s), now_s))
             case Trigger.COMMAND_CALIBRATE:
                 self._transition(i, trigger, now_s, c.move)
             case Trigger.COMMAND_APPROACH if dock is None:
-                self._transition(i, trigger, now_s, move_to(c.move, self.dock_offset(i), now_s, speed))
+                self._transition(
+                    i, trigger, now_s, move_to(self._in_trf(i, now_s), self.dock_offset(i), now_s, speed)
+                )
             case Trigger.COMMAND_APPROACH:
                 occupied = self._why_corridor_occupied(i)
                 if occupied:
                     blocked = Trigger.COMMAND_APPROACH_BLOCKED
-                    self._transition(i, blocked, now_s, stop(c.move, now_s), occupied)
+                    self._transition(i, blocked, now_s, stop(self._in_trf(i, now_s), now_s), occupied)
                 else:
                     self._align(i, trigger, now_s, 1)
             case _:
                 goal = np.asarray(command.offset_m)
-                self._transition(i, trigger, now_s, move_to(c.move, goal, now_s, speed * _GOTO_SPEED_FACTOR))
+                move = self._move(i, goal, now_s, speed * _GOTO_SPEED_FACTOR)
+                self._transition(i, trigger, now_s, move)
         return CommandResult(True, f"phase {self.chasers[i].phase}")
 
     def _why_not(self, command: OperatorCommand, now_s: float) -> str:
@@ -230,7 +294,7 @@ class PhaseMachine:
         if command.command == "identify":
             return validation.why_not_identify(self._scenario)
         if command.command == "approach":
-            offset_m = c.move.at(np.array([now_s]))[0][0]
+            offset_m = self._in_trf(i, now_s).at(np.array([now_s]))[0][0]
             return (
                 validation.why_not_along(self._scenario, i, offset_m)
                 if dock is None
@@ -244,7 +308,8 @@ class PhaseMachine:
                 for j, other in enumerate(self.chasers)
                 if j != i
             }
-            return validation.why_not_goto(self._scenario, command.offset_m, goals)
+            reason = validation.why_not_goto(self._scenario, command.offset_m, goals)
+            return reason or self._why_not_safe(i, np.asarray(command.offset_m), now_s)
         return ""
 
     # -- the stack of the target and latched chasers ---------------------------------------------------------------
@@ -324,8 +389,12 @@ class PhaseMachine:
                 self._align(i, Trigger.NEXT_ATTEMPT, now_s, c.attempt + 1)
             case NextMove.ATTEMPT | NextMove.NOMINAL:
                 nominal, speed = self._scenario.chasers[i].position_m, self._back_out_speed(c.phase)
-                self.chasers[i] = replace(c, move=move_to(c.move, nominal, now_s, speed), then=NextMove.NONE)
-            case NextMove.NONE:
+                self.chasers[i] = replace(
+                    c, move=move_to(self._in_trf(i, now_s), nominal, now_s, speed), then=NextMove.NONE
+                )
+            case NextMove.ESCAPE if (escape := self._escape(i, now_s)) is not None:
+                self.chasers[i] = replace(c, move=escape, then=NextMove.NONE)
+            case NextMove.NONE | NextMove.ESCAPE:
                 self._transition(i, Trigger.MOVE_COMPLETE, now_s, c.move)
                 self.chasers[i] = replace(self.chasers[i], faces=False)
 
@@ -503,7 +572,12 @@ class PhaseMachine:
         self.chasers[i] = ChaserGuidance(phase, now_s, move, inside_since_s, then, number, faces=before.faces)
         if phase is not before.phase:
             detail = f"from {before.phase}" + (f": {reason}" if reason else "")
-            failed = (Trigger.PLANNING_FAILED, Trigger.DETUMBLE_FAILED, Trigger.ATTEMPT_FAILED)
+            failed = (
+                Trigger.PLANNING_FAILED,
+                Trigger.DETUMBLE_FAILED,
+                Trigger.ATTEMPT_FAILED,
+                Trigger.SAFETY_LOST,
+            )
             level = "warning" if trigger in failed else "info"
             complete = trigger is Trigger.CALIBRATION_COMPLETE
             self._changes.append(PhaseChange(i, phase, detail, level, complete))
@@ -516,12 +590,16 @@ class PhaseMachine:
         self, i: int, trigger: Trigger, now_s: float, reason: str = "", then: NextMove = NextMove.NOMINAL
     ) -> None:
         """Move to the nominal offset; from inside a corridor first along its axis to the entry."""
-        c, dock = self.chasers[i], self._docks[i]
-        speed = self._back_out_speed(Phase.ABORT if trigger is Trigger.COMMAND_ABORT else Phase.RETREAT)
+        dock = self._docks[i]
+        aborts = trigger in (Trigger.COMMAND_ABORT, Trigger.SAFETY_LOST)
+        speed = self._back_out_speed(Phase.ABORT if aborts else Phase.RETREAT)
         if dock is None or not self.in_corridor(i):
-            nominal = self._scenario.chasers[i].position_m
-            self._transition(i, trigger, now_s, move_to(c.move, nominal, now_s, speed), reason)
+            escape = self._escape(i, now_s) if aborts else None
+            move = escape or self._move(i, np.asarray(self._scenario.chasers[i].position_m), now_s, speed)
+            self._transition(i, trigger, now_s, move, reason)
             return
+        if aborts and self.escapes is not None:
+            then = NextMove.ESCAPE
         entry = dock.offset(dock.docking.entry_m)
         move = move_to(stay(self._observed[i].offset_m, now_s), entry, now_s, speed)
         self._transition(i, trigger, now_s, move, reason, then=then)
@@ -530,7 +608,7 @@ class PhaseMachine:
         dock = self._docks[i]
         assert dock is not None
         speed = self._scenario.approach.max_speed_m_s * _GOTO_SPEED_FACTOR
-        move = move_to(self.chasers[i].move, dock.offset(dock.docking.entry_m), now_s, speed)
+        move = self._move(i, dock.offset(dock.docking.entry_m), now_s, speed)
         self._transition(i, trigger, now_s, move, attempt=attempt)
 
     def _why_corridor_occupied(self, i: int) -> str:

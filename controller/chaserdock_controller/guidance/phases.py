@@ -68,6 +68,7 @@ class Trigger(StrEnum):
     DETUMBLE_FAILED = "stack cannot be stopped"
     ATTEMPT_FAILED = "limit violated or time-out"
     PLANNING_FAILED = "planning failed"
+    SAFETY_LOST = "not passively safe for 1 s"
 
 
 @dataclass(frozen=True)
@@ -140,6 +141,9 @@ TRANSITIONS = (
     Transition((_P.HOLD, _P.CALIBRATE, _P.GOTO), _T.PLANNING_FAILED, _P.RETREAT),
     Transition((_P.APPROACH, _P.DOCKED), _T.PLANNING_FAILED, _P.RETREAT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR), _T.PLANNING_FAILED, _P.RETREAT, by_capture=True),
+    Transition((_P.HOLD, _P.CALIBRATE, _P.RETREAT, _P.GOTO), _T.SAFETY_LOST, _P.ABORT),
+    Transition((_P.APPROACH, _P.DOCKED), _T.SAFETY_LOST, _P.ABORT, by_capture=False),
+    Transition((_P.WAIT, *CORRIDOR), _T.SAFETY_LOST, _P.ABORT, by_capture=True),
 )
 """All transitions. There is at most one for a phase, a trigger and a kind of docking."""
 

@@ -11,6 +11,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.rotations import conjugate, cross, exp, multiply, normalize, rotate, rotate_inverse
 from numpy.typing import ArrayLike
 
+from chaserdock_controller.estimation.target_body import TargetPath
+
 
 def predict_target(
     position_m: ArrayLike,
@@ -86,6 +88,20 @@ def reference_state(
             rotate(conjugate(q_off), omega),
         ]
     )
+
+
+def seen_from(
+    target: TargetPath, position_m: Array, velocity_m_s: Array, acceleration_m_s2: Array
+) -> tuple[Array, Array, Array]:
+    """Return positions, velocities and accelerations (K, 3) in TRF of a motion (K, 3) relative to TRF's origin in WRF.
+
+    The inverse of the acceleration in a rotating frame, see ``feed_forward``.
+    """
+    q, omega, alpha = target.q_wxyz, target.omega_rad_s, target.alpha_rad_s2
+    p = rotate_inverse(q, position_m)
+    v = rotate_inverse(q, velocity_m_s) - cross(omega, p)
+    a = rotate_inverse(q, acceleration_m_s2) - cross(alpha, p) - 2.0 * cross(omega, v)
+    return p, v, a - cross(omega, cross(omega, p))
 
 
 def feed_forward(

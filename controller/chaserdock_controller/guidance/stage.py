@@ -27,6 +27,7 @@ from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 from .chaser_state import ChaserGuidance
 from .detumble.control import DetumbleControl, StackState, StackTask
 from .docking import DockingObservation
+from .escape import RelativeState
 from .horizon import ReferenceBuilder
 from .phase_machine import PhaseMachine
 from .phases import Phase
@@ -45,6 +46,7 @@ class GuidanceStage:
         self.detumble = DetumbleControl(scenario)
         self._waits = False
         self.references = ReferenceBuilder(scenario, self.machine)
+        self._abort_margins: dict[int, float] = {}
 
     @property
     def chasers(self) -> list[ChaserGuidance]:
@@ -56,9 +58,12 @@ class GuidanceStage:
         observation: Observation,
         estimation: TargetEstimation,
         failures: Mapping[int, PlanningFailure],
+        unsafe: Mapping[int, str] | None = None,
     ) -> GuidanceResult:
-        """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed."""
+        """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed; ``unsafe``: why
+        chasers whose passive safety is enforced have to abort."""
         self._follow_estimate(observation, estimation)
+        self._follow_relative_states(estimation)
         self.machine.update_planning(observation.time_s, failures)
         commands = (*self.machine.due_commands(observation.time_s), *observation.commands)
         stack = None
@@ -69,6 +74,8 @@ class GuidanceStage:
         if estimation.known:
             for i in sorted(observation.odometry):
                 references[i] = self._update_chaser(i, observation, estimation)
+        self.machine.update_safety(observation.time_s, unsafe or {})
+        abort_margins = self._update_abort_margins(observation)
         self._update_stack(observation, stack)
         thrusts = self._detumble_commands(observation, stack)
         ids, attached = sorted(observation.odometry), self._attached(observation, estimation)
@@ -92,7 +99,11 @@ class GuidanceStage:
                 direct=thrusts.get(i) or self._direct_command(i, observation, estimation, i in attached),
             )
         return GuidanceResult(
-            directives, horizon, tuple(replies), (*self._events(estimation), *self._report_waiting())
+            directives,
+            horizon,
+            tuple(replies),
+            (*self._events(estimation), *self._report_waiting()),
+            abort_margins,
         )
 
     def _follow_estimate(self, observation: Observation, estimation: TargetEstimation) -> None:
@@ -107,6 +118,31 @@ class GuidanceStage:
         if is_settled(target):
             for i, odometry in estimation.own.items():
                 self.machine.target_settled(i, now_s, pose_in_target(target, odometry)[0])
+
+    def _follow_relative_states(self, estimation: TargetEstimation) -> None:
+        escapes, target = self.machine.escapes, estimation.target
+        if escapes is None:
+            return
+        escapes.relative = {}
+        for i, covariance in estimation.motion_covariances.items():
+            own = estimation.own[i]
+            state = np.concatenate(
+                [own.position_m - target.position_m, own.velocity_m_s - target.velocity_m_s]
+            )
+            escapes.relative[i] = RelativeState(state, covariance, target)
+
+    def _update_abort_margins(self, observation: Observation) -> dict[int, float]:
+        """Return the margin of the best abort of each chaser whose passive safety is enforced, renewed once a second."""
+        escapes, machine = self.machine.escapes, self.machine
+        if escapes is None:
+            return {}
+        enforced = [i for i in sorted(observation.odometry) if machine.enforces_safety(i)]
+        renew = observation.tick % self._scenario.time.rate_hz == 0
+        for i in enforced:
+            if (renew or i not in self._abort_margins) and (found := escapes.escape(i, observation.time_s)):
+                self._abort_margins[i] = found[1]
+        self._abort_margins = {i: self._abort_margins[i] for i in enforced if i in self._abort_margins}
+        return dict(self._abort_margins)
 
     def _apply_commands(
         self, commands: Sequence[OperatorCommand], observation: Observation, stack: StackState | None

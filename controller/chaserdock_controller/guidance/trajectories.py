@@ -14,6 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.relative_motion import cw_acceleration, cw_transition
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
@@ -142,7 +143,52 @@ class Glide(Struct, frozen=True, eq=False, tag=True):
         return self.from_m + distance[:, None] * along, speed[:, None] * along, acceleration[:, None] * along
 
 
-Motion = Move | Glide
+class Escape(Struct, frozen=True, eq=False, tag=True):
+    """A constant acceleration for ``burn_s`` in addition to a coast, then the coast. Relative to the target's centre, in WRF.
+
+    ``state`` (6,): position and velocity at ``start_s``; ``acceleration_m_s2`` (3,). The coast is that of Clohessy and Wiltshire,
+    in free space (``mean_motion_rad_s`` = 0) a straight line. After ``duration_s`` it counts as complete, and goes on.
+    """
+
+    start_s: float
+    state: Array
+    acceleration_m_s2: Array
+    burn_s: float
+    mean_motion_rad_s: float
+    duration_s: float
+
+    @property
+    def goal_m(self) -> Array:
+        """Return the position (3,) at the end of ``duration_s``."""
+        return self.at(np.array([self.start_s + self.duration_s]))[0][0]
+
+    def over_at(self, time_s: float) -> bool:
+        """Return whether the motion is complete."""
+        return time_s >= self.start_s + self.duration_s
+
+    def burnt_out(self) -> Array:
+        """Return the state (6,) at the end of the burn."""
+        p, v, _ = self.at(np.array([self.start_s + self.burn_s]))
+        return np.concatenate([p[0], v[0]])
+
+    def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations (K, 3) at times (K,), in WRF."""
+        t = np.maximum(np.asarray(times_s, dtype=float) - self.start_s, 0.0)
+        burning, after = np.minimum(t, self.burn_s), np.maximum(t - self.burn_s, 0.0)
+        n, burn = self.mean_motion_rad_s, self.acceleration_m_s2
+        coast = cw_transition(n, burning) @ self.state
+        states = coast.copy()
+        states[:, :3] += 0.5 * burning[:, None] ** 2 * burn
+        states[:, 3:] += burning[:, None] * burn
+        states = (cw_transition(n, after) @ states[:, :, None])[:, :, 0]
+        positions, velocities = states[:, :3], states[:, 3:]
+        during = cw_acceleration(n, coast[:, :3], coast[:, 3:]) + burn
+        burns = (t < self.burn_s)[:, None]
+        accelerations = np.where(burns, during, cw_acceleration(n, positions, velocities))
+        return positions, velocities, accelerations
+
+
+Motion = Move | Glide | Escape
 
 
 def glide(

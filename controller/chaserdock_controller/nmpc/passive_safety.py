@@ -14,24 +14,35 @@ from chaserdock_controller.interfaces import LogEntry, TargetEstimation
 
 ORBITS = 2.0
 FREE_SPACE_S = 600.0
+UNSAFE_S = 1.0
+ARMED_AFTER_S = 10.0
+
+
+def coast_duration_s(scenario: FlightScenario) -> float:
+    """Return the length of the coast that is to be safe."""
+    orbit = scenario.orbit
+    default_s = FREE_SPACE_S if orbit is None else ORBITS * orbit.elements.period_s
+    return scenario.limits.passive_safety_s or default_s
 
 
 class PassiveSafetyMonitor:
-    """Certifies the plans of a tick. ``certificates``: of each chaser's newest plan."""
+    """Certifies the plans of a tick. ``certificates``: of each chaser's newest plan. See ``guidance.escape`` for what follows."""
 
     def __init__(self, scenario: FlightScenario) -> None:
         limits, orbit = scenario.limits, scenario.orbit
         mean_motion = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
-        default_s = FREE_SPACE_S if orbit is None else ORBITS * orbit.elements.period_s
-        self.duration_s = limits.passive_safety_s or default_s
+        self.duration_s = coast_duration_s(scenario)
         self._coast = CoastModel(mean_motion, self.duration_s)
         self._keep_out_m, self._step_s = limits.min_distance_target_m, scenario.controller.dt_s
         self._sigmas = limits.estimate_margin_sigmas
         self._safe: dict[int, bool] = {}
+        self._armed: set[int] = set()
+        self._unsafe_since_ns: dict[int, int] = {}
+        self._since_ns: dict[int, int] = {}
         self.certificates: dict[int, CoastCertificate] = {}
 
     def update(
-        self, chasers: Sequence[int], states: Array, estimation: TargetEstimation
+        self, chasers: Sequence[int], states: Array, estimation: TargetEstimation, time_ns: int = 0
     ) -> tuple[LogEntry, ...]:
         """Certify the plans ``states`` (N, D+1, 13) of these chasers; return what has changed since the last tick.
 
@@ -45,18 +56,48 @@ class PassiveSafetyMonitor:
         for row, i in enumerate(chasers):
             covariance = estimation.motion_covariances.get(i)
             if covariance is None or i in estimation.latched:
-                self._safe.pop(i, None)
-                self.certificates.pop(i, None)
+                for by_chaser in (self._safe, self.certificates, self._unsafe_since_ns, self._since_ns):
+                    by_chaser.pop(i, None)
                 continue
             own = states[row]
             relative = np.concatenate([own[:, :3] - moving, own[:, 3:6] - target.velocity_m_s], axis=1)
             found = self._coast.certify(relative, covariance, self._keep_out_m)
             self.certificates[i] = found
-            safe = found.margin_sigmas >= self._sigmas
+            safe = self.is_safe(found)
+            self._follow(i, safe, time_ns)
             if self._safe.get(i) != safe:
                 self._safe[i] = safe
                 events.append(("info" if safe else "warning", self._text(i, found, safe)))
         return tuple(events)
+
+    def is_safe(self, found: CoastCertificate) -> bool:
+        """Return whether a plan with this certificate counts as passively safe."""
+        return found.margin_sigmas >= self._sigmas
+
+    def loss_s(self, found: CoastCertificate) -> float:
+        """Return the time from the beginning of a plan to the loss of thrust of its certificate."""
+        return found.loss * self._step_s
+
+    def unsafe(self, time_ns: int) -> dict[int, str]:
+        """Return why chasers have to abort at ``time_ns``: their plans are not safe for `UNSAFE_S`.
+
+        A chaser counts from its first safe plan on, or `ARMED_AFTER_S` after its first plan: until the filter knows the target's
+        rates, no plan is safe.
+        """
+        return {
+            i: self._text(i, self.certificates[i], False)
+            for i, since_ns in self._unsafe_since_ns.items()
+            if i in self._armed and time_ns - since_ns >= UNSAFE_S * 1e9
+        }
+
+    def _follow(self, i: int, safe: bool, time_ns: int) -> None:
+        first_ns = self._since_ns.setdefault(i, time_ns)
+        if safe or time_ns - first_ns >= ARMED_AFTER_S * 1e9:
+            self._armed.add(i)
+        if safe:
+            self._unsafe_since_ns.pop(i, None)
+        else:
+            self._unsafe_since_ns.setdefault(i, time_ns)
 
     def _text(self, chaser: int, found: CoastCertificate, safe: bool) -> str:
         state = "passively safe" if safe else "not passively safe"

@@ -96,8 +96,14 @@ class PlanningStage:
             plan = _without(plan, [disturbances[i] for i in horizon.chasers])
         self.monitor.update(horizon.chasers, plan, observation.time_ns, observation.effective_ns)
         if self.passive_safety is not None and plan is not None:
-            events += self.passive_safety.update(horizon.chasers, plan.states, estimation)
+            events += self.passive_safety.update(
+                horizon.chasers, plan.states, estimation, observation.time_ns
+            )
         return PlanResult(horizon.chasers, plan, wall_s, events, self.monitor.plans(observation.time_ns))
+
+    def unsafe(self, time_ns: int) -> Mapping[int, str]:
+        """Return why chasers have to abort at ``time_ns`` for lack of passive safety; whether they do is guidance's matter."""
+        return {} if self.passive_safety is None else self.passive_safety.unsafe(time_ns)
 
     def problem(
         self, horizon: HorizonReference, states: Mapping[int, Array], input_limits: Mapping[int, Array]

@@ -8,6 +8,7 @@ from chaserdock_protocol.messages import (
     Event,
     Level,
     MassEstimate,
+    PassiveSafety,
     Plan,
     Reference,
     RelativeEstimate,
@@ -21,11 +22,13 @@ from chaserdock_protocol.messages import (
 from chaserdock_controller.estimation.identification.composite import MassProperties
 from chaserdock_controller.interfaces import (
     Directive,
+    GuidanceResult,
     IdentifiedStack,
     Observation,
     PlanResult,
     TargetEstimation,
 )
+from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan
 
 
@@ -134,6 +137,25 @@ def solver_message(observation: Observation, solver: str, result: PlanResult) ->
         cost=vector(plan.cost[:n]),
         max_violation_m=vector(plan.max_violation_m[:n]),
         wall_solve_s=result.wall_s,
+    )
+
+
+def safety_message(
+    chaser: int, observation: Observation, monitor: PassiveSafetyMonitor, guidance: GuidanceResult
+) -> PassiveSafety:
+    """Return the certificate of a chaser's newest plan, which must have one."""
+    found = monitor.certificates[chaser]
+    return PassiveSafety(
+        tick=observation.tick,
+        sim_time_ns=observation.time_ns,
+        chaser=chaser,
+        margin_sigmas=found.margin_sigmas,
+        distance_m=found.distance_m,
+        time_s=found.time_s,
+        loss_s=monitor.loss_s(found),
+        safe=monitor.is_safe(found),
+        enforced=chaser in guidance.abort_margins,
+        abort_margin_sigmas=guidance.abort_margins.get(chaser),
     )
 
 

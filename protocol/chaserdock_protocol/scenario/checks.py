@@ -37,6 +37,8 @@ def check_flight(scenario: FlightScenario) -> None:
     if scenario.docking.kind == "capture":
         _check_capture(scenario)
     _check_detumble(scenario)
+    if scenario.plume is not None and scenario.chaser.actuation != "thrusters":
+        raise ValueError('plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"')
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
         raise ValueError(
             'limits.passive_safety: needs the covariance of estimator.name = "joint", '

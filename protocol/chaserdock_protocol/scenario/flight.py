@@ -24,6 +24,7 @@ from .fields import Name, Section
 from .migrations import FORMAT
 from .navigation import NavigationSection
 from .orbit import Orbit
+from .plume import PlumeSection
 from .schema import (
     MAX_DURATION_S,
     Approach,
@@ -53,6 +54,7 @@ class FlightScenario(Section):
     )
     time: Time = Time()
     orbit: Orbit | None = None
+    plume: PlumeSection | None = None
     target: FlightTarget = FlightTarget()
     chaser: Body = Body()
     camera: FlightCamera = FlightCamera()

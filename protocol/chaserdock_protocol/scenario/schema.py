@@ -164,10 +164,17 @@ class Limits(Section):
     max_reference_distance_m: Positive = Field(
         default=25.0, description="Largest distance of a reference position from the target, m."
     )
-    passive_safety: Literal["off", "monitor"] = Field(
+    passive_safety: Literal["off", "monitor", "enforce"] = Field(
         default="off",
         description="`monitor`: at every tick, whether the coast after a loss of all thrust at any moment of the plan stays "
-        "outside `min_distance_target_m`; changes are logged. Needs the estimator `joint`.",
+        "outside `min_distance_target_m`; the certificate is published and changes are logged. `enforce`: outside the final corridor, "
+        "moves are as slow as this needs, moves that cannot be safe are refused, and a chaser whose plans are not safe aborts onto a "
+        "safe coast. Needs the estimator `joint`.",
+    )
+    final_corridor_m: NotNegative = Field(
+        default=0.0,
+        description='Distance from the target within which `passive_safety = "enforce"` does not apply, m. It never applies in the '
+        "corridor of a port.",
     )
     passive_safety_s: Annotated[float, Field(gt=0, le=100_000, allow_inf_nan=False)] | None = Field(
         default=None, description="Length of that coast, s. Without it: two orbits, in free space 600 s."

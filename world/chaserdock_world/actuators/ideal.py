@@ -56,6 +56,10 @@ class Actuators(Protocol):
         """
         ...
 
+    def thrusts(self, step: int) -> Array:
+        """Return the thrust (n,), N, of every thruster from ``step`` on, as long as the wrench does not change."""
+        ...
+
     def stop(self, step: int) -> None:
         """Stop the actuators at ``step``: the chaser is lost."""
         ...
@@ -109,6 +113,10 @@ class IdealActuators:
         self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * steps * step_s
         return self.wrench
 
+    def thrusts(self, step: int) -> Array:
+        """See ``Actuators.thrusts``: there are no thrusters."""
+        return np.zeros(0)
+
     def stop(self, step: int) -> None:
         """See ``Actuators.stop``."""
         self._queue.clear()
@@ -140,5 +148,11 @@ def fly_to(
         changes = (physics.next_change(step), *(a.next_change(step) for a in actuators.values()))
         until = min((c for c in changes if c is not None), default=end_step)
         steps = min(until, end_step) - step
-        touched |= physics.advance(steps, {name: a.act(step, steps, step_s) for name, a in actuators.items()})
+        wrenches = {name: a.act(step, steps, step_s) for name, a in actuators.items()}
+        if physics.plumes is not None:
+            states = {name: physics.state(name) for name in physics.bodies}
+            thrusts = {name: a.thrusts(step) for name, a in actuators.items()}
+            for name, load in physics.plumes.act(states, thrusts, steps * step_s).items():
+                wrenches[name] = wrenches[name] + load if name in wrenches else load
+        touched |= physics.advance(steps, wrenches)
     return touched

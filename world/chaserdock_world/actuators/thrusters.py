@@ -46,6 +46,7 @@ class ThrusterActuators:
         for failure in failures:
             self._valves.fail(failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor)
         self._wrenches: Array = np.zeros((0, 6))
+        self._thrusts: Array = np.zeros((0, len(thrusters)))
         self._wrenches_from = 0
         self._impulse = np.zeros(6)
         self._absolute_N_s = 0.0
@@ -91,7 +92,8 @@ class ThrusterActuators:
             )
             impulses = self._valves.impulses(edges_ns) / np.diff(edges_ns)[:, None] * 1e9
             # Rounded so that equal wrenches compare equal regardless of the last bits.
-            self._wrenches, self._wrenches_from, row = np.round(impulses, 12) @ self._matrix.T, step, 0
+            self._thrusts = np.round(impulses, 12)
+            self._wrenches, self._wrenches_from, row = self._thrusts @ self._matrix.T, step, 0
         return self._wrenches[row:]
 
     def next_change(self, step: int) -> int | None:
@@ -106,6 +108,11 @@ class ThrusterActuators:
         self._impulse = self._impulse + wrench * (steps * step_s)
         self._absolute_N_s += float(np.abs(wrench[:3]).sum()) * steps * step_s
         return wrench
+
+    def thrusts(self, step: int) -> Array:
+        """See ``Actuators.thrusts``."""
+        self._wrenches_after(step)
+        return self._thrusts[step - self._wrenches_from]
 
     def stop(self, step: int) -> None:
         """See ``Actuators.stop``. Valves that are stuck stay open."""

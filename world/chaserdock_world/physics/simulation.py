@@ -33,6 +33,7 @@ from .compliant_latch import ENGAGED_M, CompliantLatch, Grip
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch, latch_faults
 from .orbital_forces import OrbitalForces
+from .plume_loads import PlumeLoads
 from .port_loads import PortLoadRecorder, port_attitude
 
 TARGET = "target"
@@ -69,6 +70,7 @@ class Physics:
         if scenario.orbit is not None:
             step_s, per_tick = 1.0 / scenario.time.physics_hz, scenario.timing.steps_per_tick
             self._orbital = OrbitalForces(TargetOrbit(scenario.orbit), step_s, per_tick)
+        self.plumes = None if scenario.plume is None else PlumeLoads(scenario, scenario.plume)
         self._noise = {
             name: _disturbance_noise(scenario, i) for name, i in chasers.items() if _has_noise(scenario)
         }

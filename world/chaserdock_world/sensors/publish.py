@@ -15,6 +15,7 @@ from chaserdock_protocol.messages import (
     DrawnBody,
     DrawnTruth,
     Odometry,
+    PlumeLoad,
     PortLoad,
     WorldTruth,
 )
@@ -116,6 +117,23 @@ def publish_port_loads(node: Node, physics: Physics, tick: int, timing: Timing) 
         chaser = physics.latches[name].chaser
         message = port_load(recorder.take(), chaser, tick, timing.tick_time_ns(tick))
         node.publish(topics.TRUTH_LOAD, message, chaser)
+
+
+def publish_plume_loads(node: Node, physics: Physics, tick: int, timing: Timing) -> None:
+    """Publish what plumes gave every body since the last tick, which this takes."""
+    if physics.plumes is None:
+        return
+    for name in physics.plumes.bodies:
+        taken = physics.plumes.take(name)
+        message = PlumeLoad(
+            tick=tick,
+            sim_time_ns=timing.tick_time_ns(tick),
+            body=name,
+            impulse_N_s=vector(taken.impulse[:3]),
+            angular_impulse_N_m_s=vector(taken.impulse[3:]),
+            peak_force_N=taken.peak_force_N,
+        )
+        node.publish(topics.TRUTH_PLUME, message, name)
 
 
 def port_load(loads: IntervalLoads, chaser: int, tick: int, time_ns: int) -> PortLoad:

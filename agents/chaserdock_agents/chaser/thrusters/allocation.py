@@ -46,8 +46,10 @@ class Allocator:
         self._scale = scale
         self._cost = self._full_N / self._full_N.max()
 
-    def allocate(self, wrench: Array, thrusts_max_N: Array) -> Allocation:
+    def allocate(self, wrench: Array, thrusts_max_N: Array, cost_factors: Array | None = None) -> Allocation:
         """Return thrusts for a wrench (6,), N and N m, body axes, within limits (n,) N, which may be zero.
+
+        ``cost_factors`` (n,): how much more the thrust of each costs than otherwise.
 
         Raises ValueError for numbers that are not finite, RuntimeError if the solver fails.
         """
@@ -60,7 +62,8 @@ class Allocator:
         if not able.any():
             return Allocation(thrusts, not target.any())
         rows, most = np.ascontiguousarray(self._rows[:, able]), limits[able]
-        x, flag = _cheapest(rows, self._cost[able], target, most)
+        cost = self._cost if cost_factors is None else self._cost * cost_factors
+        x, flag = _cheapest(rows, cost[able], target, most)
         exact = flag == _SOLVED
         if not exact:
             x, flag = _closest(rows, target, most)

@@ -13,6 +13,7 @@ from chaserdock_protocol.messages import (
     ActuatorCommand,
     Level,
     Odometry,
+    TargetEstimate,
     ThrusterReport,
     ThrusterState,
     WrenchCommand,
@@ -32,6 +33,7 @@ from .impulse_residual import (
     quiescent_variance,
 )
 from .modulation import Modulator
+from .plume_avoidance import PlumeAvoidance
 from .self_test import ThrusterSelfTest
 
 _MIN_SCALE = 0.02
@@ -77,6 +79,8 @@ class ThrusterController:
             body.thruster_test_s if testable else 0.0,
             SUFFICIENT_INFORMATION,
         )
+        self._avoidance = None if scenario.plume is None else PlumeAvoidance(scenario, scenario.plume)
+        self._cost_factors: Array | None = None
         self._test_allowed = False
         self._failed: dict[int, ThrusterFault] = {}
         self._commanded_isolated: frozenset[int] = frozenset()
@@ -231,10 +235,16 @@ class ThrusterController:
         self._valves.set_shut(isolated, begin_ns)
         return msgspec.structs.replace(command, pulses=tuple(pulses), isolated=isolated)
 
+    def avoid_plumes(self, target: TargetEstimate | None) -> None:
+        """Make the thrusters whose plume hits the target dear from now on; ``target``: an estimate of it, None if unknown."""
+        self._cost_factors = None
+        if self._avoidance is not None and target is not None and target.status != "none":
+            self._cost_factors = self._avoidance.cost_factors(self._odometry, target)
+
     def _allocate(self, command: ActuatorCommand, available_N: Array) -> Array:
         wrench = np.array([*command.force_N, *command.torque_N_m])
         try:
-            return self._allocator.allocate(wrench, available_N).thrusts_N
+            return self._allocator.allocate(wrench, available_N, self._cost_factors).thrusts_N
         except RuntimeError as error:  # the next command may be solvable
             self.events.append(("error", "thruster allocation failed", str(error)))
             return np.zeros(len(available_N))

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passive safety enforced: moves whose coasts stay clear of the target, and aborts onto a safe coast.
+
+An abort is a burn of a few seconds in one of several directions, and then the coast. All coasts are those after a loss of all
+thrust (chaserdock_models/passive_safety.py); a collision avoidance manoeuvre of this kind: Fehse, Automated Rendezvous and Docking
+of Spacecraft, section 4.5.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import CoastModel
+from chaserdock_protocol.scenario import FlightScenario
+
+from chaserdock_controller.estimation.types import TargetState
+from chaserdock_controller.nmpc.passive_safety import coast_duration_s
+
+from .trajectories import Escape, Motion
+
+_COARSE_STEP_S = 60.0
+"""Step of the coasts in an orbit, by which moves and aborts are selected. The monitor's is shorter."""
+_SPEED_SHARES = 0.7 ** np.arange(14)
+_MOVE_SAMPLES, _TURN_SAMPLES = 33, 12
+_LONGEST_TURN_S = 600.0
+_DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])
+_DIRECTIONS /= np.linalg.norm(_DIRECTIONS, axis=1)[:, None]
+_IMPULSE_SHARES = (0.5, 1.0, 2.0, 4.0)
+"""Changes of velocity of an abort, as shares of the speed of an abort by a move."""
+_FORCE_SHARE = 0.4
+"""Share of the largest force per axis with which an abort burns; the rest is left to attitude and feedback."""
+_BURN_ERROR = 0.03
+"""Standard deviation of a burn's change of velocity, as a share of it."""
+_SPARE = 1.5
+"""An abort with this multiple of the required margin is as good as any with more, and the smallest such burn is taken."""
+
+
+@dataclass(frozen=True)
+class RelativeState:
+    """Estimated state (6,) of a chaser relative to the target, WRF, with covariance (6, 6), at one moment."""
+
+    state: Array
+    covariance: Array
+    target: TargetState
+
+
+class EscapePlanner:
+    """Selects moves and aborts by their coasts. ``relative``: newest states, by chaser."""
+
+    def __init__(self, scenario: FlightScenario, abort_speed_m_s: float) -> None:
+        orbit, limits, body = scenario.orbit, scenario.limits, scenario.chaser
+        self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
+        self.duration_s = coast_duration_s(scenario)
+        step_s = self.duration_s if orbit is None else _COARSE_STEP_S
+        self._coast = CoastModel(self._mean_motion_rad_s, self.duration_s, step_s)
+        self._keep_out_m, self._final_m = limits.min_distance_target_m, limits.final_corridor_m
+        self.sigmas = limits.estimate_margin_sigmas
+        self._acceleration_m_s2 = _FORCE_SHARE * float(body.wrench_max[:3].min()) / body.mass_kg
+        self._speed_m_s = abort_speed_m_s
+        self.relative: dict[int, RelativeState] = {}
+
+    def is_final(self, offset_m: Array) -> bool:
+        """Return whether a chaser at an offset (3,) is in the final corridor by its distance."""
+        return float(np.linalg.norm(offset_m)) <= self._final_m
+
+    # -- moves -----------------------------------------------------------------------------------------------
+
+    def limited(
+        self, i: int, move: Callable[[float], Motion], speed_m_s: float, now_s: float
+    ) -> Motion | None:
+        """Return the fastest of the moves at shares of ``speed_m_s`` whose coasts are safe, or None if none is.
+
+        ``move``: maps a speed to the move, which must be in TRF. Without a state of the chaser the first is returned.
+        """
+        known = self.relative.get(i)
+        for share in _SPEED_SHARES:
+            found = move(speed_m_s * float(share))
+            if known is None or self.move_margin(known, found, now_s) >= self.sigmas:
+                return found
+        return None
+
+    def move_margin(self, known: RelativeState, move: Motion, now_s: float) -> float:
+        """Return the smallest margin of the coasts from a move outside the final corridor; infinity if there is none."""
+        omega = np.asarray(known.target.omega_rad_s)
+        rate = float(np.linalg.norm(omega))
+        turn_s = min(2.0 * math.pi / rate, _LONGEST_TURN_S) if rate > 0.0 else 0.0
+        end_s = move.start_s + move.duration_s
+        times_s = np.concatenate(
+            [np.linspace(now_s, end_s, _MOVE_SAMPLES), end_s + np.linspace(0.0, turn_s, _TURN_SAMPLES)]
+        )
+        offsets, velocities, _ = move.at(times_s)
+        outside = np.linalg.norm(offsets, axis=1) > self._final_m
+        if not outside.any():
+            return math.inf
+        offsets, velocities, times_s = offsets[outside], velocities[outside], times_s[outside]
+        turned = rotations.multiply(known.target.q_wxyz, rotations.exp((times_s - now_s)[:, None] * omega))
+        moving = velocities + np.cross(omega, offsets)
+        states = np.concatenate([rotations.rotate(turned, offsets), rotations.rotate(turned, moving)], axis=1)
+        return self._margin(states, known.covariance)
+
+    # -- aborts ----------------------------------------------------------------------------------------------
+
+    def escape(self, i: int, now_s: float) -> tuple[Escape, float] | None:
+        """Return the abort of a chaser from its newest state, and the margin of its coast; None without a state.
+
+        The smallest burn whose coast has spare margin, otherwise the one with the largest margin.
+        """
+        known = self.relative.get(i)
+        if known is None:
+            return None
+        best: tuple[Escape, float] | None = None
+        for share in _IMPULSE_SHARES:
+            found = self._best_of(known, share * self._speed_m_s, now_s)
+            if best is None or found[1] > best[1]:
+                best = found
+            if best[1] >= _SPARE * self.sigmas:
+                break
+        return best
+
+    def _best_of(self, known: RelativeState, impulse_m_s: float, now_s: float) -> tuple[Escape, float]:
+        """Return the abort with a change of velocity that has the largest margin, over all directions."""
+        burn_s = impulse_m_s / self._acceleration_m_s2
+        escapes = [
+            Escape(
+                now_s,
+                known.state,
+                self._acceleration_m_s2 * direction,
+                burn_s,
+                self._mean_motion_rad_s,
+                self.duration_s,
+            )
+            for direction in _DIRECTIONS
+        ]
+        covariance = known.covariance.copy()
+        covariance[range(3, 6), range(3, 6)] += (_BURN_ERROR * impulse_m_s) ** 2
+        ends = np.array([e.burnt_out() for e in escapes])
+        margins = self._coast.closest(ends, covariance, self._keep_out_m).margin_sigmas
+        times_s = now_s + np.linspace(0.0, burn_s, 9)
+        nearest_m = np.array([np.linalg.norm(e.at(times_s)[0], axis=1).min() for e in escapes])
+        # A burn through the keep-out is worse than any coast that is not.
+        margins = np.where(nearest_m < self._keep_out_m, np.minimum(margins, -1.0), margins)
+        best = int(np.argmax(margins))
+        return escapes[best], float(margins[best])
+
+    def _margin(self, states: Array, covariance: Array) -> float:
+        return float(self._coast.closest(states, covariance, self._keep_out_m).margin_sigmas.min())

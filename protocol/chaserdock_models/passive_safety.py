@@ -72,7 +72,8 @@ class CoastModel:
 
     def closest(self, states: Array, covariance: Array, keep_out_m: float) -> ClosestApproaches:
         """Return the approach with the smallest margin of the coast from each of the states (M, 6); arguments as in ``certify``."""
-        coasts = np.einsum("kij,mj->mki", self._transitions, states)
+        # One product of matrices: (K 6, 6) by (6, M).
+        coasts = (self._transitions.reshape(-1, 6) @ states.T).T.reshape(len(states), -1, 6)
         here, step = coasts[:, :-1, :3], np.diff(coasts[:, :, :3], axis=1)
         length2 = np.maximum(np.einsum("mki,mki->mk", step, step), 1e-30)
         share = np.clip(-np.einsum("mki,mki->mk", here, step) / length2, 0.0, 1.0)
@@ -83,9 +84,17 @@ class CoastModel:
         rows = self._transitions[:, :3]
         spread = rows @ covariance @ rows.transpose(0, 2, 1)
         line = nearest / np.maximum(chord, 1e-9)[..., None]
-        ends = (np.einsum("mki,kij,mkj->mk", line, part, line) for part in (spread[:-1], spread[1:]))
-        sigma = np.sqrt(np.maximum(np.maximum(*ends), 1e-18))
+        variance = np.maximum(_variance_along(line, spread[:-1]), _variance_along(line, spread[1:]))
+        sigma = np.sqrt(np.maximum(variance, 1e-18))
         margins = (away - keep_out_m) / sigma
         every, k = np.arange(len(states)), np.argmin(margins, axis=1)
         times_s = self._times_s[k] + share[every, k] * self._step_s
         return ClosestApproaches(margins[every, k], away[every, k], times_s)
+
+
+def _variance_along(line: Array, covariance: Array) -> Array:
+    """Return the variances (M, K) along unit vectors (M, K, 3) of covariances (K, 3, 3)."""
+    x, y, z = line[..., 0], line[..., 1], line[..., 2]
+    a, b, c = covariance[:, 0], covariance[:, 1], covariance[:, 2]
+    squares = a[:, 0] * x * x + b[:, 1] * y * y + c[:, 2] * z * z
+    return squares + 2.0 * (a[:, 1] * x * y + a[:, 2] * x * z + b[:, 2] * y * z)

@@ -47,7 +47,8 @@ def test_changes_are_logged_once_with_margin_and_time() -> None:
     assert [level for level, _ in first] == ["info"]
     assert "chaser 0: passively safe: without thrust it comes to 5.00 m" in first[0][1]
     assert monitor.update((0,), plan(0.0), estimation()) == ()
-    ((level, text),) = monitor.update((0,), plan(0.05), estimation())
+    assert monitor.update((0,), plan(0.05), estimation(), 100_000_000) == ()  # not yet: it may be noise
+    ((level, text),) = monitor.update((0,), plan(0.05), estimation(), 1_100_000_000)
     assert level == "warning"
     assert "not passively safe" in text
     assert "0.00 m of the target after 100 s" in text
@@ -64,3 +65,28 @@ def test_coast_lasts_two_orbits_or_as_long_as_stated() -> None:
 def test_monitor_needs_the_joint_estimator() -> None:
     with pytest.raises(ScenarioError, match=r"limits.passive_safety: needs the covariance of estimator.name"):
         mission({"passive_safety": "monitor"}, estimator={"name": "mekf"})
+
+
+def test_chaser_counts_once_it_was_safe_for_a_while_and_then_has_to_abort_when_it_is_not_for_a_second() -> (
+    None
+):
+    monitor = PassiveSafetyMonitor(mission({"passive_safety": "enforce"}))
+    second = 1_000_000_000
+    for k in range(3):  # not yet converged
+        monitor.update((0,), plan(0.05), estimation(), k * second)
+        assert monitor.unsafe(k * second) == {}
+    for k in range(3, 14):
+        monitor.update((0,), plan(0.0), estimation(), k * second)
+    monitor.update((0,), plan(0.05), estimation(), 14 * second)
+    assert monitor.unsafe(14 * second) == {}
+    monitor.update((0,), plan(0.05), estimation(), 15 * second)
+    assert "not passively safe" in monitor.unsafe(15 * second)[0]
+    monitor.update((0,), plan(0.0), estimation(), 16 * second)
+    assert monitor.unsafe(16 * second) == {}
+
+
+def test_chaser_that_never_was_safe_has_to_abort_after_a_minute() -> None:
+    monitor = PassiveSafetyMonitor(mission({"passive_safety": "enforce"}))
+    for time_s in (0, 30, 59, 61):
+        monitor.update((0,), plan(0.05), estimation(), time_s * 1_000_000_000)
+        assert bool(monitor.unsafe(time_s * 1_000_000_000)) == (time_s > 60)

@@ -10,6 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.checks import angle_deg
 from numpy.typing import ArrayLike
 
 from .approach_cone import BESIDE_LINE_M
@@ -58,6 +59,17 @@ def why_not_offset(scenario: FlightScenario, offset_m: ArrayLike) -> str:
     if not nearest < distance <= scenario.limits.max_reference_distance_m:
         return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
     return ""
+
+
+def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
+    """Check that an offset (3,), TRF, is in a chaser's approach cone."""
+    cone_deg = scenario.approach.cone_deg
+    if cone_deg is None:
+        return ""
+    off_deg = angle_deg(scenario.chasers[chaser].position_m, np.asarray(offset_m))
+    if off_deg <= cone_deg:
+        return ""
+    return f"the offset is {off_deg:.3g} degrees off the approach axis; the approach cone has {cone_deg:g} degrees"
 
 
 def why_not_goto(scenario: FlightScenario, offset_m: ArrayLike | None, ends_m: Mapping[int, Array]) -> str:

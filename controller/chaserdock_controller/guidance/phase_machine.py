@@ -169,11 +169,31 @@ class PhaseMachine:
 
     def _move(self, i: int, goal_m: Array, now_s: float, speed_m_s: float) -> Motion:
         """Return the move to a goal (3,), TRF, at most at a speed; if passive safety is enforced, as slow as it needs."""
-        found = self._safe_move(i, goal_m, now_s, speed_m_s)
-        return found or move_to(self._in_trf(i, now_s), goal_m, now_s, speed_m_s)
+        return self._safe_move(i, goal_m, now_s, speed_m_s) or move_to(
+            self._in_trf(i, now_s), goal_m, now_s, speed_m_s
+        )
+
+    def _closing_speed(self, start: Motion, goal_m: Array, now_s: float, speed_m_s: float) -> float:
+        """Return the largest speed of a move that keeps the speed limit by range all along its way, at least ``speed_m_s``."""
+        slope = self._scenario.approach.closing_per_s
+        if not slope:
+            return speed_m_s
+        farthest = max(
+            float(np.linalg.norm(goal_m)), float(np.linalg.norm(start.at(np.array([now_s]))[0][0]))
+        )
+        speed = speed_m_s + slope * farthest
+        while speed > speed_m_s:
+            move = move_to(start, goal_m, now_s, speed)
+            positions, velocities, _ = move.at(np.linspace(now_s, now_s + move.duration_s, 65))
+            limits = speed_m_s + slope * np.linalg.norm(positions, axis=1)
+            if np.all(np.linalg.norm(velocities, axis=1) <= limits):
+                return speed
+            speed *= 0.97
+        return speed_m_s
 
     def _safe_move(self, i: int, goal_m: Array, now_s: float, speed_m_s: float) -> Motion | None:
         start = self._in_trf(i, now_s)
+        speed_m_s = self._closing_speed(start, goal_m, now_s, speed_m_s)
         if self.escapes is None:
             return move_to(start, goal_m, now_s, speed_m_s)
         return self.escapes.limited(i, lambda speed: move_to(start, goal_m, now_s, speed), speed_m_s, now_s)
@@ -309,6 +329,7 @@ class PhaseMachine:
                 if j != i
             }
             reason = validation.why_not_goto(self._scenario, command.offset_m, goals)
+            reason = reason or validation.why_not_in_cone(self._scenario, i, np.asarray(command.offset_m))
             return reason or self._why_not_safe(i, np.asarray(command.offset_m), now_s)
         return ""
 

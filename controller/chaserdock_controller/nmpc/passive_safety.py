@@ -14,8 +14,10 @@ from chaserdock_controller.interfaces import LogEntry, TargetEstimation
 
 ORBITS = 2.0
 FREE_SPACE_S = 600.0
-UNSAFE_S = 1.0
-ARMED_AFTER_S = 10.0
+PERSISTENT_S = 1.0
+"""Time for which plans must be safe, or not, to count as such in the log and for an abort."""
+CONVERGED_S, ARMED_AFTER_S = 10.0, 60.0
+"""A chaser whose plans were safe for the first, or known for the second of these times counts: the filter has converged."""
 
 
 def coast_duration_s(scenario: FlightScenario) -> float:
@@ -37,8 +39,8 @@ class PassiveSafetyMonitor:
         self._sigmas = limits.estimate_margin_sigmas
         self._safe: dict[int, bool] = {}
         self._armed: set[int] = set()
-        self._unsafe_since_ns: dict[int, int] = {}
-        self._since_ns: dict[int, int] = {}
+        self._first_ns: dict[int, int] = {}
+        self._since: dict[int, tuple[bool, int]] = {}
         self.certificates: dict[int, CoastCertificate] = {}
 
     def update(
@@ -56,7 +58,7 @@ class PassiveSafetyMonitor:
         for row, i in enumerate(chasers):
             covariance = estimation.motion_covariances.get(i)
             if covariance is None or i in estimation.latched:
-                for by_chaser in (self._safe, self.certificates, self._unsafe_since_ns, self._since_ns):
+                for by_chaser in (self._safe, self.certificates, self._first_ns, self._since):
                     by_chaser.pop(i, None)
                 continue
             own = states[row]
@@ -65,7 +67,7 @@ class PassiveSafetyMonitor:
             self.certificates[i] = found
             safe = self.is_safe(found)
             self._follow(i, safe, time_ns)
-            if self._safe.get(i) != safe:
+            if self._safe.get(i) != safe and (i not in self._safe or self._persists(i, time_ns)):
                 self._safe[i] = safe
                 events.append(("info" if safe else "warning", self._text(i, found, safe)))
         return tuple(events)
@@ -79,25 +81,26 @@ class PassiveSafetyMonitor:
         return found.loss * self._step_s
 
     def unsafe(self, time_ns: int) -> dict[int, str]:
-        """Return why chasers have to abort at ``time_ns``: their plans are not safe for `UNSAFE_S`.
+        """Return why chasers have to abort at ``time_ns``: their plans are not safe for `PERSISTENT_S`.
 
-        A chaser counts from its first safe plan on, or `ARMED_AFTER_S` after its first plan: until the filter knows the target's
-        rates, no plan is safe.
+        A chaser counts once its plans were safe for `CONVERGED_S`, or `ARMED_AFTER_S` after its first plan: until the filter has
+        converged, plans are safe at times only.
         """
         return {
             i: self._text(i, self.certificates[i], False)
-            for i, since_ns in self._unsafe_since_ns.items()
-            if i in self._armed and time_ns - since_ns >= UNSAFE_S * 1e9
+            for i, (safe, _) in self._since.items()
+            if i in self._armed and not safe and self._persists(i, time_ns)
         }
 
+    def _persists(self, i: int, time_ns: int, duration_s: float = PERSISTENT_S) -> bool:
+        return time_ns - self._since[i][1] >= duration_s * 1e9
+
     def _follow(self, i: int, safe: bool, time_ns: int) -> None:
-        first_ns = self._since_ns.setdefault(i, time_ns)
-        if safe or time_ns - first_ns >= ARMED_AFTER_S * 1e9:
+        first_ns = self._first_ns.setdefault(i, time_ns)
+        if self._since.get(i, (not safe, 0))[0] != safe:
+            self._since[i] = safe, time_ns
+        if (safe and self._persists(i, time_ns, CONVERGED_S)) or time_ns - first_ns >= ARMED_AFTER_S * 1e9:
             self._armed.add(i)
-        if safe:
-            self._unsafe_since_ns.pop(i, None)
-        else:
-            self._unsafe_since_ns.setdefault(i, time_ns)
 
     def _text(self, chaser: int, found: CoastCertificate, safe: bool) -> str:
         state = "passively safe" if safe else "not passively safe"

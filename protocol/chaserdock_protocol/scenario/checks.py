@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -37,6 +37,10 @@ def check_flight(scenario: FlightScenario) -> None:
     if scenario.docking.kind == "capture":
         _check_capture(scenario)
     _check_detumble(scenario)
+    _check_hold_points(scenario)
+    _check_approach_cone(scenario)
+    if scenario.ranging is not None and scenario.perception.name != "statistical":
+        raise ValueError(f'ranging: needs perception.name = "statistical", not {scenario.perception.name!r}')
     if scenario.plume is not None and scenario.chaser.actuation != "thrusters":
         raise ValueError('plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"')
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
@@ -110,6 +114,65 @@ def _check_references(scenario: FlightScenario) -> None:
                     f"the positions of chasers.{j} and chasers.{i} are {distance:.3g} m apart, nearer than "
                     f"limits.min_distance_chasers_m ({limits.min_distance_chasers_m:g} m) allows"
                 )
+
+
+def _check_hold_points(scenario: FlightScenario) -> None:
+    limits = scenario.limits
+    for k, entry in enumerate(scenario.timeline):
+        if entry.offset_m is None:
+            continue
+        distance_m = math.hypot(*entry.offset_m)
+        if distance_m <= limits.min_distance_target_m:
+            raise ValueError(
+                f"timeline.{k}.offset_m: {distance_m:.3g} m from the target, inside the keep-out of "
+                f"limits.min_distance_target_m ({limits.min_distance_target_m:g} m)"
+            )
+        if distance_m > limits.max_reference_distance_m:
+            raise ValueError(
+                f"timeline.{k}.offset_m: {distance_m:.3g} m from the target, farther than limits.max_reference_distance_m "
+                f"({limits.max_reference_distance_m:g} m) allows"
+            )
+        for i in entry.chasers:
+            _check_in_cone(scenario, f"timeline.{k}.offset_m", i, entry.offset_m)
+
+
+def _check_in_cone(scenario: FlightScenario, path: str, chaser: int, offset_m: tuple[float, ...]) -> None:
+    cone_deg = scenario.approach.cone_deg
+    if cone_deg is None or chaser >= len(scenario.chasers):
+        return
+    off_deg = angle_deg(scenario.chasers[chaser].position_m, offset_m)
+    if off_deg > cone_deg:
+        raise ValueError(
+            f"{path}: {off_deg:.3g} degrees off the approach axis of chaser {chaser}, outside approach.cone_deg ({cone_deg:g} degrees)"
+        )
+
+
+def angle_deg(a: Sequence[float] | Array, b: Sequence[float] | Array) -> float:
+    """Return the angle between two vectors (3,), degrees."""
+    one, two = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    cosine = float(one @ two) / (float(np.linalg.norm(one)) * float(np.linalg.norm(two)))
+    return math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
+
+
+def _check_approach_cone(scenario: FlightScenario) -> None:
+    """Check that a chaser in its reference attitude sees the target from everywhere in its approach cone."""
+    cone_deg, camera = scenario.approach.cone_deg, scenario.camera_model()
+    if cone_deg is None or scenario.approach.face_target:
+        return
+    half_deg = math.degrees(
+        min(
+            math.atan(min(camera.cx_px, camera.width_px - 1.0 - camera.cx_px) / camera.fx_px),
+            math.atan(min(camera.cy_px, camera.height_px - 1.0 - camera.cy_px) / camera.fy_px),
+        )
+    )
+    for i, c in enumerate(scenario.chasers):
+        forward = rotations.rotate(c.q_wxyz, np.array([1.0, 0.0, 0.0]))
+        off_deg = cone_deg + angle_deg(-np.asarray(c.position_m), forward)
+        if off_deg > half_deg:
+            raise ValueError(
+                f"approach.cone_deg: from the edge of the cone the target is {off_deg:.3g} degrees off the view of chaser {i}, whose "
+                f"camera sees {half_deg:.3g} degrees to the nearest edge; make the cone narrower, or set approach.face_target"
+            )
 
 
 def _check_mesh(scenario: Scenario) -> None:

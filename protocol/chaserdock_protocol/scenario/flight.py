@@ -25,6 +25,7 @@ from .migrations import FORMAT
 from .navigation import NavigationSection
 from .orbit import Orbit
 from .plume import PlumeSection
+from .ranging import Ranging
 from .schema import (
     MAX_DURATION_S,
     Approach,
@@ -59,6 +60,7 @@ class FlightScenario(Section):
     chaser: Body = Body()
     camera: FlightCamera = FlightCamera()
     navigation: NavigationSection = NavigationSection()
+    ranging: Ranging | None = None
     perception: PerceptionSection = PerceptionSection()
     estimator: EstimatorSection = EstimatorSection()
     controller: Controller = Controller()

@@ -189,6 +189,16 @@ class Approach(Section):
         default=0.03,
         description="Speed of the reference relative to the target, m/s. `goto` flies at twice this speed.",
     )
+    closing_per_s: NotNegative = Field(
+        default=0.0,
+        description="Increase of the speed limit of `goto` with the distance from the target, 1/s: `goto` flies at most at "
+        "2 `max_speed_m_s` + `closing_per_s` x distance, all along its way.",
+    )
+    cone_deg: Annotated[float, Field(gt=0, lt=90, allow_inf_nan=False)] | None = Field(
+        default=None,
+        description="Half angle of the approach cone about the direction of a chaser's reference position, apex at the target's "
+        "centre, degrees: a `goto` out of it is refused. The camera must see the target from its edge. Without it: no cone.",
+    )
     docked_position_m: Positive = Field(
         default=0.01, description="Largest position error of a docked chaser, m."
     )

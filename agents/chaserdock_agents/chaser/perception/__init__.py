@@ -33,7 +33,7 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
         case "default" | "paper" | "paper_iterative" as method:
             return Perception(camera, target, method)
         case "statistical":
-            return StatisticalPerception(camera, target)
+            return StatisticalPerception(camera, target, scenario.ranging)
         case "model":
             return ModelPerception(camera, tracker_mesh(scenario.target))
         case name:

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Scenario section ``[ranging]``: what is measured of the target where the camera cannot measure its pose."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from .fields import Fraction, NotNegative, Positive, Section
+
+
+class Ranging(Section):
+    """Measurements at far range, of a target too small in the image for its markers: its bearing, from the image, its range, from a
+    range sensor, and its attitude, as a cooperative target sends it. The errors are white. Only with `perception.name =
+    "statistical"`; where markers are detected, they alone are used ([estimation.md](estimation.md#far-range)). Without this section:
+    a target whose markers are too small is not seen."""
+
+    range_noise_m: Positive = Field(
+        default=0.02, description="Standard deviation of the range, m, of a target nearby."
+    )
+    range_share: Fraction = Field(
+        default=1e-4, description="Standard deviation of the range in addition, as a share of it."
+    )
+    bearing_noise_deg: Positive = Field(
+        default=0.005,
+        lt=10,
+        description="Standard deviation of the bearing per axis, degrees: about a tenth of a pixel.",
+    )
+    attitude_noise_deg: Positive = Field(
+        default=0.02, lt=90, description="Standard deviation of the attitude that the target sends, degrees."
+    )
+    reach_m: NotNegative = Field(default=1000.0, description="Greatest range, m.")

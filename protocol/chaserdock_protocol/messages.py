@@ -356,9 +356,7 @@ class StackEstimate(Message, frozen=True, kw_only=True):
     chasers: ChaserIds
     stack: MassEstimate
     target: MassEstimate
-    thrust_factors: Annotated[
-        tuple[Annotated[tuple[float, ...], Meta(max_length=255)], ...], Meta(max_length=256)
-    ]
+    thrust_factors: Annotated[tuple[float, ...], Meta(max_length=8192)]
     failed: Annotated[tuple[Thrusters, ...], Meta(max_length=256)] = ()
 
 

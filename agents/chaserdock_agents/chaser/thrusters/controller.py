@@ -78,6 +78,7 @@ class ThrusterController:
             SUFFICIENT_INFORMATION,
         )
         self._test_allowed = False
+        self._reports_each = scenario.detumble.identification.enabled
         self._failed: dict[int, ThrusterFault] = {}
         self._commanded_isolated: frozenset[int] = frozenset()
         self._trusted: frozenset[int] = frozenset()
@@ -187,7 +188,7 @@ class ThrusterController:
             isolated=self.isolated,
             given_impulse_N_s=vector(total[:3]),
             given_angular_impulse_N_m_s=vector(total[3:]),
-            given_thrusters_N_s=vector(given),
+            given_thrusters_N_s=vector(given) if self._reports_each else (),
         )
 
     def apply_command(self, command: WrenchCommand) -> None:

@@ -151,6 +151,8 @@ def _check_fields(message: Struct) -> None:
         if isinstance(value, float):
             if not -MAX_MAGNITUDE <= value <= MAX_MAGNITUDE:
                 raise _bad_number(name, value)
+        elif isinstance(value, Struct):
+            _check_fields(value)
         elif value and isinstance(value, tuple):
             if isinstance(value[0], Struct):
                 for item in value:
@@ -220,10 +222,17 @@ def vector(array: Any) -> Any:
     return tuple(array.ravel().tolist())
 
 
+_LATER_FIELDS = frozenset({"given_thrusters_N_s"})
+
+
 def without_wall_time(message: Message) -> dict[str, Any]:
-    """Return the fields that are equal in two equal flights: all but wall-clock times and process instances."""
+    """Return the fields that are equal in two equal flights: all but wall-clock times and process instances.
+
+    Fields that came later are left out while they are empty, so that flights without them keep their digest.
+    """
     return {
-        name: getattr(message, name)
+        name: value
         for name in message.__struct_fields__
         if not name.startswith("wall_") and name not in ("instance", "controllers")
+        if (value := getattr(message, name)) or name not in _LATER_FIELDS
     }

@@ -368,9 +368,7 @@ class StackEstimate(Message, frozen=True, kw_only=True):
     chasers: ChaserIds
     stack: MassEstimate
     target: MassEstimate
-    thrust_factors: Annotated[
-        tuple[Annotated[tuple[float, ...], Meta(max_length=255)], ...], Meta(max_length=256)
-    ]
+    thrust_factors: Annotated[tuple[float, ...], Meta(max_length=8192)]
     failed: Annotated[tuple[Thrusters, ...], Meta(max_length=256)] = ()
 
 
@@ -507,7 +505,7 @@ class ThrusterReport(Message, frozen=True, kw_only=True):
 
     ``force_max_N`` and ``torque_max_N_m`` can be reached on all body axes at once. ``coming_*``: remaining impulse (body
     axes) of commanded pulses, without the part that belongs to the next command. ``given_*``: expected impulse of the
-    thrusters since the previous report; ``given_thrusters_N_s``: of each.
+    thrusters since the previous report; ``given_thrusters_N_s``: of each, with identification only.
     """
 
     chaser: ChaserId

@@ -36,7 +36,7 @@ def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() ->
     assert start is not None
     moved = place - start
     assert mission.retreats(1) == ["from detumble: the latch opened"]
-    assert float(moved @ axis) > 0.02
+    assert float(moved @ axis) > 0.01
     assert np.linalg.norm(moved - (moved @ axis) * axis) < 0.5 * float(moved @ axis)
     assert not mission.physics.latches["chaser/1"].latched
     # The other two, at opposite ports, go on.

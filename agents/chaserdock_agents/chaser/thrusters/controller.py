@@ -82,6 +82,7 @@ class ThrusterController:
         self._avoidance = None if scenario.plume is None else PlumeAvoidance(scenario, scenario.plume)
         self._cost_factors: Array | None = None
         self._test_allowed = False
+        self._reports_each = scenario.detumble.identification.enabled
         self._failed: dict[int, ThrusterFault] = {}
         self._commanded_isolated: frozenset[int] = frozenset()
         self._trusted: frozenset[int] = frozenset()
@@ -191,7 +192,7 @@ class ThrusterController:
             isolated=self.isolated,
             given_impulse_N_s=vector(total[:3]),
             given_angular_impulse_N_m_s=vector(total[3:]),
-            given_thrusters_N_s=vector(given),
+            given_thrusters_N_s=vector(given) if self._reports_each else (),
         )
 
     def apply_command(self, command: WrenchCommand) -> None:

@@ -169,7 +169,7 @@ static void draw_meshes(void) {
     memset(depth, 0, (size_t)depth_size * sizeof *depth);
     BodyPose *placed = block((size_t)bodies * sizeof *placed);
     Triangle *triangles = block((size_t)(6 * m) * sizeof *triangles);
-    int32_t *spans = block((size_t)(12 * m) * sizeof *spans);
+    int32_t *spans = block((size_t)(12 * m + 2 * (6 * m / GROUP + 1) + 2 * (height / BAND + 1)) * sizeof *spans);
     uint8_t *canvas = bytes(width * height);
     memset(canvas, 4, (size_t)(width * height));
     NAME(draw_meshes)(f, width, height, camera, bodies, poses, first, corners, normals, uv, surface, surfaces, light, wrinkles, n, maps,

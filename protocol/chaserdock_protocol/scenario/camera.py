@@ -20,6 +20,14 @@ class Effects(Section):
     """Image effects. A gain of 1, and 0 elsewhere, switch an effect off."""
 
     gain: Positive = Field(default=1.0, description="Exposure: factor on the grey levels.")
+    auto_exposure: float = Field(
+        default=0.0,
+        ge=0,
+        le=255,
+        allow_inf_nan=False,
+        description="Grey level that the brightest hundredth of each image is exposed to, in place of `gain`, by a factor of "
+        "1/8 to 8. 0: off.",
+    )
     point_spread_px: NotNegative = Field(
         default=0.6, description="Standard deviation of the lens' Gaussian blur, pixels."
     )

@@ -21,6 +21,14 @@ from .native import function
 _SPARE_ROWS, _SPARE_COLUMNS = 251, 256
 # Fixed-point steps per unit of white noise: 16 bits hold eight standard deviations.
 _NOISE_STEPS = 4096.0
+_METERED_SHARE, _LARGEST_GAIN = 0.01, 8.0
+
+
+def exposure_gain(image: NDArray[np.uint8], level: float) -> float:
+    """Return the factor, 1/8 to 8, that brings the darkest of the brightest hundredth of the pixels to ``level``."""
+    above = np.cumsum(np.bincount(image.ravel(), minlength=256)[::-1])
+    bright = 255 - int(np.searchsorted(above, _METERED_SHARE * image.size))
+    return float(np.clip(level / max(bright, 1), 1.0 / _LARGEST_GAIN, _LARGEST_GAIN))
 
 
 class CameraEffects:
@@ -53,8 +61,13 @@ class CameraEffects:
         if image.shape != self._shape or image.dtype != np.uint8:
             raise ValueError(f"expected a uint8 image of {self._shape}, got {image.dtype} {image.shape}")
         out = image
-        if self.effects.gain != 1.0:
-            out = np.asarray(cv2.convertScaleAbs(out, alpha=self.effects.gain), dtype=np.uint8)
+        gain = (
+            exposure_gain(image, self.effects.auto_exposure)
+            if self.effects.auto_exposure
+            else self.effects.gain
+        )
+        if gain != 1.0:
+            out = np.asarray(cv2.convertScaleAbs(out, alpha=gain), dtype=np.uint8)
         if self._bank is not None:
             return self._add_noise(out, self._bank, chaser, number)
         return out.copy() if out is image else out

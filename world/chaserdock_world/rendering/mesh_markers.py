@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import IntArray
 from chaserdock_models.meshes import Material, MeshPart, TriangleMesh
 from chaserdock_models.targets import Marker, TargetModel
 
@@ -62,6 +62,6 @@ def marker_parts(model: TargetModel, marker: Marker) -> tuple[MeshPart, MeshPart
     )
 
 
-def _halves(quads: Array) -> Array:
+def _halves(quads: IntArray) -> IntArray:
     """Return two triangles of each quadrangle (m, 4)."""
     return np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])

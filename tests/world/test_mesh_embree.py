@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The mesh renderer against Embree: grey levels, silhouettes and shadow edges of a shipped satellite with highlights."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from chaserdock_models import rotations
+from chaserdock_models.camera import Camera
+from chaserdock_models.satellites import satellite
+from chaserdock_world.rendering.background import Light
+
+pytest.importorskip("embreex", reason="embreex (development requirement) is not installed")
+
+from embree_images import compare, displacements
+
+
+def test_image_equals_that_of_embree() -> None:
+    camera = Camera.from_hfov(240, 160, np.deg2rad(60.0))
+    q = rotations.normalize((0.3, 0.8, 0.45, 0.25))
+    light = Light((0.5, -0.6, -0.7), 0.8, 0.2)
+    grey, silhouette, shadow = compare(
+        satellite("geo_servicer"), camera, np.array([0.05, 0.0, 0.8]), q, light, 5
+    )
+    assert grey < 1.5
+    assert len(silhouette) > 20
+    assert np.abs(silhouette).max() < 0.1
+    assert len(shadow) >= 5
+    assert np.abs(shadow).mean() < 0.15
+    assert np.percentile(np.abs(shadow), 95) < 0.3
+
+
+def test_displacement_of_an_edge_is_measured() -> None:
+    columns = np.arange(60.0)
+    traced = np.tile(np.clip(columns - 29.3, 0.0, 1.0), (48, 1))
+    drawn = np.tile(np.clip(columns - 29.1, 0.0, 1.0), (48, 1))
+    found = displacements(drawn, traced, np.ones_like(traced, dtype=bool))
+    assert len(found) == 4
+    np.testing.assert_allclose(found, 0.2, atol=0.01)

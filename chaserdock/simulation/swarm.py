@@ -40,6 +40,8 @@ RECEIVED = {
     "controller": ["odometry", "sighting"],
     "chaser": ["image", "odometry", "wrench"],
 }
+MESSAGE_KINDS = ("drop", "delay", "duplicate", "reorder", "corrupt")
+"""Kinds of faults of what a process receives."""
 PUBLISHED = {"world": ["image", "odometry"], "controller": ["wrench"], "chaser": ["sighting", "actuators"]}
 
 Case = dict[str, Any]
@@ -148,6 +150,8 @@ def draw_case(
     faults += _draw_device_faults(devices, scenario)
     if failures := _draw_thruster_failures(devices, scenario):
         case["thruster_failure"] = failures
+    # A stream of its own, so that seeds without such a fault fly as before it was drawn.
+    faults += _draw_other_faults(random.Random(f"others {seed}"), scenario, standby)
     return case
 
 
@@ -159,10 +163,41 @@ def _draw_device_faults(draw: random.Random, scenario: Scenario) -> list[dict[st
         readers += [(f"chaser/{p.chaser}", "docking") for p in scenario.docking.ports]
     if not readers or draw.random() > 0.3:
         return []
-    kind = draw.choice(["drop", "delay", "duplicate", "reorder", "corrupt"])
+    return [_draw_message_fault(draw.choice(MESSAGE_KINDS), draw, scenario, readers)]
+
+
+def _draw_other_faults(draw: random.Random, scenario: Scenario, standby: bool) -> list[dict[str, Any]]:
+    """Return at most one fault: of the leases that a controller receives, a controller that is cut off, or a flood of leases
+    or of a device's messages."""
+    if draw.random() > 0.15:
+        return []
+    controllers = ["controller", *(["standby"] if standby else [])]
+    names = [f"chaser/{i}" for i in range(len(scenario.chasers))]
+    what = draw.choice(["lease", "lease", "lease", "cut", "flood"])
+    if what == "lease":
+        readers = [(name, "lease") for name in controllers]
+        return [_draw_message_fault(draw.choice(MESSAGE_KINDS), draw, scenario, readers)]
+    if what == "cut":
+        fault = draw_fault("cut", draw, len(names), 0.8 * scenario.duration_s)
+        fault["process"] = draw.choice(controllers)
+        if "peer" in fault:
+            fault["peer"] = draw.choice(names)
+        return [fault]
+    publishers = [(name, "lease") for name in names]
+    if scenario.chaser.actuation == "thrusters":
+        publishers += [(name, "thrusters") for name in names]
+    if scenario.docking.kind == "capture":
+        publishers.append(("world", "docking"))
+    return [_draw_message_fault("flood", draw, scenario, publishers)]
+
+
+def _draw_message_fault(
+    kind: str, draw: random.Random, scenario: Scenario, choices: Sequence[tuple[str, str]]
+) -> dict[str, Any]:
+    """Return a fault of one of the ``choices``, process and topic."""
     fault = draw_fault(kind, draw, len(scenario.chasers), 0.8 * scenario.duration_s)
-    fault["process"], fault["topic"] = draw.choice(readers)
-    return [fault]
+    fault["process"], fault["topic"] = draw.choice(choices)
+    return fault
 
 
 def _draw_thruster_failures(draw: random.Random, scenario: Scenario) -> list[dict[str, Any]]:

@@ -4,8 +4,12 @@
 from __future__ import annotations
 
 import copy
+import itertools
+import random
+import re
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import msgspec
 import pytest
@@ -30,16 +34,26 @@ from chaserdock_protocol.messages import (
     encoding_of,
 )
 from chaserdock_protocol.scenario import Scenario, load_scenario
+from chaserdock_protocol.scenario.faults import FAULTY_TOPICS, Fault, FaultKind, role_of
 from chaserdock_protocol.topics import Topic
 from chaserdock_protocol.transport import RawSample
 from harness import ROOT
 from message_samples import BY_TYPE
+from pydantic import ValidationError
 
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
 from chaserdock.simulation.shrinking import shrink
-from chaserdock.simulation.swarm import KINDS, LATCH_KINDS, Case, SimulationResult, draw_case, queue_limit
+from chaserdock.simulation.swarm import (
+    KINDS,
+    LATCH_KINDS,
+    Case,
+    SimulationResult,
+    draw_case,
+    draw_fault,
+    queue_limit,
+)
 from chaserdock.toml_text import toml_document
 
 DRILL = ROOT / "scenarios" / "fault-drill.toml"
@@ -118,9 +132,43 @@ def test_seeds_draw_thruster_failures_and_lost_device_messages_where_there_are_a
         path.write_text(toml_document(case))
         loaded = load_scenario(path)
         kinds |= {f.kind for f in loaded.thruster_failure}
-        topics_of |= {(f.process, f.topic) for f in loaded.fault if f.topic in ("docking", "thrusters")}
+        lost = [f for f in loaded.fault if f.topic in ("docking", "thrusters") and f.kind != "flood"]
+        topics_of |= {(f.process, f.topic) for f in lost}
     assert kinds == {"stuck_off", "stuck_on", "weak"}
     assert topics_of == {("controller", "thrusters"), ("controller", "docking"), ("chaser/0", "docking")}
+
+
+def documented_faults() -> set[str]:
+    """Return the kinds in the table of docs/faults.md."""
+    text = (ROOT / "docs" / "faults.md").read_text(encoding="utf-8")
+    table = text.partition("| kind | effect |")[2].partition("\n\n")[0]
+    return set(re.findall(r"^\| `(\w+)` \|", table, re.MULTILINE))
+
+
+def possible_faults() -> set[tuple[str, str, str]]:
+    """Return kind, role and topic of every fault that a mission with ports and thrusters can have; topic: empty if it has
+    none."""
+    possible = set()
+    for kind in get_args(FaultKind):
+        drawn = draw_fault(kind, random.Random(0), 1, ports=(0,))
+        keys = {name: value for name, value in drawn.items() if name not in ("process", "peer", "topic")}
+        for process, topic in itertools.product(
+            ("world", "controller", "chaser/0", "recorder"), ("", *FAULTY_TOPICS)
+        ):
+            with suppress(ValidationError):
+                Fault.model_validate(keys | {"process": process} | ({"topic": topic} if topic else {}))
+                possible.add((kind, role_of(process), topic))
+    return possible
+
+
+def test_seeds_draw_every_documented_fault_of_every_message() -> None:
+    capture = load_scenario(ROOT / "scenarios" / "docking-contact.toml")
+    drawn = set()
+    for seed in range(3000):
+        for fault in draw_case("docking-contact", seed, capture)["fault"]:
+            drawn.add((fault["kind"], role_of(fault["process"]), fault.get("topic", "")))
+    assert documented_faults() == set(get_args(FaultKind))
+    assert drawn == possible_faults()
 
 
 def test_a_case_without_timeline_overrides_that_of_its_base(tmp_path: Path) -> None:

@@ -75,6 +75,11 @@ class ModelPerception:
         self._tracks: tuple[PoseTrack, ...] = ()
         self._until_acquisition = 0
 
+    def prepare(self) -> None:
+        """Compute what depends on the mesh alone; takes one to two seconds, which the first image would take otherwise."""
+        self._acquisition.prepare()
+        _ = self.mesh.suns
+
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:

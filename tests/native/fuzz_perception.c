@@ -146,12 +146,26 @@ static void render_mesh(void) {
     float *depth = floats((int64_t)map.size * (int64_t)map.size), *grey = floats(all), *coverage = floats(all), *nearest = floats(all);
     int32_t *owner = block((size_t)(all) * sizeof(int32_t));
     for (int64_t i = 0; i < (int64_t)map.size * (int64_t)map.size; i++) depth[i] = (float)value(-1.0, 1.0);
-    NAME(render_mesh)(lens, height, width, samples, m.pose, m.at, m.triangles, m.normals, m.reflectance, m.n, &light, &map, depth,
-                      grey, coverage, nearest, owner, floats(3 * samples * samples * all));
+    NAME(render_mesh)(lens, height, width, samples, m.pose, m.at, m.triangles, m.normals, doubles(3 * m.n, 0.0, 1.0), m.n, &light, &map,
+                      depth, grey, coverage, nearest, owner, outputs(3 * m.n), floats(3 * samples * samples * all));
     for (int64_t i = 0; i < all; i++) {
         CHECK(coverage[i] >= 0.0f && coverage[i] <= 1.0f && owner[i] >= -1 && owner[i] < m.n);
         CHECK((owner[i] >= 0) == (coverage[i] > 0.0f) && nearest[i] >= 0.0f);
     }
+}
+
+static void rate_suns(void) {
+    const int64_t n = whole(0, 20), k = whole(0, 4);
+    const ShadowMap any = shadow_settings();
+    const int64_t texels = (int64_t)any.size * (int64_t)any.size;
+    double *points = doubles(14 * n, -1.0, 1.0), *directions = doubles(3 * k, -1.0, 1.0), *out = outputs(3 * k);
+    ShadowMap *maps = block((size_t)k * sizeof(ShadowMap));
+    float *depths = floats(k * texels);
+    for (int64_t j = 0; j < k; j++) maps[j] = any;
+    for (int64_t i = 0; i < k * texels; i++) depths[i] = (float)value(-1.0, 1.0);
+    for (int64_t i = 0; i < n; i++) points[14 * i + 11] = value(0.0, 60.0), points[14 * i + 12] = value(0.0, 255.0), points[14 * i + 13] = value(2.0, 80.0);
+    NAME(rate_suns)((const LitPoint *)points, n, directions, maps, depths, k, value(0.0, 0.1), out, outputs(2 * n));
+    for (int64_t j = 0; j < k; j++) CHECK(!(out[3 * j] < 0.0));
 }
 
 static void control_points(void) {
@@ -200,6 +214,7 @@ static const Target TARGETS[] = {
     {"count_visible_markers", count_visible_markers},
     {"shadow_map", shadow_map},
     {"render_mesh", render_mesh},
+    {"rate_suns", rate_suns},
     {"control_points", control_points},
     {"align_points", align_points},
 };

@@ -235,7 +235,7 @@ def start(
 
     The covariance contains the correlation of the pose error with the camera's bias.
     """
-    scale = p.single_marker_scale**2 if m.markers <= 1 else 1.0
+    scale = p.single_marker_scale**2 if m.markers == 1 else 1.0
     covariance = np.zeros((12, 12))
     covariance[np.ix_(RATES, RATES)] = rates.covariance
     covariance[_POSE_GRID] = measurement_noise(h, p) * scale

@@ -35,7 +35,9 @@ def make_perception(scenario: FlightScenario) -> PerceptionMethod:
         case "statistical":
             return StatisticalPerception(camera, target, scenario.ranging)
         case "model":
-            return ModelPerception(camera, tracker_mesh(scenario.target))
+            perception = ModelPerception(camera, tracker_mesh(scenario.target))
+            perception.prepare()
+            return perception
         case name:
             return plugins.load("perception", name, PERCEPTIONS)(camera, target)
 

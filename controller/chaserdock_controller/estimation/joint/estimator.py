@@ -294,7 +294,7 @@ def _start(
     first = max(sorted(seen), key=rank)
     supports = [support(first, pose) for pose in poses[first]]
     kept = [pose for pose, n in zip(poses[first], supports, strict=True) if n == max(supports)]
-    scale = p.target.single_marker_scale**2 if len(seen[first].marker_ids) <= 1 else 1.0
+    scale = p.target.single_marker_scale**2 if len(seen[first].marker_ids) == 1 else 1.0
     others = {i: sighting for i, sighting in seen.items() if i != first}
     results = []
     for pose in kept:

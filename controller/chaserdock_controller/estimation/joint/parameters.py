@@ -36,6 +36,8 @@ class SightingNoise(NamedTuple):
 
 SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
+# What is stated covers errors of geometry and shading, which change only with the view.
+SHAPE = SightingNoise(white_ratio=0.5, view_ratio=1.0, view_time_s=10.0)
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class JointParameters:
     target_noise: square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular acceleration
         (rad/s²/√Hz), by motion model. Torque-free motion depends on inertia ratios, which may be wrong by some 15 %.
     single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
-        more on the pixel grid.
+        more on the pixel grid. shape: errors of a sighting of the target's shape, without markers.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
         as by a stuck thruster: for the velocity about a third of the greatest change under commands; for the rate all of it, as
         the torque of a stuck thruster exceeds that of commands. It is assumed only where velocity or rate does not fit otherwise.
@@ -95,6 +97,7 @@ class JointParameters:
     target_noise: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TARGET_NOISE)
     single_marker: SightingNoise = SINGLE_MARKER
     several_markers: SightingNoise = SEVERAL_MARKERS
+    shape: SightingNoise = SHAPE
     gate_sighting: float = GATE_CHI_SQUARE
     gate_odometry: float = GATE_CHI_SQUARE_3
     unexpected_velocity_m_s: float = 0.003
@@ -116,7 +119,9 @@ class JointParameters:
         object.__setattr__(self, "camera_turn_rad", turn)
 
     def sighting_noise(self, markers: int) -> SightingNoise:
-        """Return the errors of a sighting of this many markers."""
+        """Return the errors of a sighting of this many markers, 0 for one by shape."""
+        if markers == 0:
+            return self.shape
         return self.single_marker if markers <= 1 else self.several_markers
 
     @property

@@ -49,7 +49,7 @@ class JointState(TargetHypothesis):
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
     additive states. covariance (12 + CHASER N, 12 + CHASER N). alive (N,): chasers whose state is known.
     odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
-    markers (N,): number of markers in the newest sighting of each chaser.
+    markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
     updates: ticks with sightings since the start of the target.
     """
@@ -96,7 +96,7 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         odometry_ns=np.zeros(n, dtype=np.int64),
         rejections=np.zeros((n, len(CHANNELS)), dtype=np.int64),
         nis=np.full((n, len(CHANNELS) - 1), 3.0),
-        markers=np.zeros(n, dtype=np.int64),
+        markers=np.ones(n, dtype=np.int64),
     )
 
 

@@ -2,14 +2,15 @@
 """Find the target's pose in an image without a prior.
 
 Silhouettes of the tracker mesh from attitudes spread over all rotations, normalized to one size, are compared with the image's
-brightest region; the best are compared by how well some light explains their grey levels, and refined by the tracker.
-The target must stand out from its background by its brightness: not in front of the Earth.
+region of the target; the best are compared by how well some light explains their grey levels, and refined by the tracker.
+That region stands out by its brightness or, in front of the Earth, by its sharp edges.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,17 +21,21 @@ from numpy.typing import NDArray
 
 from ..refine import PoseInCamera
 from .alignment import Alignment, Pyramid
-from .lighting import appearance, fit_light, light_at
-from .mesh import TrackerMesh
+from .lighting import appearance, light_at, points_on, rate_suns
+from .mesh import ShadowMaps, TrackerMesh, spread_directions
 from .rendering import Lighting, PixelWindow, render
-from .tracking import is_valid, levels_of, refine_pose, turn_between
+from .tracking import is_valid, levels_of, refine_from_prior, refine_pose, turn_between
 
 _TEMPLATES, _SIDE_PX = 3000, 40
 _SPREAD_PX = 8.0
 """Root mean square distance of a normalized silhouette's pixels from their centre."""
 _DISTANCE_RADII = 6.0
-_BY_SILHOUETTE, _BY_LIGHT, _FULL = 250, 24, 4
-MIN_APPEARANCE = 0.9
+_BY_SILHOUETTE, _BY_LIGHT, _FULL = 250, 24, 6
+_TEMPLATE_POINTS, _TEMPLATE_SUNS, _BY_LIGHT_WEIGHT = 100, 100, 0.1
+_APPEARANCE_LEVEL = 1
+_SHARP_PER_PX = (1.5, 4.0)
+"""Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over bright parts of the Earth."""
+MIN_APPEARANCE = 0.85
 """Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a pose."""
 _MIN_AREA_PX, _MIN_CONTRAST = 60, 5.0
 _AMBIGUOUS_SCORE, _DISTINCT_RAD = 0.04, math.radians(8.0)
@@ -63,46 +68,63 @@ class Acquisition:
     def __init__(self, camera: Camera, mesh: TrackerMesh) -> None:
         self._camera, self._mesh = camera, mesh
         self._templates: _Templates | None = None
+        # Templates are compared without cast shadows.
+        towards = spread_directions(_TEMPLATE_SUNS)
+        self._suns = ShadowMaps(
+            towards, np.zeros((_TEMPLATE_SUNS, 12)), np.zeros((_TEMPLATE_SUNS, 0, 0), np.float32)
+        )
 
     def prepare(self) -> None:
         """Render the templates, if that has not been done; takes about a second."""
         if self._templates is None:
             self._templates = _make_templates(self._mesh)
 
-    def find(self, image: NDArray[np.uint8]) -> tuple[Alignment, ...]:
-        """Return the alignments that pass the gate, best first; several if they explain the image about equally well."""
+    def find(self, image: NDArray[np.uint8]) -> tuple[tuple[Alignment, Lighting], ...]:
+        """Return the alignments that pass the gate, and their light, best first; several if they explain the image about equally
+        well."""
         pyramid = Pyramid(image, self._camera)
-        candidates = self._candidates(pyramid)
-        coarse: list[tuple[Alignment, Lighting]] = []
-        for pose in candidates:
-            levels = levels_of(pyramid, self._mesh, pose)
-            light = light_at(pyramid, self._mesh, pose, levels[0], thorough=False) if levels else None
-            found = refine_pose(pyramid, self._mesh, pose, light, levels[:1]) if light else None
-            if found is not None and light is not None:
-                coarse.append((found, light))
-        coarse.sort(key=lambda item: -item[0].score)
-        fine: list[Alignment] = []
-        for start, light in coarse:
-            if len(fine) == _FULL:
-                break
-            if any(turn_between(start.pose, other.pose) < _DISTINCT_RAD for other in fine):
-                continue
-            levels = levels_of(pyramid, self._mesh, start.pose)
-            light = light_at(pyramid, self._mesh, start.pose, levels[0]) or light
-            found = refine_pose(pyramid, self._mesh, start.pose, light, levels)
-            if not is_valid(found) or any(turn_between(found.pose, o.pose) < _DISTINCT_RAD for o in fine):
-                continue
-            light = light_at(pyramid, self._mesh, found.pose, levels[0]) or light
-            if appearance(pyramid, self._mesh, found.pose, levels[-1], light) >= MIN_APPEARANCE:
-                fine.append(found)
-        fine.sort(key=lambda a: -a.score)
-        return tuple(a for a in fine if a.score > fine[0].score - _AMBIGUOUS_SCORE)
+        bright = _brightest_region(pyramid.level(0))
+        found = self._find_in(pyramid, bright)
+        if not found and bright is not None:
+            for slope in _SHARP_PER_PX:
+                found = found or self._find_in(pyramid, _sharp_region(pyramid.level(0), slope))
+        return found
 
-    def _candidates(self, pyramid: Pyramid) -> list[PoseInCamera]:
-        """Return coarse poses, the most likely first."""
-        region = _brightest_region(pyramid.level(0))
-        if region is None:
-            return []
+    def _find_in(
+        self, pyramid: Pyramid, region: NDArray[np.uint8] | None
+    ) -> tuple[tuple[Alignment, Lighting], ...]:
+        """Return what `find` does, for a target that covers ``region`` (h, w)."""
+        coarse: list[Alignment] = []
+        for pose in self._candidates(pyramid, region) if region is not None else ():
+            levels = levels_of(pyramid, self._mesh, pose)
+            light = light_at(pyramid, self._mesh, pose, levels[0]) if levels else None
+            aligned = refine_pose(pyramid, self._mesh, pose, light, levels[:1]) if light else None
+            if aligned is not None:
+                coarse.append(aligned)
+        coarse.sort(key=lambda a: -a.score)
+        fine: list[tuple[Alignment, Lighting]] = []
+        tried: list[PoseInCamera] = []
+        for start in coarse:
+            if len(tried) == _FULL:
+                break
+            if any(turn_between(start.pose, other) < _DISTINCT_RAD for other in tried):
+                continue
+            tried.append(start.pose)
+            refined = refine_from_prior(pyramid, self._mesh, start.pose)
+            if refined is None or not is_valid(refined[0]) or not self._looks_right(pyramid, *refined):
+                continue
+            if all(turn_between(refined[0].pose, a.pose) >= _DISTINCT_RAD for a, _ in fine):
+                fine.append(refined)
+        fine.sort(key=lambda found: -found[0].score)
+        return tuple(f for f in fine if f[0].score > fine[0][0].score - _AMBIGUOUS_SCORE)
+
+    def _looks_right(self, pyramid: Pyramid, found: Alignment, light: Lighting) -> bool:
+        levels = levels_of(pyramid, self._mesh, found.pose)
+        level = next((k for k in levels[::-1] if k >= _APPEARANCE_LEVEL), levels[0])
+        return appearance(pyramid, self._mesh, found.pose, level, light) >= MIN_APPEARANCE
+
+    def _candidates(self, pyramid: Pyramid, region: NDArray[np.uint8]) -> list[PoseInCamera]:
+        """Return coarse poses of a target that covers ``region`` (h, w), the most likely first."""
         self.prepare()
         assert self._templates is not None
         t, camera = self._templates, self._camera
@@ -150,19 +172,16 @@ class Acquisition:
         return mask.ravel().astype(np.float32), np.asarray(grey, dtype=float).ravel()
 
     def _unexplained(self, i: int, mask: NDArray[np.float32], grey: Array, overlap: float) -> float:
-        """Return the share of the grey levels' variance that no light explains, plus that of the silhouette."""
+        """Return the share of the grey levels that no light explains, plus that of the silhouette."""
         t = self._templates
         assert t is not None
-        inside = (t.owners[i] >= 0) & (mask > 0.0)
-        _, _, normals, reflectance = self._mesh.contiguous
-        owners = t.owners[i][inside]
-        normal = normals[owners].mean(axis=1) @ t.rotations[i].T
-        light = fit_light(reflectance[owners], normal, grey[inside]) if inside.sum() > 30 else None
-        if light is None or light.to_sun_irf is None:
+        inside = np.flatnonzero((t.owners[i] >= 0) & (mask > 0.0))
+        inside = inside[:: max(1, len(inside) // _TEMPLATE_POINTS)]
+        if len(inside) < 30:
             return math.inf
-        lambert = np.maximum(normal @ light.to_sun_irf, 0.0)
-        residual = np.abs(grey[inside] - reflectance[owners] * (light.ambient + light.direct * lambert))
-        return float(residual.mean() / max(grey[inside].mean(), 1.0)) + 2.0 * (1.0 - overlap)
+        owners, nowhere = t.owners[i][inside], np.zeros((len(inside), 3))
+        points = points_on(self._mesh, owners, nowhere, -t.rotations[i][2], grey[inside], t.rotations[i])
+        return float(rate_suns(points, self._suns)[:, 0].min()) * _BY_LIGHT_WEIGHT + 2.0 * (1.0 - overlap)
 
 
 def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
@@ -170,13 +189,38 @@ def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
     level = float(np.median(image)) + _MIN_CONTRAST
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     bright = cv2.morphologyEx((smooth > level).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
-    count, labels, statistics, _ = cv2.connectedComponentsWithStats(bright, connectivity=8)
+    return _largest_region(bright)
+
+
+def _largest_region(mask: NDArray[Any]) -> NDArray[np.uint8] | None:
+    """Return the largest connected region of a mask (h, w), as a mask; None if it is too small."""
+    count, labels, statistics, _ = cv2.connectedComponentsWithStats(mask, connectivity=8)
     if count < 2:
         return None
     largest = 1 + int(np.argmax(statistics[1:, cv2.CC_STAT_AREA]))
     if statistics[largest, cv2.CC_STAT_AREA] < _MIN_AREA_PX:
         return None
     return (labels == largest).astype(np.uint8)
+
+
+def _sharp_region(image: NDArray[np.float32], slope: float) -> NDArray[np.uint8] | None:
+    """Return the mask (h, w) of the largest region within edges of at least ``slope`` grey levels per pixel; None without any.
+
+    The Earth has no sharp edges but its limb, which is a thin line.
+    """
+    smooth = cv2.GaussianBlur(image, (0, 0), 1.2)
+    gx, gy = (
+        cv2.Sobel(smooth, cv2.CV_32F, 1, 0, scale=0.125),
+        cv2.Sobel(smooth, cv2.CV_32F, 0, 1, scale=0.125),
+    )
+    edges = (cv2.magnitude(gx, gy) > slope).astype(np.uint8)
+    closed = cv2.morphologyEx(edges, cv2.MORPH_CLOSE, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (11, 11)))
+    outlines, _ = cv2.findContours(closed, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_SIMPLE)
+    filled = np.zeros_like(edges)
+    cv2.drawContours(filled, outlines, -1, 1, cv2.FILLED)
+    opened = cv2.morphologyEx(filled, cv2.MORPH_OPEN, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (7, 7)))
+    # Edges are found up to a pixel outside.
+    return _largest_region(cv2.erode(opened, np.ones((3, 3), np.uint8)))
 
 
 def _look_at(ray: Array) -> Array:

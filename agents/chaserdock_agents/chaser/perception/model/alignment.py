@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
@@ -32,9 +33,11 @@ _NOISE = 2.0
 """Standard deviation of a grey level by noise and by texture that the mesh does not have."""
 _FLOOR_PX = 0.1
 INLIER_PX = 1.5
+_DISPLACED_INLIER_PX, _REFINED_REACH_PX = 5.0, 3
 MIN_POINTS = 24
-_CORRELATED_POINTS = 6.0
-"""Number of neighbouring control points that err together: their information counts once."""
+_CORRELATED_POINTS, _INDEPENDENT_MOST = 5.5, 60.0
+"""Number of neighbouring control points that err together, so that their information counts once; and largest number of points
+that count: shading and facets that the mesh does not have do not become more accurate with more pixels."""
 _SPREAD_PX = {0: 0.6, 1: 0.45, -1: 1.2}
 """Standard deviation, in pixels of a level, of the point spread that the synthetic view gets."""
 
@@ -87,7 +90,8 @@ class ControlPoints:
 @dataclass(frozen=True)
 class Alignment:
     """An aligned pose: ``inlier_share`` of the points in the image, ``correlation``: mean of the points in the image, -1 to 1;
-    ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6, 6): as in `TargetPose`."""
+    ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6, 6): as in `TargetPose`; ``modes`` (k,): estimated errors of
+    the geometry in standard deviations."""
 
     pose: PoseInCamera
     inlier_share: float
@@ -95,6 +99,7 @@ class Alignment:
     rms_px: float
     covariance: Array
     points: ControlPoints
+    modes: Array
 
     @property
     def score(self) -> float:
@@ -203,63 +208,117 @@ def in_grey_levels(view: SyntheticView, patch: NDArray[np.float32]) -> tuple[NDA
 
 
 def align(
-    pyramid: Pyramid, points: ControlPoints, prior: PoseInCamera, reach_px: int, iterations: int = 6
+    pyramid: Pyramid,
+    points: ControlPoints,
+    prior: PoseInCamera,
+    reach_px: int,
+    modes: Array | None = None,
+    iterations: int = 6,
 ) -> Alignment | None:
-    """Align control points with an image, searching ``reach_px`` of their level around ``prior``; None if that fails."""
+    """Align control points with an image, searching ``reach_px`` of their level around ``prior``; None if that fails.
+
+    ``modes`` (k,): errors of the geometry as far as they are known. They are estimated with the pose: points that they displace by
+    more than the width of an edge would be outliers otherwise.
+    """
+    k = len(points.displaced_m)
+    known = np.zeros(k) if modes is None or len(modes) != k else modes
+    if not k:
+        found = _match(pyramid, points, known, prior, reach_px, iterations, INLIER_PX)
+        return found and _alignment(pyramid, points, known, found)
+    found = _match(pyramid, points, known, prior, reach_px, iterations, _DISPLACED_INLIER_PX)
+    solved = found and _alignment(pyramid, points, known, found)
+    if not solved:
+        return None
+    found = _match(pyramid, points, solved.modes, solved.pose, _REFINED_REACH_PX, 1, INLIER_PX)
+    return found and _alignment(pyramid, points, solved.modes, found)
+
+
+@dataclass(frozen=True)
+class _Matches:
+    """Result of align_points (native/align.c) for n points: ``pose``, ``inside``: number of points in the image; ``residual`` (n,),
+    ``weight`` (n,), ``correlation`` (n,), ``rows`` (n, 6)."""
+
+    pose: PoseInCamera
+    inside: int
+    residual: Array
+    weight: Array
+    correlation: Array
+    rows: Array
+
+
+def _match(
+    pyramid: Pyramid, points: ControlPoints, modes: Array, prior: PoseInCamera, reach_px: int, iterations: int, inlier_px: float
+) -> _Matches | None:  # fmt: skip
+    """Match the profiles of control points, displaced by ``modes``, and fit the pose; None for too few matches."""
     image = pyramid.level(points.level)
     n = len(points.points_m)
     distortion = (*pyramid.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     camera = (c_double * 11)(*pyramid.lens(points.level), *distortion, *image.shape)
-    settings = (c_double * 6)(reach_px, iterations, _MIN_CORRELATION, _NOISE, _FLOOR_PX, INLIER_PX)
+    settings = (c_double * 6)(reach_px, iterations, _MIN_CORRELATION, _NOISE, _FLOOR_PX, inlier_px)
+    displacement = np.einsum("k,kni->ni", modes, points.displaced_m) if len(modes) else 0.0
+    at, ahead = points.points_m + displacement, points.ahead_m + displacement
     pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
     correlation, rows, work = np.empty(n), np.empty((n, 6)), np.empty(2 * n)
     inside = function("align_points", c_int64)(
-        camera, address(image), settings, address(points.points_m), address(points.ahead_m), address(points.profiles),
+        camera, address(image), settings, address(at), address(ahead), address(points.profiles),
         c_int64(n), address(pose), address(residual), address(weight), address(correlation), address(rows), address(work),
     )  # fmt: skip
-    if inside < MIN_POINTS:
-        return None
-    used = weight > 0.0
-    if used.sum() < MIN_POINTS:
+    if inside < MIN_POINTS or int((weight > 0.0).sum()) < MIN_POINTS:
         return None
     aligned = PoseInCamera(pose[:3], pose[3:].reshape(3, 3))
-    covariance = _covariance(points, aligned, residual[used], weight[used], rows[used], used)
-    if covariance is None:
+    return _Matches(aligned, int(inside), residual, weight, correlation, rows)
+
+
+def _alignment(pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Matches) -> Alignment | None:
+    """Estimate pose and errors of the geometry together from matches; None for a pose that is not observable."""
+    used = found.weight > 0.0
+    residual, weight, moved = found.residual[used], found.weight[used], found.rows[used, 3:]
+    pose = found.pose
+    # A rotation phi in camera axes is R dtheta; a displacement in TRF moves a point as that of the position in IRF axes.
+    jacobian = np.concatenate([moved, found.rows[used, :3] @ pose.rotation], axis=1)
+    shifts = np.einsum("ni,kni->nk", moved @ pose.rotation, points.displaced_m[:, used])
+    solved = _solve(_Fit(residual, weight, jacobian, shifts), modes)
+    if solved is None:
         return None
-    rms = math.sqrt(float(np.average(residual[used] ** 2, weights=weight[used]))) * 2.0**points.level
-    seen = weight >= 0.0
-    return Alignment(
-        aligned, float(used.sum()) / inside, float(correlation[seen].mean()), rms, covariance, points
-    )
+    step, covariance = solved
+    if len(modes):
+        turn = rotations.to_matrix(rotations.exp(step[3:6]))
+        pose = PoseInCamera(pose.position + step[:3], pose.rotation @ turn)
+    rms = math.sqrt(float(np.average(residual**2, weights=weight))) * 2.0**points.level
+    seen = found.weight >= 0.0
+    share, correlation = float(used.sum()) / found.inside, float(found.correlation[seen].mean())
+    return Alignment(pose, share, correlation, rms, covariance, points, modes + step[6:])
 
 
-def _covariance(
-    points: ControlPoints,
-    pose: PoseInCamera,
-    residual: Array,
-    weight: Array,
-    rows: Array,
-    used: NDArray[np.bool_],
-) -> Array | None:
-    """Return the covariance (6, 6), as in `TargetPose`: of the fit, and of the geometry's errors as considered parameters.
+@dataclass(frozen=True)
+class _Fit:
+    """Linearized fit of m used control points at a pose: ``residual`` (m,) pixels, ``weight`` (m,), ``jacobian`` (m, 6): of the
+    residual by position (IRF) and rotation (TRF); ``shifts`` (m, k): of each point, pixels, by the k modes of the geometry."""
 
-    With J the rows and W the weights, the pose errs by K = (J'WJ)^-1 J'W times the residuals' errors. A mode of the geometry
-    displaces all of its points together: K times the shift that it causes is added as its outer product (consider covariance,
-    B. D. Tapley, B. E. Schutz, G. H. Born, "Statistical Orbit Determination", 2004, sec. 6.2).
+    residual: Array
+    weight: Array
+    jacobian: Array
+    shifts: Array
+
+
+def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array] | None:
+    """Return the step (6 + k,) of pose and modes, and the covariance (6, 6) of the pose; None for a pose that is not observable.
+
+    The errors of the geometry have their standard deviations, 1, as prior knowledge around 0; ``modes`` (k,) is where the fit is
+    linearized. Control points near to each other err together, which divides their information.
     """
-    # A rotation phi in camera axes is R dtheta.
-    jacobian = np.concatenate([rows[:, 3:], rows[:, :3] @ pose.rotation], axis=1)
-    information = jacobian.T @ (jacobian * weight[:, None])
+    rows = np.concatenate([fit.jacobian, fit.shifts], axis=1)
+    chi_square = float(fit.residual**2 @ fit.weight) / max(len(fit.residual) - 6, 1)
+    correlated = max(_CORRELATED_POINTS, len(fit.residual) / _INDEPENDENT_MOST)
+    weight = fit.weight / (correlated * max(chi_square, 1.0))
+    information = rows.T @ (rows * weight[:, None])
+    right = rows.T @ (weight * fit.residual)
+    information[6:, 6:] += np.eye(len(modes))
+    right[6:] -= modes
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     if not values[0] > 1e-10 * values[-1]:
         return None
     inverse = (vectors / values) @ vectors.T * np.outer(scale, scale)
-    chi_square = float(residual**2 @ weight) / max(len(residual) - 6, 1)
-    total = inverse * max(chi_square, 1.0) * _CORRELATED_POINTS
-    for displaced in points.displaced_m:
-        # A displacement in TRF moves a projection as the same displacement of the position in IRF axes.
-        shift = np.einsum("ni,ni->n", rows[:, 3:], displaced[used] @ pose.rotation.T)
-        moved = inverse @ (jacobian.T @ (weight * shift))
-        total = total + np.outer(moved, moved)
-    return 0.5 * (total + total.T)
+    covariance = inverse[:6, :6]
+    return inverse @ right, 0.5 * (covariance + covariance.T)

@@ -1,92 +1,144 @@
 # SPDX-License-Identifier: Apache-2.0
 """Estimate the light on the target from the image, so that sun, eclipse and lamp need no ephemeris.
 
-By Lambert's law the grey level of a lit surface is reflectance (a + n's), linear in the ambient level a and in s, the direction to
-the sun times its level. Both follow from least squares over the pixels of a predicted view. Surfaces turned away have n's = 0,
-and pixels in cast shadows are outliers.
+Each of several hundred directions of the sun is rated by how well its light explains the grey levels of points on the target,
+with cast shadows and highlights (native/light.c). The best one is refined between its neighbours.
 """
 
 from __future__ import annotations
 
+from ctypes import c_double, c_int64
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.native import address
+from numpy.typing import NDArray
 
+from ..native import function
 from ..refine import PoseInCamera
 from .alignment import Pyramid, image_window, in_grey_levels, window_of
-from .mesh import TrackerMesh
+from .mesh import ShadowMaps, TrackerMesh
 from .rendering import Lighting, render
 
-_MOST_PIXELS = 3000
-_RIDGE = 1e-6
-_ROUNDS = 4
-_AMBIENT_SHARES = (0.03, 0.1, 0.2, 0.35, 0.6)
-"""Trials of the ambient level, as shares of the level of the brightest surfaces."""
+_MOST_POINTS, _FEWEST_POINTS = 600, 40
+_EVERY_POINT = 3
+"""Of the points, those that rate directions all around."""
+_LEAST_AMBIENT = 0.02
+"""Least ambient level as a share of the directed one."""
+_GREY_NOISE = 3.0
+_NEIGHBOURS_RAD, _FINE_TEXELS = (0.12, 0.05), 96
+_LIKELY = 0.08
+"""Increase of the mean squared residual, as a share of its least, at which a direction weighs 1/e in the mean of the likely ones."""
+
+
+@dataclass(frozen=True)
+class LitPoints:
+    """n points as native/light.c takes them, ``rows`` (n, 14), seen at the attitude ``rotation`` (3, 3), TRF to IRF."""
+
+    rows: Array
+    rotation: Array
 
 
 def light_at(
-    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, thorough: bool = True
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, previous: Lighting | None = None
 ) -> Lighting | None:
     """Return the light, in grey levels, that the image shows on a target at ``pose``; None if too little of it is in view.
 
-    Where three sides or less are visible, the ambient level is not observable from them: with ``thorough`` several ones are
-    tried, and the one whose rendering, with cast shadows, fits best is taken.
+    With ``previous``, only directions near that light are tried.
     """
+    points = lit_points(pyramid, mesh, pose, level)
+    return fit_light(mesh, points, previous) if points else None
+
+
+def lit_points(
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, most: int = _MOST_POINTS
+) -> LitPoints | None:
+    """Return at most ``most`` points of the target with their grey levels, away from edges; None if there are too few."""
     found = window_of(pyramid, level, mesh, pose)
     if found is None:
         return None
     window, left, top = found
     patch = image_window(pyramid, level, window, left, top)
-    view = render(mesh, pose, window, Lighting(np.array([0.0, 0.0, -1.0]), shadows=False), samples=1)
-    pixels = np.flatnonzero(view.coverage.ravel() > 0.99)
-    if len(pixels) < 50:
+    unlit = Lighting(None, 0.0, 1.0, shadows=False)
+    view = render(mesh, pose, window, unlit, samples=1)
+    covered = (view.coverage > 0.99).astype(np.uint8)
+    for side in (5, 3, 1):
+        # Beside edges of the outline a slightly wrong pose mixes target and background.
+        pixels = np.flatnonzero(cv2.erode(covered, np.ones((side, side), np.uint8)))
+        if len(pixels) >= 4 * _FEWEST_POINTS:
+            break
+    if len(pixels) < _FEWEST_POINTS:
         return None
-    pixels = pixels[:: max(1, len(pixels) // _MOST_PIXELS)]
-    owners = view.owner.ravel()[pixels]
-    _, _, normals, reflectance = mesh.contiguous
-    normal = normals[owners].mean(axis=1) @ pose.rotation.T
+    pixels = pixels[np.linspace(0, len(pixels) - 1, min(most, len(pixels))).astype(np.int64)]
+    row, column = np.divmod(pixels, window.width)
+    fx, fy, cx, cy = window.lens
+    rays = np.column_stack([(column - cx) / fx, (row - cy) / fy, np.ones(len(pixels))])
+    at = rays / view.nearest.ravel()[pixels, None]
+    to_camera = -(at / np.linalg.norm(at, axis=1, keepdims=True)) @ pose.rotation
     grey = patch.ravel()[pixels].astype(float)
-    if not thorough:
-        return fit_light(reflectance[owners], normal, grey)
-    brightest = float(np.percentile(grey / np.maximum(reflectance[owners], 0.02), 95))
-    best: tuple[float, Lighting] | None = None
-    for share in _AMBIENT_SHARES:
-        light = fit_light(reflectance[owners], normal, grey, share * brightest)
-        if light is None:
-            continue
-        shaded = render(mesh, pose, window, light, samples=1).grey.ravel()[pixels]
-        # Limited, so that wrong reflectances and texture do not decide.
-        misfit = float(np.minimum(np.abs(shaded - grey), 0.2 * brightest).mean())
-        if best is None or misfit < best[0]:
-            best = misfit, light
-    return best[1] if best else None
+    return points_on(
+        mesh, view.owner.ravel()[pixels], (at - pose.position) @ pose.rotation, to_camera, grey, pose.rotation
+    )
 
 
-def fit_light(
-    reflectance: Array, normals: Array, grey: Array, ambient: float | None = None
-) -> Lighting | None:
-    """Return the light from n pixels: reflectance (n,), unit normals (n, 3), grey levels (n,); ``ambient``: level, if known."""
-    lit, weight = np.ones(len(grey)), np.ones(len(grey))
-    level: float = ambient or 0.0
-    sun: Array = np.zeros(3)
-    for _ in range(_ROUNDS):
-        columns = reflectance[:, None] * np.column_stack([np.ones(len(grey)), normals * lit[:, None]])
-        known = columns[:, 0] * level if ambient is not None else np.zeros(len(grey))
-        used = columns[:, 1:] if ambient is not None else columns
-        matrix = used.T @ (used * weight[:, None])
-        matrix[np.diag_indices(len(matrix))] += _RIDGE * np.trace(matrix) + 1e-12
-        solution = np.linalg.solve(matrix, used.T @ (weight * (grey - known)))
-        sun = np.asarray(solution[-3:], dtype=np.float64)
-        level = ambient if ambient is not None else float(solution[0])
-        residual = np.abs(grey - known - used @ solution)
-        scale = max(1.4826 * float(np.median(residual)), 1.0)
-        weight = 1.0 / (1.0 + (residual / (2.0 * scale)) ** 2)
-        lit = (normals @ sun > 0.0).astype(float)
-    direct = float(np.linalg.norm(sun))
-    level = max(level, 0.02 * direct)
-    if not (level + direct > 1e-3 and np.isfinite(level + direct)):
+def points_on(
+    mesh: TrackerMesh, owners: NDArray[np.integer], at_trf: Array, to_camera_trf: Array, grey: Array, rotation: Array
+) -> LitPoints:  # fmt: skip
+    """Return n points on the triangles ``owners`` (n,), with grey levels (n,), at (n, 3), seen in directions (n, 3), all in TRF."""
+    rows = np.empty((len(owners), 14))
+    rows[:, 0:3], rows[:, 3:6], rows[:, 6:9] = at_trf, mesh.mean_normals[owners], to_camera_trf
+    rows[:, 9:12] = mesh.contiguous[3][owners]
+    rows[:, 12] = grey
+    rows[:, 13] = np.hypot(_GREY_NOISE, mesh.texture_share[owners] * grey)
+    return LitPoints(rows, rotation)
+
+
+def rate_suns(points: LitPoints, maps: ShadowMaps) -> Array:
+    """Return, for each of k directions of the sun, (k, 3): mean squared residual (robust), ambient and direct level."""
+    k, n = len(maps.to_sun_trf), len(points.rows)
+    out, work = np.empty((k, 3)), np.empty(2 * n)
+    function("rate_suns")(
+        address(points.rows), c_int64(n), address(maps.to_sun_trf), address(maps.settings), address(maps.depths),
+        c_int64(k), c_double(_LEAST_AMBIENT), address(out), address(work),
+    )  # fmt: skip
+    return out
+
+
+def fit_light(mesh: TrackerMesh, points: LitPoints, previous: Lighting | None = None) -> Lighting | None:
+    """Return the light that explains the points best; None for a dark image."""
+    if previous is not None and previous.to_sun_irf is not None:
+        best = points.rotation.T @ previous.to_sun_irf
+    else:
+        few = LitPoints(np.ascontiguousarray(points.rows[::_EVERY_POINT]), points.rotation)
+        best = _likely_direction(rate_suns(few, mesh.suns), mesh.suns)
+    for angle in _NEIGHBOURS_RAD:
+        maps = mesh.shadow_maps(_around(best, angle), _FINE_TEXELS)
+        rated = rate_suns(points, maps)
+        best = _likely_direction(rated, maps)
+    _, ambient, direct = rate_suns(points, mesh.shadow_maps(best[None], _FINE_TEXELS))[0].tolist()
+    if not ambient + direct > 1e-3:
         return None
-    return Lighting(sun / direct if direct > 0.0 else np.array([0.0, 0.0, -1.0]), direct, level)
+    return Lighting(points.rotation @ best, direct, ambient)
+
+
+def _likely_direction(rated: Array, maps: ShadowMaps) -> Array:
+    """Return the mean, weighted by likelihood, of the directions near the best one."""
+    k = int(np.argmin(rated[:, 0]))
+    near = maps.to_sun_trf @ maps.to_sun_trf[k] > 0.9
+    excess = (rated[near, 0] - rated[k, 0]) / max(float(rated[k, 0]), 1e-6)
+    mean = np.exp(-excess / _LIKELY) @ maps.to_sun_trf[near]
+    return mean / np.linalg.norm(mean)
+
+
+def _around(direction: Array, angle_rad: float) -> Array:
+    """Return ``direction`` and eight unit vectors (9, 3) ``angle_rad`` away from it."""
+    across = np.cross(direction, np.eye(3)[int(np.argmin(np.abs(direction)))])
+    across /= np.linalg.norm(across)
+    turns = np.arange(8) * np.pi / 4.0
+    ring = np.cos(turns)[:, None] * across + np.sin(turns)[:, None] * np.cross(direction, across)
+    return np.concatenate([direction[None], np.cos(angle_rad) * direction + np.sin(angle_rad) * ring])
 
 
 def appearance(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, light: Lighting) -> float:

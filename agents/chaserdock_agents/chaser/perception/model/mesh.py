@@ -4,16 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from ctypes import c_double, c_int64
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.meshes import TriangleMesh, with_geometry_errors
+from chaserdock_models.meshes import Material, TriangleMesh, with_geometry_errors
+from chaserdock_models.native import address
 from chaserdock_models.satellites import BOX_TRIANGLES
 from chaserdock_models.targets import Box, cuboid_corners
 from numpy.typing import NDArray
+
+from ..native import function
 
 _CREASE_COSINE = 0.8
 """Normals are smoothed over edges of a smaller angle, 37 degrees: facets of a cylinder, not the edges of a box."""
@@ -23,24 +27,61 @@ MAX_TRIANGLES = 200_000
 SCALE_SIGMA = 0.003
 """Standard deviation of the scale of a target's known shape."""
 
+_PLAIN_TEXTURE, _FOIL_TEXTURE = 0.1, 0.3
+"""Relative standard deviation of grey levels by texture that the mesh does not have: of plain surfaces, and of wrinkled foil."""
+_FOIL_SLOPE = 0.35
+"""Standard deviation of the slopes of wrinkled foil, which widen its highlights."""
+_SUNS, _SUN_TEXELS = 400, 64
+
 
 class MeshError(ValueError):
     """A mesh that cannot be tracked."""
 
 
 @dataclass(frozen=True)
+class ShadowMaps:
+    """Depth maps (k, size, size) of a mesh towards k directions (k, 3), unit vectors in TRF; ``settings`` (k, 12): native/mesh.c."""
+
+    to_sun_trf: Array
+    settings: Array
+    depths: NDArray[np.float32]
+
+
+def spread_directions(n: int) -> Array:
+    """Return ``n`` unit vectors (n, 3) spread evenly over the sphere: a Fibonacci spiral."""
+    k = np.arange(n)
+    z, turn = 1.0 - (2.0 * k + 1.0) / n, np.pi * (3.0 - np.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - z * z)
+    return np.ascontiguousarray(np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1))
+
+
+def _surface(material: Material) -> tuple[float, float, float, float]:
+    """Return reflectance, gloss, exponent and texture of a material. Wrinkles widen the highlights of foil and weaken them."""
+    if material.texture != "insulation":
+        return material.diffuse, material.specular, material.shininess, _PLAIN_TEXTURE
+    # A lobe of exponent m has a variance of about 1 / m.
+    width = 1.0 / material.shininess
+    wide = width + _FOIL_SLOPE**2
+    return material.diffuse, material.specular * width / wide, 1.0 / wide, _FOIL_TEXTURE
+
+
+@dataclass(frozen=True)
 class TrackerMesh:
-    """A closed triangle mesh with one reflectance per triangle.
+    """A closed triangle mesh with one material per triangle.
 
     ``vertices_m`` (n, 3) in TRF; ``triangles`` (m, 3) int64, counter-clockwise seen from outside; ``reflectance`` (m,), 0 to 1.
     ``modes_m`` (k, n, 3): displacement of the vertices by one standard deviation of each of k independent errors of the
-    geometry, such as the angle of a panel. Raises MeshError for arrays that are not such a mesh.
+    geometry, such as the angle of a panel. ``gloss`` (m, 2): specular reflectance and Blinn's exponent, empty for dull surfaces;
+    ``texture`` (m,): relative standard deviation of the grey levels by texture, empty for that of plain surfaces.
+    Raises MeshError for arrays that are not such a mesh.
     """
 
     vertices_m: Array
     triangles: NDArray[np.int64]
     reflectance: Array
     modes_m: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
+    gloss: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    texture: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         vertices, triangles, reflectance = self.vertices_m, self.triangles, self.reflectance
@@ -54,6 +95,12 @@ class TrackerMesh:
             raise MeshError(f"triangles must index the {len(vertices)} vertices")
         if reflectance.shape != (len(triangles),) or not np.all((reflectance >= 0.0) & (reflectance <= 1.0)):
             raise MeshError(f"reflectance must be {len(triangles)} numbers from 0 to 1")
+        for name, values, shape in (
+            ("gloss", self.gloss, (len(triangles), 2)),
+            ("texture", self.texture, (len(triangles),)),
+        ):
+            if len(values) and not (values.shape == shape and np.all((values >= 0.0) & (values < 1000.0))):
+                raise MeshError(f"{name} must be numbers from 0 to 1000 of shape {shape}")
         if len(self.modes_m) and self.modes_m.shape[1:] != vertices.shape:
             raise MeshError(f"modes must have shape (k, {len(vertices)}, 3), not {self.modes_m.shape}")
 
@@ -75,7 +122,9 @@ class TrackerMesh:
         triangles = np.concatenate(
             [p.triangles + first for p, first in zip(mesh.parts, counts[:-1], strict=True)]
         )
-        shade = np.repeat([p.material.diffuse for p in mesh.parts], [len(p.triangles) for p in mesh.parts])
+        surfaces = np.repeat(
+            [_surface(p.material) for p in mesh.parts], [len(p.triangles) for p in mesh.parts], axis=0
+        )
 
         def vertices(of: TriangleMesh) -> Array:
             return np.concatenate([part.vertices_m for part in of.parts])
@@ -90,17 +139,54 @@ class TrackerMesh:
         if scale_sigma > 0.0:
             modes.append(vertices(with_geometry_errors(mesh, scale_sigma, {})) - known)
         stacked = np.array(modes).reshape(len(modes), len(known), 3)
-        return cls(known, triangles.astype(np.int64), shade, stacked)
+        return cls(
+            known, triangles.astype(np.int64), surfaces[:, 0], stacked, surfaces[:, 1:3], surfaces[:, 3]
+        )
 
     @cached_property
     def contiguous(self) -> tuple[Array, NDArray[np.int64], Array, Array]:
-        """Vertices, triangles, corner normals (m, 3, 3) and reflectance as the kernels take them."""
+        """Vertices, triangles, corner normals (m, 3, 3) and surfaces (m, 3): reflectance, gloss, exponent; as kernels take them."""
+        gloss = self.gloss if len(self.gloss) else np.zeros((len(self.triangles), 2))
         return (
             np.array(self.vertices_m, dtype=float, order="C"),
             np.array(self.triangles, dtype=np.int64, order="C"),
             self._corner_normals(),
-            np.array(self.reflectance, dtype=float, order="C"),
+            np.ascontiguousarray(np.column_stack([self.reflectance, gloss]), dtype=float),
         )
+
+    @cached_property
+    def texture_share(self) -> Array:
+        """Relative standard deviation (m,) of the grey levels of each triangle by texture."""
+        return self.texture if len(self.texture) else np.full(len(self.triangles), _PLAIN_TEXTURE)
+
+    @cached_property
+    def mean_normals(self) -> Array:
+        """Unit normal (m, 3) of each triangle, the mean of its corners'."""
+        mean = self.contiguous[2].mean(axis=1)
+        return mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-30)
+
+    @cached_property
+    def suns(self) -> ShadowMaps:
+        """Shadow maps of directions all around, made when first used."""
+        return self.shadow_maps(spread_directions(_SUNS), _SUN_TEXELS)
+
+    def shadow_maps(self, to_sun_trf: Array, texels: int) -> ShadowMaps:
+        """Return a shadow map of ``texels`` squared for each of k unit vectors (k, 3) to the sun in TRF."""
+        k = len(to_sun_trf)
+        axis = np.eye(3)[np.argmin(np.abs(to_sun_trf), axis=1)]
+        right = np.cross(axis, to_sun_trf)
+        right /= np.linalg.norm(right, axis=1, keepdims=True)
+        per_m = 0.49 * texels / self.radius_m
+        settings = np.empty((k, 12))
+        settings[:, :9] = np.stack([right, np.cross(to_sun_trf, right), to_sun_trf], axis=1).reshape(k, 9)
+        settings[:, 9:] = per_m, texels, 1.5 / per_m
+        depths = np.empty((k, texels, texels), np.float32)
+        vertices, triangles, _, _ = self.contiguous
+        for row, depth in zip(settings, depths, strict=True):
+            function("shadow_map")(
+                (c_double * 12)(*row), address(vertices), address(triangles), c_int64(len(triangles)), address(depth)
+            )  # fmt: skip
+        return ShadowMaps(np.array(to_sun_trf, dtype=float, order="C"), settings, depths)
 
     @cached_property
     def radius_m(self) -> float:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
@@ -17,9 +17,11 @@ from .acquisition import Acquisition
 from .alignment import Alignment, Pyramid
 from .lighting import light_at
 from .mesh import TrackerMesh
+from .rendering import Lighting
 from .tracking import (
     is_valid,
     levels_of,
+    refine_from_prior,
     refine_from_starts,
     refine_pose,
     starts_around,
@@ -41,9 +43,11 @@ _WORSE = 0.1
 
 @dataclass(frozen=True)
 class PoseTrack:
-    """One hypothesis: last alignment, the pose before it, and the numbers of images since its view and since it was valid."""
+    """One hypothesis: last alignment and light, the pose before it, and the numbers of images since its view and since it was
+    valid."""
 
     last: Alignment
+    light: Lighting
     before: PoseInCamera | None = None
     age: int = 0
     missed: int = 0
@@ -61,14 +65,20 @@ class PoseTrack:
 class ModelPerception:
     """Estimates the pose of the target from its shape. Stateful: equal sequences of images give equal results.
 
-    One instance belongs to one camera. ``solutions`` are ambiguous poses, the best first, and without markers.
+    One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be shared. ``solutions`` are ambiguous
+    poses, the best first, and without markers.
     """
 
-    def __init__(self, camera: Camera, mesh: TrackerMesh) -> None:
+    def __init__(self, camera: Camera, mesh: TrackerMesh, acquisition: Acquisition | None = None) -> None:
         self.camera, self.mesh = camera, mesh
-        self._acquisition = Acquisition(camera, mesh)
+        self._acquisition = acquisition or Acquisition(camera, mesh)
         self._tracks: tuple[PoseTrack, ...] = ()
         self._until_acquisition = 0
+
+    def prepare(self) -> None:
+        """Compute what depends on the mesh alone; takes one to two seconds, which the first image would take otherwise."""
+        self._acquisition.prepare()
+        _ = self.mesh.suns
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
@@ -89,7 +99,7 @@ class ModelPerception:
         elif self._until_acquisition > 0:
             self._until_acquisition -= 1
         else:
-            self._tracks = tuple(PoseTrack(found) for found in self._acquisition.find(image))
+            self._tracks = tuple(PoseTrack(*found) for found in self._acquisition.find(image))
             self._until_acquisition = _ACQUIRE_EVERY - 1
         valid = [_target_pose(t.last) for t in self._tracks if t.missed == 0]
         return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
@@ -98,24 +108,26 @@ class ModelPerception:
 def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> PoseTrack:
     """Return a track after the next image: with the points of its view while they hold, else by a new one, else from several
     starts."""
-    prior = track.predicted()
+    prior, modes = track.predicted(), track.last.modes
+    missed = replace(track, missed=track.missed + 1)
     fresh = track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
     if fresh and not track.missed:
-        found = track_points(pyramid, track.last.points, prior)
+        found = track_points(pyramid, track.last.points, prior, modes)
         if is_valid(found):
-            return PoseTrack(found, track.last.pose, track.age + 1)
+            return PoseTrack(found, track.light, track.last.pose, track.age + 1)
     levels = levels_of(pyramid, mesh, prior)
-    light = light_at(pyramid, mesh, prior, levels[0]) if levels else None
+    light = light_at(pyramid, mesh, prior, levels[0], track.light) if levels else None
     if light is None:
-        return PoseTrack(track.last, track.before, track.age, track.missed + 1)
-    for chosen in (levels[-1:], levels):
-        found = refine_pose(pyramid, mesh, prior, light, chosen)
-        if is_valid(found):
-            return PoseTrack(found, track.last.pose)
-    found = refine_from_starts(pyramid, mesh, starts_around(prior), light)
+        return missed
+    found = refine_pose(pyramid, mesh, prior, light, levels[-1:], modes=modes)
     if is_valid(found):
-        return PoseTrack(found)
-    return PoseTrack(track.last, track.before, track.age, track.missed + 1)
+        return PoseTrack(found, light, track.last.pose)
+    refined = refine_from_prior(pyramid, mesh, prior, modes)
+    if refined and is_valid(refined[0]):
+        return PoseTrack(*refined)
+    light = refined[1] if refined else light
+    found = refine_from_starts(pyramid, mesh, starts_around(prior), light)
+    return PoseTrack(found, light) if is_valid(found) else missed
 
 
 def _distinct(tracks: list[PoseTrack]) -> tuple[PoseTrack, ...]:

@@ -63,7 +63,7 @@ def render(
     mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, light: Lighting, samples: int = 2
 ) -> SyntheticView:
     """Render ``mesh`` with ``samples`` by ``samples`` samples per pixel."""
-    vertices, triangles, normals, reflectance = mesh.contiguous
+    vertices, triangles, normals, surfaces = mesh.contiguous
     h, w = window.height, window.width
     shape = (h, w)
     view = SyntheticView(
@@ -79,35 +79,15 @@ def render(
         shadow_settings, depth = (0.0,) * 12, _NO_SHADOW
     else:
         settings = (*light.to_sun_irf, light.direct, light.ambient, 0.0)
-        shadow_settings, depth = (
-            _shadow_map(mesh, pose.rotation.T @ light.to_sun_irf)
-            if light.shadows
-            else ((0.0,) * 12, _NO_SHADOW)
-        )
-    work = np.empty(3 * samples * samples * h * w, np.float32)
+        shadow_settings, depth = (0.0,) * 12, _NO_SHADOW
+        if light.shadows:
+            maps = mesh.shadow_maps((pose.rotation.T @ light.to_sun_irf)[None], _SHADOW_TEXELS)
+            shadow_settings, depth = tuple(maps.settings[0].tolist()), maps.depths
+    facing, work = np.empty((len(triangles), 3)), np.empty(3 * samples * samples * h * w, np.float32)
     function("render_mesh")(
         (c_double * 4)(*window.lens), c_int64(h), c_int64(w), c_int64(samples), address(at),
-        address(vertices), address(triangles), address(normals), address(reflectance), c_int64(len(triangles)),
+        address(vertices), address(triangles), address(normals), address(surfaces), c_int64(len(triangles)),
         (c_double * 6)(*settings), (c_double * 12)(*shadow_settings), address(depth),
-        address(view.grey), address(view.coverage), address(view.nearest), address(view.owner), address(work),
+        address(view.grey), address(view.coverage), address(view.nearest), address(view.owner), address(facing), address(work),
     )  # fmt: skip
     return view
-
-
-def _shadow_map(mesh: TrackerMesh, to_sun_trf: Array) -> tuple[tuple[float, ...], NDArray[np.float32]]:
-    axis = np.eye(3)[int(np.argmin(np.abs(to_sun_trf)))]
-    right = np.cross(axis, to_sun_trf)
-    right /= np.linalg.norm(right)
-    basis = np.stack([right, np.cross(to_sun_trf, right), to_sun_trf])
-    texels_per_m = 0.49 * _SHADOW_TEXELS / mesh.radius_m
-    settings = (*basis.ravel().tolist(), texels_per_m, float(_SHADOW_TEXELS), 1.5 / texels_per_m)
-    depth = np.empty(_SHADOW_TEXELS**2, np.float32)
-    vertices, triangles, _, _ = mesh.contiguous
-    function("shadow_map")(
-        (c_double * 12)(*settings),
-        address(vertices),
-        address(triangles),
-        c_int64(len(triangles)),
-        address(depth),
-    )
-    return settings, depth

@@ -13,18 +13,21 @@ from chaserdock_models.arrays import Array
 
 from ..refine import PoseInCamera
 from .alignment import Alignment, ControlPoints, Pyramid, align, control_points, window_of
+from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
 
-MIN_INLIER_SHARE = 0.55
+MIN_INLIER_SHARE = 0.66
 """Gate: a smaller share of inliers rejects a pose."""
-MIN_SCORE = 0.45
+MIN_SCORE = 0.56
 """Gate: a smaller product of inlier share and mean correlation rejects a pose."""
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
 """Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
-_FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 140_000, 12_000, 24_000
+_FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
 _FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
 _START_SHARE, _START_RAD = 0.02, math.radians(3.0)
+_EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
+"""Light from everywhere."""
 
 
 def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
@@ -40,7 +43,7 @@ def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
 def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
     """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is out of view.
 
-    The finest one shows the target on at most 140,000 pixels, so that a rendering takes bounded time; small targets are
+    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time; small targets are
     upsampled twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
@@ -51,7 +54,7 @@ def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[
     while area / 4**finest > _FINEST_AREA_PX:
         finest += 1
     coarsest = finest
-    while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 3:
+    while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 4:
         coarsest += 1
     return tuple(range(coarsest, finest - 1, -1))
 
@@ -63,6 +66,7 @@ def refine_pose(
     light: Lighting,
     levels: tuple[int, ...],
     first_reach_px: int = _FIRST_REACH_PX,
+    modes: Array | None = None,
 ) -> Alignment | None:
     """Align the mesh with an image from ``prior``, level by level; None without an alignment at the last level."""
     pose, alignment = prior, None
@@ -71,16 +75,41 @@ def refine_pose(
         alignment = (
             None
             if points is None
-            else align(pyramid, points, pose, first_reach_px if number == 0 else _NEXT_REACH_PX)
+            else align(pyramid, points, pose, first_reach_px if number == 0 else _NEXT_REACH_PX, modes)
         )
         if alignment is not None:
-            pose = alignment.pose
+            pose, modes = alignment.pose, alignment.modes
     return alignment
 
 
-def track_points(pyramid: Pyramid, points: ControlPoints, prior: PoseInCamera) -> Alignment | None:
+def refine_from_prior(
+    pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
+) -> tuple[Alignment, Lighting] | None:
+    """Return the pose near ``prior`` and the light, neither of which needs to be known well; None without an alignment.
+
+    The outline and the borders of materials give a coarse pose by light from everywhere; from it follows the light, which improves
+    the coarse pose, which improves the light.
+    """
+    levels = levels_of(pyramid, mesh, prior)
+    if not levels:
+        return None
+    pose, light = prior, _EVEN_LIGHT
+    for _ in range(2):
+        coarse = refine_pose(pyramid, mesh, pose, light, levels[:1], modes=modes)
+        pose = coarse.pose if coarse else pose
+        found = light_at(pyramid, mesh, pose, levels[0])
+        if found is None:
+            return None
+        light = found
+    fine = refine_pose(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
+    return (fine, light) if fine else None
+
+
+def track_points(
+    pyramid: Pyramid, points: ControlPoints, prior: PoseInCamera, modes: Array | None = None
+) -> Alignment | None:
     """Align the control points of an earlier rendering from ``prior``."""
-    return align(pyramid, points, prior, _FIRST_REACH_PX)
+    return align(pyramid, points, prior, _FIRST_REACH_PX, modes)
 
 
 def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:

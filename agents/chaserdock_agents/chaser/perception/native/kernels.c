@@ -6,4 +6,5 @@
 #include "pose.c"
 #include "views.c"
 #include "mesh.c"
+#include "light.c"
 #include "align.c"

@@ -1,9 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Synthetic views of a triangle mesh: z-buffer rasterization, Lambert shading, cast shadows. */
+/* Synthetic views of a triangle mesh: z-buffer rasterization, Lambert shading with Blinn's gloss, cast shadows. */
 #include "base.h"
 
 #define CLIPPED_MOST 4
 #define NEAR_M 0.02
+#define GLOSS_MOST 1023
 
 /* A vertex on the sample grid: position, depth (linear on the grid, larger is nearer) and Lambert factor. */
 typedef struct {
@@ -108,6 +109,20 @@ static inline int in_shadow(const ShadowMap *map, const float *depth, const doub
     return dot3(map->basis + 6, at) < (double)depth[(int64_t)y * (int64_t)map->size + (int64_t)x] - map->tolerance_m;
 }
 
+/* Return the sunlit share of a point in TRF: bilinear interpolation of the comparisons with four texels. */
+static inline double sunlit_share(const ShadowMap *map, const float *depth, const double *at) {
+    double x = dot3(map->basis, at) * map->texels_per_m + 0.5 * map->size;
+    double y = dot3(map->basis + 3, at) * map->texels_per_m + 0.5 * map->size;
+    if (!(x >= 0.0 && y >= 0.0 && x < map->size - 1.0 && y < map->size - 1.0)) return 1.0;
+    int64_t size = (int64_t)map->size, column = (int64_t)x, row = (int64_t)y;
+    const float *d = depth + row * size + column;
+    float near = (float)(dot3(map->basis + 6, at) + map->tolerance_m);
+    double u = x - (double)column, v = y - (double)row;
+    double upper = (near < d[0] ? 0.0 : 1.0 - u) + (near < d[1] ? 0.0 : u);
+    double lower = (near < d[size] ? 0.0 : 1.0 - u) + (near < d[size + 1] ? 0.0 : u);
+    return upper + v * (lower - upper);
+}
+
 /* Project the corners of a triangle in IRF, clip them at NEAR_M, and rasterize. ``lens``: fx, fy, cx, cy on the sample grid. */
 static void draw_triangle(const double *lens, double at[3][4], int32_t index, int64_t width, int64_t height, float *depth,
                           int32_t *owner, float *shade) {
@@ -140,16 +155,63 @@ static inline double lambert(const MeshLight *light, const double *at, const dou
     return max_of(0.0, -dot3(normal, at)) / (distance * square);
 }
 
+/* (n'h)^exponent for unit vectors to the camera and to the light. */
+static inline double gloss_factor(const double *normal, const double *to_camera, const double *to_light, double exponent) {
+    double half[3];
+    for (int i = 0; i < 3; i++) half[i] = to_camera[i] + to_light[i];
+    double square = dot3(half, half), along = dot3(normal, half), power = 1.0;
+    if (!(along > 0.0 && square > 1e-12)) return 0.0;
+    along /= sqrt_of(square);
+    /* Below, the result is less than 0.001. */
+    if (1.0 - along > 7.0 / max_of(exponent, 1.0)) return 0.0;
+    for (int64_t m = ceiling(exponent, GLOSS_MOST); m > 0; m >>= 1) {
+        if (m & 1) power *= along;
+        along *= along;
+    }
+    return power;
+}
+
+/* What shades a sample: the view's grid (lens), TRF to IRF, surfaces and facing normals by triangle, light and its shadows. */
+typedef struct {
+    const double *grid, *to_trf, *offset, *surfaces, *facing;
+    const MeshLight *light;
+    const ShadowMap *map;
+    const float *map_depth;
+} SampleShading;
+
+/* Light reflected by triangle ``which`` at (x, y) of the grid, with inverse depth ``depth`` and Lambert factor ``lit``. */
+static inline double shade_sample(const SampleShading *s, int32_t which, double x, double y, double depth, double lit) {
+    const double *surface = s->surfaces + 3 * which;
+    const MeshLight *light = s->light;
+    double shine = 0.0;
+    if (lit > 0.0 && light->lamp == 0.0 && (s->map->size > 0.0 || surface[1] > 0.0)) {
+        double z = 1.0 / depth, point[3], ray[3] = {(x - s->grid[2]) / s->grid[0] * z, (y - s->grid[3]) / s->grid[1] * z, z};
+        double share = 1.0;
+        if (s->map->size > 0.0) {
+            multiply3(s->to_trf, ray, point);
+            subtract3(point, s->offset, point);
+            share = sunlit_share(s->map, s->map_depth, point);
+        }
+        lit *= share;
+        if (lit > 0.0 && surface[1] > 0.0) {
+            double length = sqrt_of(dot3(ray, ray)), to_camera[3];
+            for (int i = 0; i < 3; i++) to_camera[i] = -ray[i] / length;
+            shine = share * surface[1] * gloss_factor(s->facing + 3 * which, to_camera, light->to_light, surface[2]);
+        }
+    }
+    return surface[0] * (light->ambient + light->direct * lit) + light->direct * shine;
+}
+
 /* Render a mesh. ``lens``: fx, fy, cx, cy of the image (height, width) of ideal pixels; ``samples``: per pixel along each axis;
  * ``pose``: position (3) and rotation (3, 3) TRF to IRF; ``vertices`` (.., 3) and ``normals`` (n, 3, 3), of each corner, in TRF;
- * ``triangles`` (n, 3) int64, outward orientation; ``reflectance`` (n). Output, (height, width): ``grey`` float, reflectance times
- * light, averaged over the target's samples and black ones of the background; ``coverage`` float, share of the target's samples;
- * ``nearest`` float, inverse depth of the nearest sample, 1/m, 0 without any; ``owner`` int32, its triangle or -1. ``work``:
- * 3 samples^2 height width floats. Faces turned away are not drawn. */
+ * ``triangles`` (n, 3) int64, outward orientation; ``surfaces`` (n, 3): reflectance, gloss and Blinn's exponent. Output, (height,
+ * width): ``grey`` float, light reflected, averaged over the target's samples and black ones of the background; ``coverage`` float,
+ * share of the target's samples; ``nearest`` float, inverse depth of the nearest sample, 1/m, 0 without any; ``owner`` int32, its
+ * triangle or -1. ``facing``: 3 n doubles; ``work``: 3 samples^2 height width floats. Faces turned away are not drawn. */
 EXPORT void NAME(render_mesh)(const double *lens, int64_t height, int64_t width, int64_t samples, const double *pose,
-                             const double *vertices, const int64_t *triangles, const double *normals, const double *reflectance,
+                             const double *vertices, const int64_t *triangles, const double *normals, const double *surfaces,
                              int64_t n, const MeshLight *light, const ShadowMap *map, const float *map_depth, float *grey,
-                             float *coverage, float *nearest, int32_t *owner, float *work) {
+                             float *coverage, float *nearest, int32_t *owner, double *facing, float *work) {
     int64_t wide = width * samples, high = height * samples, all = wide * high;
     float *depth = work, *shade = work + all;
     int32_t *index = (int32_t *)(work + 2 * all);
@@ -157,14 +219,15 @@ EXPORT void NAME(render_mesh)(const double *lens, int64_t height, int64_t width,
                                                (lens[3] + 0.5) * scale - 0.5};
     for (int64_t i = 0; i < all; i++) depth[i] = 0.0f, shade[i] = 0.0f, index[i] = -1;
     for (int64_t t = 0; t < n; t++) {
-        double at[3][4], ab[3], ac[3], facing[3], normal[3];
+        double at[3][4], ab[3], ac[3], normal[3];
         for (int i = 0; i < 3; i++) {
             multiply3(pose + 3, vertices + 3 * triangles[3 * t + i], at[i]);
             for (int k = 0; k < 3; k++) at[i][k] += pose[k];
         }
         subtract3(at[1], at[0], ab), subtract3(at[2], at[0], ac);
-        cross3(ab, ac, facing);
-        if (!(dot3(facing, at[0]) < 0.0)) continue;
+        cross3(ab, ac, facing + 3 * t);
+        if (!(dot3(facing + 3 * t, at[0]) < 0.0)) continue;
+        normalize3(facing + 3 * t);
         for (int i = 0; i < 3; i++) {
             multiply3(pose + 3, normals + 9 * t + 3 * i, normal);
             at[i][3] = lambert(light, at[i], normal);
@@ -175,28 +238,41 @@ EXPORT void NAME(render_mesh)(const double *lens, int64_t height, int64_t width,
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) to_trf[3 * i + j] = pose[3 + 3 * j + i];
     multiply3(to_trf, pose, offset);
+    const SampleShading shading = {grid, to_trf, offset, surfaces, facing, light, map, map_depth};
     for (int64_t y = 0; y < height; y++)
         for (int64_t x = 0; x < width; x++) {
+            int64_t corner = y * samples * wide + x * samples, at = y * width + x, count = 0, best = -1;
+            int32_t first = index[corner];
+            int uniform = 1;
+            for (int64_t j = 0; j < samples; j++)
+                for (int64_t i = 0; i < samples; i++) uniform &= index[corner + j * wide + i] == first;
             double sum = 0.0;
-            int64_t count = 0, best = -1;
             float near = 0.0f;
-            for (int64_t k = 0; k < samples * samples; k++) {
-                int64_t sx = x * samples + k % samples, sy = y * samples + k / samples, at = sy * wide + sx;
-                int32_t which = index[at];
-                if (which < 0) continue;
-                count++;
-                if (depth[at] > near) near = depth[at], best = which;
-                double lit = shade[at];
-                if (lit > 0.0 && map->size > 0.0 && light->lamp == 0.0) {
-                    double z = 1.0 / (double)depth[at], point[3];
-                    double ray[3] = {((double)sx - grid[2]) / grid[0] * z, ((double)sy - grid[3]) / grid[1] * z, z};
-                    multiply3(to_trf, ray, point);
-                    subtract3(point, offset, point);
-                    if (in_shadow(map, map_depth, point)) lit = 0.0;
-                }
-                sum += reflectance[which] * (light->ambient + light->direct * lit);
+            if (uniform && first >= 0) {
+                /* Depth and Lambert factor are linear on the grid: shade the middle of the pixel. */
+                double lit = 0.0, middle = 0.0;
+                for (int64_t j = 0; j < samples; j++)
+                    for (int64_t i = 0; i < samples; i++) {
+                        int64_t k = corner + j * wide + i;
+                        lit += (double)shade[k], middle += (double)depth[k];
+                        if (depth[k] > near) near = depth[k];
+                    }
+                double half = 0.5 * (scale - 1.0);
+                count = samples * samples, best = first;
+                sum = (double)count * shade_sample(&shading, first, (double)(x * samples) + half, (double)(y * samples) + half,
+                                                   middle * share, lit * share);
+            } else if (!uniform) {
+                for (int64_t j = 0; j < samples; j++)
+                    for (int64_t i = 0; i < samples; i++) {
+                        int64_t k = corner + j * wide + i;
+                        int32_t which = index[k];
+                        if (which < 0) continue;
+                        count++;
+                        if (depth[k] > near) near = depth[k], best = which;
+                        sum += shade_sample(&shading, which, (double)(x * samples + i), (double)(y * samples + j),
+                                            (double)depth[k], (double)shade[k]);
+                    }
             }
-            int64_t at = y * width + x;
             grey[at] = (float)(sum * share), coverage[at] = (float)((double)count * share);
             nearest[at] = near, owner[at] = (int32_t)best;
         }

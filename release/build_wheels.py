@@ -186,7 +186,7 @@ def build(out: Path) -> Iterator[Path]:
 
 def main() -> int:
     """Build everything; the exit status is 1 if a file may not be published."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser = argparse.ArgumentParser(description="Build and inspect sdist and wheels.")
     parser.add_argument(
         "--out", type=Path, default=ROOT / "dist", help="folder for the files (default: dist)"
     )

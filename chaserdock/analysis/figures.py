@@ -213,11 +213,10 @@ def tracking_axes(flight: RecordedFlight, _: Traces) -> Figure:
         axes[3 * row].set_ylabel(label)
         axes[3 * row].set_ylim(-reach[row], reach[row])
     for k, name in enumerate("xyz"):
-        # Inside: the legend of several chasers is wider than one plot and lies where titles are.
         axes[k].annotate(name, (0.03, 0.95), xycoords="axes fraction", va="top", weight="bold")
         axes[3 + k].set_xlabel("time / s")
     axes[0].set_xlim(_span_s(flight.truth["target"].time_s))
-    legend_above(axes[2])
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper right", ncols=8, handlelength=1.4)
     return figure
 
 

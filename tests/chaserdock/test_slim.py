@@ -15,7 +15,9 @@ without_symbols = runpy.run_path(str(ROOT / "docker" / "slim.py"), run_name="sli
 
 
 def test_a_library_without_symbols_is_smaller_and_loads(tmp_path: Path) -> None:
-    library = next(Path(daqp.__file__).parents[1].glob("daqp*.so"), None) or Path(daqp.__file__)
+    assert daqp.__file__ is not None
+    module = Path(daqp.__file__)
+    library = next(module.parents[1].glob("daqp*.so"), module)
     content = library.read_bytes()
     kept = without_symbols(content)
     assert len(kept) < len(content)

@@ -39,15 +39,19 @@ def deferred_signals() -> Generator[None]:
         yield
         return
     received: list[tuple[int, FrameType | None]] = []
-    before = {}
+    before: dict[int, Callable[[int, FrameType | None], object]] = {}
+
+    def receive(number: int, frame: FrameType | None) -> None:
+        received.append((number, frame))
+
     for number in (signal.SIGINT, signal.SIGTERM):
         if callable(handler := signal.getsignal(number)):
             before[number] = handler
-            signal.signal(number, lambda *call: received.append(call))
+            signal.signal(number, receive)
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         for number, frame in received:
-            before[signal.Signals(number)](number, frame)
+            before[number](number, frame)

@@ -26,15 +26,14 @@ def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() ->
         mission.step()
     mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(3)))
     axis = np.array(mission.scenario.docking.ports[1].axis)
-    start = None
+    places = []
     while mission.time_s < 6.0:
         record = mission.step()
         if record.outputs is not None and mission.phase(1) == "retreat":
             target, own = record.states["target"], record.states["chaser/1"]
-            place = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
-            start = place if start is None else start
-    assert start is not None
-    moved = place - start
+            places.append(rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m))
+    assert places
+    moved = places[-1] - places[0]
     assert mission.retreats(1) == ["from detumble: the latch opened"]
     assert float(moved @ axis) > 0.01
     assert np.linalg.norm(moved - (moved @ axis) * axis) < 0.5 * float(moved @ axis)

@@ -6,7 +6,7 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from contextlib import contextmanager
 from types import FrameType
 
@@ -39,15 +39,20 @@ def deferred_signals() -> Generator[None]:
         yield
         return
     received: list[tuple[int, FrameType | None]] = []
-    before = {}
+    before: dict[int, Callable[[int, FrameType | None], object]] = {}
+
+    def note(number: int, frame: FrameType | None) -> None:
+        received.append((number, frame))
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        if callable(handler := signal.getsignal(number)):
+        handler = signal.getsignal(number)
+        if callable(handler):
             before[number] = handler
-            signal.signal(number, lambda *call: received.append(call))
+            signal.signal(number, note)
     try:
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         for number, frame in received:
-            before[signal.Signals(number)](number, frame)
+            before[number](number, frame)

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.spatial import KDTree
 
 from .arrays import Array, IntArray
 from .meshes import MeshPart, TriangleMesh, open_edges
@@ -32,6 +31,8 @@ def deviation_m(part: MeshPart, other: MeshPart) -> float:
 
 
 def _one_sided(part: MeshPart, other: MeshPart) -> float:
+    from scipy.spatial import KDTree  # slow to import, and needed for meshes of files only
+
     points = np.concatenate([part.vertices_m, part.vertices_m[part.triangles].mean(axis=1)])
     points = points[:: max(1, len(points) // _QUERIES)]
     corners = other.vertices_m[other.triangles]

@@ -42,7 +42,7 @@ _FREESTANDING = ("-nostdlib", "-s", "-Wl,-z,defs")
 
 
 @dataclass(frozen=True)
-class Target:
+class BuildTarget:
     """A kind of machine: its instruction sets, zig's flags for compiling and linking, and the platform tag of its wheel."""
 
     levels: tuple[tuple[int, str], ...]
@@ -51,16 +51,16 @@ class Target:
     tag: str
 
 
-def _linux(machine: str, levels: tuple[tuple[int, str], ...]) -> Target:
+def _linux(machine: str, levels: tuple[tuple[int, str], ...]) -> BuildTarget:
     # glibc 2.17 is the oldest that a package index accepts wheels for; the kernels use none.
     flags = ("-target", f"{machine}-linux-gnu.2.17", "-fPIC")
-    return Target(levels, flags, _FREESTANDING, f"manylinux_2_17_{machine}")
+    return BuildTarget(levels, flags, _FREESTANDING, f"manylinux_2_17_{machine}")
 
 
 TARGETS = {
     "x86_64-linux": _linux("x86_64", X86_64),
     "aarch64-linux": _linux("aarch64", OTHER),
-    "arm64-macos": Target(
+    "arm64-macos": BuildTarget(
         OTHER,
         ("-target", "aarch64-macos.11.0"),
         ("-s", f"-Wl,-install_name,@rpath/{LIBRARY_NAME}"),
@@ -69,7 +69,7 @@ TARGETS = {
 }
 
 
-def this_machine() -> Target:
+def this_machine() -> BuildTarget:
     """Return the target of this machine; one outside TARGETS has the platform tag that Python reports."""
     system = {"linux": "linux", "darwin": "macos"}.get(sys.platform, sys.platform)
     machine = platform.machine().lower()
@@ -78,7 +78,7 @@ def this_machine() -> Target:
         return TARGETS[f"{machine}-{system}"]
     if system == "linux":
         return _linux(machine, OTHER)
-    return Target(X86_64 if machine in ("x86_64", "amd64") else OTHER, (), (), tag)
+    return BuildTarget(X86_64 if machine in ("x86_64", "amd64") else OTHER, (), (), tag)
 
 
 def source_digest(folder: Path) -> str:
@@ -90,7 +90,7 @@ def source_digest(folder: Path) -> str:
     return digest.hexdigest()
 
 
-def compile_kernels(folder: Path, target: Target | None = None, library: Path | None = None) -> Path:
+def compile_kernels(folder: Path, target: BuildTarget | None = None, library: Path | None = None) -> Path:
     """Compile ``kernels.c`` of ``folder`` for ``target`` (default: this machine) into a shared library and return its path.
 
     ``library``: the path to write, by default LIBRARY_NAME in ``folder``. Raises RuntimeError with the compiler's output if
@@ -136,7 +136,7 @@ def compile_all(root: Path) -> list[Path]:
     return [compile_kernels(root / folder) for folder in NATIVE_FOLDERS]
 
 
-def compile_into(out: Path, root: Path, target: Target) -> dict[Path, str]:
+def compile_into(out: Path, root: Path, target: BuildTarget) -> dict[Path, str]:
     """Compile all libraries for ``target`` into ``out``; return each one's file, with its place among the packages."""
     libraries = {}
     for folder in NATIVE_FOLDERS:

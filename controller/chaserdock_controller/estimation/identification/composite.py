@@ -18,17 +18,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, BoolArray
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.rigid_body import BodyState, RigidBody, free_rotation
 from chaserdock_models.wrench_set import ThrusterMount, wrench_matrix
 from chaserdock_protocol.scenario.navigation import NavigationErrors
-from numpy.typing import NDArray
-from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
-
-Flags = NDArray[np.bool_]
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 MASS, CENTRE, INERTIA = slice(12, 13), slice(13, 16), slice(16, 22)
@@ -139,7 +135,7 @@ class _Estimate:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class StackPrediction:
     """``transition`` of the error state; ``pushed`` (6, u): change of velocity (WRF) and rate (TRF) by 1 N s of each thruster that
     may fire; ``impulses_N_s`` (u,) that they were to give in ``step_s``."""
 
@@ -150,13 +146,12 @@ class Prediction:
 
 
 @dataclass(frozen=True, eq=False)
-class Innovation:
-    """``matrix`` (K, size) of the measurement, ``gain`` (size, K), Cholesky ``factor`` of the residual's covariance as of SciPy,
-    ``residual`` (K,)."""
+class StackInnovation:
+    """``matrix`` (K, size) of the measurement, ``gain`` (size, K), ``residual`` (K,) and its expected ``covariance`` (K, K)."""
 
     matrix: Array
     gain: Array
-    factor: tuple[Array, bool]
+    covariance: Array
     residual: Array
 
 
@@ -174,7 +169,7 @@ class CompositeIdentification:
         chasers: Mapping[int, MountedChaser],
         states: Mapping[int, BodyState],
         thrusters: Sequence[ThrusterMount],
-        usable: Mapping[int, Flags],
+        usable: Mapping[int, BoolArray],
         errors: NavigationErrors,
         parameters: IdentificationParameters,
         measured: int | None = None,
@@ -242,7 +237,7 @@ class CompositeIdentification:
 
     def predict(
         self, impulses_N_s: Mapping[int, Array], step_s: float, unknown: Mapping[int, Array] | None = None
-    ) -> Prediction:
+    ) -> StackPrediction:
         """Advance by ``step_s`` with the impulses (n,) that the thrusters of every chaser were to give since the last tick.
 
         Half of the impulse acts at the begin and half at the end. ``unknown`` (n,): standard deviations of further impulses
@@ -273,7 +268,7 @@ class CompositeIdentification:
             q_wxyz=qs[1],
             omega_rad_s=omegas[1] + turn / 2.0,
         )
-        return Prediction(transition, pushed[:, self._usable], stated[self._usable], step_s)
+        return StackPrediction(transition, pushed[:, self._usable], stated[self._usable], step_s)
 
     def _of_all(self, by_chaser: Mapping[int, Array]) -> Array:
         """Return the figures of all thrusters (N n,), zero where a chaser has none."""
@@ -342,7 +337,7 @@ class CompositeIdentification:
 
     # -- update ----------------------------------------------------------------------------------------------
 
-    def update(self, states: Mapping[int, BodyState]) -> Innovation | None:
+    def update(self, states: Mapping[int, BodyState]) -> StackInnovation | None:
         """Take the measured states of the chasers at this tick; return the innovation, None without any state."""
         self.ticks += 1
         rows = [row for row, chaser in enumerate(self.chasers) if chaser in states]
@@ -352,7 +347,7 @@ class CompositeIdentification:
         h, residual = np.concatenate([m for m, _ in parts]), np.concatenate([r for _, r in parts])
         return self._update(h, residual, np.diag(np.tile(self._noise, len(rows))))
 
-    def update_poses(self, poses: Mapping[int, tuple[BodyState, Array]]) -> Innovation | None:
+    def update_poses(self, poses: Mapping[int, tuple[BodyState, Array]]) -> StackInnovation | None:
         """Take measured poses, by chaser, with their covariances (6, 6): position (WRF) and attitude (axes of the measured body).
 
         The rates in the states are not used. None without any pose.
@@ -366,22 +361,24 @@ class CompositeIdentification:
                 parts.append((h[used], residual[used], poses[chaser][1]))
         if not parts:
             return None
-        noise = np.asarray(block_diag(*(r for _, _, r in parts)), dtype=np.float64)
+        noise = np.zeros((6 * len(parts), 6 * len(parts)))
+        for k, (_, _, covariance) in enumerate(parts):
+            noise[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = covariance
         return self._update(
             np.concatenate([h for h, _, _ in parts]), np.concatenate([r for _, r, _ in parts]), noise
         )
 
-    def _update(self, h: Array, residual: Array, noise: Array) -> Innovation:
+    def _update(self, h: Array, residual: Array, noise: Array) -> StackInnovation:
         projected = h @ self.covariance
-        factor = cho_factor(projected @ h.T + noise, lower=True)
-        self.nis = float(residual @ cho_solve(factor, residual)) / len(residual)
-        gain = cho_solve(factor, projected).T
+        expected = projected @ h.T + noise
+        self.nis = float(residual @ np.linalg.solve(expected, residual)) / len(residual)
+        gain = np.linalg.solve(expected, projected).T
         # Joseph's form, which stays positive definite under rounding.
         kept = self.covariance - gain @ projected
         kept = kept - (kept @ h.T) @ gain.T + gain @ noise @ gain.T
         self.covariance = (kept + kept.T) / 2.0
         self._estimate = self._corrected(self._estimate, gain @ residual)
-        return Innovation(h, gain, factor, residual)
+        return StackInnovation(h, gain, expected, residual)
 
     def loosen_mounts(self, position_m: float, attitude_rad: float) -> None:
         """Let the poses of the chasers in TRF walk by these standard deviations per axis."""
@@ -487,7 +484,7 @@ class CompositeIdentification:
 
     @property
     def usable(self) -> list[tuple[int, int]]:
-        """Return chaser and number of the thrusters that may fire, in the order of ``Prediction``."""
+        """Return chaser and number of the thrusters that may fire, in the order of ``StackPrediction``."""
         return [(self.chasers[k // self._n], int(k % self._n)) for k in self._usable]
 
     @property

@@ -13,10 +13,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from chaserdock_models.arrays import Array
-from scipy.linalg import cho_solve
+from chaserdock_models.arrays import Array, BoolArray
 
-from .composite import RATE, VELOCITY, CompositeIdentification, Flags, Innovation, Prediction
+from .composite import RATE, VELOCITY, CompositeIdentification, StackInnovation, StackPrediction
 
 _LEAST_GAIN = 25.0
 """Least log-likelihood ratio to the fault-free hypothesis."""
@@ -49,7 +48,7 @@ class StackFaultDetector:
         """Begin all tests again."""
         self._signatures[:], self.gains[:] = 0.0, 0.0
 
-    def predict(self, prediction: Prediction) -> None:
+    def predict(self, prediction: StackPrediction) -> None:
         """Propagate the signatures over a tick."""
         count = len(self._thrusters)
         self._signatures = prediction.transition @ self._signatures
@@ -60,10 +59,10 @@ class StackFaultDetector:
             self._signatures[part, :count] += missing[rows]
             self._signatures[part, count:] += beyond[rows]
 
-    def update(self, innovation: Innovation, suspects: Flags) -> tuple[StackFault, Array] | None:
+    def update(self, innovation: StackInnovation, suspects: BoolArray) -> tuple[StackFault, Array] | None:
         """Return a failure that the innovations prove, with its effect on the state; ``suspects`` (u,): thrusters in question."""
         shift = innovation.matrix @ self._signatures
-        weighted = cho_solve(innovation.factor, shift)
+        weighted = np.linalg.solve(innovation.covariance, shift)
         self.gains += innovation.residual @ weighted - 0.5 * np.sum(shift * weighted, axis=0)
         self._signatures = self._signatures - innovation.gain @ shift
         again = (self.gains < 0.0) | np.tile(~suspects, 2)

@@ -11,7 +11,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.wrench_set import wrench_matrix
 from chaserdock_protocol.messages import Odometry
@@ -26,7 +26,7 @@ from chaserdock_controller.interfaces import DirectCommand, IdentifiedStack, Obs
 
 from .allocation import feedback, minimum_time, spans_all_directions
 from .planner import StackPlanner
-from .planning import Indices, StackProblem
+from .planning import StackProblem
 from .port_loads import LoadModel, load_model
 from .sequencer import Sequencer
 from .stack import StackMotion, thruster_wrenches
@@ -82,7 +82,7 @@ class _Thrusters:
     chasers: tuple[int, ...]
     wrenches: Array
     limits_N: Array
-    groups: Indices
+    groups: IntArray
 
 
 class DetumbleControl:

@@ -16,14 +16,9 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
-from numpy.typing import NDArray
-from scipy.optimize import linprog
-from scipy.sparse import csr_array, eye_array, hstack, kron
+from chaserdock_models.arrays import Array, IntArray
 
 from .allocation import units_of
-
-Indices = NDArray[np.intp]
 
 _PENALTY = 30.0
 """Price of a remaining momentum over that of the impulse that would remove it in the thrusters' best direction."""
@@ -42,7 +37,7 @@ class StackProblem:
     inertia_kg_m2: Array
     wrenches: Array
     limits_N: Array
-    groups: Indices
+    groups: IntArray
     at_once: int | None = None
 
 
@@ -129,7 +124,7 @@ def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
     return _Flight(np.concatenate([p, h]), middles, rates, momenta, bodies)
 
 
-def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Indices) -> Array:
+def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: IntArray) -> Array:
     """Return the matrix (6, K a) of the momentum at the end by the thrusts of the thrusters ``able`` at every step."""
     inverse = np.linalg.inv(problem.inertia_kg_m2)
     own = problem.wrenches[:, able]
@@ -160,7 +155,7 @@ def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: Ind
     return rows.transpose(1, 0, 2).reshape(6, -1)
 
 
-def _price(problem: StackProblem, able: Indices) -> Array:
+def _price(problem: StackProblem, able: IntArray) -> Array:
     """Return the penalty (6,) per N s and N m s of remaining momentum."""
     force, torque = units_of(problem.wrenches[:, able], problem.limits_N[able])
     thrust = float(problem.limits_N[able].max())
@@ -176,11 +171,13 @@ def _linear_step(
     flight: _Flight,
     thrusts_N: Array,
     step_s: float,
-    able: Indices,
+    able: IntArray,
     price: Array,
     radius: float,
 ) -> tuple[Array, float]:
     """Return the change of the thrusts (K, n) that the linear programme gives, and the merit that it predicts."""
+    from scipy.optimize import linprog  # as slow to import as the controller, and needed for plans only
+
     count, a = len(thrusts_N), len(able)
     jacobian = sensitivity(problem, flight, step_s, able)
     now = thrusts_N[:, able].reshape(-1)
@@ -211,10 +208,12 @@ def _linear_step(
     return step, float(found.fun)
 
 
-def _sequencing(problem: StackProblem, able: Indices, count: int) -> tuple[Any, Array | None]:
+def _sequencing(problem: StackProblem, able: IntArray, count: int) -> tuple[Any, Array | None]:
     """Return the rows (sparse) that let at most ``at_once`` thrusters of a chaser fire in a step; None without a limit."""
     if problem.at_once is None:
         return None, None
+    from scipy.sparse import csr_array, eye_array, hstack, kron
+
     groups = problem.groups[able]
     own = csr_array(np.array([groups == g for g in np.unique(groups)], dtype=float))
     number = count * len(np.unique(groups))

@@ -37,7 +37,7 @@ class SightingNoise(NamedTuple):
 SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0)
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
 # Errors of geometry and shading change only with the view, and are alike in the images of several cameras.
-SHAPE = SightingNoise(white_ratio=0.75, view_ratio=1.5, view_time_s=10.0)
+SHAPE = SightingNoise(white_ratio=1.0, view_ratio=2.4, view_time_s=10.0)
 
 
 @dataclass(frozen=True)

@@ -59,6 +59,11 @@ def _item(name: str, k: int) -> Reader:
     return read
 
 
+def _part(name: str, read: Reader) -> Reader:
+    """Return a reader of a column of the structure in a field, which may be None."""
+    return lambda message: None if getattr(message, name) is None else read(getattr(message, name))
+
+
 def _json(name: str) -> Reader:
     return lambda message: json.dumps(getattr(message, name), sort_keys=True)
 
@@ -103,6 +108,8 @@ def _columns(kind: type[msgspec.Struct], images: bool) -> tuple[list[Column], li
                     columns.append((f"{stem}_{axis}", pa.float64(), _item(name, k)))
             case inspect.VarTupleType(item_type=inspect.StructType()):
                 children.append(name)
+            case inspect.StructType(cls=part):
+                columns += [(f"{name}_{n}", t, _part(name, read)) for n, t, read in _columns(part, images)[0]]
             case inspect.BytesType() if not images:
                 columns.append(
                     (f"{name}_bytes", pa.int64(), lambda message, n=name: len(getattr(message, n)))

@@ -434,7 +434,7 @@ class PassiveSafety(Message, frozen=True, kw_only=True):
     """Certificate of one chaser: the coasts after a loss of all thrust at any state of its newest plan (``limits.passive_safety``).
 
     ``margin_sigmas``: smallest distance of a coast from the keep-out over its standard deviation; negative inside.
-    ``distance_m``: a lower bound on the distance from the target there, ``time_s`` after the loss of thrust, which is
+    ``distance_m``: a lower bound on the distance from the target there, ``closest_s`` after the loss of thrust, which is
     ``loss_s`` after the plan's beginning. ``safe``: the margin is at least ``limits.estimate_margin_sigmas``. ``enforced``: the
     chaser aborts while it is not. ``abort_margin_sigmas``: the same margin of the best abort from here; None where none is sought.
     """
@@ -442,7 +442,7 @@ class PassiveSafety(Message, frozen=True, kw_only=True):
     chaser: ChaserId
     margin_sigmas: float
     distance_m: float
-    time_s: float
+    closest_s: float
     loss_s: float
     safe: bool
     enforced: bool

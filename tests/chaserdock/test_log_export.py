@@ -54,6 +54,12 @@ def test_every_message_fits_its_table(topic: topics.Topic) -> None:
             plain = {k: list(v) if isinstance(v, tuple) else v for k, v in first.items() if k in inner[0]}
             assert plain
             assert all(inner[0][k] == v for k, v in plain.items())
+        elif isinstance(value, msgspec.Struct):
+            for part, whole_part in msgspec.to_builtins(value).items():
+                if f"{name}_{part}" in row:
+                    assert row[f"{name}_{part}"] == whole_part
+                else:
+                    assert [row[f"{name}_{part}_{axis}"] for axis in "xyz"] == list(whole_part)
         elif value == () and name not in row:
             assert len(whole[f"{table_name(topic)}_{name}"]) == 0  # a list of structures, none this time
         elif isinstance(value, dict):

@@ -151,7 +151,7 @@ def safety_message(
         chaser=chaser,
         margin_sigmas=found.margin_sigmas,
         distance_m=found.distance_m,
-        time_s=found.time_s,
+        closest_s=found.time_s,
         loss_s=monitor.loss_s(found),
         safe=monitor.is_safe(found),
         enforced=chaser in guidance.abort_margins,

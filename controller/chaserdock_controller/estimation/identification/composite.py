@@ -372,7 +372,7 @@ class CompositeIdentification:
         projected = h @ self.covariance
         expected = projected @ h.T + noise
         self.nis = float(residual @ np.linalg.solve(expected, residual)) / len(residual)
-        gain = np.linalg.solve(expected, projected).T
+        gain = np.asarray(np.linalg.solve(expected, projected).T, dtype=np.float64)
         # Joseph's form, which stays positive definite under rounding.
         kept = self.covariance - gain @ projected
         kept = kept - (kept @ h.T) @ gain.T + gain @ noise @ gain.T

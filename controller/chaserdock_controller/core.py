@@ -8,7 +8,6 @@ from collections.abc import Callable
 from chaserdock_protocol.messages import TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 
-from .estimation.identification.stage import StackIdentification
 from .estimation.joint import JointEstimator
 from .estimation.stage import EstimationStage
 from .estimation.types import Estimator
@@ -38,8 +37,6 @@ class ControllerCore:
         self.scenario = scenario
         self.ingest = IngestStage(scenario)
         self.estimation = EstimationStage(scenario, estimator or estimator_of(scenario))
-        enabled = scenario.detumble.identification.enabled
-        self.identification = StackIdentification(scenario) if enabled else None
         self.guidance = GuidanceStage(scenario)
         self.planning = PlanningStage(scenario, nmpc_parameters(scenario), now_s, realtime)
         self.output = OutputStage(scenario)
@@ -48,11 +45,6 @@ class ControllerCore:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
         observation = self.ingest.run(inputs, self.output.history)
         estimation = self.estimation.run(observation)
-        if self.identification is not None:
-            estimation = self.identification.identified(observation, estimation)
-            refined = self.identification.refined_target(observation)
-            if refined is not None:
-                self.estimation.composite.refine_target(refined)
         failures = self.planning.monitor.failures(observation.time_ns)
         unsafe = self.planning.unsafe(observation.time_ns)
         guidance = self.guidance.run(observation, estimation, failures, unsafe)

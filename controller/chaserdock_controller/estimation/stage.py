@@ -20,6 +20,7 @@ from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
 from chaserdock_controller.interfaces import LogEntry, Observation, TargetEstimation
 
 from .composite_body import CompositeBody
+from .identification.stage import StackIdentification
 from .joint import JointEstimator
 from .joint.estimator import JointInputs
 from .joint.prediction import disturbance
@@ -44,9 +45,22 @@ class EstimationStage:
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
+        enabled = scenario.detumble.identification.enabled
+        self._identification = StackIdentification(scenario) if enabled else None
 
     def run(self, observation: Observation) -> TargetEstimation:
-        """Update the estimator with a tick's inputs, and with contacts and impulses from before them."""
+        """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the identification
+        of the stack, whose result the estimator takes from the next tick on."""
+        estimation = self._estimate(observation)
+        if self._identification is None:
+            return estimation
+        estimation = self._identification.identified(observation, estimation)
+        refined = self._identification.refined_target(observation)
+        if refined is not None:
+            self.composite.refine_target(refined)
+        return estimation
+
+    def _estimate(self, observation: Observation) -> TargetEstimation:
         o, now_ns, estimator = observation, observation.time_ns, self.estimator
         before = self.composite.latched
         own = _without_drift(estimator, o.odometry)

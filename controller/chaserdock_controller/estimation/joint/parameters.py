@@ -122,7 +122,7 @@ class JointParameters:
         """Return the errors of a sighting of this many markers, 0 for one by shape."""
         if markers == 0:
             return self.shape
-        return self.single_marker if markers <= 1 else self.several_markers
+        return self.single_marker if markers == 1 else self.several_markers
 
     @property
     def inertia(self) -> Vector3:

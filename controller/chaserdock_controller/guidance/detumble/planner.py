@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies a stack by a plan of least propellant, which is made anew from the estimates while it is flown."""
+"""Flies a stack by a plan of least propellant, which is renewed from the estimates while it is flown."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class StackPlanner:
         return ActivePlan(plan, now_ns, end_ns, now_ns, problem.limits_N.copy())
 
     def _again(self, problem: StackProblem, active: ActivePlan, now_ns: int) -> ActivePlan:
-        """Return the plan made anew from the present state, begun with what is left of the last one."""
+        """Return a plan from the present state; its first guess is the rest of the last plan."""
         left_s = (active.end_ns - now_ns) / 1e9
         count = max(1, round(left_s / active.plan.step_s))
         step_s = left_s / count

@@ -192,7 +192,7 @@ class StackIdentification:
         self._events.append(("warning", text))
 
     def _by_information(self) -> tuple[tuple[int, int], ...]:
-        """Return the thrusters by what a pulse tells about the mass properties, the best first."""
+        """Return the thrusters by the information of a pulse on the mass properties, the best first."""
         assert self._filter is not None
         errors, stack = self._scenario.navigation.errors(), self._filter.stack
         count = len(self._filter.chasers) * _WATCH_S / self._period_s

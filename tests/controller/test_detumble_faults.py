@@ -7,9 +7,13 @@ import math
 
 import numpy as np
 import pytest
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.detumble.control import StackTask
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.scenario import flight_scenario
 
 from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario
 from chaserdock.evaluation.perception import RenderedImages
@@ -50,6 +54,53 @@ def test_a_stuck_thruster_is_found_on_the_stack_and_isolated(kind: str, expected
     flight = fly_controlled(stack_scenario(1, (0, 1, 2, 3), [*wrong_knowledge(1), failure]), 15.0)
     assert flight.time_s is not None
     assert flight.failed == f"chaser 0: thruster 2 {expected}, seen in the motion of the stack, isolated"
+
+
+class WatchedMission(StackMission):
+    """A mission that a second controller follows from ``follow`` on; ``outputs`` of both for every tick since."""
+
+    follower: ControllerCore | None = None
+    outputs: list[tuple[TickOutputs | None, TickOutputs]]
+
+    def follow(self) -> None:
+        """Let a standby join: it starts from the present state of the controller."""
+        state = Checkpoint(self.controller, self._validation).save()
+        self.follower, self.outputs = ControllerCore(flight_scenario(self.scenario), lambda: 0.0), []
+        Checkpoint(self.follower, self._validation).restore(state)
+
+    def _control(self, inputs: TickInputs) -> TickOutputs | None:
+        own = super()._control(inputs)
+        if self.follower is not None:
+            self.outputs.append((own, self.follower.step(inputs)))
+        return own
+
+
+def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same() -> None:
+    limits = "docking.ports.0.force_limit_N=3.0"
+    scenario = stack_scenario(1, (0, 3), [*wrong_knowledge(1, 0.1, False), "detumble.plan_s=6", limits])
+    with WatchedMission(scenario, RenderedImages(scenario)) as mission:
+        while mission.time_s < 1.5:
+            mission.step()
+        mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(2)))
+        while mission.time_s < 3.3:
+            mission.step()
+        mission.follow()
+        while mission.time_s < 5.0:
+            mission.step()
+        assert mission.phase(0) == "detumble"
+        fired = 0.0
+        for own, other in mission.outputs:
+            assert own is not None
+            assert {i: w.thrusts_N for i, w in own.wrenches.items()} == {
+                i: w.thrusts_N for i, w in other.wrenches.items()
+            }
+            assert own.stack == other.stack
+            fired += sum(sum(w.thrusts_N) for w in own.wrenches.values())
+        assert fired > 0.0
+        state = Checkpoint(mission.controller, mission._validation).save()
+    other = ControllerCore(flight_scenario(stack_scenario(1, (0, 3))), lambda: 0.0)
+    with pytest.raises(CheckpointError, match="of another mission"):
+        Checkpoint(other, mission._validation).restore(state)
 
 
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:

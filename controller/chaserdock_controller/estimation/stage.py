@@ -46,16 +46,16 @@ class EstimationStage:
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
         enabled = scenario.detumble.identification.enabled
-        self._identification = StackIdentification(scenario) if enabled else None
+        self.identification = StackIdentification(scenario) if enabled else None
 
     def run(self, observation: Observation) -> TargetEstimation:
         """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the identification
         of the stack, whose result the estimator takes from the next tick on."""
         estimation = self._estimate(observation)
-        if self._identification is None:
+        if self.identification is None:
             return estimation
-        estimation = self._identification.identified(observation, estimation)
-        refined = self._identification.refined_target(observation)
+        estimation = self.identification.identified(observation, estimation)
+        refined = self.identification.refined_target(observation)
         if refined is not None:
             self.composite.refine_target(refined)
         return estimation

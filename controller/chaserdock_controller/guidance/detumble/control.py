@@ -98,10 +98,9 @@ class DetumbleControl:
         self._own = wrench_matrix(self._thrusters)
         self._target = scenario.target_model()
         self._plume_free = lru_cache(maxsize=32)(partial(plume_free_thrusters, scenario))
-        plan_s = self._settings.plan_s
-        self.planner = None if plan_s is None else StackPlanner(plan_s)
+        self.planner = StackPlanner(self._settings.plan_s)
         self.sequencer = Sequencer(scenario)
-        self._judged: tuple[object, str] = (None, "")
+        self._judged: tuple[tuple[tuple[int, ...], tuple[bool, ...]] | None, str] = (None, "")
         self._pulse: tuple[int, int | None] = (-1, None)
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
@@ -149,8 +148,7 @@ class DetumbleControl:
 
     def reset(self) -> None:
         """Forget plan and pulses that wait: no chaser stops the stack."""
-        if self.planner is not None:
-            self.planner.reset()
+        self.planner.reset()
         self.sequencer.reset()
 
     def commands(
@@ -187,7 +185,7 @@ class DetumbleControl:
     def _stop(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
         if self.share_of_limits(state) <= _DEADBAND_SHARE:
             return np.zeros(len(thrusters.limits_N))
-        if self.planner is not None:
+        if self.planner.enabled:
             can = spans_all_directions(thrusters.wrenches, thrusters.limits_N)
             planned = self.planner.thrusts(self._problem(state, thrusters), now_ns, can)
             if planned is not None:
@@ -292,7 +290,7 @@ class DetumbleControl:
 
     def _why_no_plan(self, state: StackState, thrusters: _Thrusters, reason: str) -> str:
         """Return why these thrusters cannot stop the stack even by a plan that uses its rotation. Judged once for each set."""
-        if self.planner is None:
+        if not self.planner.enabled:
             return reason
         key = (thrusters.chasers, tuple((thrusters.limits_N > 0.0).tolist()))
         if self._judged[0] != key:

@@ -67,6 +67,7 @@ def test_there_are_no_import_cycles() -> None:
     [
         ("zenoh", {"chaserdock_protocol.transport.zenoh_network"}),
         ("pybullet", {"chaserdock_world.physics.bullet"}),
+        ("mujoco", {"chaserdock_world.physics.mujoco_engine"}),
     ],
 )
 def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:

@@ -98,6 +98,22 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
     assert fastest == pytest.approx(docking.approach_speed_m_s, rel=1e-6)
 
 
+def test_contact_conditions_of_a_preset_limit_the_final_approach() -> None:
+    pilot = Pilot(docking={"final": {"preset": "idss", "lateral_m": 0.02}})
+    final = pilot.scenario.docking.final
+    assert (final.lateral_m, final.angle_deg, final.closing_m_s, final.rate_deg_s) == (0.02, 4.0, 0.10, 0.20)
+    pilot.ask("approach")
+    pilot.fly_to("final")
+    pilot.observed[0] = {"angle_rad": np.radians(3.9), "rate_rad_s": np.radians(0.19)}
+    pilot.fly(2 * DT_S)
+    assert pilot.phase() == "final"
+    drain(pilot.guidance)
+    pilot.observed[0] = {"rate_rad_s": np.radians(0.21)}
+    pilot.fly(2 * DT_S)
+    assert pilot.phase() == "retreat"
+    assert "left the corridor: rate 0.21 deg/s, at most 0.2" in drain(pilot.guidance)[0][2]
+
+
 @pytest.mark.parametrize(
     ("phase", "observed", "why"),
     [

@@ -15,9 +15,9 @@ from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import flight_scenario
 
-from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario
+from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario, with_load_limits
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import ControlledStack, fly_controlled, wrong_knowledge
+from chaserdock.evaluation.rigid_control import ControlledStack, FlightEvents, fly_controlled, wrong_knowledge
 
 
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
@@ -104,7 +104,9 @@ def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same() -> 
 
 
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
-    flight = fly_controlled(stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)), 15.0, loss=(1.0, 1))
+    flight = fly_controlled(
+        stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)), 15.0, events=FlightEvents(loss=(1.0, 1))
+    )
     assert flight.time_s is not None
     assert flight.failed == ""
 
@@ -126,6 +128,20 @@ def test_a_stopped_stack_turns_to_its_commanded_attitude_and_keeps_it() -> None:
     assert math.degrees(float(rotations.angle_between(stack.stack.q_wxyz, wanted))) < 0.8
     assert math.degrees(stack.stack.rates()[1]) < 0.1
     assert stack.stack.rates()[0] < 0.001
+
+
+def test_no_port_exceeds_its_limits_in_any_physics_step() -> None:
+    """Pulses of one carrier period do not last into the next one, in which others fire; with pulse scatter."""
+    scenario = with_load_limits(stack_scenario(0, (0, 1, 2, 3), wrong_knowledge(0)), 2.5, 0.9)
+    stack = ControlledStack(scenario)
+    before, peaks = np.linalg.norm(stack.state().motion.momentum), np.zeros(2)
+    for k in range(60):
+        observation, estimation = stack.estimate()
+        flown = stack.step(StackTask.STOP if k > 2 else None, observation, estimation)
+        peaks = np.maximum(peaks, [flown.peak_force_N, flown.peak_torque_N_m])
+    assert (peaks < [2.5, 0.9]).all()
+    assert (peaks > [1.5, 0.6]).all()
+    assert np.linalg.norm(stack.state().motion.momentum) < 0.75 * before
 
 
 def hold(stack: ControlledStack, seconds: float) -> None:

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.detumble.control import StackTask
+from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
 from chaserdock_models import rotations
@@ -101,6 +103,17 @@ def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same() -> 
     other = ControllerCore(flight_scenario(stack_scenario(1, (0, 3))), lambda: 0.0)
     with pytest.raises(CheckpointError, match="of another mission"):
         Checkpoint(other, mission._validation).restore(state)
+
+
+def test_a_thruster_that_an_operator_restores_fires_again() -> None:
+    flight = flight_scenario(stack_scenario(1, (0, 3), wrong_knowledge(1)))
+    stage = GuidanceStage(flight)
+    state = ControlledStack(stack_scenario(1, (0, 3), wrong_knowledge(1))).state()
+    failed = replace(state, failed={0: (2, 3), 1: (7,)})
+    stage.thrusters.command(OperatorCommand(command="restore", chaser=0, thruster=3), 0.0)
+    found = stage.with_trusted(failed)
+    assert found is not None
+    assert found.failed == {0: (2,), 1: (7,)}
 
 
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.detumble.control import StackTask
+from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_controller.guidance.stage import GuidanceStage
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
 from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
@@ -155,6 +156,17 @@ def test_no_port_exceeds_its_limits_in_any_physics_step() -> None:
     assert (peaks < [2.5, 0.9]).all()
     assert (peaks > [1.5, 0.6]).all()
     assert np.linalg.norm(stack.state().motion.momentum) < 0.75 * before
+
+
+def test_a_stack_at_rest_is_stopped_again_before_it_exceeds_the_limits() -> None:
+    """Where disturbances act, the estimate is late and the thrusters take time."""
+    stack = ControlledStack(stack_scenario(1, (0, 3)))
+    state, limit_rad_s = stack.state(), math.radians(0.05)
+    for share, moves in ((0.5, False), (0.75, True)):
+        angular = state.body.inertia_kg_m2 @ (share * limit_rad_s * np.array([0.6, 0.0, 0.8]))
+        at = replace(state, motion=StackMotion(np.zeros(3), angular))
+        assert stack.control.moves_again(at) == moves
+        assert stack.control.is_stopped(at) != moves
 
 
 def hold(stack: ControlledStack, seconds: float) -> None:

@@ -162,7 +162,7 @@ def test_a_stack_at_rest_is_stopped_again_before_it_exceeds_the_limits() -> None
     """Where disturbances act, the estimate is late and the thrusters take time."""
     stack = ControlledStack(stack_scenario(1, (0, 3)))
     state, limit_rad_s = stack.state(), math.radians(0.05)
-    for share, moves in ((0.5, False), (0.75, True)):
+    for share, moves in ((0.4, False), (0.7, True)):
         angular = state.body.inertia_kg_m2 @ (share * limit_rad_s * np.array([0.6, 0.0, 0.8]))
         at = replace(state, motion=StackMotion(np.zeros(3), angular))
         assert stack.control.moves_again(at) == moves

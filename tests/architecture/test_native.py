@@ -212,7 +212,7 @@ def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached(
 
 
 def test_working_memory_is_enough() -> None:
-    """Nothing is written behind the memory that a tick asks for, with as many rows as there can be."""
+    """No kernel writes beyond its output, with the largest number of rows."""
     n, d = 3, PARAMS.stages
     doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(ctypes.c_int64(n), ctypes.c_int64(d))
     guarded = np.full(doubles + 64, 7.0)

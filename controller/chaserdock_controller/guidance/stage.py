@@ -20,10 +20,10 @@ from chaserdock_controller.interfaces import (
     GuidanceResult,
     LogEntry,
     Observation,
+    PlanningHistory,
     ReferencePose,
     TargetEstimation,
 )
-from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from .chaser_state import ChaserGuidance
 from .detumble.control import DetumbleControl, StackState, StackTask
@@ -58,14 +58,12 @@ class GuidanceStage:
         self,
         observation: Observation,
         estimation: TargetEstimation,
-        failures: Mapping[int, PlanningFailure],
-        unsafe: Mapping[int, str] | None = None,
+        history: PlanningHistory,
     ) -> GuidanceResult:
-        """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed; ``unsafe``: why
-        chasers whose passive safety is enforced have to abort."""
+        """Return what every chaser is to do in this tick; ``history``: how planning went in the ticks before."""
         self._follow_estimate(observation, estimation)
         self._follow_relative_states(estimation)
-        self.machine.update_planning(observation.time_s, failures)
+        self.machine.update_planning(observation.time_s, history.failures(observation.time_ns))
         commands = (*self.machine.due_commands(observation.time_s), *observation.commands)
         stack = None
         if self.machine.thrusting() or any(c.command in ("detumble", "identify") for c in commands):
@@ -75,7 +73,7 @@ class GuidanceStage:
         if estimation.known:
             for i in sorted(observation.odometry):
                 references[i] = self._update_chaser(i, observation, estimation)
-        self.machine.update_safety(observation.time_s, unsafe or {})
+        self.machine.update_safety(observation.time_s, history.unsafe(observation.time_ns))
         abort_margins = self._update_abort_margins(observation)
         self._update_stack(observation, stack)
         thrusts = self._detumble_commands(observation, stack)

@@ -238,7 +238,7 @@ class StackIdentification:
         self._events.append(("warning", text))
 
     def _by_information(self, found: CompositeIdentification) -> tuple[tuple[int, int], ...]:
-        """Return the thrusters by what a pulse tells about the mass properties, the best first."""
+        """Return the thrusters by the information of a pulse on the mass properties, the best first."""
         errors, stack = self._scenario.navigation.errors(), found.stack
         count = len(found.chasers) * _WATCH_S / self._period_s
         noise = (

@@ -210,7 +210,7 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum - wanted, thrusters)
 
     def _informative(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
-        """Return a pulse of the thruster that tells most about the mass properties, of those that damp the motion."""
+        """Return a pulse of the most informative thruster for the mass properties, of those that damp the motion."""
         thrusts = np.zeros(len(thrusters.limits_N))
         number = now_ns // _PULSE_PERIOD_NS
         if now_ns % _PULSE_PERIOD_NS >= _PULSE_NS:

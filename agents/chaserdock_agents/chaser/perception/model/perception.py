@@ -80,6 +80,10 @@ class ModelPerception:
         self._acquisition.prepare()
         _ = self.mesh.suns
 
+    def reset(self) -> None:
+        """Forget all tracks: the next image is searched without a prior."""
+        self._tracks, self._until_acquisition = (), 0
+
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:

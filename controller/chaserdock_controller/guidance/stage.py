@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from chaserdock_models import rotations
@@ -66,7 +67,7 @@ class GuidanceStage:
         commands = (*self.machine.due_commands(observation.time_s), *observation.commands)
         stack = None
         if self.machine.thrusting() or any(c.command in ("detumble", "identify") for c in commands):
-            stack = self.detumble.state(observation, estimation)
+            stack = self.with_trusted(self.detumble.state(observation, estimation))
         replies = self._apply_commands(commands, observation, stack)
         references: dict[int, ReferencePose] = {}
         if estimation.known:
@@ -239,6 +240,16 @@ class GuidanceStage:
         if observed is not None:
             self.machine.update_docking(i, now_s, observed)
         return self.references.reference(i, pose)
+
+    def with_trusted(self, stack: StackState | None) -> StackState | None:
+        """Return the stack's state without failures of thrusters that an operator has restored."""
+        if stack is None or not stack.failed:
+            return stack
+        failed = {
+            i: tuple(k for k in thrusters if k not in self.thrusters.trusted(i))
+            for i, thrusters in stack.failed.items()
+        }
+        return replace(stack, failed=failed)
 
     def _isolated(self, i: int, estimation: TargetEstimation) -> tuple[int, ...]:
         """Return the thrusters that an operator or the motion of the stack has isolated."""

@@ -34,7 +34,13 @@ from .stack import StackMotion, thruster_wrenches
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
 _STOPPED_SHARE = 0.6
-"""Share of the rest limits below which the stack counts as stopped; above the limits it moves again."""
+"""Share of the rest limits below which the stack counts as stopped."""
+_MOVING_SHARE = 0.5
+"""Share of the rest limits above which a stopped stack moves again.
+
+Disturbances of 5 mN and 0.5 mN m on each of two chasers turn the stack faster by 0.01 degrees/s every second, and the estimate is a
+second late: if the thrusters waited for the limit, the true rate would exceed it. The thrusters fire down to ``_DEADBAND_SHARE``.
+"""
 _SLEW_SHARE = 20.0
 """Share of the rest limits beyond which a stack that turns to its commanded attitude counts as moving."""
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
@@ -257,10 +263,10 @@ class DetumbleControl:
         return self.share_of_limits(state) < _STOPPED_SHARE
 
     def moves_again(self, state: StackState) -> bool:
-        """Return whether a stack at rest moves: faster than the limits, beside the turn to its commanded attitude."""
+        """Return whether a stack at rest moves, beside the turn to its commanded attitude, so that it has to be stopped again."""
         share = self.share_of_limits(state, slewing=True)
         slews = self._slew_rate(state) is not None
-        return share > (_SLEW_SHARE if slews else 1.0)
+        return share > (_SLEW_SHARE if slews else _MOVING_SHARE)
 
     def why_not(
         self, state: StackState | None, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]

@@ -11,9 +11,11 @@ T = TypeVar("T")
 Steps = Generator[float, None, T]
 """Yields the expected CPU time of the next step, ms, and returns a result. The time decides only how work is spread."""
 
-LIGHT_MS = 6.0
+LIGHT_MS = 5.0
 """Time to estimate the light without a previous one."""
-_LEVEL_MS, _MS_PER_PX = 4.0, 7e-5
+VIEWS_MS = 10.0
+"""Time to compare likely lights by synthetic views."""
+_LEVEL_MS, _MS_PER_PX = 3.0, 5.5e-5
 
 
 def result_of(steps: Steps[T]) -> T:

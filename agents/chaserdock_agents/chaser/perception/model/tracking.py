@@ -16,7 +16,7 @@ from .alignment import Alignment, ControlPoints, Pyramid, align, control_points,
 from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
-from .steps import LIGHT_MS, Steps, level_ms, result_of
+from .steps import LIGHT_MS, VIEWS_MS, Steps, level_ms, result_of
 
 MIN_INLIER_SHARE = 0.66
 """Gate: a smaller share of inliers rejects a pose."""
@@ -24,7 +24,7 @@ MIN_SCORE = 0.56
 """Gate: a smaller product of inlier share and mean correlation rejects a pose."""
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
 """Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
-_FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 400_000, 12_000, 24_000
+_FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
 _FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
 _START_SHARE, _START_RAD = 0.02, math.radians(3.0)
 _EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
@@ -44,7 +44,7 @@ def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
 def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
     """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is out of view.
 
-    The finest one shows the target on at most 400,000 pixels, so that a rendering takes bounded time; small targets are
+    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time; small targets are
     upsampled twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
@@ -116,11 +116,11 @@ def prior_steps(
     if not levels:
         return None
     pose, light = prior, _EVEN_LIGHT
-    for _ in range(2):
+    for by_view in (False, True):
         coarse = yield from pose_steps(pyramid, mesh, pose, light, levels[:1], modes=modes)
         pose = coarse.pose if coarse else pose
-        yield LIGHT_MS
-        found = light_at(pyramid, mesh, pose, levels[0])
+        yield LIGHT_MS + by_view * VIEWS_MS
+        found = light_at(pyramid, mesh, pose, levels[0], by_view=by_view)
         if found is None:
             return None
         light = found

@@ -11,6 +11,8 @@ front of the target are random. Parts:
 - ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and those that pass the
   gate.
 - ``acquisition`` and ``earth``: without a prior at 1 to 3 m, in front of space and of the Earth.
+- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated from 36 views from all around at 1 to 1.6 m
+  by the controller's filter; twelve views of each of ``views / 12`` drawn meshes.
 - ``sequence``: a tumbling target at 3 m, followed at 15 Hz from its acquisition on.
 
 Gross: an error above 2 degrees or 2 % of the range that passes the gate. Times are CPU times of this process.
@@ -32,9 +34,11 @@ from chaserdock_agents.chaser.perception.model.alignment import Alignment, Pyram
 from chaserdock_agents.chaser.perception.model.mesh import TrackerMesh
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
 from chaserdock_agents.chaser.perception.refine import PoseInCamera
+from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.geometry_errors import geometry_parameters
 from chaserdock_models.meshes import with_geometry_errors
 from chaserdock_models.satellites import satellite
 from chaserdock_protocol.scenario.camera import Effects
@@ -51,6 +55,8 @@ EXACT = TrackerMesh.of_mesh(satellite(TARGET), 0.0, 0.0)
 KNOWN = satellite(TARGET, 0.001)
 EARTH_RADIUS_RAD = 1.1
 PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
+_VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
+"""Views of an inspection, and views of each mesh after it."""
 
 
 class SatelliteImages:
@@ -106,6 +112,56 @@ def track_cell(name: str, range_m: float, views: int, wrong: bool) -> Figures:
         f"{key}_nees_mean": float(np.mean(nees)),
         f"{key}_mean_s": float(np.mean(times)),
         f"{key}_max_s": float(np.max(times)),
+    }
+
+
+def inspect(views: int) -> Figures:
+    """Estimate the geometry from many views, correct the mesh, and track ``views`` single images at 1 m."""
+    rng, scene = np.random.default_rng(21), SatelliteImages()
+    errors, nees, rejected, shape_nees, used = [], [], 0, [], []
+    parameters = geometry_parameters(KNOWN, PANEL_SIGMA_RAD, SCALE_SIGMA)
+    for number in range(max(views // _VIEWS_AFTER, 1)):
+        turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in KNOWN.joints}
+        scale = rng.normal(0.0, SCALE_SIGMA)
+        mesh = TrackerMesh.of_mesh(with_geometry_errors(KNOWN, scale, turns), PANEL_SIGMA_RAD, SCALE_SIGMA)
+        _ = mesh.suns
+        fused = ShapeFilter.prior(len(parameters))
+        for k in range(_VIEWS_BEFORE):
+            pose, light = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
+            image = scene.image(pose, light, 1000 * number + k)
+            found = _track(image, mesh, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
+            if tracking.is_valid(found):
+                direction = -found.pose.rotation.T @ found.pose.position
+                fused = fused.with_view(
+                    direction / np.linalg.norm(direction), found.geometry.matrix, found.geometry.vector
+                )
+        # The tracker's mesh is the true one with errors, which it should find with the opposite sign.
+        true = -np.append(
+            np.concatenate([turns[j] for j in KNOWN.joints]) / PANEL_SIGMA_RAD, scale / SCALE_SIGMA
+        )
+        off = fused.mean()[: len(true)] - true
+        shape_nees.append(
+            float(off @ np.linalg.solve(fused.covariance()[: len(true), : len(true)], off)) / len(true)
+        )
+        used.append(len(fused.cells))
+        corrected = mesh.corrected(fused.mean(), fused.covariance())
+        for k in range(_VIEWS_AFTER):
+            pose, light = random_view(rng, 1.0, CAMERA)
+            image = scene.image(pose, light, 1000 * number + 500 + k)
+            found = _track(image, corrected, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
+            if not tracking.is_valid(found):
+                rejected += 1
+                continue
+            errors.append(error_of(found.pose, pose))
+            e = tracking.pose_error(found.pose, pose)
+            nees.append(float(e @ np.linalg.solve(found.covariance, e)))
+    return _quantiles("inspect_1m", np.array(errors)) | {
+        "inspect_1m_views": len(errors) + rejected,
+        "inspect_1m_rejected": rejected,
+        "inspect_1m_nees_mean": float(np.mean(nees)),
+        "inspect_meshes": len(used),
+        "inspect_views_fused_mean": float(np.mean(used)),
+        "inspect_geometry_nees_per_parameter": float(np.mean(shape_nees)),
     }
 
 
@@ -210,7 +266,7 @@ def _quantiles(key: str, errors: Array) -> Figures:
 
 
 def main() -> None:
-    parts = ("exact", "knowledge", "gate", "acquisition", "earth", "sequence")
+    parts = ("exact", "knowledge", "inspect", "gate", "acquisition", "earth", "sequence")
     parser = make_parser(__doc__, parts)
     parser.add_argument("--views", type=int, help="views per cell (default 300, with --quick 20)")
     parser.add_argument(
@@ -230,6 +286,7 @@ def main() -> None:
         {
             "exact": lambda: cells("exact", False),
             "knowledge": lambda: cells("knowledge", True),
+            "inspect": lambda: inspect(views),
             "gate": lambda: gate(views),
             "acquisition": lambda: acquire(views, False),
             "earth": lambda: acquire(views, True),

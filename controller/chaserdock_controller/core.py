@@ -44,7 +44,7 @@ class ControllerCore:
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
         observation = self.ingest.run(inputs, self.output.history)
-        estimation = self.estimation.run(observation)
+        estimation = self.estimation.run(observation, self.guidance.machine.inspecting())
         failures = self.planning.monitor.failures(observation.time_ns)
         unsafe = self.planning.unsafe(observation.time_ns)
         guidance = self.guidance.run(observation, estimation, failures, unsafe)

@@ -46,7 +46,7 @@ from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, 
 from .lease_grantor import LeaseGrantor
 from .local_damping import LocalDamping
 from .perception import make_perception
-from .sighting import look, prediction_from
+from .sighting import apply_geometry, look, prediction_from
 
 
 def main(options: ProcessOptions) -> int:
@@ -373,6 +373,9 @@ class ChaserProcess:
         known = self._last.target
         self._remember(command)
         self._was_detumbling = command.mode == "detumble"
+        # Before the reply, so that the next image is seen with it in lock-step.
+        if (refused := apply_geometry(self._perception, command.geometry)) is not None:
+            self._publish_warning("geometry refused", refused, command.tick, command.sim_time_ns)
         if self._thrusters is not None:
             self._thrusters.avoid_plumes(known)
             self._thrusters.apply_command(command)

@@ -42,9 +42,8 @@ def case(name: str, duration_s: float) -> Figures:
     for engine, flight in flights.items():
         figures[f"{name}_{engine}_step_s"] = flight.step_s
         if name in WITHOUT_LOADS:
-            linear, angular = flight.momentum_errors
-            figures[f"{name}_{engine}_momentum_share"] = linear
-            figures[f"{name}_{engine}_angular_momentum_share"] = angular
+            figures[f"{name}_{engine}_momentum_share"] = flight.momentum_error
+            figures[f"{name}_{engine}_angular_momentum_share"] = flight.angular_momentum_error
     return figures
 
 

@@ -32,11 +32,9 @@ def test_engines_agree_over_30_s_of_free_flight() -> None:
     assert apart.position_m < NANO
     assert apart.angle_rad < NANO
     for flight in (bullet, mujoco):
-        linear, angular = flight.momentum_errors
-        assert linear < 1e-12
-        assert angular < 1e-5
-        turned = rate_change(flight, "target")
-        assert turned > 0.03  # the target tumbles: its rate is not constant
+        assert 0.0 <= flight.momentum_error < 1e-12
+        assert 0.0 < flight.angular_momentum_error < 1e-4
+        assert rate_change(flight, "target") > 0.03  # it tumbles: its rate is not constant
 
 
 def rate_change(flight: EngineFlight, name: str) -> float:
@@ -66,9 +64,8 @@ def test_engines_agree_over_a_capture_and_30_s_after_it() -> None:
     assert closing[0] == pytest.approx(closing[1], rel=0.02)  # and the touch before it, against a spring
     assert closing[0] > 0.05
     for flight in (bullet, mujoco):
-        linear, angular = flight.momentum_errors
-        assert linear < 1e-12
-        assert angular < 1e-5
+        assert 0.0 <= flight.momentum_error < 1e-12
+        assert 0.0 < flight.angular_momentum_error < 1e-4
 
 
 def test_engines_agree_on_a_stack_that_fires_its_thrusters() -> None:

@@ -72,9 +72,10 @@ class RigidBodyDefinition:
 
 @dataclass(frozen=True)
 class ContactSpring:
-    """Compliant contact between two bodies: stiffness along the normal, N/m, and damping, N s/m.
+    """Compliance of each body in a contact: stiffness along the normal, N/m, and damping, N s/m.
 
-    ``mass_kg``: effective mass of the contact, for engines that state contacts per mass.
+    In a contact of two bodies the stiffnesses are in series, half of one, and the dampings add up, as in PyBullet. ``mass_kg``:
+    effective mass of the contact, for engines that state contacts per mass.
     """
 
     stiffness_N_m: float

@@ -34,8 +34,8 @@ from .engine import (
     SolidBox,
     SolidCapsule,
     SolidHull,
-    make_engine,
 )
+from .engine_factory import make_engine
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch, latch_faults
 from .orbital_forces import OrbitalForces

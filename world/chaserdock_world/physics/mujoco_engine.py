@@ -213,14 +213,15 @@ def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
 def _contact_reference(spring: ContactSpring | None, step_s: float) -> list[float]:
     """Return ``solref`` of contacts.
 
-    A spring is that of an implicit step, as in PyBullet: F = k (r + h v) + c v at the end of the step. Hard contacts are
-    critically damped, with the shortest time constant that MuJoCo takes.
+    A spring is that of an implicit step, as in PyBullet: F = k (r + h v) + c v with the velocity at the end of the step. Hard
+    contacts are critically damped, with the shortest time constant that MuJoCo takes.
     """
     if spring is None:
         return [2.0 * step_s, 1.0]
-    damping = spring.damping_N_s_m + step_s * spring.stiffness_N_m
-    mass = spring.mass_kg + step_s * damping
-    return [-spring.stiffness_N_m / mass, -damping / mass]
+    stiffness = spring.stiffness_N_m / 2.0
+    damping = 2.0 * spring.damping_N_s_m + step_s * stiffness
+    mass_kg = spring.mass_kg + step_s * damping
+    return [-stiffness / mass_kg, -damping / mass_kg]
 
 
 def _add_body(spec: mujoco.MjSpec, number: int, body: RigidBodyDefinition, reference: list[float]) -> None:

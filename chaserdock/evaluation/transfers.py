@@ -20,7 +20,8 @@ from .perception import PerceptionModel
 
 SYMMETRIC_EVERY = 4
 SMALL = {"width_px": 640, "height_px": 360}
-CLUTTER_S = 120.0
+CLUTTER_S = 100.0
+CLUTTER_TIMING = ("time.rate_hz=10", "time.image_hz=10", "time.physics_hz=120")
 _DIAGONAL = 9.0
 """m: stands for a chaser's distance to itself, larger than any between two."""
 
@@ -92,7 +93,9 @@ CLUTTER_SHELL_M, CLUTTER_APART_M = (0.8, 1.4), 0.5
 def clutter(seed: int, chasers: int = 16) -> Scenario:
     """Return a scenario in which chasers at random places around the tumbling target fly to random places, all at once."""
     rng = np.random.default_rng([seed, 0xC107])
-    base = load_shipped("swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={CLUTTER_S}")
+    base = load_shipped(
+        "swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={CLUTTER_S}", *CLUTTER_TIMING
+    )
     starts, goals = _places(rng, chasers), _places(rng, chasers)
     nominal, entry = base.chasers[0], base.timeline[0]
     made = [
@@ -147,8 +150,11 @@ class TransferOutcome:
         )
 
 
-def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel | None) -> TransferOutcome:
-    """Fly to the end, or with ``perception`` None with exact knowledge of the target; distances and goals are checked on ground truth at every tick."""
+def fly_transfer(
+    seed: int, scenario: Scenario, perception: PerceptionModel | None, stay_s: float = math.inf
+) -> TransferOutcome:
+    """Fly to the end, or until all chasers with a goal are there for ``stay_s``; distances and goals are checked on ground truth at
+    every tick. Without ``perception`` the target is known exactly."""
     out = TransferOutcome(seed)
     goals = {i: g for i in range(len(scenario.chasers)) if (g := scenario.goal_of(i)) is not None}
     last_away_s: dict[int, float] = {}
@@ -162,6 +168,9 @@ def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel | No
             if distances[i] > scenario.success.reached_position_m or time_s < sent_s:
                 last_away_s[i] = time_s - sent_s
 
+    def there_for_s(time_s: float) -> float:
+        return min(time_s - sent_s - last_away_s[i] for i, (sent_s, _) in goals.items())
+
     with InProcessMission(scenario, perception) as flight:
         for record in flight.ticks():
             measure(record.time_s, record.states)
@@ -169,6 +178,8 @@ def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel | No
             if solver is not None:
                 out.failed += solver.status.count("failed")
                 out.relaxed += solver.status.count("infeasible_relaxed")
+            if there_for_s(record.time_s) >= stay_s:
+                break
         measure(flight.time_s, flight.states())
         out.contacts = len(flight.contacts)
     step_s = 1.0 / scenario.time.rate_hz

@@ -27,6 +27,7 @@ def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
         inertia_kg_m2=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
+        boxes=len(scenario.target_model().boxes) if scenario.limits.min_distance_shape_m else 0,
         **nmpc_settings(scenario.controller, scenario.limits),
     )
 

@@ -158,6 +158,11 @@ class Limits(Section):
         description="Standard deviations of a chaser's estimated position relative to the target that are added to "
         "`min_distance_target_m`, at most 0.1 m in all.",
     )
+    min_distance_shape_m: NotNegative = Field(
+        default=0.0,
+        description="Smallest distance of a chaser's centre from each cuboid of the target's shape (bus, panels, booms), m, outside of "
+        "its corridor, in addition to `min_distance_target_m`, which may then be smaller or 0. 0: off. Needs the solver `rti`.",
+    )
     min_distance_chasers_m: NotNegative = Field(
         default=0.35, description="Smallest distance between chasers, m."
     )

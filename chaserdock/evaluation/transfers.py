@@ -86,17 +86,22 @@ def swap(seed: int) -> Scenario:
     return scenario.model_copy(update={"chasers": chasers, "target": target})
 
 
-CLUTTER_SHELL_M, CLUTTER_APART_M = (0.8, 1.4), 0.5
-"""Distances from the target, and least distances of places from each other, in `clutter`."""
+CLUTTER, DENSE_CLUTTER = (0.8, 1.4, 0.5), (0.7, 1.15, 0.42)
+"""Smallest and largest distance of places from the target, and least distance from each other, m, in `clutter`."""
 
 
-def clutter(seed: int, chasers: int = 16) -> Scenario:
+def clutter(
+    seed: int,
+    chasers: int = 16,
+    places_m: tuple[float, float, float] = CLUTTER,
+    duration_s: float = CLUTTER_S,
+) -> Scenario:
     """Return a scenario in which chasers at random places around the tumbling target fly to random places, all at once."""
     rng = np.random.default_rng([seed, 0xC107])
     base = load_shipped(
-        "swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={CLUTTER_S}", *CLUTTER_TIMING
+        "swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={duration_s}", *CLUTTER_TIMING
     )
-    starts, goals = _places(rng, chasers), _places(rng, chasers)
+    starts, goals = _places(rng, chasers, places_m), _places(rng, chasers, places_m)
     nominal, entry = base.chasers[0], base.timeline[0]
     made = [
         nominal.model_copy(
@@ -114,13 +119,14 @@ def clutter(seed: int, chasers: int = 16) -> Scenario:
     return base.model_copy(update={"chasers": tuple(made), "timeline": tuple(timeline)})
 
 
-def _places(rng: np.random.Generator, count: int) -> Array:
-    """Return random places (count, 3) in the shell of `clutter`."""
+def _places(rng: np.random.Generator, count: int, places_m: tuple[float, float, float]) -> Array:
+    """Return random places (count, 3); ``places_m`` as in `clutter`."""
+    nearest_m, farthest_m, apart_m = places_m
     places = np.zeros((0, 3))
     while len(places) < count:
         way = rng.normal(size=3)
-        place = way / np.linalg.norm(way) * rng.uniform(*CLUTTER_SHELL_M)
-        if np.all(np.linalg.norm(places - place, axis=1) >= CLUTTER_APART_M):
+        place = way / np.linalg.norm(way) * rng.uniform(nearest_m, farthest_m)
+        if np.all(np.linalg.norm(places - place, axis=1) >= apart_m):
             places = np.vstack([places, place])
     return places
 

@@ -76,9 +76,7 @@ def test_signed_distance_and_gradient_agree_with_differences_and_with_the_kernel
 
 
 def test_chaser_passes_between_turning_panels() -> None:
-    end, nearest = fly(
-        np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 250, np.array([0.02, 0.0, 0.0])
-    )
+    end, nearest = fly(np.array([-1.0, 0.0, 0.0]), np.array([1.0, 0.0, 0.0]), 250, np.array([0.02, 0.0, 0.0]))
     np.testing.assert_allclose(end, [1.0, 0.0, 0.0], atol=0.02)
     assert nearest > CLEARANCE_M - 1e-3
 
@@ -111,7 +109,9 @@ def test_goto_into_a_panel_is_refused_and_places_that_the_sphere_forbade_are_not
     assert not refused.accepted
     assert "from the target's shape; allowed are at least 0.3 m" in refused.reason
     thin = int(np.argmin(box.size_m))
-    beside = np.array(box.position_m) + rotations.to_matrix(box.q_wxyz)[:, thin] * (0.4 + box.size_m[thin] / 2)
+    beside = np.array(box.position_m) + rotations.to_matrix(box.q_wxyz)[:, thin] * (
+        0.4 + box.size_m[thin] / 2
+    )
     assert signed_distance(box_table(scenario.target.shape().boxes), beside)[0] > 0.3
     assert np.linalg.norm(beside) < np.linalg.norm(box.position_m) + 0.3
     offset = tuple(beside.tolist())
@@ -121,5 +121,7 @@ def test_goto_into_a_panel_is_refused_and_places_that_the_sphere_forbade_are_not
 def test_places_inside_the_shape_and_other_solvers_are_refused() -> None:
     with pytest.raises(ScenarioError, match=r"limits\.min_distance_shape_m: needs controller\.solver"):
         parse_scenario(with_shape() | {"controller": {"solver": "ipopt"}}, "test")
-    with pytest.raises(ScenarioError, match=r"chasers\.0\.position_m: .* from the target's shape, nearer than"):
+    with pytest.raises(
+        ScenarioError, match=r"chasers\.0\.position_m: .* from the target's shape, nearer than"
+    ):
         parse_scenario(with_shape(min_distance_shape_m=20.0), "test")

@@ -130,7 +130,7 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
         return
     if scenario.controller.solver != "rti":
         raise ValueError(
-            f"limits.min_distance_shape_m: needs controller.solver = \"rti\", not {scenario.controller.solver!r}"
+            f'limits.min_distance_shape_m: needs controller.solver = "rti", not {scenario.controller.solver!r}'
         )
     places = [(f"chasers.{i}.position_m", c.position_m) for i, c in enumerate(scenario.chasers)]
     places += [(f"timeline.{k}.offset_m", e.offset_m) for k, e in enumerate(scenario.timeline) if e.offset_m]

@@ -70,6 +70,14 @@ class EstimatorSection(Section):
         description="`joint`: filter of target, chasers, sensors and disturbances. `mekf`: filter of the target, with odometry "
         "taken as exact. `paper`: the paper's average. Or an installed plugin.",
     )
+    target_acceleration_noise: Positive | None = Field(
+        default=None,
+        description="Of `joint`: square root of the spectral density of the target's unmodelled acceleration, m/s²/√Hz. Not set: 1e-4 "
+        "for `torque_free`, otherwise 5e-6. Far away it decides how well the relative velocity is known.",
+    )
+    target_angular_noise: Positive | None = Field(
+        default=None, description="The same of its angular acceleration, rad/s²/√Hz."
+    )
 
 
 class PerceptionSection(Section):

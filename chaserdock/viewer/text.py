@@ -61,8 +61,7 @@ def visibility(chaser: ChaserState) -> str:
         return "-"
     if chaser.sighting.status != "seen":
         return chaser.sighting.status.replace("_", " ")
-    markers = len(chaser.sighting.marker_ids)
-    return f"{markers} marker{'s' if markers != 1 else ''}"
+    return str(len(chaser.sighting.marker_ids))
 
 
 def faults(state: MissionState, history: History, lost: set[str]) -> str:

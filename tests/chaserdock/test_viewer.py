@@ -217,7 +217,7 @@ def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
     assert len(mission.history.series["estimate_error_mm", None]) >= 17
     assert "approach chaser 0: accepted, phase approach" in words.events(mission.history.lines_until(9.0, 99))
     table = words.chasers(mission.at(1.0), mission.history)
-    assert table.count("1 marker") == 2
+    assert table.count("| 1 |") == 2
     assert "| approach |" in table
     assert "| hold |" in table
 

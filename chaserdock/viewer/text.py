@@ -37,7 +37,7 @@ def _numbers(chasers: tuple[int, ...]) -> str:
 def chasers(state: MissionState, history: History) -> str:
     """Return a table with one row per chaser."""
     rows = [
-        "| # | phase | error | distance | markers | latency |",
+        "| # | phase | error | distance | seen | latency |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for i, chaser in enumerate(state.chasers):
@@ -46,7 +46,7 @@ def chasers(state: MissionState, history: History) -> str:
         cells = (
             f"**{i}**",
             chaser.reference.phase if chaser.reference is not None else "-",
-            f"{error[0] * 1e3:.2f} mm, {math.degrees(error[1]):.3f}°" if error is not None else "-",
+            f"{error[0] * 1e3:.1f} mm {math.degrees(error[1]):.2f}°" if error is not None else "-",
             f"{distance:.3f} m" if distance is not None else "-",
             visibility(chaser),
             f"{latency:.0f} ms" if latency is not None else "-",

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 import pytest
-from engines import ENGINES
+from engine_cases import ENGINES
 
 from chaserdock.evaluation.engine_comparison import CASES, EngineFlight, difference, fly_case
 

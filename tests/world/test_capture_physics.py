@@ -13,7 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import TARGET, Physics
 from docking_cases import CHASER_INERTIA, CHASER_KG, REACH_M, TARGET_INERTIA, TARGET_KG, scenario
-from engines import both
+from engine_cases import both
 
 HZ = 960
 

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.orbit import Scalars3
 from chaserdock_models.rigid_body import BodyState
 
@@ -49,7 +49,7 @@ class SolidHull:
     """The convex hull of ``vertices_m`` (n, 3) in the frame of the body, and its triangles (m, 3), none for points in a plane."""
 
     vertices_m: Array
-    triangles: Array
+    triangles: IntArray
 
 
 Solid = SolidBox | SolidCapsule | SolidHull

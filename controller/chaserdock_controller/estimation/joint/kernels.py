@@ -128,6 +128,14 @@ class Innovation:
         function("reduce")(self._n, c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
 
+def check_size(mean: Array, covariance: Array) -> int:
+    """Return the number of chasers of a state. Raises ValueError if its covariance has another size."""
+    n, rest = divmod(mean.size - TARGET_MEAN, CHASER_MEAN)
+    if rest or covariance.shape != (12 + 43 * n, 12 + 43 * n):
+        raise ValueError(f"a state of {n} chasers with a covariance of shape {covariance.shape}")
+    return n
+
+
 def _work_size(name: str, n: int) -> int:
     return function(name, c_int64)(c_int64(n))
 
@@ -150,8 +158,13 @@ def predict(
     mean: Array,
     covariance: Array,
 ) -> Array:
-    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of native/covariance.c."""
-    n, out = len(fade_view), np.empty_like(covariance)
+    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of native/covariance.c.
+
+    Raises ValueError if sizes contradict each other, as in a state from a checkpoint."""
+    n = check_size(mean, covariance)
+    if any(len(a) != n for a in (impulses, orbital, fade_view, alive, latched)):
+        raise ValueError(f"a state of {n} chasers with other numbers of chasers in its fields")
+    out = np.empty_like(covariance)
     work = scratch(_work_size("predict_workspace", n))
     arrays: tuple[NDArray[Any], ...] = (
         target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,

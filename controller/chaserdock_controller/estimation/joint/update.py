@@ -192,6 +192,7 @@ class RunningUpdate:
 
     def __init__(self, state: JointState) -> None:
         self.state, self.mean, self.covariance = state, packed(state), state.covariance.copy()
+        kernels.check_size(self.mean, self.covariance)
         self.rejections, self.nis = state.rejections.copy(), state.nis.copy()
         self.log_likelihood = state.log_likelihood
         self.innovation = kernels.Innovation(state.chasers)
@@ -337,7 +338,7 @@ def _gate(
             # Bound the penalty: a gross outlier counts as much as one at the gate.
             likelihood -= 0.5 * (min(value, gate) + math.log(values[-1]))
         else:
-            nis[number - 1] += (min(value, 10.0 * gate) - nis[number - 1]) / p.overconfident_ticks
+            nis[number - 1] += (min(10.0 * gate, value) - nis[number - 1]) / p.overconfident_ticks
     return _Gates(fits, rejections, nis, likelihood)
 
 

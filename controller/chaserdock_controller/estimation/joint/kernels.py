@@ -25,7 +25,7 @@ _SEEN = 55
 _CHANNELS = 5
 
 
-class Motion(Structure):
+class MotionParameters(Structure):
     """`Motion` of native/motion.c."""
 
     _fields_ = [
@@ -66,7 +66,7 @@ class _Innovation(Structure):
     ]
 
 
-class Measurement:
+class ChaserMeasurement:
     """Measurements of chaser ``i`` of ``n``, of which one may be None.
 
     mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting: pose (7,) in IRF, stated
@@ -91,7 +91,7 @@ class Measurement:
         self.native = _Measurement(n, i, *map(address, mounting), state, noise, pose, stated, *ratios)
 
 
-class Innovation:
+class JointInnovation:
     """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of native/update.c."""
 
     def __init__(self, n: int) -> None:
@@ -109,13 +109,13 @@ class Innovation:
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
 
-    def innovate(self, z: Measurement, mean: Array, prior: Array, covariance: Array) -> None:
+    def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""
         function("innovate")(
             ctypes.byref(z.native), address(mean), address(prior), address(covariance), self._address, self._work_address
         )  # fmt: skip
 
-    def correct(self, z: Measurement, used: NDArray[np.int64], prior: Array, mean: Array) -> bool:
+    def correct(self, z: ChaserMeasurement, used: NDArray[np.int64], prior: Array, mean: Array) -> bool:
         """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their covariance is not positive."""
         return bool(
             function("correct", c_int64)(
@@ -123,7 +123,7 @@ class Innovation:
             )
         )  # fmt: skip
 
-    def reduce(self, z: Measurement, rows: int, covariance: Array) -> None:
+    def reduce(self, z: ChaserMeasurement, rows: int, covariance: Array) -> None:
         """Reduce the covariance by the last correction, of so many rows."""
         function("reduce")(self._n, c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
@@ -146,7 +146,7 @@ def complete(n: int, covariance: Array) -> None:
 
 
 def predict(
-    motion: Motion,
+    motion: MotionParameters,
     target: Array,
     target_noise: Array,
     impulses: Array,
@@ -185,7 +185,7 @@ def wrench_at_origin(
     return out
 
 
-def linearize(z: Measurement, mean: Array) -> tuple[Array, Array, Array]:
+def linearize(z: ChaserMeasurement, mean: Array) -> tuple[Array, Array, Array]:
     """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k, k)."""
     k = z.rows
     out = np.empty(k), np.empty((k, _SEEN)), np.empty((k, k))

@@ -195,15 +195,15 @@ class RunningUpdate:
         kernels.check_size(self.mean, self.covariance)
         self.rejections, self.nis = state.rejections.copy(), state.nis.copy()
         self.log_likelihood = state.log_likelihood
-        self.innovation = kernels.Innovation(state.chasers)
+        self.innovation = kernels.JointInnovation(state.chasers)
 
-    def values(self, z: kernels.Measurement) -> list[float]:
+    def values(self, z: kernels.ChaserMeasurement) -> list[float]:
         """Compute the innovation of a measurement; return the squared norm of each channel's residual by its innovation
         covariance, then the determinant of the sighting's."""
         self.innovation.innovate(z, self.mean, self.mean, self.covariance)
         return self.innovation.values.tolist()
 
-    def correct(self, z: kernels.Measurement, used: NDArray[np.int64], iterations: int) -> None:
+    def correct(self, z: kernels.ChaserMeasurement, used: NDArray[np.int64], iterations: int) -> None:
         """Update with the rows ``used`` of the last innovation, linearized ``iterations`` times.
 
         Raises numpy.linalg.LinAlgError for an innovation covariance that is not positive definite.
@@ -287,7 +287,7 @@ def _update_chaser(
 def _follow_unexpected_motion(
     running: RunningUpdate,
     i: int,
-    z: kernels.Measurement,
+    z: kernels.ChaserMeasurement,
     channels: Sequence[_Channel],
     gates: _Gates,
     p: JointParameters,

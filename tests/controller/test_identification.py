@@ -10,6 +10,9 @@ import pytest
 from chaserdock_controller.estimation.identification.composite import (
     CompositeIdentification,
     IdentificationParameters,
+)
+from chaserdock_controller.estimation.identification.faults import StackFaultDetector, apply_fault
+from chaserdock_controller.estimation.mass_properties import (
     MassProperties,
     attach,
     body_of,
@@ -17,7 +20,6 @@ from chaserdock_controller.estimation.identification.composite import (
     prior_of,
     properties_of,
 )
-from chaserdock_controller.estimation.identification.faults import StackFaultDetector, apply_fault
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -75,7 +77,7 @@ class Stack:
         self.q, self.omega = qs[1], omegas[1] + turn / 2.0
 
     def filter(self, target: TargetBody | None = None) -> CompositeIdentification:
-        prior = attach(prior_of(target or target_alone(), PARAMETERS), self.chasers, BODY)
+        prior = attach(prior_of(target or target_alone(), 0.3, 0.3, 0.1), self.chasers, BODY)
         usable = dict.fromkeys(self.chasers, FREE)
         return CompositeIdentification(
             prior, self.chasers, self.states(0.0), BODY.thrusters, usable, ERRORS, PARAMETERS

@@ -21,6 +21,7 @@ from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParam
 from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.estimator import JointFilterState, JointTickRecord
+from chaserdock_controller.estimation.mass_properties import MassProperties
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.replay import ReplayBuffer
@@ -83,6 +84,7 @@ class ThrusterCommandState(Struct, forbid_unknown_fields=True):
 
 
 class CompositeState(Struct, forbid_unknown_fields=True):
+    _target_alone: MassProperties
     body: TargetBody
     latched: frozenset[int]
     _changed: bool

@@ -18,7 +18,7 @@ from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MekfPar
 GATE_CHI_SQUARE_3 = 21.107513466160444
 """0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with SciPy)."""
 
-TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-4, 1e-4)}
+TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-5, 1e-5)}
 
 
 class SightingNoise(NamedTuple):

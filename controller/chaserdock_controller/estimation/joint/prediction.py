@@ -21,7 +21,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_matrix, cw_wrench
 from chaserdock_models.rigid_body import newton_euler, rk4_step
 
-from chaserdock_controller.estimation.motion_models import process_noise, propagate_target
+from chaserdock_controller.estimation.body_shape import SHAPE
+from chaserdock_controller.estimation.motion_models import free_shape, process_noise, propagate_target
 
 from .parameters import JointParameters
 from .state import (
@@ -103,18 +104,30 @@ def predict(
 def predict_target(state: JointState, time_ns: int, p: JointParameters) -> tuple[JointState, Array]:
     """Return the state with the target's mean at ``time_ns``, and the target's covariance (12, 12) then."""
     dt = (time_ns - state.time_ns) * 1e-9
-    covariance = state.covariance[:TARGET, :TARGET]
     if dt == 0.0:
-        return state, covariance.copy()
+        return state, state.covariance[:TARGET, :TARGET].copy()
     moved, f = _predict_target(state, dt, p)
-    return moved, f @ covariance @ f.T + _target_noise(dt, p)
+    return moved, f @ target_covariance(state) @ f.T + _target_noise(dt, p)
+
+
+def target_covariance(state: JointState) -> Array:
+    """Return the covariance (12, 12) of the target's motion, or (20, 20) of its motion and shape."""
+    if state.shape is None:
+        return state.covariance[:TARGET, :TARGET]
+    size = len(state.covariance)
+    part = np.concatenate([np.arange(TARGET), np.arange(size - SHAPE, size)])
+    return state.covariance[np.ix_(part, part)]
 
 
 def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[JointState, Array]:
+    """Return the state with the target after ``dt``, and the transition (12, 12), or (12, 20) if its shape is estimated."""
     if not state.target_known:
-        return state, np.eye(TARGET)
+        return state, np.eye(TARGET, TARGET if state.shape is None else TARGET + SHAPE)
     motion = (state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s)
-    (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
+    if state.shape is None:
+        (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
+    else:
+        (position, velocity, q, omega), f = free_shape(motion, dt, state.shape, p.mean_motion_rad_s)
     return replace(state, position_m=position, velocity_m_s=velocity, q_wxyz=q, omega_rad_s=omega), f
 
 
@@ -199,14 +212,18 @@ def _motion_transitions(
 
 
 def _transform(target: Array, motion: Array, fade: Array, covariance: Array) -> Array:
-    """Return F P F' for the block-diagonal F of ``target`` (12, 12) and, for each chaser, ``motion`` (N, MOTION, MOTION) and
-    the decay ``fade`` (N, CHASER) of its other components."""
+    """Return F P F' for the F of ``target`` (12, 12) and, for each chaser, ``motion`` (N, MOTION, MOTION) and the decay ``fade``
+    (N, CHASER) of its other components. With ``target`` (12, 20) the target moves by its shape, too, which is constant."""
     n, size = len(motion), len(covariance)
+    end = TARGET + CHASER * n
 
     def left(m: Array) -> Array:
         out = np.empty((size, size))
-        np.matmul(target, m[:TARGET], out=out[:TARGET])
-        before, after = (x[TARGET:].reshape(n, CHASER, size) for x in (m, out))
+        np.matmul(target[:, :TARGET], m[:TARGET], out=out[:TARGET])
+        if end < size:
+            out[:TARGET] += target[:, TARGET:] @ m[end:]
+            out[end:] = m[end:]
+        before, after = (x[TARGET:end].reshape(n, CHASER, size) for x in (m, out))
         np.matmul(motion, before[:, :MOTION], out=after[:, :MOTION])
         np.multiply(before[:, MOTION:], fade[:, MOTION:, None], out=after[:, MOTION:])
         return out

@@ -2,7 +2,8 @@
 """State of the joint filter, and the layout of its error vector.
 
 The error vector has 12 components for the target, then ``CHASER`` for each chaser. Both begin with position and velocity
-(WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body axes). A chaser's additive states follow.
+(WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body axes). A chaser's additive states follow. The last
+``SHAPE`` components, of a torque-free target only, are those of its ``BodyShape``.
 """
 
 from __future__ import annotations
@@ -16,6 +17,8 @@ from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 from chaserdock_controller.estimation import target_hypotheses
+from chaserdock_controller.estimation.body_shape import SHAPE, BodyShape, shape_covariance, shape_of
+from chaserdock_controller.estimation.parameters import BodyPrior, MekfParameters
 from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
@@ -47,7 +50,8 @@ class JointState(TargetHypothesis):
     """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``) and of N chasers.
 
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
-    additive states. covariance (12 + CHASER N, 12 + CHASER N). alive (N,): chasers whose state is known.
+    additive states. covariance (12 + CHASER N, 12 + CHASER N), or with ``shape`` ``SHAPE`` more. alive (N,): chasers whose state
+    is known. shape: of a torque-free target. prior: knowledge that it started from.
     odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
     markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
@@ -66,6 +70,8 @@ class JointState(TargetHypothesis):
     markers: NDArray[np.int64]
     target_known: bool = False
     updates: int = 0
+    shape: BodyShape | None = None
+    prior: BodyPrior | None = None
 
     @property
     def chasers(self) -> int:
@@ -100,6 +106,25 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
     )
 
 
+def with_body(state: JointState, p: MekfParameters) -> JointState:
+    """Return the state of a target that is the body of ``p`` from now on: the same, unless it was another body until now."""
+    if p.motion_model != "torque_free" or state.prior == p.body_prior:
+        return state
+    return start_shape(state, p)
+
+
+def start_shape(state: JointState, p: MekfParameters) -> JointState:
+    """Return the state in which no more is known of the target's body than ``p`` tells."""
+    inertia = np.array(p.inertia_ratios, dtype=float)
+    own = TARGET + CHASER * state.chasers
+    covariance = np.zeros((own + SHAPE, own + SHAPE))
+    covariance[:own, :own] = state.covariance[:own, :own]
+    if p.body_covariance:
+        covariance[own:, own:] = shape_covariance(inertia, np.array(p.body_covariance))
+    shape = shape_of(inertia, np.array(p.centre_of_mass_trf_m))
+    return replace(state, shape=shape, prior=p.body_prior, covariance=covariance)
+
+
 def block(chaser: int) -> slice:
     """Return the components of a chaser in the error vector."""
     return slice(TARGET + CHASER * chaser, TARGET + CHASER * (chaser + 1))
@@ -107,7 +132,8 @@ def block(chaser: int) -> slice:
 
 def inject(state: JointState, error: Array) -> JointState:
     """Return the state corrected by an error vector; the covariance stays."""
-    each = error[TARGET:].reshape(-1, CHASER)
+    end = TARGET + CHASER * state.chasers
+    each = error[TARGET:end].reshape(-1, CHASER)
     return replace(
         state,
         position_m=state.position_m + error[POSITION],
@@ -121,19 +147,23 @@ def inject(state: JointState, error: Array) -> JointState:
         ),
         omegas_rad_s=state.omegas_rad_s + each[:, RATE],
         extra=state.extra + each[:, 12:],
+        shape=None if state.shape is None else state.shape.corrected(error[end:]),
     )
 
 
 def difference(a: JointState, b: JointState) -> Array:
     """Return the error vector that takes the state ``a`` to ``b``."""
     n = a.chasers
-    error = np.empty(TARGET + CHASER * n)
+    end = TARGET + CHASER * n
+    error = np.empty(len(a.covariance))
     error[:TARGET] = target_hypotheses.difference(a, b)
-    each = error[TARGET:].reshape(n, CHASER)
+    each = error[TARGET:end].reshape(n, CHASER)
     each[:, POSITION] = b.positions_m - a.positions_m
     each[:, VELOCITY] = b.velocities_m_s - a.velocities_m_s
     turns = rotations.multiply(rotations.conjugate(a.attitudes_wxyz), b.attitudes_wxyz)
     each[:, ATTITUDE] = rotations.log(turns)
     each[:, RATE] = b.omegas_rad_s - a.omegas_rad_s
     each[:, 12:] = b.extra - a.extra
+    if a.shape is not None and b.shape is not None:
+        error[end:] = a.shape.error_of(b.shape)
     return error

@@ -2,23 +2,27 @@
 """Free tumbles seen by chasers that keep their places: what vision alone tells of the target's mass properties. Fast.
 
 The chasers move with the target as if they were fixed to it, and the filter gets the impulses that this takes, so that no
-controller is involved. ``RenderedImages`` gives the sightings: drawn ones with statistical perception, otherwise those of images.
+controller is involved. Sightings are those of rendered images, or with statistical perception drawn ones, to which ``ViewErrors``
+adds what images have and drawn ones lack: errors that persist with the view, as the filter expects them.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 from chaserdock_controller.estimation.composite_body import stated_properties
-from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint import JointEstimator, JointParameters
 from chaserdock_controller.estimation.joint.estimator import JointInputs
 from chaserdock_controller.estimation.mass_properties import inertia_ratios, properties_of, with_shape
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
+from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import Sighting
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from chaserdock_world.physics.simulation import TARGET
@@ -26,16 +30,43 @@ from chaserdock_world.plant import target_plant
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import odometry_of
 
-from .detumble_flights import moving_with
+from .detumble_flights import moving_with, stack_scenario
 from .latched_stack import body_of_plant
 from .perception import RenderedImages
+from .rigid_control import wrong_knowledge
+
+
+class ViewErrors:
+    """Errors of the sightings of one chaser that persist with the view: a Gauss-Markov process with the figures of the filter."""
+
+    def __init__(self, parameters: JointParameters, seed: int, chaser: int) -> None:
+        self._parameters = parameters
+        self._rng = np.random.default_rng([seed, 0x71E, chaser])
+        self._view = self._rng.standard_normal(6)
+
+    def added_to(self, sighting: Sighting, step_s: float) -> Sighting:
+        """Return the sighting with errors, ``step_s`` after the one before."""
+        noise = self._parameters.sighting_noise(len(sighting.marker_ids))
+        fade = math.exp(-step_s / noise.view_time_s)
+        self._view = fade * self._view + math.sqrt(1.0 - fade**2) * self._rng.standard_normal(6)
+        more = math.sqrt(max(0.0, noise.white_ratio**2 - 1.0)) * self._rng.standard_normal(6)
+        solutions = []
+        for s in sighting.solutions:
+            error = np.linalg.cholesky(np.reshape(s.covariance, (6, 6))) @ (
+                more + noise.view_ratio * self._view
+            )
+            q = rotations.multiply(np.array(s.q_wxyz), rotations.exp(error[3:]))
+            position = np.array(s.position_m) + error[:3]
+            solutions.append(msgspec.structs.replace(s, position_m=vector(position), q_wxyz=vector(q)))
+        return msgspec.structs.replace(sighting, solutions=tuple(solutions))
 
 
 @dataclass(frozen=True)
 class TumbleOutcome:
     """One tumble. ``ratio_error``: largest error of an element of the inertia over its trace, as a share of the largest moment over
-    the trace; ``stated_error``: that of the stated inertia. ``centre_m``: error of the centre of mass. ``ratio_nees``, ``centre_nees``:
-    normalized squared errors (5 and 3 degrees of freedom); ``nees``: mean of those of the relative poses (6) after the first 10 s."""
+    the trace; ``stated_error``: that of the stated inertia. ``centre_m``: error of the centre of mass. ``ratio_nees`` and
+    ``centre_nees``: normalized squared errors (5 and 3 degrees of freedom). ``nees``: mean of those of the relative poses (6) after
+    the first 10 s."""
 
     seed: int
     rate_deg_s: float
@@ -45,6 +76,17 @@ class TumbleOutcome:
     ratio_nees: float
     centre_nees: float
     nees: float
+
+
+def tumble_scenario(
+    seed: int, chasers: Sequence[int], rate_deg_s: float, changes: Sequence[str] = ()
+) -> Scenario:
+    """Return ``stack_scenario`` with a tumble of this rate, of which mass, inertia and centre are stated wrong."""
+    scenario = stack_scenario(seed, chasers, [*wrong_knowledge(seed), *changes])
+    omega = np.array(scenario.target.omega_rad_s)
+    omega *= math.radians(rate_deg_s) / float(np.linalg.norm(omega))
+    target = scenario.target.model_copy(update={"omega_rad_s": tuple(omega.tolist())})
+    return scenario.model_copy(update={"target": target})
 
 
 def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
@@ -61,6 +103,8 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
     if not isinstance(estimator, JointEstimator):
         raise ValueError('needs estimator.name = "joint"')
     chasers, before, nees = range(len(scenario.chasers)), None, []
+    drawn = scenario.perception.name == "statistical"
+    views = [ViewErrors(estimator.parameters, scenario.seed, i) for i in chasers]
     for tick in range(ticks):
         now_ns, q, omega = timing.tick_time_ns(tick), qs[tick], omegas[tick]
         arm = rotations.rotate(q, body.centre_trf_m)
@@ -74,6 +118,9 @@ def watch_tumble(scenario: Scenario, duration_s: float) -> TumbleOutcome:
         sightings: tuple[Sighting, ...] = ()
         if timing.has_images(tick):
             sightings = tuple(camera(i, tick, now_ns, states) for i in chasers)
+        if drawn:
+            image_s = period_s * timing.ticks_per_image
+            sightings = tuple(views[s.chaser].added_to(s, image_s) for s in sightings)
         estimator.update(
             JointInputs(
                 time_ns=now_ns,

@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from chaserdock_controller.estimation.mass_properties import properties_of
 from chaserdock_controller.estimation.identification.stage import StackIdentification
+from chaserdock_controller.estimation.mass_properties import properties_of
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime
 from chaserdock_controller.guidance.detumble.control import DetumbleControl, StackState, StackTask

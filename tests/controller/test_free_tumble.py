@@ -8,14 +8,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock.evaluation.detumble_flights import stack_scenario
-from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, watch_tumble
-from chaserdock.evaluation.rigid_control import wrong_knowledge
 from chaserdock_controller.estimation.joint.prediction import predict_target
 from chaserdock_controller.estimation.joint.state import empty_state, start_shape, with_body
 from chaserdock_controller.parameters import estimator_of
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from detumble_cases import target_alone
+
+from chaserdock.evaluation.detumble_flights import stack_scenario
+from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, watch_tumble
+from chaserdock.evaluation.rigid_control import wrong_knowledge
 
 
 def scenario_of(omega_deg_s: list[float], *more: str) -> Scenario:

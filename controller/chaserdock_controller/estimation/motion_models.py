@@ -99,43 +99,55 @@ def _rotation(
 ) -> tuple[Array, Array, Array]:
     """Return attitude, rate and the transition (6, 11) of (dtheta, domega) by themselves and by the ratios of the inertia.
 
-    Steps as in ``torque_free``. With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at
-    Omega = omega + W: I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u x I u with u away from the Earth.
-    The change of T with an error (4e-6 1/s^2 at most) is left out of the transition.
+    With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at Omega = omega + W:
+    I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u x I u with u away from the Earth. The change of T with
+    an error (4e-6 1/s^2 at most) is left out of the transition. Attitude and rate by RK4, in the steps of ``torque_free``; the
+    transition of a step to third order, with the derivatives in its middle.
     """
-    n = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
-    inertia, rate = shape.inertia, mean_motion_rad_s
+    steps = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
+    inertia, n, h = shape.inertia, mean_motion_rad_s, dt_s / steps
     inverse = np.linalg.inv(inertia)
 
-    def derivative(y: Array) -> Array:
-        q, w, transition = y[:4], y[4:7], y[7:].reshape(6, 11)
-        frame, torque, total = _ZERO3, _ZERO3, w
-        if rate:
-            axes = so3.to_matrix(q)
-            up, frame = axes[0], rate * axes[2]
-            torque = 3.0 * rate**2 * (so3.skew(up) @ (inertia @ up))
-            total = w + frame
-        momentum, turning = inertia @ total, so3.skew(total)
-        alpha = inverse @ (torque - turning @ momentum)
-        own = inverse @ (so3.skew(momentum) - turning @ inertia)
-        jacobian = np.zeros((6, 6))
-        jacobian[:3, :3] = -so3.skew(w)
-        jacobian[:3, 3:] = _EYE3
-        jacobian[3:, 3:] = own
-        if rate:
-            turned = so3.skew(frame)
-            jacobian[3:, :3] = (own + so3.skew(w)) @ turned
-            jacobian[3:, 3:] -= turned
-        change = jacobian @ transition
-        change[3:, 6:] -= inverse @ (RATIO_BASIS @ alpha + (RATIO_BASIS @ total) @ turning.T).T
-        q_rate = 0.5 * so3.multiply(q, np.array([0.0, *w.tolist()]))
-        return np.concatenate([q_rate, alpha + so3.skew(w) @ frame, change.ravel()])
+    def frame(q: Array) -> tuple[Array, Array]:
+        """Return W and T."""
+        if n == 0.0:
+            return _ZERO3, _ZERO3
+        axes = so3.to_matrix(q)
+        return n * axes[2], 3.0 * n * n * (so3.skew(axes[0]) @ (inertia @ axes[0]))
 
-    y = np.concatenate([q_wxyz, omega_rad_s, np.eye(6, 11).ravel()])
-    for _ in range(n):
-        y = rk4_step(derivative, y, dt_s / n)
+    def derivative(y: Array) -> Array:
+        w = y[4:]
+        turning, torque = frame(y[:4])
+        total = w + turning
+        alpha = inverse @ (torque - so3.skew(total) @ (inertia @ total))
+        q_rate = 0.5 * so3.multiply(y[:4], np.array([0.0, *w.tolist()]))
+        return np.concatenate([q_rate, alpha if n == 0.0 else alpha + so3.skew(w) @ turning])
+
+    y, transition = np.concatenate([q_wxyz, omega_rad_s]), np.eye(6, 11)
+    for _ in range(steps):
+        middle = y + 0.5 * h * derivative(y)
+        y = rk4_step(derivative, y, h)
         y[:4] = so3.normalize(y[:4])
-    return y[:4], y[4:7], y[7:].reshape(6, 11)
+        middle[4:] = 0.5 * (middle[4:] + y[4:] - 0.5 * h * derivative(y)[4:])
+        w = middle[4:]
+        turning, torque = frame(so3.normalize(middle[:4]))
+        total = w + turning
+        spin, momentum = so3.skew(total), inertia @ total
+        alpha = inverse @ (torque - spin @ momentum)
+        a = np.zeros((6, 6))
+        a[:3, :3] = -so3.skew(w)
+        a[:3, 3:] = _EYE3
+        a[3:, 3:] = inverse @ (so3.skew(momentum) - spin @ inertia)
+        if n:
+            turned = so3.skew(turning)
+            a[3:, :3] = (a[3:, 3:] + so3.skew(w)) @ turned
+            a[3:, 3:] -= turned
+        a *= h
+        change = a @ transition
+        change[3:, 6:] -= h * (inverse @ (RATIO_BASIS @ alpha + (RATIO_BASIS @ total) @ spin.T).T)
+        second = a @ change
+        transition = transition + change + 0.5 * second + (a @ second) / 6.0
+    return y[:4], y[4:], transition
 
 
 def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:

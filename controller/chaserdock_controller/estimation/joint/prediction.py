@@ -49,6 +49,8 @@ from .state import (
 )
 
 _EYE3 = np.eye(3)
+_YOUNG_S = 1.0
+"""Least age of a shape in the rate at which measurements of it fade, s."""
 
 
 def predict(
@@ -89,6 +91,8 @@ def predict(
     motion = _motion_transitions(state, wrenches, totals, centres, dt, p)
     covariance = _transform(target_transition, motion, fade, state.covariance)
     _add_noise(covariance, state, impulses, dt, p, latched, fade, max(0.0, dt - nominal_s))
+    if state.prior_information is not None:
+        _fade_shape(covariance[-SHAPE:, -SHAPE:], state.prior_information, dt, state, p)
     return replace(
         moved,
         time_ns=time_ns,
@@ -134,6 +138,19 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
 def _target_noise(dt: float, p: JointParameters) -> Array:
     linear, angular = p.target_noise[p.target.motion_model]
     return process_noise(dt, linear**2, angular**2)
+
+
+def _fade_shape(
+    covariance: Array, prior_information: Array, dt: float, state: JointState, p: JointParameters
+) -> None:
+    """Let the filter forget, in place, a part of what measurements told of the shape since it started.
+
+    They were linearized at an earlier estimate, which was far from the truth at first: after the time t, what was measured at the
+    time s weighs (s / t)^``shape_memory``. The knowledge from before the measurements is kept.
+    """
+    age = max((state.time_ns - state.shape_ns) * 1e-9, _YOUNG_S)
+    share = p.shape_memory * dt / (age + dt)
+    covariance += share * (covariance - covariance @ prior_information @ covariance)
 
 
 def _fading(state: JointState, dt: float, p: JointParameters) -> Array:

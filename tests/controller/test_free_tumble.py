@@ -28,12 +28,12 @@ def scenario_of(omega_deg_s: list[float], *more: str) -> Scenario:
 
 @pytest.fixture(scope="module")
 def tumble() -> TumbleOutcome:
-    return watch_tumble(scenario_of([4.0, -3.0, 5.0]), 30.0)
+    return watch_tumble(scenario_of([8.0, -6.0, 10.0]), 20.0)
 
 
 def test_a_tumble_shows_ratios_and_centre(tumble: TumbleOutcome) -> None:
     assert tumble.stated_error > 0.1
-    assert tumble.ratio_error < 0.02
+    assert tumble.ratio_error < 0.3 * tumble.stated_error
     assert tumble.centre_m < 0.003
     assert tumble.ratio_nees < 20.5  # 0.999 quantile, 5 degrees of freedom
     assert tumble.centre_nees < 16.3
@@ -42,7 +42,7 @@ def test_a_tumble_shows_ratios_and_centre(tumble: TumbleOutcome) -> None:
 def test_relative_poses_are_consistent_although_the_inertia_is_wrong(tumble: TumbleOutcome) -> None:
     assert 0.5 < tumble.nees < 15.0
     sure = ("target.inertia_sigma_share=1e-6", "target.centre_of_mass_sigma_m=1e-6")
-    assert watch_tumble(scenario_of([4.0, -3.0, 5.0], *sure), 15.0).nees > 100.0
+    assert watch_tumble(scenario_of([4.0, -3.0, 5.0], *sure), 13.0).nees > 30.0
 
 
 def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleOutcome) -> None:
@@ -50,7 +50,7 @@ def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleO
     axis = np.linalg.eigh(target_alone().inertia_kg_m2)[1][:, 2]
     values = "{target=true,mass_kg=150.0,inertia_kg_m2=[20.0,22.0,25.0,0.0,0.0,0.0]}"
     changes = [f"truth.values=[{values}]", "target.inertia_kg_m2=[22.0,20.0,25.0]", f"seed={axis.size}"]
-    spin = watch_tumble(scenario_of([0.0, 0.0, 7.0], *changes), 15.0)
+    spin = watch_tumble(scenario_of([0.0, 0.0, 7.0], *changes), 8.0)
     assert spin.ratio_error > 0.5 * spin.stated_error
     assert spin.ratio_nees < 20.5
 

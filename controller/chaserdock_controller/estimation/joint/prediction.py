@@ -21,7 +21,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_matrix, cw_wrench
 from chaserdock_models.rigid_body import newton_euler, rk4_step
 
-from chaserdock_controller.estimation.body_shape import SHAPE
+from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
 from chaserdock_controller.estimation.motion_models import free_shape, process_noise, propagate_target
 
 from .parameters import JointParameters
@@ -91,8 +91,9 @@ def predict(
     motion = _motion_transitions(state, wrenches, totals, centres, dt, p)
     covariance = _transform(target_transition, motion, fade, state.covariance)
     _add_noise(covariance, state, impulses, dt, p, latched, fade, max(0.0, dt - nominal_s))
-    if state.prior_information is not None:
-        _fade_shape(covariance[-SHAPE:, -SHAPE:], state.prior_information, dt, state, p)
+    if state.ratio_information is not None:
+        ratios = covariance[-SHAPE:, -SHAPE:][RATIOS, RATIOS]
+        _fade_ratios(ratios, state.ratio_information, dt, state, p)
     return replace(
         moved,
         time_ns=time_ns,
@@ -140,17 +141,17 @@ def _target_noise(dt: float, p: JointParameters) -> Array:
     return process_noise(dt, linear**2, angular**2)
 
 
-def _fade_shape(
-    covariance: Array, prior_information: Array, dt: float, state: JointState, p: JointParameters
+def _fade_ratios(
+    covariance: Array, information: Array, dt: float, state: JointState, p: JointParameters
 ) -> None:
-    """Let the filter forget, in place, a part of what measurements told of the shape since it started.
+    """Let the filter forget, in place, a part of what measurements told of the ratios of the inertia since the shape started.
 
     They were linearized at an earlier estimate, which was far from the truth at first: after the time t, what was measured at the
-    time s weighs (s / t)^``shape_memory``. The knowledge from before the measurements is kept.
+    time s weighs (s / t)^``ratio_memory``. The ``information`` (5, 5) from before the measurements is kept.
     """
     age = max((state.time_ns - state.shape_ns) * 1e-9, _YOUNG_S)
-    share = p.shape_memory * dt / (age + dt)
-    covariance += share * (covariance - covariance @ prior_information @ covariance)
+    share = p.ratio_memory * dt / (age + dt)
+    covariance += share * (covariance - covariance @ information @ covariance)
 
 
 def _fading(state: JointState, dt: float, p: JointParameters) -> Array:

@@ -17,7 +17,7 @@ from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
 from chaserdock_controller.estimation import target_hypotheses
-from chaserdock_controller.estimation.body_shape import SHAPE, BodyShape, shape_covariance, shape_of
+from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE, BodyShape, shape_covariance, shape_of
 from chaserdock_controller.estimation.parameters import BodyPrior, MekfParameters
 from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
 
@@ -51,8 +51,8 @@ class JointState(TargetHypothesis):
 
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
     additive states. covariance (12 + CHASER N, 12 + CHASER N), or with ``shape`` ``SHAPE`` more. alive (N,): chasers whose state
-    is known. shape: of a torque-free target. prior: knowledge that it started from at ``shape_ns``, with ``prior_information``
-    (8, 8), the (pseudo-)inverse of its covariance.
+    is known. shape: of a torque-free target. prior: knowledge that it started from at ``shape_ns``, with ``ratio_information``
+    (5, 5), the (pseudo-)inverse of the covariance of its ratios.
     odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
     markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
@@ -73,7 +73,7 @@ class JointState(TargetHypothesis):
     updates: int = 0
     shape: BodyShape | None = None
     prior: BodyPrior | None = None
-    prior_information: Array | None = None
+    ratio_information: Array | None = None
     shape_ns: int = 0
 
     @property
@@ -128,7 +128,7 @@ def start_shape(state: JointState, p: MekfParameters) -> JointState:
         state,
         shape=shape_of(inertia, np.array(p.centre_of_mass_trf_m)),
         prior=p.body_prior,
-        prior_information=np.linalg.pinv(covariance[own:, own:], rcond=1e-12, hermitian=True),
+        ratio_information=np.linalg.pinv(covariance[own:, own:][RATIOS, RATIOS], rcond=1e-12, hermitian=True),
         shape_ns=state.time_ns,
         covariance=covariance,
     )

@@ -101,6 +101,19 @@ def test_detaching_undoes_attaching(seed: int) -> None:
     assert properties_of(body_of(target.values)) == pytest.approx(target.values)
 
 
+def test_a_stack_is_as_uncertain_as_its_nonlinear_dependence_on_the_mass() -> None:
+    """Centre and ratios are known and the mass is 30 % wrong: the true stack is within its covariance."""
+    true, chasers = target_alone(), mounted((0,))
+    scale = np.diag([45.0**2, *[1e-6] * 3, *[1e-4] * 6])
+    for share in (0.7, 1.3):
+        stated = TargetBody(share * true.mass_kg, true.inertia_kg_m2, true.centre_trf_m)
+        stack = attach(MassProperties(stated, share**2 * scale), chasers, BODY)
+        off = properties_of(stack_of(chasers)) - stack.values
+        # The mass of the stack is learned as a logarithm.
+        off[0] = stack.body.mass_kg * math.log1p(off[0] / stack.body.mass_kg)
+        assert off @ np.linalg.solve(stack.covariance, off) < 16.0
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_transition_is_the_derivative_of_the_prediction(seed: int) -> None:
     """Shift the error state before a prediction, and compare the innovations of the exact state with those that follow."""

@@ -29,7 +29,7 @@ def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.parametrize("command", [("world", "single"), ("simulate", "single", "--images")])
-def test_the_world_without_pybullet_says_where_it_runs(command: tuple[str, ...]) -> None:
+def test_world_without_pybullet_names_the_platforms_that_have_it(command: tuple[str, ...]) -> None:
     done = without("pybullet", *command)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()

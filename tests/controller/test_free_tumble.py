@@ -9,8 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint.prediction import predict_target
-from chaserdock_controller.estimation.joint.state import empty_state, start_shape, with_body
+from chaserdock_controller.estimation.joint.state import JointState, empty_state, start_shape, with_body
 from chaserdock_controller.parameters import estimator_of
+from chaserdock_controller.redundancy.serialization import decode, encode
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 from detumble_cases import target_alone
 
@@ -74,3 +75,13 @@ def test_a_change_of_the_body_restarts_its_shape() -> None:
     )
     assert np.trace(wide[9:, 9:]) > 4.0 * np.trace(narrow[9:, 9:])
     assert math.isfinite(np.trace(wide))
+
+
+def test_a_checkpoint_keeps_the_shape() -> None:
+    p = estimator_of(flight_scenario(scenario_of([4.0, -3.0, 5.0]))).parameters  # type: ignore[union-attr]
+    state = start_shape(empty_state(0, 2), p.target)
+    again = decode(encode(state), JointState)
+    assert state.shape is not None
+    assert again.shape is not None
+    assert again.shape.inertia.tobytes() == state.shape.inertia.tobytes()
+    assert with_body(again, p.target) is again

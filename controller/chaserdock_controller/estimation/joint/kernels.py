@@ -16,6 +16,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.native import address, scratch
 from numpy.typing import NDArray
 
+from chaserdock_controller.estimation.body_shape import SHAPE
+
 from .native import function
 
 TARGET_MEAN, CHASER_MEAN = 13, 44
@@ -63,6 +65,7 @@ class _Innovation(Structure):
             for name in ("residual", "jacobian", "noise", "s", "cross", "white", "correction", "values")
         ),
         ("stride", c_int64),
+        ("size", c_int64),
     ]
 
 
@@ -94,8 +97,7 @@ class ChaserMeasurement:
 class JointInnovation:
     """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of native/update.c."""
 
-    def __init__(self, n: int) -> None:
-        size = 12 + 43 * n
+    def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
         self.values: Array = np.empty(_CHANNELS + 1)
         self._arrays = [
@@ -104,10 +106,15 @@ class JointInnovation:
                 MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
             )
         ] + [self.values]  # fmt: skip
-        self._native = _Innovation(*map(address, self._arrays), stride)
-        self._work = scratch(_work_size("innovate_workspace", n))
+        self._native = _Innovation(*map(address, self._arrays), stride, size)
+        self._work = scratch(_work_size("innovate_workspace", size))
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
+
+    @property
+    def correction(self) -> Array:
+        """Return the last correction (D,)."""
+        return self._arrays[6]
 
     def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""
@@ -125,24 +132,25 @@ class JointInnovation:
 
     def reduce(self, z: ChaserMeasurement, rows: int, covariance: Array) -> None:
         """Reduce the covariance by the last correction, of so many rows."""
-        function("reduce")(self._n, c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
+        function("reduce")(c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
 
 def check_size(mean: Array, covariance: Array) -> int:
-    """Return the number of chasers of a state. Raises ValueError if its covariance has another size."""
+    """Return the number of chasers of a state. Raises ValueError if its covariance has another size, with or without a shape."""
     n, rest = divmod(mean.size - TARGET_MEAN, CHASER_MEAN)
-    if rest or covariance.shape != (12 + 43 * n, 12 + 43 * n):
+    size = 12 + 43 * n
+    if rest or covariance.shape not in ((size, size), (size + SHAPE, size + SHAPE)):
         raise ValueError(f"a state of {n} chasers with a covariance of shape {covariance.shape}")
     return n
 
 
-def _work_size(name: str, n: int) -> int:
-    return function(name, c_int64)(c_int64(n))
+def _work_size(name: str, *sizes: int) -> int:
+    return function(name, c_int64)(*map(c_int64, sizes))
 
 
-def complete(n: int, covariance: Array) -> None:
+def complete(covariance: Array) -> None:
     """Make a covariance (D, D) symmetric by its lower triangle."""
-    function("complete")(c_int64(n), address(covariance))
+    function("complete")(c_int64(len(covariance)), address(covariance))
 
 
 def predict(
@@ -165,11 +173,11 @@ def predict(
     if any(len(a) != n for a in (impulses, orbital, fade_view, alive, latched)):
         raise ValueError(f"a state of {n} chasers with other numbers of chasers in its fields")
     out = np.empty_like(covariance)
-    work = scratch(_work_size("predict_workspace", n))
+    work = scratch(_work_size("predict_workspace", n, len(covariance)))
     arrays: tuple[NDArray[Any], ...] = (
         target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,
     )  # fmt: skip
-    function("predict")(ctypes.byref(motion), c_int64(n), *map(address, arrays))
+    function("predict")(ctypes.byref(motion), c_int64(n), c_int64(len(covariance)), *map(address, arrays))
     return out
 
 

@@ -21,6 +21,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
 from numpy.typing import NDArray
 
+from chaserdock_controller.estimation.body_shape import SHAPE
 from chaserdock_controller.estimation.target_hypotheses import POSE, RATES, TargetRates
 from chaserdock_controller.estimation.types import PoseHypothesis
 
@@ -195,7 +196,8 @@ class RunningUpdate:
         kernels.check_size(self.mean, self.covariance)
         self.rejections, self.nis = state.rejections.copy(), state.nis.copy()
         self.log_likelihood = state.log_likelihood
-        self.innovation = kernels.JointInnovation(state.chasers)
+        self.shape = state.shape
+        self.innovation = kernels.JointInnovation(state.chasers, len(self.covariance))
 
     def values(self, z: kernels.ChaserMeasurement) -> list[float]:
         """Compute the innovation of a measurement; return the squared norm of each channel's residual by its innovation
@@ -216,13 +218,16 @@ class RunningUpdate:
             if not innovation.correct(z, used, prior, self.mean):
                 raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         innovation.reduce(z, len(used), self.covariance)
+        if self.shape is not None:
+            self.shape = self.shape.corrected(innovation.correction[-SHAPE:])
 
     def finished(self, updates: int, markers: NDArray[np.int64]) -> JointState:
         """Return the state after the updates, with these fields."""
-        kernels.complete(self.state.chasers, self.covariance)
+        kernels.complete(self.covariance)
         return replace(
             self.state,
             covariance=self.covariance,
+            shape=self.shape,
             rejections=self.rejections,
             nis=self.nis,
             log_likelihood=self.log_likelihood,

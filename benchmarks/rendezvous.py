@@ -77,7 +77,9 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each, from 0")
     parser.add_argument("--images", action="store_true", help="render images")
     parser.add_argument("--events", action="store_true", help="print the controller's events")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario key")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario key"
+    )
     options = parser.parse_args()
     figures: Figures = {}
     for name in options.scenario:

@@ -6,6 +6,7 @@ Lengths are in millimetres, rotations row-wise from the model to the camera. A s
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from .json_files import numbers, read_object, write_json
 from .model_files import OBJECT, read_models, write_models
-from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split
+from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split, TargetShape
 from .views import ViewImage
 
 _SCENE = "000000"
@@ -31,11 +32,11 @@ class BopWriter:
     """Writes a dataset into ``folder``: ``camera.json``, ``models``, ``models_eval``, ``train`` and ``val``. Raises OSError, and
     DatasetError for a camera with lens distortion, which the format does not have."""
 
-    def __init__(self, folder: Path, camera: Camera, mesh: TriangleMesh) -> None:
+    def __init__(self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape) -> None:
         check_camera(camera)
         self._folder, self._camera = folder, camera
-        for name in ("models", "models_eval"):
-            write_models(mesh, folder / name)
+        write_models(mesh, shape, folder / "models")
+        shutil.copytree(folder / "models", folder / "models_eval")
         c = camera
         values = {
             "width": c.width_px,

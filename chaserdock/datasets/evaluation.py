@@ -6,9 +6,10 @@ from __future__ import annotations
 import importlib
 import time
 from collections.abc import Callable, Sequence
+from typing import Any, get_args
 
 import numpy as np
-from chaserdock_agents.chaser.perception import PerceptionMethod, make_perception
+from chaserdock_agents.chaser.perception import Method, PerceptionMethod, make_perception
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_protocol.scenario import FlightScenario
@@ -28,17 +29,15 @@ def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> P
     """
     if name is not None and ":" in name:
         return _of_class(name, flight, camera)
-    updated = {"camera": _section_of(camera)}
+    updated: dict[str, Any] = {"camera": _section_of(camera)}
     if name is not None:
         updated["perception"] = PerceptionSection(name=name)
-    if (name or flight.perception.name) == "statistical":
-        raise DatasetError(
-            "--perception statistical: needs no images, it draws measurements; give another one"
-        )
-    try:
-        return make_perception(flight.model_copy(update=updated))
-    except ValueError as error:
-        raise DatasetError(f"--perception {name or flight.perception.name}: {error}") from None
+    used = name or flight.perception.name
+    if used == "statistical":
+        raise DatasetError(f"--perception {used}: needs no images, it draws measurements; give another one")
+    if used in get_args(Method) and not flight.target_model().markers:
+        raise DatasetError(f"--perception {used}: needs markers; the target {flight.target.model!r} has none")
+    return make_perception(flight.model_copy(update=updated))
 
 
 def _of_class(name: str, flight: FlightScenario, camera: Camera) -> PerceptionMethod:

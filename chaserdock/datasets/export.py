@@ -45,7 +45,8 @@ def export_dataset(
     with errors_of_writing(folder, DatasetError):
         folder.mkdir(parents=True, exist_ok=True)
         kinds = {"bop": BopWriter, "speed+": SpeedPlusWriter}
-        writers = [kinds[k](folder / FOLDERS[k], renderer.camera, renderer.mesh) for k in layouts]
+        made = (renderer.camera, renderer.mesh, renderer.shape)
+        writers = [kinds[k](folder / FOLDERS[k], *made) for k in layouts]
         for number in range(images):
             image = renderer.render(number)
             split: Split = "train" if number < first_validation else "validation"

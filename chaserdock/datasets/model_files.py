@@ -10,18 +10,18 @@ import numpy as np
 from chaserdock_models.meshes import TriangleMesh, triangle_soup
 
 from .json_files import numbers, read_object, write_json
-from .shapes import diameter_of, shape_of
+from .shapes import diameter_of
 from .types import DatasetError, TargetShape
 
 OBJECT = 1
 """Number of the target in a dataset of ours."""
 
 
-def write_models(mesh: TriangleMesh, folder: Path) -> None:
-    """Write the model of the target and its entry in ``models_info.json`` into a new folder. Raises OSError."""
+def write_models(mesh: TriangleMesh, shape: TargetShape, folder: Path) -> None:
+    """Write the model of the target, without markers, and its entry in ``models_info.json`` into a new folder. Raises OSError."""
     folder.mkdir(parents=True)
     _write_ply(mesh, folder / f"obj_{OBJECT:06d}.ply")
-    write_json(folder / "models_info.json", {str(OBJECT): _info(shape_of(mesh))})
+    write_json(folder / "models_info.json", {str(OBJECT): _info(shape)})
 
 
 def _write_ply(mesh: TriangleMesh, path: Path) -> None:

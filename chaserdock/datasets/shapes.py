@@ -18,11 +18,13 @@ _SAME_SHARE = 0.002
 _MOST_POINTS = 2000
 
 
-def shape_of(mesh: TriangleMesh) -> TargetShape:
-    """Return the shape of a target. Its candidates for symmetries are the rotations of a cube in TRF."""
+def shape_of(mesh: TriangleMesh, symmetric: bool = True) -> TargetShape:
+    """Return the shape of a target. Its candidates for symmetries are the rotations of a cube in TRF; ``symmetric``: False for a
+    target with markers, which has none."""
     vertices = np.concatenate([part.vertices_m for part in mesh.parts])
     diameter_m = diameter_of(vertices)
-    return TargetShape(vertices, diameter_m, _symmetries(mesh, _SAME_SHARE * diameter_m))
+    turns = _symmetries(mesh, _SAME_SHARE * diameter_m) if symmetric else np.zeros((0, 3, 3))
+    return TargetShape(vertices, diameter_m, turns)
 
 
 def diameter_of(points: Array) -> float:

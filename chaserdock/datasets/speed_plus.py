@@ -20,7 +20,7 @@ from chaserdock_models.meshes import TriangleMesh
 
 from .json_files import numbers, read_list, read_object, write_json
 from .model_files import read_models, write_models
-from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split
+from .types import DatasetError, LabelledDataset, LabelledImage, PoseLabel, Split, TargetShape
 from .views import ViewImage
 
 _DOMAIN = "synthetic"
@@ -34,11 +34,11 @@ class SpeedPlusWriter:
     """Writes a dataset into ``folder``: ``camera.json`` and ``synthetic/`` with images, masks and labels; and, what SPEED+ does not
     have, ``models`` as in BOP, for ADD. Raises OSError."""
 
-    def __init__(self, folder: Path, camera: Camera, mesh: TriangleMesh) -> None:
+    def __init__(self, folder: Path, camera: Camera, mesh: TriangleMesh, shape: TargetShape) -> None:
         self._domain = folder / _DOMAIN
         for name in ("images", "masks"):
             (self._domain / name).mkdir(parents=True)
-        write_models(mesh, folder / "models")
+        write_models(mesh, shape, folder / "models")
         write_json(folder / "camera.json", _camera_values(camera))
         self._labels: dict[Split, list[dict[str, Any]]] = {"train": [], "validation": []}
 

@@ -22,13 +22,13 @@ from chaserdock_world.physics.simulation import TARGET
 from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
 from chaserdock_world.rendering.cameras import Cameras
-from chaserdock_world.rendering.mesh_markers import with_markers
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer, mesh_of_boxes
 from chaserdock_world.rendering.rasterizer import chaser_boxes
 from chaserdock_world.rendering.scene_geometry import Obstacle
 from chaserdock_world.sensors.errors import true_camera
 from numpy.typing import NDArray
 
+from .shapes import shape_of
 from .types import DatasetError, PoseLabel
 
 _STREAM = 0xDA7A
@@ -130,6 +130,7 @@ class ViewRenderer:
         self._cameras = Cameras(scenario)
         self._to_sun_w = np.array(self._cameras.light_at(0.0).direction_w)
         self.mesh = target_mesh(scenario)
+        self.shape = shape_of(self.mesh, symmetric=not true_target(scenario).markers)
         self._mask = _Coverage(self.camera, self.mesh)
         _, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
         self._visible = _Coverage(self.camera, self.mesh, probe)
@@ -197,9 +198,9 @@ class _Coverage:
 
 
 def target_mesh(scenario: Scenario) -> TriangleMesh:
-    """Return the mesh of the target as the world draws it, with its markers."""
-    model, mesh = true_target(scenario), true_mesh(scenario)
-    return with_markers(mesh_of_boxes(model.boxes) if mesh is None else mesh, model)
+    """Return the mesh of the target as the world draws it, without its markers."""
+    mesh = true_mesh(scenario)
+    return mesh_of_boxes(true_target(scenario).boxes) if mesh is None else mesh
 
 
 def _padded(camera: Camera, margin_px: tuple[int, int]) -> Camera:

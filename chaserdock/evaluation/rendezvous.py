@@ -20,6 +20,7 @@ from .perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""
+IMAGES_FROM_M = 2.5
 _AFTER_CAPTURE_S = 1.0
 
 
@@ -175,10 +176,22 @@ def rendezvous(
     return out
 
 
-def last_leg(scenario: Scenario, wait_s: float = 20.0) -> Scenario:
-    """Return the scenario from its last hold point on: it starts there at rest and flies its last command after ``wait_s``."""
+def last_leg(scenario: Scenario, wait_s: float = 20.0, images: bool = False) -> Scenario:
+    """Return the scenario from its last hold point on: it starts there at rest and flies its last command after ``wait_s``.
+
+    ``images``: with images and markers in place of statistical perception and ranging, from `IMAGES_FROM_M` on, where a camera
+    of 960 x 540 detects the servicer's markers.
+    """
     *_, hold, last = sorted(scenario.timeline, key=lambda entry: entry.at_s)
-    chaser = scenario.chasers[0].model_copy(update={"position_m": hold.offset_m})
+    assert hold.offset_m is not None
+    start_m = hold.offset_m
+    if images:
+        perception = scenario.perception.model_copy(update={"name": "default"})
+        scenario = scenario.model_copy(update={"perception": perception, "ranging": None})
+        x, y, z = hold.offset_m
+        share = IMAGES_FROM_M / math.hypot(x, y)
+        start_m = (share * x, share * y, z)
+    chaser = scenario.chasers[0].model_copy(update={"position_m": start_m})
     return scenario.model_copy(
         update={
             "chasers": (chaser, *scenario.chasers[1:]),

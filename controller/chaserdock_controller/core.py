@@ -44,7 +44,7 @@ class ControllerCore:
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
         observation = self.ingest.run(inputs, self.output.history)
-        estimation = self.estimation.run(observation)
+        estimation = self.estimation.run(observation, self.guidance.machine.inspecting())
         guidance = self.guidance.run(observation, estimation, self.planning.history)
         plan = self.planning.run(observation, estimation, guidance)
         return self.output.run(observation, estimation, guidance, plan)

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol
 
 from chaserdock_models.arrays import Array
+from chaserdock_models.geometry_errors import GeometryParameter
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.passive_safety import CoastCertificate
 from chaserdock_models.rigid_body import BodyState
@@ -129,6 +130,20 @@ class IdentifiedStack:
     informative: Callable[[], tuple[tuple[int, int], ...]]
 
 
+@dataclass(frozen=True, eq=False)
+class EstimatedShape:
+    """Errors of the target's known geometry: ``parameters``, their estimated values (k,) and covariance (k, k), both in the
+    parameters' standard deviations; number of ``views``, the share of directions that they cover, and whether this tick brought
+    one (``changed``)."""
+
+    parameters: tuple[GeometryParameter, ...]
+    values: Array
+    covariance: Array
+    views: int
+    coverage: float
+    changed: bool
+
+
 @dataclass(frozen=True)
 class TargetEstimation:
     """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose is known.
@@ -138,7 +153,8 @@ class TargetEstimation:
     ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, unless passive safety is off.
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
-    target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are.
+    target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are. ``shape``: errors of
+    the known geometry, once they are estimated.
     """
 
     target: TargetState
@@ -154,6 +170,7 @@ class TargetEstimation:
     body: TargetBody
     events: tuple[LogEntry, ...]
     stack: IdentifiedStack | None = None
+    shape: EstimatedShape | None = None
 
     @property
     def known(self) -> bool:
@@ -210,6 +227,8 @@ class HorizonReference:
     min_distance_target_m: Array
     corridors: Array | None
     attached: frozenset[int]
+    boxes: Array | None = None
+    box_clearance_m: Array | None = None
 
 
 @dataclass(frozen=True)

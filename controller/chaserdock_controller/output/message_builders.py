@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     Event,
+    GeometryEstimate,
     Level,
     MassEstimate,
     PassiveSafety,
@@ -22,6 +24,7 @@ from chaserdock_protocol.messages import (
 from chaserdock_controller.estimation.identification.composite import MassProperties
 from chaserdock_controller.interfaces import (
     Directive,
+    EstimatedShape,
     GuidanceResult,
     IdentifiedStack,
     Observation,
@@ -72,6 +75,19 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
             for r in estimation.relative
             if r.chaser in estimation.disturbances
         ),
+    )
+
+
+def geometry_estimate(shape: EstimatedShape) -> GeometryEstimate:
+    """Return the estimated errors of the geometry in their units."""
+    sigmas = np.array([p.sigma for p in shape.parameters])
+    return GeometryEstimate(
+        names=tuple(p.name for p in shape.parameters),
+        sigmas=vector(sigmas),
+        values=vector(sigmas * shape.values),
+        covariance=vector(shape.covariance * np.outer(sigmas, sigmas)),
+        views=shape.views,
+        coverage=shape.coverage,
     )
 
 

@@ -26,6 +26,7 @@ from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.replay import ReplayBuffer
 from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
 from chaserdock_controller.guidance.detumble.planner import ActivePlan
@@ -129,6 +130,10 @@ class OdometryState(Struct, forbid_unknown_fields=True):
     _known: dict[int, Known]
 
 
+class ShapeState(Struct, forbid_unknown_fields=True):
+    filter: ShapeFilter
+
+
 class ConsistencyState(Struct, forbid_unknown_fields=True):
     inconsistent: set[int]
     _since_s: dict[int, tuple[bool, float]]
@@ -196,6 +201,7 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     odometry: OdometryState
     consistency: ConsistencyState
     identification: IdentificationState | None
+    shape: ShapeState | None
     estimator: JointEstimatorState | MekfState | PaperState | None
     plans: dict[int, Array]
 
@@ -209,7 +215,7 @@ class Checkpoint:
     def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
         """Return the objects whose attributes are copied, and what is copied of them, by field of the checkpoint."""
         core = self._core
-        return {
+        parts: dict[str, tuple[Any, type[Struct]]] = {
             "sightings": (vars(core.estimation)["_converter"], SightingState),
             "planning": (core.planning, PlanningState),
             "plan_monitor": (core.planning.monitor, PlanMonitorState),
@@ -228,10 +234,14 @@ class Checkpoint:
             "odometry": (self._odometry, OdometryState),
             "consistency": (core.estimation.consistency, ConsistencyState),
         }
+        if core.estimation.shape is not None:
+            parts["shape"] = (core.estimation.shape, ShapeState)
+        return parts
 
     def save(self) -> bytes:
         """Return the state now. Raises CheckpointError when it contains something other than data."""
-        parts: dict[str, Any] = {name: _read(*part) for name, part in self._parts().items()}
+        parts: dict[str, Any] = {"shape": None}
+        parts |= {name: _read(*part) for name, part in self._parts().items()}
         frame, identification = self._warm_starts(), self._core.estimation.identification
         try:
             return encode(
@@ -255,6 +265,9 @@ class Checkpoint:
         timeline = sorted(self._core.scenario.timeline, key=lambda entry: entry.at_s)
         chasers = len(self._core.scenario.chasers)
         if len(state.guidance.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
+            raise CheckpointError("the state is of another mission")
+        count = None if self._core.estimation.shape is None else len(self._core.estimation.shape.parameters)
+        if count != (None if state.shape is None else len(state.shape.filter.vector)):
             raise CheckpointError("the state is of another mission")
         self._restore_identification(state.identification)
         for name, (owner, _) in self._parts().items():

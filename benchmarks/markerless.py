@@ -16,6 +16,8 @@ front of the target are random. Parts:
   gate;
 - ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the Earth, and in front of space by one
   of two cameras that see the target at right angles;
+- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated from 36 views from all around at 1 to 1.6 m
+  by the controller's filter; twelve views of each of ``views / 12`` drawn meshes;
 - ``sequence`` and ``closing``: a tumbling target, followed at 15 Hz from its acquisition on, at 3 m and from 1.4 to 0.55 m.
 
 Gross: an error above 2 degrees or 2 % of range that passes the gate. Times are CPU times of this process. ``--results FILE`` appends
@@ -43,9 +45,11 @@ from chaserdock_agents.chaser.perception.model.alignment import Alignment, Pyram
 from chaserdock_agents.chaser.perception.model.mesh import TrackerMesh
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
 from chaserdock_agents.chaser.perception.refine import PoseInCamera
+from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.geometry_errors import geometry_parameters
 from chaserdock_models.meshes import with_geometry_errors
 from chaserdock_models.satellites import satellite
 from chaserdock_protocol.scenario.camera import Effects
@@ -69,6 +73,8 @@ RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0]
 
 Row = dict[str, float]
 """Figures of one view."""
+_VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
+"""Views of an inspection, and views of each mesh after it."""
 
 
 class SatelliteImages:
@@ -115,6 +121,56 @@ class Cells:
                 known[number] = view(np.random.default_rng([zlib.crc32(cell.encode()), number]), number)
                 append_line(self.path, {"cell": cell, "number": number, "row": known[number]})
         return [known[number] for number in range(views)]
+
+
+def inspect(views: int) -> Figures:
+    """Estimate the geometry from many views, correct the mesh, and track ``views`` single images at 1 m."""
+    rng, scene = np.random.default_rng(21), SatelliteImages()
+    errors, nees, rejected, shape_nees, used = [], [], 0, [], []
+    parameters = geometry_parameters(KNOWN, PANEL_SIGMA_RAD, SCALE_SIGMA)
+    for number in range(max(views // _VIEWS_AFTER, 1)):
+        turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in KNOWN.joints}
+        scale = rng.normal(0.0, SCALE_SIGMA)
+        mesh = TrackerMesh.of_mesh(with_geometry_errors(KNOWN, scale, turns), PANEL_SIGMA_RAD, SCALE_SIGMA)
+        _ = mesh.suns
+        fused = ShapeFilter.prior(len(parameters))
+        for k in range(_VIEWS_BEFORE):
+            pose, light = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
+            image = scene.image(pose, light, 1000 * number + k)
+            found = _track(image, mesh, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
+            if found is not None and tracking.is_valid(found):
+                direction = -found.pose.rotation.T @ found.pose.position
+                fused = fused.with_view(
+                    direction / np.linalg.norm(direction), found.geometry.matrix, found.geometry.vector
+                )
+        # The tracker's mesh is the true one with errors, which it should find with the opposite sign.
+        true = -np.append(
+            np.concatenate([turns[j] for j in KNOWN.joints]) / PANEL_SIGMA_RAD, scale / SCALE_SIGMA
+        )
+        off = fused.mean()[: len(true)] - true
+        shape_nees.append(
+            float(off @ np.linalg.solve(fused.covariance()[: len(true), : len(true)], off)) / len(true)
+        )
+        used.append(len(fused.cells))
+        corrected = mesh.corrected(fused.mean(), fused.covariance())
+        for k in range(_VIEWS_AFTER):
+            pose, light = random_view(rng, 1.0, CAMERA)
+            image = scene.image(pose, light, 1000 * number + 500 + k)
+            found = _track(image, corrected, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
+            if found is None or not tracking.is_valid(found):
+                rejected += 1
+                continue
+            errors.append(error_of(found.pose, pose))
+            e = tracking.pose_error(found.pose, pose)
+            nees.append(float(e @ np.linalg.solve(found.covariance, e)))
+    return _quantiles("inspect_1m", np.array(errors)) | {
+        "inspect_1m_views": len(errors) + rejected,
+        "inspect_1m_rejected": rejected,
+        "inspect_1m_nees_mean": float(np.mean(nees)),
+        "inspect_meshes": len(used),
+        "inspect_views_fused_mean": float(np.mean(used)),
+        "inspect_geometry_nees_per_parameter": float(np.mean(shape_nees)),
+    }
 
 
 def tracked_view(image: NDArray[np.uint8], mesh: TrackerMesh, pose: PoseInCamera, prior: PoseInCamera) -> Row:
@@ -331,6 +387,7 @@ def main() -> None:
     parts = (
         "exact",
         "knowledge",
+        "inspect",
         "independent",
         "behind",
         "backlit",
@@ -364,6 +421,7 @@ def main() -> None:
         {
             "exact": lambda: at_ranges("exact"),
             "knowledge": lambda: at_ranges("knowledge"),
+            "inspect": lambda: inspect(views),
             "independent": lambda: independent(cells, views),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),

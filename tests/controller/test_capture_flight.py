@@ -19,7 +19,7 @@ from chaserdock.evaluation.perception import measurement_model
 from chaserdock.evaluation.transfers import load_shipped
 
 
-def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
+def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
     """A seed with fast rates, noise of 2 mm and 0.1 degrees: 5 mm, 1.5 degrees, 1.2 cm/s; momentum to 1e-4."""
     scenario = docking_scenario(1)
     flight = ConservationMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1)))

@@ -8,14 +8,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from numpy.typing import ArrayLike, NDArray
 
-from ..pipeline import PerceptionResult
+from ..pipeline import GeometryInformation, PerceptionResult
 from ..pnp import TargetPose
 from ..refine import PoseInCamera
 from .acquisition import Acquisition
 from .alignment import Alignment, Pyramid
+from .geometry import GeometryCorrection
 from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
@@ -84,11 +86,36 @@ class ModelPerception:
         self._waiting: deque[NDArray[np.uint8]] = deque()
         self._work: Steps[None] | None = None
         self._next_ms = 0.0
+        self._uncorrected = mesh
+        self._correction: GeometryCorrection | None = None
 
     def prepare(self) -> None:
         """Compute what depends on the mesh alone; takes one to two seconds, which the first image would take otherwise."""
         self._acquisition.prepare()
         _ = self.mesh.suns
+
+    def correct_geometry(self, mean: Array, covariance: Array) -> None:
+        """Correct the mesh by its estimated errors (k,) with covariance (k, k), in its standard deviations; tracks go on.
+
+        Raises ValueError for another number of errors than the mesh has, or a covariance that is not positive definite.
+        """
+        k = len(self._uncorrected.modes_m)
+        if mean.shape != (k,) or covariance.shape != (k, k) or not np.linalg.eigvalsh(covariance)[0] > 0.0:
+            raise ValueError(f"the mesh has {k} errors; {len(mean)} or their covariance do not fit")
+        if self._correction is not None and self._correction.is_of(mean):
+            return
+        self._correction = GeometryCorrection(mean, covariance)
+        self.mesh = self._correction.applied(self._uncorrected)
+        if self._tracks:
+            self._work = None  # begins again, with this mesh
+        self._tracks = tuple(
+            replace(t, last=replace(t.last, modes=np.zeros(k)), age=_KEY_EVERY) for t in self._tracks
+        )
+
+    def reset(self) -> None:
+        """Forget all tracks: the next image is searched without a prior."""
+        self._tracks, self._work = (), None
+        self._waiting.clear()
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
@@ -109,7 +136,17 @@ class ModelPerception:
         # Poses in an earlier image are no solutions of this one.
         tracks = () if self._waiting else self._tracks
         valid = [_target_pose(t.last) for t in tracks if t.missed == 0]
-        return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
+        geometry = self._geometry() if tracks else None
+        return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), (), geometry)
+
+    def _geometry(self) -> GeometryInformation | None:
+        """Return what the image tells about the errors of the mesh before corrections: if the view of the only track is new."""
+        if len(self._tracks) != 1 or self._tracks[0].age or self._tracks[0].missed:
+            return None
+        found = self._tracks[0].last.geometry
+        if not len(found.vector):
+            return None
+        return found if self._correction is None else self._correction.of_uncorrected(found)
 
     def _work_on(self) -> None:
         """Take the next steps, as many as the time of one image allows, and at least one."""

@@ -207,7 +207,7 @@ class Invariants:
     def _on_world(self, world: WorldTruth) -> None:
         self._state_tick = world.tick
         for a, b in world.contacts:
-            # A chaser that no command reaches drifts: what it hits is nobody's doing.
+            # A chaser that no command reaches drifts; its contacts are not counted.
             if not {a, b} & self.dead:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
         for i in self._latched - set(world.latched):

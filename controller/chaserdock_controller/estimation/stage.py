@@ -50,7 +50,7 @@ class EstimationStage:
         parameters = shape_parameters(scenario)
         self.shape = ShapeEstimation(parameters) if parameters else None
         enabled = scenario.detumble.identification.enabled
-        self._identification = StackIdentification(scenario) if enabled else None
+        self.identification = StackIdentification(scenario) if enabled else None
 
     def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
         """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the geometry by the
@@ -59,10 +59,10 @@ class EstimationStage:
         estimation = self._estimate(observation)
         if self.shape is not None:
             estimation = replace(estimation, shape=self.shape.update(observation, inspecting))
-        if self._identification is None:
+        if self.identification is None:
             return estimation
-        estimation = self._identification.identified(observation, estimation)
-        refined = self._identification.refined_target(observation)
+        estimation = self.identification.identified(observation, estimation)
+        refined = self.identification.refined_target(observation)
         if refined is not None:
             self.composite.refine_target(refined)
         return estimation

@@ -586,6 +586,11 @@ class PhaseMachine:
             return limit
         return 0.0 if self._is_held(i) else min(limit, dock.keep_out_m())
 
+    def min_distance_shape_m(self, i: int) -> float:
+        """Return the distance from the cuboids of the target's shape that a chaser's plan keeps; 0 in its corridor and at its port."""
+        free = self.corridor(i) is None and not self.in_corridor(i) and not self._is_held(i)
+        return self._scenario.limits.min_distance_shape_m if free else 0.0
+
     def latch(self, i: int) -> Latch:
         """Return the latch command: armed from the final approach on, open before and when backing out."""
         if self._docks[i] is None:

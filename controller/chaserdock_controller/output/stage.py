@@ -30,6 +30,7 @@ from .message_builders import (
     geometry_estimate,
     plan_message,
     reference_message,
+    safety_message,
     solver_message,
     stack_message,
     target_message,
@@ -76,6 +77,7 @@ class OutputStage:
             assert command is not None
             out.wrenches[i] = self._send(i, observation, guidance, command, geometry)
         self.history.forget_before(observation.time_ns)
+        out.safety = {i: safety_message(i, observation, guidance, c) for i, c in result.certificates.items()}
         out.solver = solver_message(observation, self._scenario.controller.solver, result)
         out.events = [event_message(observation, level, text) for level, text in events]
         return out

@@ -9,7 +9,7 @@ from collections import defaultdict
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.meshes import Material, TriangleMesh
-from scipy.spatial import ConvexHull, QhullError, KDTree
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from .types import TargetShape
 

@@ -37,7 +37,7 @@ def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
     "command",
     [("world", "single"), ("simulate", "single", "--images"), ("run", "single", "--out", "never-made")],
 )
-def test_the_world_without_pybullet_says_where_it_runs(command: tuple[str, ...]) -> None:
+def test_world_without_pybullet_names_its_platforms_and_mujoco(command: tuple[str, ...]) -> None:
     done = without("pybullet", *command)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()

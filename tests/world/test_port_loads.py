@@ -116,7 +116,7 @@ def test_peaks_cover_steps_between_ticks(worlds: Any) -> None:
 
 @both
 @pytest.mark.parametrize("physics_hz", [960, 3840])
-def test_closing_counts_as_an_impulse_whatever_the_step(worlds: Any, physics_hz: int) -> None:
+def test_closing_impulse_does_not_depend_on_the_step(worlds: Any, physics_hz: int) -> None:
     """It stops the closing speed against the reduced mass; the peaks are without it."""
     physics = worlds(omega_rad_s=(0.0, 0.0, 0.0), time={"physics_hz": physics_hz})
     latch(physics)

@@ -48,7 +48,7 @@ def with_mathematics(text: str) -> str:
             return found[0]
         # One line: an empty one would end the block for Markdown.
         mathml = " ".join(convert(found[3].strip(), display="block").split())
-        return f'<div class="equation">{mathml}</div>'
+        return f'<div class="equation" style="overflow-x: auto; overflow-y: hidden">{mathml}</div>'
 
     parts, last = [], 0
     for found in _FENCE.finditer(text):

@@ -21,6 +21,7 @@ from chaserdock.html_page import PAGE_FILES, html_page, table
 from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
+from .mass_properties import property_rows, stated_values, true_values
 from .plots import decimation, to_inline_svg
 from .replay_scene import replay_data, small_images
 from .summary import summary_of
@@ -75,6 +76,7 @@ def report_of(log: Path) -> str:
         _outcome(result),
         _chasers(flight, result),
         _numbers(flight, result),
+        _identified(flight),
         _drawn(flight),
         replay,
         '<h2 id="figures">Figures</h2>',
@@ -92,8 +94,14 @@ def report_of(log: Path) -> str:
 def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
     if value is None:
         return _DASH
-    # "#" keeps trailing zeros; a trailing decimal point is removed.
-    return f"{f'{value * factor:#.{digits}g}'.rstrip('.')} {unit}".rstrip()
+    scaled = value * factor
+    # "#" keeps trailing zeros; a trailing decimal point is removed. Large numbers without exponent.
+    text = f"{scaled:.0f}" if 10**digits <= abs(scaled) < 1e9 else f"{scaled:#.{digits}g}".rstrip(".")
+    return f"{text} {unit}".rstrip()
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def _rms(mean_square: float | None, unit: str, factor: float) -> str:
@@ -115,7 +123,7 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
     return (
         f"<h1>{escape(s.name)}</h1><p>{escape(s.description)}</p>\n<p>{verdict} "
         f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
-        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {len(s.chasers)} chaser(s); seed {s.seed}; "
+        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed {s.seed}; "
         f"digest {escape(result['digest'][:16])}</span></p>\n<nav>{links}</nav>"
     )
 
@@ -237,6 +245,26 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         f'<p class="faint">Fused estimate relative to ground truth at the time of exposure, from '
         f"{flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
+    )
+
+
+def _identified(flight: RecordedFlight) -> str:
+    """Return a table of the identified mass properties at the end, beside the stated and the true ones."""
+    if flight.identified is None:
+        return ""
+    drawn = next((b for b in flight.drawn if b.body == "target"), None)
+    last = flight.identified.last
+    rows = property_rows(
+        last, stated_values(flight.scenario), None if drawn is None else true_values(drawn), _DASH
+    )
+    chasers = ", ".join(map(str, last.chasers))
+    stack = f"stack with chasers {chasers}" if chasers else "stack"
+    head = ("", "target, identified", "stated", "true", "error", stack)
+    cells = [(r.name, r.target, r.stated, r.true, r.off, r.stack) for r in rows]
+    return (
+        f'<h2 id="identified">Identified mass properties</h2>{table(head, cells)}'
+        f'<p class="faint">At {last.sim_time_ns / 1e9:.1f} s, with one standard deviation. Centre of mass and inertia about it in '
+        "TRF axes. Stated: what the controllers know before the flight.</p>"
     )
 
 

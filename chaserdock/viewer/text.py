@@ -8,6 +8,8 @@ import re
 
 from chaserdock_protocol.scenario import FlightScenario
 
+from chaserdock.analysis.mass_properties import property_rows, stated_values, true_values
+
 from .history import History, Line
 from .snapshot import ChaserState, MissionState
 
@@ -37,7 +39,7 @@ def _numbers(chasers: tuple[int, ...]) -> str:
 def chasers(state: MissionState, history: History) -> str:
     """Return a table with one row per chaser."""
     rows = [
-        "| # | phase | error | distance | markers | latency |",
+        "| # | phase | error | distance | seen | latency |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for i, chaser in enumerate(state.chasers):
@@ -46,7 +48,7 @@ def chasers(state: MissionState, history: History) -> str:
         cells = (
             f"**{i}**",
             chaser.reference.phase if chaser.reference is not None else "-",
-            f"{error[0] * 1e3:.2f} mm, {math.degrees(error[1]):.3f}°" if error is not None else "-",
+            f"{error[0] * 1e3:.1f} mm {math.degrees(error[1]):.2f}°" if error is not None else "-",
             f"{distance:.3f} m" if distance is not None else "-",
             visibility(chaser),
             f"{latency:.0f} ms" if latency is not None else "-",
@@ -55,14 +57,26 @@ def chasers(state: MissionState, history: History) -> str:
     return "\n".join(rows)
 
 
+def mass_properties(scenario: FlightScenario, state: MissionState) -> str:
+    """Return a table of the identified mass properties of target and stack beside the stated and, if known, the true ones."""
+    if state.stack is None:
+        return "not yet identified"
+    true = None if state.true_body is None else true_values(state.true_body)
+    head = ("", "target", "stated", *(("true",) if true is not None else ()), "stack")
+    lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
+    for row in property_rows(state.stack, stated_values(scenario), true, "-"):
+        cells = (row.name, row.target, row.stated, *((row.true,) if true is not None else ()), row.stack)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def visibility(chaser: ChaserState) -> str:
     """Return the number of markers in view, or the status of the sighting."""
     if chaser.sighting is None:
         return "-"
     if chaser.sighting.status != "seen":
         return chaser.sighting.status.replace("_", " ")
-    markers = len(chaser.sighting.marker_ids)
-    return f"{markers} marker{'s' if markers != 1 else ''}"
+    return str(len(chaser.sighting.marker_ids))
 
 
 def faults(state: MissionState, history: History, lost: set[str]) -> str:

@@ -289,7 +289,7 @@ def test_from_far_beside_the_axis_it_must_come_round_first() -> None:
     assert "beside the port's axis" in reason
 
 
-def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
+def test_two_dock_at_once_and_a_chaser_in_the_way_waits() -> None:
     pilot = Pilot(chasers=4)
     pilot.ask("approach", 0)
     pilot.ask("approach", 1)
@@ -306,7 +306,7 @@ def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
     pilot.fly_to("align", 2, limit_s=120.0)
 
 
-def test_keep_out_is_the_corridors_for_who_is_in_it_alone() -> None:
+def test_corridor_replaces_the_keep_out_only_for_the_chaser_in_it() -> None:
     pilot = Pilot(chasers=2)
     limit = pilot.scenario.limits.min_distance_target_m
     assert pilot.guidance.min_distance_target_m(0) == limit

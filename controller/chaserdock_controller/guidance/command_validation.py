@@ -52,6 +52,18 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     return ""
 
 
+def why_not_inspect(scenario: FlightScenario, offset_m: Array, at_rest: bool) -> str:
+    """Check that a chaser can fly around the target."""
+    if not at_rest:
+        return "the chaser moves; hold first"
+    distance_m, own_m = scenario.inspection.distance_m, float(np.linalg.norm(offset_m))
+    if reason := why_not_offset(scenario, (distance_m, 0.0, 0.0)):
+        return reason
+    if own_m > 2.0 * distance_m:
+        return f"the chaser is {own_m:.3g} m from the target; fly to less than twice inspection.distance_m ({distance_m:g} m) first"
+    return ""
+
+
 def why_not_offset(scenario: FlightScenario, offset_m: ArrayLike) -> str:
     """Check the distance of an offset (3,), TRF, from the target."""
     distance = float(np.linalg.norm(offset_m))

@@ -255,6 +255,7 @@ class TimelineEntry(Section):
     command: OperatorCommandName = Field(
         description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to the reference position. "
         "`abort`: the same, twice as fast. `goto`: fly to `offset_m`. `calibrate`: manoeuvre to calibrate the camera. "
+        "`inspect`: fly around the target and estimate its geometry. "
         "`identify`: fire pulses that show the mass properties of the stack. `detumble`: stop the target with latched chasers. "
         "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
     )

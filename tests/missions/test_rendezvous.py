@@ -27,7 +27,8 @@ def test_relative_velocity_at_200_m_is_known_well_enough_for_a_passively_safe_mo
     """After 20 s: the errors agree with their covariance, and the move to the first hold point is not refused."""
     scenario = load_shipped("v-bar", "duration_s=40.0", "timeline=[]")
     with InProcessMission(scenario, RenderedImages(scenario)) as flight:
-        while flight.time_s < 20.0:
+        record = flight.step()
+        while record.time_s < 20.0:
             record = flight.step()
         machine = flight.controller.guidance.machine
         assert machine.escapes is not None

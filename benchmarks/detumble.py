@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N] [--first SEED]
-[--sets 0123 013 03] [--silent | --rigid CASE] [--set KEY=VALUE] [--results FILE]``.
+[--sets 0123 013 03] [--silent | --rigid CASE] [--limits FORCE TORQUE] [--set KEY=VALUE] [--results FILE]``.
 
 Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one process with the
 scenario's sensors and statistical perception. Tumbles of 5 to 10 degrees/s and attitudes are drawn from the seed. Five
@@ -12,11 +12,14 @@ those of the linear programme: the shortest time, and the least impulse in that 
 ``--silent``: nobody commands; each chaser damps the stack by its own odometry for at most 120 s, until 10 s after it stopped. The
 stack is then one rigid body (``chaserdock.evaluation.rigid_stack``), not the physics engine's.
 
+``--limits FORCE TORQUE``: load limits (N, N m) of every port, kept by the controller. The largest loads at a port are printed: from
+the physics engine's joints in every step, or with ``--rigid`` from the equations of motion at the same rate of 960 Hz.
+
 ``--rigid CASE``: identification and plan in closed loop with one rigid body (``chaserdock.evaluation.rigid_control``). The stated
 mass and inertia are 30 % wrong, the stated centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (14 s;
 one chaser 75 s), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck`` (a thruster
-drawn from the seed is stuck off from the start, not reported), ``lost`` (a chaser dies at a random moment), ``limited`` (at most 2.5
-N and 0.9 N m at a port).
+drawn from the seed is stuck off from the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser dies at a
+random moment), ``silent`` (feedback; no controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
 
 ``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it.
 """
@@ -31,9 +34,14 @@ import msgspec
 import numpy as np
 from common import Figures, append_line, make_parser, percentiles, print_figures, read_lines, write_json
 
-from chaserdock.evaluation.detumble_flights import DetumbleOutcome, fly_stack, stack_scenario
+from chaserdock.evaluation.detumble_flights import (
+    DetumbleOutcome,
+    fly_stack,
+    stack_scenario,
+    with_load_limits,
+)
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import StackFlight, fly_controlled, wrong_knowledge
+from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_controlled, wrong_knowledge
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 
@@ -80,8 +88,11 @@ def figures_of(name: str, outcomes: list[DetumbleOutcome]) -> Figures:
         ("impulse_over_lp", "ratio", [o.impulse_N_s / x.impulse_N_s for o, _, x in least]),
         ("final_rate", "deg_s", [o.final_rate_deg_s for o in stopped]),
         ("final_speed", "m_s", [o.final_speed_m_s for o in stopped]),
+        ("port_force", "N", [o.peak_force_N for o in stopped if o.peak_force_N is not None]),
+        ("port_torque", "N_m", [o.peak_torque_N_m for o in stopped if o.peak_torque_N_m is not None]),
     ):
-        out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
+        if values:
+            out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
     return out | {f"{name}_held_N_s_per_minute": 60.0 * sum(o.held_N_s for o in stopped) / held_s}
 
 
@@ -142,38 +153,44 @@ class RigidRow(msgspec.Struct, frozen=True):
     flight: StackFlight
 
 
-def fly_rigid(case: str, chasers: str, seed: int, changes: list[str]) -> StackFlight:
+def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> StackFlight:
     """Fly one case."""
     numbers, one = [int(c) for c in chasers], len(chasers) == 1
-    settings = [*wrong_knowledge(seed), *changes]
-    if case != "fast":
+    settings, events = [*wrong_knowledge(seed), *o.set], FlightEvents()
+    if case not in ("fast", "silent"):
         settings.append(f"detumble.plan_s={75.0 if one else 14.0}")
     if one:
         settings += ["detumble.timeout_s=120", "detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002"]
-    rng, loss = np.random.default_rng([seed, 0xFA]), None
-    if case == "stuck":
-        settings.append(stuck_thruster(rng, len(numbers)))
-    if case == "lost":
-        loss = (float(rng.uniform(0.5, 10.0)), int(rng.integers(len(numbers))))
+    rng = np.random.default_rng([seed, 0xFA])
+    match case:
+        case "stuck" | "reported":
+            chaser, thruster = drawn_thruster(rng, len(numbers))
+            failure = f"{{chaser={chaser},thruster={thruster},at_s=0.0,kind='stuck_off'}}"
+            settings.append(f"thruster_failure=[{failure}]")
+            if case == "reported":
+                events = FlightEvents(reported=(chaser, thruster))
+        case "lost":
+            events = FlightEvents(loss=(float(rng.uniform(0.5, 10.0)), int(rng.integers(len(numbers)))))
+        case "silent":
+            events = FlightEvents(silent_from_s=1.0)
     scenario = stack_scenario(seed, numbers, settings)
-    if case == "limited":
-        ports = [
-            p.model_copy(update={"force_limit_N": 2.5, "torque_limit_N_m": 0.9})
-            for p in scenario.docking.ports
-        ]
-        docking = scenario.docking.model_copy(update={"ports": tuple(ports)})
-        scenario = scenario.model_copy(update={"docking": docking})
-    identify_s = 10.0 if case == "identify" else 0.0
-    duration_s = 90.0 if one else 20.0 if case in ("plan", "identify", "fast") else 40.0
-    return fly_controlled(scenario, duration_s, identify_s, loss)
+    limits = o.limits or ([2.5, 0.9] if case == "limited" else None)
+    if limits:
+        scenario = with_load_limits(scenario, *limits)
+    durations_s = {"plan": 20.0, "identify": 20.0, "fast": 20.0, "silent": 120.0}
+    return fly_controlled(
+        scenario,
+        90.0 if one else durations_s.get(case, 40.0),
+        10.0 if case == "identify" else 0.0,
+        events,
+    )
 
 
-def stuck_thruster(rng: np.random.Generator, chasers: int) -> str:
-    """Return the override that lets one of the thrusters that may fire fail: those that push their chaser towards the port."""
+def drawn_thruster(rng: np.random.Generator, chasers: int) -> tuple[int, int]:
+    """Return chaser and number of one of the thrusters that may fire: those that push their chaser towards the port."""
     scenario = stack_scenario(0, list(range(chasers)))
     able = [k for k, t in enumerate(scenario.chaser.thrusters) if t.direction[0] > 0.0]
-    chaser, thruster = int(rng.integers(chasers)), int(rng.choice(able))
-    return f"thruster_failure=[{{chaser={chaser},thruster={thruster},at_s=0.0,kind='stuck_off'}}]"
+    return int(rng.integers(chasers)), int(rng.choice(able))
 
 
 def rigid_figures(name: str, flights: list[StackFlight]) -> Figures:
@@ -194,19 +211,31 @@ def rigid_figures(name: str, flights: list[StackFlight]) -> Figures:
         ("time_over_lp", "ratio", [f.time_s / x.time_s for f, x in least if f.time_s is not None]),
         ("final_rate", "deg_s", [f.final_rate_deg_s for f in stopped]),
         ("final_speed", "m_s", [f.final_speed_m_s for f in stopped]),
-        ("mass_error", "share", [f.mass_share for f in flights if not f.refused]),
-        ("centre_error", "m", [f.centre_m for f in flights if not f.refused]),
-        ("inertia_error", "share", [f.inertia_share for f in flights if not f.refused]),
-        ("nees", "ratio", [f.nees for f in flights if not f.refused]),
+        (
+            "mass_error",
+            "share",
+            [f.mass_share for f in flights if f.mass_share is not None and not f.refused],
+        ),
+        ("centre_error", "m", [f.centre_m for f in flights if f.centre_m is not None and not f.refused]),
+        (
+            "inertia_error",
+            "share",
+            [f.inertia_share for f in flights if f.inertia_share is not None and not f.refused],
+        ),
+        ("nees", "ratio", [f.nees for f in flights if f.nees is not None and not f.refused]),
+        ("port_force", "N", [f.peak_force_N for f in flights if f.peak_force_N is not None]),
+        ("port_torque", "N_m", [f.peak_torque_N_m for f in flights if f.peak_torque_N_m is not None]),
     ):
         if values:
             out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
-    return out
+    known = [f.nees for f in flights if f.nees is not None and not f.refused]
+    return out | ({f"{name}_nees_mean_ratio": float(np.mean(known))} if known else {})
 
 
 def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
     """Fly a case with every set of chasers; return the figures."""
-    case, figures = f"{o.rigid} set={sorted(o.set)}", {}
+    limits = f" limits={o.limits}" if o.limits else ""
+    case, figures = f"{o.rigid} set={sorted(o.set)}{limits}", {}
     known = {
         (row["chasers"], row["case"], row["flight"]["seed"]): msgspec.convert(row, RigidRow).flight
         for row in read_lines(o.results)
@@ -216,7 +245,7 @@ def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
         for seed in seeds:
             flight = known.get((chasers, case, seed))
             if flight is None:
-                flight = fly_rigid(o.rigid, chasers, seed, o.set)
+                flight = fly_rigid(o.rigid, chasers, seed, o)
                 append_line(o.results, msgspec.to_builtins(RigidRow(chasers, case, flight)))
                 print(f"{o.rigid} {chasers}: {flight}", file=sys.stderr, flush=True)
             flights.append(flight)
@@ -228,8 +257,11 @@ def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--silent", action="store_true", help="without a controller")
-    cases = ("plan", "identify", "fast", "stuck", "lost", "limited")
+    cases = ("plan", "identify", "fast", "stuck", "reported", "lost", "silent", "limited")
     parser.add_argument("--rigid", choices=cases, help="identification and plan, on one rigid body")
+    parser.add_argument(
+        "--limits", type=float, nargs=2, metavar=("FORCE", "TORQUE"), help="of every port, N and N m"
+    )
     parser.add_argument("--tumbles", type=int, default=50)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--sets", nargs="+", default=["0123", "013", "03"], metavar="CHASERS")
@@ -245,6 +277,7 @@ def main() -> None:
         write_json(o.json, fly_sets_rigid(o, range(o.first, o.first + number)))
         return
     settings = f"duration={o.duration:g} set={sorted(o.set)}"
+    settings += f" limits={o.limits}" if o.limits else ""
     rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results) if row["settings"] == settings]
     known = {(r.chasers, r.outcome.seed): r.outcome for r in rows}
     figures: Figures = {}
@@ -254,6 +287,8 @@ def main() -> None:
             outcome = known.get((chasers, seed))
             if outcome is None:
                 scenario = stack_scenario(seed, [int(c) for c in chasers], o.set)
+                if o.limits:
+                    scenario = with_load_limits(scenario, *o.limits)
                 outcome = fly_stack(scenario, RenderedImages, o.duration)
                 append_line(o.results, msgspec.to_builtins(DetumbleRow(chasers, settings, outcome)))
                 print(f"{chasers} {line_of(outcome)}", file=sys.stderr, flush=True)

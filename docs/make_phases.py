@@ -28,6 +28,7 @@ MEANING = {
     Phase.SEARCHING: "turns along a search pattern",
     Phase.HOLD: "keeps its offset from the target",
     Phase.CALIBRATE: "turns about the line of sight, which makes the errors of its camera observable",
+    Phase.INSPECT: "flies once around the target, whose geometry is estimated meanwhile",
     Phase.APPROACH: "moves to the docking distance, or down the corridor of its port",
     Phase.DOCKED: "is within the docking tolerances at the docking distance",
     Phase.RETREAT: "moves back to its nominal offset",

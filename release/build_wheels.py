@@ -31,6 +31,7 @@ KERNELS = {
     "chaserdock_world/rendering/native/kernels.so",
     "chaserdock_agents/chaser/perception/native/kernels.so",
     "chaserdock_controller/nmpc/native/kernels.so",
+    "chaserdock_controller/estimation/joint/native/kernels.so",
 }
 # Files that a mission needs beside modules.
 DATA = ("chaserdock/shipped/single.toml", "chaserdock/py.typed", "chaserdock_models/native/kernels.c")

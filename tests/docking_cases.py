@@ -128,7 +128,7 @@ def balance(physics: Physics, wrench: Array) -> tuple[Array, Array]:
 
 
 def senses(offset_m: Any, **changes: Any) -> DockingObservation:
-    """Perfectly in line, at rest, at ``offset_m`` (3,), unless said otherwise."""
+    """Perfectly in line, at rest, at ``offset_m`` (3,), unless stated otherwise."""
     view: dict[str, float] = {
         "gap_m": 0.1,
         "lateral_m": 0.0,

@@ -49,7 +49,7 @@ def chaserdock(*arguments: str, **options: Any) -> subprocess.Popen[bytes]:
 
 
 def finished(*arguments: str, timeout_s: float = 120.0, **options: Any) -> tuple[int, str]:
-    """Status and everything said by a program run to its end."""
+    """Status and everything printed by a program run to its end."""
     process = chaserdock(*arguments, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, **options)
     out, _ = process.communicate(timeout=timeout_s)
     return process.returncode, out.decode(errors="replace")
@@ -139,7 +139,7 @@ class ByHand:
         self.processes[name] = process
         return process
 
-    def said(self, name: str, timeout_s: float = 120.0) -> tuple[int, str]:
+    def output_of(self, name: str, timeout_s: float = 120.0) -> tuple[int, str]:
         out, _ = self.processes[name].communicate(timeout=timeout_s)
         return self.processes[name].returncode, out.decode(errors="replace")
 

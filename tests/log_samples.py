@@ -25,7 +25,7 @@ class Clock:
 
 
 def flight(ticks: int) -> Iterator[tuple[topics.Topic, int | str | None, m.Message]]:
-    """What a short mission with two chasers would publish."""
+    """Return the messages of a short mission with two chasers."""
     for k in range(ticks):
         head: dict[str, Any] = {"seq": k, "tick": k, "sim_time_ns": k * 66_666_666}
         yield topics.TICK, None, m.Tick(**head, images=True, chasers=(0, 1), controllers={"controller": "c"})

@@ -63,6 +63,7 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         marker_ids=(0, 4),
         corners_px=tuple(float(i) for i in range(16)),
         rejected_ids=(17,),
+        geometry=m.GeometryMeasurement(information=(4.0, 0.0, 0.0, 9.0), vector=(1.0, -2.0)),
         wall_estimate_s=0.01,
     ),
     m.TargetEstimate(
@@ -98,7 +99,21 @@ SAMPLES: tuple[msgspec.Struct, ...] = (
         min_distance_target_m=0.35,
     ),
     m.WrenchCommand(
-        **HEAD, chaser=0, effective_time_ns=9, expires_ns=10, mode="nmpc", force_N=V, torque_N_m=V
+        **HEAD,
+        chaser=0,
+        effective_time_ns=9,
+        expires_ns=10,
+        mode="nmpc",
+        force_N=V,
+        torque_N_m=V,
+        geometry=m.GeometryEstimate(
+            names=("panel_left x", "scale"),
+            sigmas=(0.01, 0.003),
+            values=(0.004, -0.001),
+            covariance=(1e-6, 0.0, 0.0, 1e-7),
+            views=12,
+            coverage=0.15,
+        ),
     ),
     m.Plan(**HEAD, chaser=0, step_s=0.1, positions_m=V * 2, quaternions_wxyz=Q * 2, inputs=V * 2),
     m.PassiveSafety(

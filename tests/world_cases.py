@@ -12,7 +12,7 @@ STEP_S = 1.0 / HZ
 
 
 def scenario(**changes: Any) -> Scenario:
-    """One chaser five metres from the target, unless said otherwise."""
+    """One chaser five metres from the target, unless stated otherwise."""
     values: dict[str, Any] = {
         "name": "test",
         "duration_s": 10.0,

@@ -24,6 +24,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from .flight import RecordedFlight, Track, load_flight
+from .mass_properties import NAMES, SCALE, stated_values, true_values
 from .plots import (
     AXES_XYZ,
     FAINT,
@@ -329,6 +330,40 @@ def loads(flight: RecordedFlight, _: Traces) -> Figure:
         for limit in sorted(x for x in limits if x is not None):
             limit_line(axes, limit, f"limit {limit:g} {unit}")
     legend_above(top)
+    return figure
+
+
+@_figure(
+    "Identified mass properties",
+    "Mass, centre of mass and inertia of the target alone, as identified in flight, with a band of two standard deviations; "
+    "dashed: true values; dotted: values stated in the scenario.",
+)
+def identification(flight: RecordedFlight, _: Traces) -> Figure:
+    found = flight.identified
+    if found is None:
+        raise MissingData("no mass properties were identified")
+    drawn = next((b for b in flight.drawn if b.body == "target"), None)
+    known = [(stated_values(flight.scenario), ":")]
+    if drawn is not None:
+        known.append((true_values(drawn), "--"))
+    figure, panels = new_figure(3, sharex=True)
+    for axes, rows, label in (
+        (panels[0], range(1), "mass / kg"),
+        (panels[1], range(1, 4), "centre of mass / mm"),
+        (panels[2], range(4, 10), "inertia / kg m²"),
+    ):
+        for n, k in enumerate(rows):
+            value, sigma = found.values[:, k] * SCALE[k], found.sigmas[:, k] * SCALE[k]
+            axes.plot(found.time_s, value, color=colour(n), label=NAMES[k])
+            band = (value - 2.0 * sigma, value + 2.0 * sigma)
+            axes.fill_between(found.time_s, *band, color=colour(n), alpha=0.15, linewidth=0.0)
+            for values, style in known:
+                axes.axhline(values[k] * SCALE[k], color=colour(n), linestyle=style, linewidth=0.8)
+        axes.set(ylabel=label)
+        _mark_phases(axes, flight, axes is panels[0])
+    panels[2].set(xlabel="time / s", xlim=_span_s(found.time_s))
+    for axes in panels[1:]:
+        legend_above(axes)
     return figure
 
 

@@ -29,6 +29,7 @@ from chaserdock_protocol.messages import (
     Reference,
     Sighting,
     SolverStatus,
+    StackEstimate,
     TargetEstimate,
     Tick,
     WorldTruth,
@@ -39,6 +40,7 @@ from chaserdock_protocol.scenario import Scenario
 from numpy.typing import NDArray
 
 from .columns import Columns
+from .mass_properties import values_of
 
 # Messages whose number or content depends on the wall clock.
 NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK, topics.STATE)
@@ -162,6 +164,17 @@ class LoadHistory:
 
 
 @dataclass
+class IdentificationHistory:
+    """Identified mass properties of the target, in the order of ``mass_properties.NAMES``: times (K,) s, values and standard
+    deviations (K, 10), SI units; the ``last`` message."""
+
+    time_s: Array
+    values: Array
+    sigmas: Array
+    last: StackEstimate
+
+
+@dataclass
 class SafetyHistory:
     """Certificates of passive safety of a chaser: times (K,) s, margins (K,) in sigmas, distances (K,) m of closest approach,
     whether the plan was safe (K,)."""
@@ -191,7 +204,8 @@ class RecordedFlight:
     """Content of a log without the images. Mappings by body name or chaser.
 
     ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the target was tracked or
-    predicted. ``expected_commands``: number of actuator commands that all ticks expected.
+    predicted. ``identified``: None without identification. ``expected_commands``: number of actuator commands that all ticks
+    expected.
     """
 
     scenario: Scenario
@@ -206,6 +220,7 @@ class RecordedFlight:
     references: dict[int, ReferenceHistory]
     sightings: dict[int, SightingHistory]
     loads: dict[int, LoadHistory]
+    identified: IdentificationHistory | None
     safety: dict[int, SafetyHistory]
     plumes: dict[str, PlumeTotals]
     solves: SolverHistory
@@ -292,6 +307,8 @@ class _Collector:
     )
     sightings: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(3)))
     loads: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(7)))
+    identified: Columns = field(default_factory=lambda: Columns(21))
+    stack: StackEstimate | None = None
     safety: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(4)))
     plumes: dict[str, PlumeTotals] = field(default_factory=lambda: defaultdict(PlumeTotals))
     solves: Columns = field(default_factory=lambda: Columns(3))
@@ -337,7 +354,7 @@ class _Collector:
                 self.world.add(message)
             case Sighting() | PortLoad() | PassiveSafety():
                 self._add_of_chaser(message)
-            case Event() | CommandReply() | Health() | DrawnTruth() | PlumeLoad():
+            case Event() | CommandReply() | Health() | DrawnTruth() | PlumeLoad() | StackEstimate():
                 self._add_report(message)
 
     def _add_of_chaser(self, message: Sighting | PortLoad | PassiveSafety) -> None:
@@ -354,8 +371,13 @@ class _Collector:
                     (time_s, message.margin_sigmas, message.distance_m, message.safe)
                 )
 
-    def _add_report(self, message: Event | CommandReply | Health | DrawnTruth | PlumeLoad) -> None:
+    def _add_report(
+        self, message: Event | CommandReply | Health | DrawnTruth | PlumeLoad | StackEstimate
+    ) -> None:
         match message:
+            case StackEstimate():
+                self.stack = message
+                self.identified.add((message.sim_time_ns / 1e9,), *values_of(message.target))
             case PlumeLoad():
                 self.plumes[message.body].add(message)
             case DrawnTruth():
@@ -425,6 +447,13 @@ def _safety_history(columns: Columns) -> SafetyHistory:
     return SafetyHistory(t[:, 0].copy(), t[:, 1].copy(), t[:, 2].copy(), t[:, 3] > 0.0)
 
 
+def _identification_history(c: _Collector) -> IdentificationHistory | None:
+    if c.stack is None:
+        return None
+    t = c.identified.table()
+    return IdentificationHistory(t[:, 0].copy(), t[:, 1:11].copy(), t[:, 11:].copy(), c.stack)
+
+
 def load_flight(log: LogSource) -> RecordedFlight:
     """Read the flight in a log. Raise LogError for a log that is unreadable or not recorded by chaserdock."""
     scenario, run = logged_scenario(log)
@@ -451,6 +480,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         references={i: collector.finish() for i, collector in c.references.items()},
         sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
         loads={i: _load_history(columns) for i, columns in c.loads.items()},
+        identified=_identification_history(c),
         plumes=dict(c.plumes),
         safety={i: _safety_history(columns) for i, columns in c.safety.items()},
         solves=SolverHistory(

@@ -21,6 +21,7 @@ from chaserdock.html_page import PAGE_FILES, html_page, table
 from .criteria import capture_state
 from .figures import draw_figures
 from .flight import RecordedFlight, load_flight
+from .mass_properties import property_rows, stated_values, true_values
 from .plots import decimation, to_inline_svg
 from .replay_scene import replay_data, small_images
 from .summary import summary_of
@@ -75,6 +76,7 @@ def report_of(log: Path) -> str:
         _outcome(result),
         _chasers(flight, result),
         _numbers(flight, result),
+        _identified(flight),
         _drawn(flight),
         replay,
         '<h2 id="figures">Figures</h2>',
@@ -243,6 +245,26 @@ def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         f'<p class="faint">Fused estimate relative to ground truth at the time of exposure, from '
         f"{flight.scenario.settling_s:g} s on.</p></section>"
         f"<section><h2>Safety and timing</h2>{table(('', ''), safety)}</section></div>"
+    )
+
+
+def _identified(flight: RecordedFlight) -> str:
+    """Return a table of the identified mass properties at the end, beside the stated and the true ones."""
+    if flight.identified is None:
+        return ""
+    drawn = next((b for b in flight.drawn if b.body == "target"), None)
+    last = flight.identified.last
+    rows = property_rows(
+        last, stated_values(flight.scenario), None if drawn is None else true_values(drawn), _DASH
+    )
+    chasers = ", ".join(map(str, last.chasers))
+    stack = f"stack with chasers {chasers}" if chasers else "stack"
+    head = ("", "target, identified", "stated", "true", "error", stack)
+    cells = [(r.name, r.target, r.stated, r.true, r.off, r.stack) for r in rows]
+    return (
+        f'<h2 id="identified">Identified mass properties</h2>{table(head, cells)}'
+        f'<p class="faint">At {last.sim_time_ns / 1e9:.1f} s, with one standard deviation. Centre of mass and inertia about it in '
+        "TRF axes. Stated: what the controllers know before the flight.</p>"
     )
 
 

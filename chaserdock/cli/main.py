@@ -17,6 +17,7 @@ from chaserdock.exit_codes import FAILED
 from . import logs, mesh, scenario
 from .analysis import figures, report, snapshot, summary, video
 from .compare import check, compare, replay, reproduce, study
+from .datasets import dataset, evaluate
 from .help import HELP_OPTIONS, GroupedHelp, add_command
 from .operate import command, status, thruster_fault, view
 from .options import fail
@@ -33,6 +34,7 @@ GROUPS: dict[str, tuple[Any, ...]] = {
     "Look at a flight": (summary, report, figures, video, snapshot),
     "Logs": (logs.app,),
     "Reproduce and compare": (replay, compare, reproduce, study, check),
+    "Datasets": (dataset, evaluate),
     "Setup": (markers, calibrate, keys, compose),
 }
 """Commands (functions) and groups of commands (apps) by the section of the help that lists them."""

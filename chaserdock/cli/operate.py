@@ -34,6 +34,7 @@ class CommandName(StrEnum):
     abort = "abort"
     goto = "goto"
     calibrate = "calibrate"
+    inspect = "inspect"
     identify = "identify"
     detumble = "detumble"
     isolate = "isolate"

@@ -86,7 +86,7 @@ class AbortOutcome:
 def study(scenario: Scenario, aborts: int, seed: int) -> AbortOutcome:
     """Abort at random moments of a scenario's rendezvous, with random errors of navigation and burn.
 
-    The true state differs from the one that guidance aborts from by an error of the covariance that guidance is told, and the
+    The true state differs from the one that guidance aborts from by an error of the covariance that guidance receives, and the
     burn by 3 % in size.
     """
     if scenario.orbit is None:

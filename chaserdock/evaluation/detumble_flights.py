@@ -73,6 +73,13 @@ def stack_scenario(seed: int, chasers: Sequence[int], changes: Sequence[str] = (
     )
 
 
+def with_load_limits(scenario: Scenario, force_N: float, torque_N_m: float) -> Scenario:
+    """Return a scenario with these load limits at every port."""
+    limits = {"force_limit_N": force_N, "torque_limit_N_m": torque_N_m}
+    ports = tuple(port.model_copy(update=limits) for port in scenario.docking.ports)
+    return scenario.model_copy(update={"docking": scenario.docking.model_copy(update={"ports": ports})})
+
+
 def _random_vector(rng: np.random.Generator, length: float) -> list[float]:
     direction = rng.normal(size=3)
     return (length * direction / np.linalg.norm(direction)).tolist()
@@ -163,7 +170,8 @@ def least_time(
 @dataclass(frozen=True)
 class DetumbleOutcome:
     """One flight. ``time_s`` from the command until the stack stays below the limits, None if it does not; ``impulse_N_s`` of
-    all thrusters until then, and ``held_N_s`` from then to the end, ``held_s`` long. ``least``: at the command."""
+    all thrusters until then, and ``held_N_s`` from then to the end, ``held_s`` long. ``least``: at the command. ``peak_*``: largest
+    loads at a port in any physics step after the command."""
 
     seed: int
     chasers: int
@@ -176,6 +184,8 @@ class DetumbleOutcome:
     least: MinimumTime | None
     final_rate_deg_s: float
     final_speed_m_s: float
+    peak_force_N: float | None = None
+    peak_torque_N_m: float | None = None
 
 
 def fly_stack(
@@ -201,10 +211,12 @@ def fly_stack(
         first = mission.step(commands)
         replies = [] if first.outputs is None else first.outputs.replies
         refused = next((reply.reason for reply in replies if not reply.accepted), "")
-        impulses, inside = [_impulse(first)], [False]
+        impulses, inside, peaks = [_impulse(first)], [False], np.zeros(2)
         while not refused and mission.time_s < COMMAND_AT_S + duration_s:
             record = mission.step()
             impulses.append(_impulse(record))
+            for load in record.loads.values():
+                peaks = np.maximum(peaks, [load.peak_force_N, load.peak_torque_N_m])
             speed, rate = mission.truth(record.states)[2].rates(body)
             inside.append(speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s)
         speed, rate = mission.truth(mission.states())[2].rates(body)
@@ -222,4 +234,6 @@ def fly_stack(
         least=least,
         final_rate_deg_s=math.degrees(rate),
         final_speed_m_s=speed,
+        peak_force_N=float(peaks[0]),
+        peak_torque_N_m=float(peaks[1]),
     )

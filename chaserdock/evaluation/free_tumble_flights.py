@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Free tumbles seen by chasers that keep their places: what vision alone tells of the target's mass properties. Fast."""
+"""Free tumbles seen by chasers that keep their places: estimates of its mass properties from vision alone."""
 
 from __future__ import annotations
 

@@ -26,16 +26,20 @@ from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario import Scenario, flight_scenario
 
 from .detumble_flights import least_time
-from .rigid_stack import RigidStack
+from .rigid_stack import RigidStack, StackStep
 
 _POSE_M, _POSE_RAD = 0.001, math.radians(0.1)
+_SETTLE_TICKS = 2
+_SILENT_REST_S = 10.0
+"""A flight without controller ends so long after the stack came to rest."""
 
 
 @dataclass(frozen=True)
 class StackFlight:
     """One flight. ``time_s`` until the stack stays below the limits (None: it does not), ``impulse_N_s`` until then, and
     ``held_N_s`` from then to the end. ``least``: with a frozen attitude. Errors of the identified target: mass (share), centre (m),
-    worst inertia (share of the largest moment); ``nees`` per degree of freedom of the stack's mass properties."""
+    worst inertia (share of the largest moment); ``nees`` per degree of freedom of the stack's mass properties (None if the
+    controller fell silent). ``peak_*``: largest loads at a port at 960 Hz."""
 
     seed: int
     rate_deg_s: float
@@ -46,21 +50,27 @@ class StackFlight:
     least: MinimumTime | None
     final_rate_deg_s: float
     final_speed_m_s: float
-    mass_share: float
-    centre_m: float
-    inertia_share: float
-    nees: float
+    mass_share: float | None
+    centre_m: float | None
+    inertia_share: float | None
+    nees: float | None
     failed: str
+    peak_force_N: float | None = None
+    peak_torque_N_m: float | None = None
 
 
 class ControlledStack:
-    """A rigid stack and its controller, one ``step`` per tick. ``lost``: chasers that are dead: no odometry, no thrust."""
+    """A rigid stack and its controller, one ``step`` per tick. ``lost``: chasers that are dead: no odometry, no thrust.
+
+    ``reported``: thrusters that their chasers report as failed and have shut off, by chaser.
+    """
 
     def __init__(self, scenario: Scenario) -> None:
         self.scenario, self.stack = scenario, RigidStack(scenario, port_errors=True)
         flight = flight_scenario(scenario)
         self.identification, self.control = StackIdentification(flight), DetumbleControl(flight)
         self.lost: frozenset[int] = frozenset()
+        self.reported: Mapping[int, tuple[int, ...]] = {}
         self.events: list[str] = []
         rng = np.random.default_rng([scenario.seed, 0x90E])
         self._pose_error = rng.normal(0.0, _POSE_M, 3), rng.normal(0.0, _POSE_RAD, 3)
@@ -88,7 +98,7 @@ class ControlledStack:
             thruster_impulses={i: given for i, given in self._given.items() if i in odometry},
             ahead={i: ((1.0, self._coming[i]),) if i in self._coming and seconds else () for i in odometry},
             input_limits={},
-            isolated={},
+            isolated=dict(self.reported),
             events=(),
         )
         estimation = self._estimation(now_ns, odometry)
@@ -120,19 +130,32 @@ class ControlledStack:
             events=(),
         )
 
-    def step(self, task: StackTask | None, observation: Observation, estimation: TargetEstimation) -> float:
-        """Fly one tick with a task of the thrusters, None for no thrust; return their impulse (N s)."""
+    def step(
+        self, task: StackTask | None, observation: Observation, estimation: TargetEstimation
+    ) -> StackStep:
+        """Fly one tick with a task of the thrusters, None for no thrust."""
         self.events += [text for _, text in estimation.events]
         commands: Mapping[int, Array] = {}
         state = self.control.state(observation, estimation)
         if task is not None and state is not None:
-            isolated = {i: tuple(f) for i, f in self.identification.failed.items()}
-            directs = self.control.commands(state, set(observation.odometry), isolated, task, observation)
+            directs = self.control.commands(state, set(observation.odometry), self._shut(), task, observation)
             commands = {i: d.thrusts_N for i, d in directs.items() if d.thrusts_N is not None}
-        shut = self.identification.failed
-        flown = self.stack.step({i: commands.get(i, self._none()) for i in observation.odometry}, shut)
+        return self._fly({i: commands.get(i, self._none()) for i in observation.odometry})
+
+    def damp(self) -> StackStep:
+        """Fly one tick without the controller: every chaser damps the stack by its own odometry."""
+        damping = self.stack.damping()
+        return self._fly({i: thrusts for i, thrusts in damping.items() if i not in self.lost})
+
+    def _fly(self, thrusts_N: Mapping[int, Array]) -> StackStep:
+        flown = self.stack.step(thrusts_N, self._shut())
         self._given, self._coming = flown.stated_N_s, flown.coming
-        return flown.used_N_s
+        return flown
+
+    def _shut(self) -> dict[int, tuple[int, ...]]:
+        """Return the thrusters whose shut-off valve is closed."""
+        found, reported = self.identification.failed, self.reported
+        return {i: (*found.get(i, ()), *reported.get(i, ())) for i in found.keys() | reported.keys()}
 
     def _none(self) -> Array:
         return np.zeros(len(self.scenario.chaser.thrusters))
@@ -147,65 +170,119 @@ class ControlledStack:
         return StackState(stack.body, stack.mounted, motion, stack.q_wxyz)
 
 
+@dataclass(frozen=True)
+class FlightEvents:
+    """What happens in a flight, in seconds after the command to stop. ``loss``: time and chaser that dies. ``reported``: chaser and
+    thruster that it reports as failed from the start. ``silent_from_s``: from then on the chasers are without a controller."""
+
+    loss: tuple[float, int] | None = None
+    reported: tuple[int, int] | None = None
+    silent_from_s: float = math.inf
+
+
 def fly_controlled(
-    scenario: Scenario,
-    duration_s: float,
-    identify_s: float = 0.0,
-    loss: tuple[float, int] | None = None,
+    scenario: Scenario, duration_s: float, identify_s: float = 0.0, events: FlightEvents | None = None
 ) -> StackFlight:
-    """Stop a stack from the first tick on, after ``identify_s`` of identifying pulses. ``loss``: time and chaser that dies."""
-    flight, rate_hz = ControlledStack(scenario), scenario.time.rate_hz
+    """Stop a stack from the first tick on, after ``identify_s`` of identifying pulses."""
+    flight, rate_hz, events = ControlledStack(scenario), scenario.time.rate_hz, events or FlightEvents()
+    if events.reported is not None:
+        flight.reported = {events.reported[0]: (events.reported[1],)}
     true = flight.state()
     least = least_time(scenario, true.body, dict(true.chasers), true.motion)
     rate_deg_s = math.degrees(flight.stack.rates()[1])
-    limits, impulses, inside, refused = scenario.detumble, [], [], ""
-    settle, begin = 2, round(identify_s * rate_hz) + 2
-    holding = 0
+    limits, log, refused = scenario.detumble, _FlightLog(), ""
+    begin = round(identify_s * rate_hz) + _SETTLE_TICKS
+    tasks = _Tasks(begin, rate_hz)
     for k in range(begin + round(duration_s * rate_hz)):
-        if loss is not None and k >= begin + round(loss[0] * rate_hz):
-            flight.lost = frozenset({loss[1]})
-        observation, estimation = flight.estimate()
-        state = flight.control.state(observation, estimation)
-        if k == begin and state is not None:
-            refused = flight.control.why_not(state, set(observation.odometry), {})
-            if refused:
-                break
-        task = None if k < settle else StackTask.IDENTIFY if k < begin else StackTask.STOP
-        if task is StackTask.STOP and state is not None:
-            at_rest = flight.control.is_stopped(state)
-            holding = holding + 1 if at_rest or (holding and not flight.control.moves_again(state)) else 0
-            task = StackTask.HOLD if holding > 0.5 * rate_hz else StackTask.STOP
-        used = flight.step(task, observation, estimation)
+        since_s = (k - begin) / rate_hz
+        if events.loss is not None and since_s >= events.loss[0]:
+            flight.lost = frozenset({events.loss[1]})
+        if since_s >= events.silent_from_s:
+            flown = flight.damp()
+        else:
+            observation, estimation = flight.estimate()
+            state = flight.control.state(observation, estimation)
+            if k == begin and state is not None:
+                refused = flight.control.why_not(state, set(observation.odometry), flight.reported)
+                if refused:
+                    break
+            flown = flight.step(tasks.at(k, flight.control, state), observation, estimation)
         if k >= begin:
-            impulses.append(used)
             speed, rate = flight.stack.rates()
-            inside.append(speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s)
-    since = len(inside) - next((n for n, x in enumerate(reversed(inside)) if not x), len(inside))
-    stopped = bool(inside) and since < len(inside)
+            at_rest = speed < limits.speed_m_s and math.degrees(rate) < limits.rate_deg_s
+            log.add(flown, at_rest)
+            if since_s >= events.silent_from_s and log.rest_ticks >= _SILENT_REST_S * rate_hz:
+                break
+    since = log.stopped_at()
     speed, rate = flight.stack.rates()
     return StackFlight(
         seed=scenario.seed,
         rate_deg_s=rate_deg_s,
         refused=refused,
-        time_s=since / rate_hz if stopped else None,
-        impulse_N_s=float(sum(impulses[:since])),
-        held_N_s=float(sum(impulses[since:])),
+        time_s=None if since is None else since / rate_hz,
+        impulse_N_s=float(sum(log.impulses[:since])),
+        held_N_s=0.0 if since is None else float(sum(log.impulses[since:])),
         least=least,
         final_rate_deg_s=math.degrees(rate),
         final_speed_m_s=speed,
         failed="; ".join(flight.events),
-        **identification_errors(flight),
+        peak_force_N=log.peak_force_N,
+        peak_torque_N_m=log.peak_torque_N_m,
+        **identification_errors(None if math.isfinite(events.silent_from_s) else flight),
     )
 
 
-def identification_errors(flight: ControlledStack) -> dict[str, float]:
-    """Return the errors of the identified mass properties."""
+class _Tasks:
+    """The task of every tick: nothing while the filter settles, identifying pulses until the command at tick ``begin``, then to
+    stop, and to hold once the stack has been at rest for half a second."""
+
+    def __init__(self, begin: int, rate_hz: int) -> None:
+        self._begin, self._rest_ticks, self._holding = begin, 0.5 * rate_hz, 0
+
+    def at(self, tick: int, control: DetumbleControl, state: StackState | None) -> StackTask | None:
+        if tick < self._begin or state is None:
+            return (
+                None if tick < _SETTLE_TICKS else StackTask.IDENTIFY if tick < self._begin else StackTask.STOP
+            )
+        rests = control.is_stopped(state) or (self._holding and not control.moves_again(state))
+        self._holding = self._holding + 1 if rests else 0
+        return StackTask.HOLD if self._holding > self._rest_ticks else StackTask.STOP
+
+
+class _FlightLog:
+    """Impulses per tick, whether the stack was at rest after it, and the largest loads."""
+
+    def __init__(self) -> None:
+        self.impulses: list[float] = []
+        self._at_rest: list[bool] = []
+        self.peak_force_N = self.peak_torque_N_m = 0.0
+
+    def add(self, flown: StackStep, at_rest: bool) -> None:
+        self.impulses.append(flown.used_N_s)
+        self._at_rest.append(at_rest)
+        self.peak_force_N = max(self.peak_force_N, flown.peak_force_N)
+        self.peak_torque_N_m = max(self.peak_torque_N_m, flown.peak_torque_N_m)
+
+    @property
+    def rest_ticks(self) -> int:
+        """Return for how many ticks the stack has been at rest."""
+        moved = max((k for k, rests in enumerate(self._at_rest) if not rests), default=-1)
+        return len(self._at_rest) - moved - 1
+
+    def stopped_at(self) -> int | None:
+        """Return the tick from which on the stack stays at rest; None without one."""
+        return len(self._at_rest) - self.rest_ticks if self.rest_ticks else None
+
+
+def identification_errors(flight: ControlledStack | None) -> dict[str, float | None]:
+    """Return the errors of the identified mass properties, by field of ``StackFlight``; all None without a flight."""
+    if flight is None:
+        return dict.fromkeys(("mass_share", "centre_m", "inertia_share", "nees"))
     found, true = flight.identification.target, properties_of(flight.stack.target)
     error = found.values - true
     largest = float(np.linalg.eigvalsh(flight.stack.target.inertia_kg_m2)[-1])
     _, estimation = flight.estimate()
-    stack = estimation.stack
-    nees = math.nan
+    stack, nees = estimation.stack, None
     if stack is not None:
         off = stack.stack.values - properties_of(flight.stack.body)
         nees = float(off @ np.linalg.solve(stack.stack.covariance, off)) / len(off)

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_agents.chaser.local_damping import LocalDamping
 from chaserdock_agents.chaser.thrusters.modulation import Modulator
+from chaserdock_controller.guidance.detumble.port_loads import load_model
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -31,6 +32,8 @@ from chaserdock_world.sensors.publish import odometry_of
 from .latched_stack import attach_plants, body_of_plant, with_port_error
 
 _SUBSTEPS = 4
+_LOAD_HZ = 960
+"""Rate of the loads at the ports: that of the physics engine."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +52,13 @@ class SilentOutcome:
 @dataclass(frozen=True, eq=False)
 class StackStep:
     """One tick of a stack: impulse of all thrusters (N s), and by chaser the impulses (n,) that its thrusters should have given,
-    and the impulse (6,), body axes, that they should give until the next command acts."""
+    and the impulse (6,), body axes, that they should give until the next command acts; the largest force and torque at any port."""
 
     used_N_s: float
     stated_N_s: Mapping[int, Array]
     coming: Mapping[int, Array]
+    peak_force_N: float
+    peak_torque_N_m: float
 
 
 class RigidStack:
@@ -86,7 +91,9 @@ class RigidStack:
         }
         self._errors = {i: actuation_errors(scenario, i) for i in self.mounted}
         self._valves, self._stated_valves = {}, {i: Valves(thrusters) for i in self.mounted}
-        self._wrenches = {}
+        self._wrenches, self._true_own = {}, {}
+        self._load_steps = _SUBSTEPS * round(_LOAD_HZ / (_SUBSTEPS * scenario.time.rate_hz))
+        self._tips_m = {port.chaser: np.array(port.position_m) for port in scenario.docking.ports}
         for i, chaser in self.mounted.items():
             true = true_thrusters(thrusters, self._errors[i])
             self._valves[i] = Valves(true)
@@ -94,7 +101,8 @@ class RigidStack:
                 self._valves[i].fail(
                     failure.thruster, failure.kind, round(failure.at_s * 1e9), failure.factor
                 )
-            self._wrenches[i] = chaser.wrench_to_stack(wrench_matrix(true), self.body.centre_trf_m)
+            self._true_own[i] = wrench_matrix(true)
+            self._wrenches[i] = chaser.wrench_to_stack(self._true_own[i], self.body.centre_trf_m)
         self._shortest_ns = [round(t.min_on_s * 1e9) for t in thrusters]
         self._sensor = OdometrySensor(scenario)
 
@@ -130,8 +138,10 @@ class RigidStack:
         """Fly one tick with commanded thrusts (n,) by chaser; ``shut``: thrusters whose shut-off valve is closed."""
         timing = self.scenario.timing
         begin_ns, end_ns = timing.tick_time_ns(self.tick), timing.tick_time_ns(self.tick + 1)
-        edges_ns = np.linspace(begin_ns, end_ns, _SUBSTEPS + 1).astype(int)
+        fine = self._load_steps
+        edges_ns = np.linspace(begin_ns, end_ns, fine + 1).astype(int)
         impulses = np.zeros((_SUBSTEPS, 6))
+        opened = {}
         used_N_s, stated, coming = 0.0, {}, {}
         next_ns = timing.effective_ns(self.tick + 1)
         for i, modulator in self._modulators.items():
@@ -149,12 +159,29 @@ class RigidStack:
             stated[i] = self._stated_valves[i].impulses(edges_ns[[0, -1]])[0]
             for valves in (self._valves[i], self._stated_valves[i]):
                 valves.forget_before(begin_ns)
-            impulses += given @ self._wrenches[i].T
+            opened[i] = given
+            impulses += given.reshape(_SUBSTEPS, -1, given.shape[1]).sum(axis=1) @ self._wrenches[i].T
             used_N_s += float(given.sum())
+        peaks = self._peak_loads(opened, (end_ns - begin_ns) * 1e-9 / fine)
         for impulse in impulses:
             self._advance(impulse, (end_ns - begin_ns) * 1e-9 / _SUBSTEPS)
         self.tick += 1
-        return StackStep(used_N_s, stated, coming)
+        return StackStep(used_N_s, stated, coming, *peaks)
+
+    def _peak_loads(self, given_N_s: Mapping[int, Array], step_s: float) -> tuple[float, float]:
+        """Return the largest force (N) and torque about the tip (N m) at any port under impulses (K, n) of every chaser's thrusters
+        in K steps; the mass and inertia of the chasers are the scenario's."""
+        count = len(self._full_N)
+        own = {i: (slice(k * count, (k + 1) * count), self._true_own[i]) for k, i in enumerate(self.mounted)}
+        wrenches = np.concatenate([self._wrenches[i] for i in self.mounted], axis=1)
+        chaser = self.scenario.chaser
+        model = load_model(self.body, self.omega_rad_s, wrenches, self.mounted, own, chaser, self._tips_m, {})
+        thrusts = np.concatenate([given_N_s[i] for i in self.mounted], axis=1) / step_s
+        loads = model.constant[:, :, None] + model.by_thrust @ thrusts.T
+        return (
+            float(np.linalg.norm(loads[:, :3], axis=1).max()),
+            float(np.linalg.norm(loads[:, 3:], axis=1).max()),
+        )
 
     def _width_ns(self, chaser: int, pulse: ThrusterPulse) -> int:
         """Return how long a pulse opens its valve: as commanded, up to scatter, but not below the minimum on-time."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
@@ -19,6 +20,8 @@ from .perception import PerceptionModel
 
 SYMMETRIC_EVERY = 4
 SMALL = {"width_px": 640, "height_px": 360}
+CLUTTER_S = 100.0
+CLUTTER_TIMING = ("time.rate_hz=10", "time.image_hz=10", "time.physics_hz=120")
 _DIAGONAL = 9.0
 """m: stands for a chaser's distance to itself, larger than any between two."""
 
@@ -83,16 +86,63 @@ def swap(seed: int) -> Scenario:
     return scenario.model_copy(update={"chasers": chasers, "target": target})
 
 
+CLUTTER, DENSE_CLUTTER = (0.8, 1.4, 0.5), (0.7, 1.15, 0.42)
+"""Smallest and largest distance of places from the target, and least distance from each other, m, in `clutter`."""
+
+
+def clutter(
+    seed: int,
+    chasers: int = 16,
+    places_m: tuple[float, float, float] = CLUTTER,
+    duration_s: float = CLUTTER_S,
+) -> Scenario:
+    """Return a scenario in which chasers at random places around the tumbling target fly to random places, all at once."""
+    rng = np.random.default_rng([seed, 0xC107])
+    base = load_shipped(
+        "swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={duration_s}", *CLUTTER_TIMING
+    )
+    starts, goals = _places(rng, chasers, places_m), _places(rng, chasers, places_m)
+    nominal, entry = base.chasers[0], base.timeline[0]
+    made = [
+        nominal.model_copy(
+            update={
+                "position_m": tuple(place.tolist()),
+                "q_wxyz": tuple(facing_attitudes(nominal.position_m, nominal.q_wxyz, place)[0].tolist()),
+            }
+        )
+        for place in starts
+    ]
+    timeline = [
+        entry.model_copy(update={"at_s": 1.0, "chasers": (i,), "offset_m": tuple(goal.tolist())})
+        for i, goal in enumerate(goals)
+    ]
+    return base.model_copy(update={"chasers": tuple(made), "timeline": tuple(timeline)})
+
+
+def _places(rng: np.random.Generator, count: int, places_m: tuple[float, float, float]) -> Array:
+    """Return random places (count, 3); ``places_m`` as in `clutter`."""
+    nearest_m, farthest_m, apart_m = places_m
+    places = np.zeros((0, 3))
+    while len(places) < count:
+        way = rng.normal(size=3)
+        place = way / np.linalg.norm(way) * rng.uniform(nearest_m, farthest_m)
+        if np.all(np.linalg.norm(places - place, axis=1) >= apart_m):
+            places = np.vstack([places, place])
+    return places
+
+
 @dataclass
 class TransferOutcome:
     """Figures of one flight: least true distances between centres; ``reached_s``: when the last of the chasers with a goal
-    was there for good, from its command on (NaN if never); ``end_m``: the largest final distance from a goal."""
+    was there for good, from its command on (NaN if never); ``end_m``: the largest final distance from a goal; ``missed``:
+    chasers that are not at their goal at the end."""
 
     seed: int
     to_target_m: float = math.inf
     between_m: float = math.inf
     reached_s: float = math.nan
     end_m: float = math.inf
+    missed: int = 0
     failed: int = 0
     relaxed: int = 0
     contacts: int = 0
@@ -101,13 +151,16 @@ class TransferOutcome:
         """Return one line for people."""
         return (
             f"{self.seed:3d}  to target {self.to_target_m:.4f} m  between chasers {self.between_m:.4f} m  "
-            f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  failed {self.failed}  "
+            f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  missed {self.missed}  failed {self.failed}  "
             f"relaxed {self.relaxed}  contacts {self.contacts}"
         )
 
 
-def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel) -> TransferOutcome:
-    """Fly to the end; distances and goals are checked on ground truth at every tick."""
+def fly_transfer(
+    seed: int, scenario: Scenario, perception: PerceptionModel | None, stay_s: float = math.inf
+) -> TransferOutcome:
+    """Fly to the end, or until all chasers with a goal are there for ``stay_s``; distances and goals are checked on ground truth at
+    every tick. Without ``perception`` the target is known exactly."""
     out = TransferOutcome(seed)
     goals = {i: g for i in range(len(scenario.chasers)) if (g := scenario.goal_of(i)) is not None}
     last_away_s: dict[int, float] = {}
@@ -121,6 +174,9 @@ def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel) -> 
             if distances[i] > scenario.success.reached_position_m or time_s < sent_s:
                 last_away_s[i] = time_s - sent_s
 
+    def there_for_s(time_s: float) -> float:
+        return min(time_s - sent_s - last_away_s[i] for i, (sent_s, _) in goals.items())
+
     with InProcessMission(scenario, perception) as flight:
         for record in flight.ticks():
             measure(record.time_s, record.states)
@@ -128,10 +184,13 @@ def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel) -> 
             if solver is not None:
                 out.failed += solver.status.count("failed")
                 out.relaxed += solver.status.count("infeasible_relaxed")
+            if there_for_s(record.time_s) >= stay_s:
+                break
         measure(flight.time_s, flight.states())
         out.contacts = len(flight.contacts)
     step_s = 1.0 / scenario.time.rate_hz
     out.end_m = max(distances.values())
+    out.missed = sum(d > scenario.success.reached_position_m for d in distances.values())
     if all(last_away_s[i] < scenario.duration_s - sent_s - step_s for i, (sent_s, _) in goals.items()):
         out.reached_s = max(last_away_s.values()) + step_s
     return out

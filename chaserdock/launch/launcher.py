@@ -31,6 +31,7 @@ from chaserdock_protocol.shipped_scenarios import find_scenario
 from chaserdock_protocol.stall import DEFAULT_STALL_S, StallTimer
 from chaserdock_protocol.topics import Role
 from chaserdock_protocol.transport import Link, Node, Tls, TransportError
+from chaserdock_world.requirements import require_packages
 
 from chaserdock.exit_codes import DONE, FAILED, STOPPED
 
@@ -250,11 +251,13 @@ def fly_mission(
     the flight. ``keys``: connect through a router, over TLS, with access rights. ``stall_s``: longest time (s) without
     progress. ``port`` and ``namespace``: where other processes reach the mission, by default a free port and a unique name;
     ``network.json`` in the folder contains them while the mission flies. ``stop_requested`` is polled. Installs no signal
-    handler; an exception ends all processes. Raises RunError, ScenarioError or TransportError when the mission cannot start.
+    handler; an exception ends all processes. Raises RunError, ScenarioError, MissingPackageError or TransportError
+    when the mission cannot start.
     """
     path = find_scenario(str(scenario_name))
     overrides = overrides if seed is None else (*overrides, f"seed={seed}")
     scenario = load_scenario(path, overrides)
+    require_packages(scenario)
     folder = folder or _new_folder(path.stem)
     output = folder / "processes"
     if keys is not None:

@@ -47,7 +47,9 @@ from chaserdock.analysis.criteria import nearest_allowed_m
 from .message_checks import defects_of
 from .network import decode_once
 
-SAFE_PHASES = frozenset({"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate"})
+SAFE_PHASES = frozenset(
+    {"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate", "inspect"}
+)
 """Phases in which a chaser keeps its distance, if their reason is in the log."""
 KEEP_OUT_SLACK_M = 0.02
 RETREAT_SLACK_M = 0.15
@@ -56,7 +58,7 @@ TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 """Time (s) after which a retreat leads to the nominal place, and the noise of its reference."""
 SETTLING_S = 15.0
 """Longest time (s) after the last warning or command until a chaser has docked or is safe."""
-_NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate")
+_NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate", "inspect")
 ATTACHED = frozenset({"latched", "verified", "identify", "detumble", "stack_hold"})
 DOCKED = ATTACHED | {"docked"}
 DETUMBLING = frozenset({"identify", "detumble", "stack_hold"})
@@ -205,7 +207,7 @@ class Invariants:
     def _on_world(self, world: WorldTruth) -> None:
         self._state_tick = world.tick
         for a, b in world.contacts:
-            # A chaser that no command reaches drifts: what it hits is nobody's doing.
+            # A chaser that no command reaches drifts; its contacts are not counted.
             if not {a, b} & self.dead:
                 self.violate("no contact", f"{a} and {b}", "bodies touch")
         for i in self._latched - set(world.latched):

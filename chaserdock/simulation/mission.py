@@ -17,6 +17,7 @@ from chaserdock_protocol.process import ProcessOptions
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.transport import Link, RawSample
 from chaserdock_world import process as world
+from chaserdock_world.requirements import require_packages
 
 from .network import SimulatedNetwork, Traffic
 from .scheduler import Scheduler, Task
@@ -54,9 +55,10 @@ def simulate(
     """Fly a scenario file under the conditions of its section ``[simulation]``; the recorder writes to ``folder``.
 
     ``tap`` sees every message when it is published: the sender's name, the sample. The flight is broken off when ``over``
-    holds. Raises ScenarioError.
+    holds. Raises ScenarioError and MissingPackageError.
     """
     scenario = load_scenario(path, overrides)
+    require_packages(scenario)
     scheduler = Scheduler(scenario.seed)
     conditions = scenario.simulation
     lockstep = conditions.mode == "lockstep"

@@ -25,9 +25,12 @@ from chaserdock_protocol.messages import (
     PortLoad,
     Reference,
     SolverStatus,
+    StackEstimate,
     TargetEstimate,
 )
 from chaserdock_protocol.topics import Topic
+
+from chaserdock.analysis.mass_properties import values_of
 
 from .snapshot import TARGET, keep_newest
 
@@ -43,6 +46,9 @@ ChartQuantity = Literal[
     "estimate_error_mm",
     "estimate_error_deg",
     "port_load_N",
+    "mass_sigma_percent",
+    "centre_sigma_mm",
+    "inertia_sigma_percent",
 ]
 
 
@@ -153,10 +159,22 @@ class History:
                 self.series["port_load_N", message.chaser].add(
                     message.sim_time_ns / 1e9, message.peak_force_N
                 )
+            case StackEstimate():
+                self._add_identification(message)
             case SolverStatus():
                 self.series["solve_ms", None].add(message.sim_time_ns / 1e9, message.wall_solve_s * 1e3)
             case Health():
                 self.rejected[message.process] = sum(message.rejected.values()) + message.lost
+
+    def _add_identification(self, message: StackEstimate) -> None:
+        """Add the standard deviations of the target: of the mass, of the centre of mass per axis at the worst, and of the worst
+        element of the inertia as a share of the largest moment."""
+        time_s, (values, sigmas) = message.sim_time_ns / 1e9, values_of(message.target)
+        self.series["mass_sigma_percent", None].add(time_s, 100.0 * float(sigmas[0] / values[0]))
+        self.series["centre_sigma_mm", None].add(time_s, 1e3 * float(sigmas[1:4].max()))
+        self.series["inertia_sigma_percent", None].add(
+            time_s, 100.0 * float(sigmas[4:].max() / np.abs(values[4:7]).max())
+        )
 
     def _add_event(self, message: Event | CommandReply | MissionEnd) -> None:
         time_s = message.sim_time_ns / 1e9

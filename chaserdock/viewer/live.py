@@ -151,11 +151,12 @@ class _Feed:
             feed.subscriptions += [
                 node.subscribe_newest(topics.TRUTH_LOAD, _STATES, i) for i in range(chasers)
             ]
+            feed.subscriptions.append(node.subscribe_newest(topics.TRUTH_DRAWN, 1))
         for topic in OF_CHASERS:
             depth = 1 if topic is topics.IMAGE else _STATES
             feed.subscriptions += [node.subscribe_newest(topic, depth, i) for i in range(chasers)]
         feed.subscriptions += [
-            node.subscribe_newest(topic, _STATES) for topic in (topics.TARGET, topics.SOLVER)
+            node.subscribe_newest(topic, _STATES) for topic in (topics.TARGET, topics.STACK, topics.SOLVER)
         ]
         events = (topics.COMMAND, topics.EVENT, topics.HEALTH, topics.END)
         feed.subscriptions += [node.subscribe_newest(topic, _EVENTS) for topic in events]

@@ -38,6 +38,7 @@ _DECODED = (
     topics.ODOMETRY,
     topics.REFERENCE,
     topics.TARGET,
+    topics.STACK,
     topics.SOLVER,
     topics.TRUTH_BODY,
     topics.TRUTH_LOAD,
@@ -74,7 +75,7 @@ class LoggedMission:
         # per message would take 0.5 GB for ten hours.
         self._index: dict[str, tuple[array[int], array[int]]] = defaultdict(lambda: (array("q"), array("l")))
         self._latest: dict[str, int] = defaultdict(int)
-        self._shown = {topic.key_of(): topic for topic in OF_ALL}
+        self._shown = {topic.key_of(): topic for topic in (*OF_ALL, topics.TRUTH_DRAWN)}
         self._shown |= {topic.key_of(i): topic for topic in OF_CHASERS for i in range(self.chasers)}
         bodies = ("target", *(f"chaser/{i}" for i in range(self.chasers)))
         self._shown |= {topics.TRUTH_BODY.key_of(body): topics.TRUTH_BODY for body in bodies}

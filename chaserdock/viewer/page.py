@@ -116,6 +116,10 @@ class Page:
         if self._timeline is not None:
             self._time_line(self._timeline)
         self._table = gui.add_markdown("")
+        self._mass: Any = None
+        if self._scenario.detumble.identification.enabled:
+            with gui.add_folder("Mass properties"):
+                self._mass = gui.add_markdown("")
         with gui.add_folder("Faults"):
             self._faults = gui.add_markdown("none")
         if command is not None:
@@ -219,7 +223,8 @@ class Page:
         plots.dock_below(images)
         with plots.add_tab("Plots"):
             ports = [i for i in range(number) if scenario.docking.port_of(i) is not None]
-            for plot in plots_of(number, truth, ports):
+            identified = scenario.detumble.identification.enabled
+            for plot in plots_of(number, truth, ports, identified):
                 self._plots.append((plot, self._chart(plot)))
 
     def _chart(self, plot: Plot) -> Any:
@@ -273,7 +278,9 @@ class Page:
     def _write(
         self, state: MissionState, history: History, mode: str, speed: float | None, lost: set[str]
     ) -> None:
+        mass = () if self._mass is None else ((self._mass, text.mass_properties(self._scenario, state)),)
         for element, content in (
+            *mass,
             (self._head, text.head(self._scenario, state, mode, speed)),
             (self._table, text.chasers(state, history)),
             (self._faults, text.faults(state, history, lost)),

@@ -33,9 +33,11 @@ class Plot:
     curves: tuple[Curve, ...]
 
 
-def plots_of(chasers: int, truth: bool, ports: Sequence[int] = ()) -> tuple[Plot, ...]:
+def plots_of(
+    chasers: int, truth: bool, ports: Sequence[int] = (), identified: bool = False
+) -> tuple[Plot, ...]:
     """Return the plots of the page; the estimation error and the loads at the ports of the chasers ``ports`` only with ground
-    truth."""
+    truth; the uncertainty of the target's mass properties only if they are ``identified``."""
 
     def each(quantity: ChartQuantity, numbers: Iterable[int] = range(chasers)) -> tuple[Curve, ...]:
         return tuple((f"chaser {i}", COLOURS[i % len(COLOURS)], quantity, i) for i in numbers)
@@ -44,12 +46,18 @@ def plots_of(chasers: int, truth: bool, ports: Sequence[int] = ()) -> tuple[Plot
         ("position, mm", ESTIMATE_COLOUR, "estimate_error_mm", None),
         ("attitude, deg", "#7c8aa0", "estimate_error_deg", None),
     )
+    uncertainty: tuple[Curve, ...] = (
+        ("mass, %", COLOURS[0], "mass_sigma_percent", None),
+        ("centre, mm", COLOURS[1], "centre_sigma_mm", None),
+        ("inertia, %", COLOURS[2], "inertia_sigma_percent", None),
+    )
     return (
         Plot("distance to the target, m", each("distance_m")),
         Plot("position error, mm", each("position_error_mm")),
         Plot("orientation error, deg", each("orientation_error_deg")),
         *((Plot("error of the target estimate", estimate),) if truth else ()),
         *((Plot("load at the port, N", each("port_load_N", ports)),) if truth and ports else ()),
+        *((Plot("identified target, 1 sigma", uncertainty),) if identified else ()),
         Plot("solve time, ms", (("controller", COLOURS[0], "solve_ms", None),)),
         Plot("image to command, ms wall time", each("latency_ms")),
     )

@@ -15,6 +15,8 @@ from chaserdock_protocol.messages import (
     ActuatorCommand,
     BodyTruth,
     DockingStatus,
+    DrawnBody,
+    DrawnTruth,
     Image,
     MissionEnd,
     Odometry,
@@ -23,6 +25,7 @@ from chaserdock_protocol.messages import (
     Reference,
     Sighting,
     SolverStatus,
+    StackEstimate,
     TargetEstimate,
     ThrusterReport,
     Tick,
@@ -43,7 +46,7 @@ OF_CHASERS = (
     topics.PLAN,
     topics.SAFETY,
 )
-OF_ALL = (topics.TICK, topics.TARGET, topics.SOLVER, topics.END)
+OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
 
 _KEPT = 64
@@ -129,14 +132,17 @@ def keep_newest(store: OrderedDict[int, Any], key: int, message: Any, kept: int 
 
 @dataclass
 class MissionState:
-    """Latest messages of the mission; ``truth`` by body (``target``, ``chaser/0``), empty without access to it."""
+    """Latest messages of the mission; ``truth`` by body (``target``, ``chaser/0``), empty without access to it. ``true_body``: the
+    target's true mass properties, with access to ground truth."""
 
     chasers: list[ChaserState]
     tick: Tick | None = None
     target: TargetEstimate | None = None
+    stack: StackEstimate | None = None
     solver: SolverStatus | None = None
     ended: MissionEnd | None = None
     truth: dict[str, BodyTruth] = field(default_factory=dict)
+    true_body: DrawnBody | None = None
 
     @classmethod
     def empty(cls, chasers: int) -> MissionState:
@@ -150,12 +156,16 @@ class MissionState:
                 self.tick = message
             case TargetEstimate():
                 self.target = message
+            case StackEstimate():
+                self.stack = message
             case SolverStatus():
                 self.solver = message
             case MissionEnd():
                 self.ended = message
             case BodyTruth():
                 self.truth[message.body] = message
+            case DrawnTruth():
+                self.true_body = next((b for b in message.bodies if b.body == TARGET), None)
             case _ if topic in OF_CHASERS and message.chaser < len(self.chasers):
                 self.chasers[message.chaser].update(message)
 

@@ -8,6 +8,8 @@ import re
 
 from chaserdock_protocol.scenario import FlightScenario
 
+from chaserdock.analysis.mass_properties import property_rows, stated_values, true_values
+
 from .history import History, Line
 from .snapshot import ChaserState, MissionState
 
@@ -53,6 +55,19 @@ def chasers(state: MissionState, history: History) -> str:
         )
         rows.append("| " + " | ".join(cells) + " |")
     return "\n".join(rows)
+
+
+def mass_properties(scenario: FlightScenario, state: MissionState) -> str:
+    """Return a table of the identified mass properties of target and stack beside the stated and, if known, the true ones."""
+    if state.stack is None:
+        return "not yet identified"
+    true = None if state.true_body is None else true_values(state.true_body)
+    head = ("", "target", "stated", *(("true",) if true is not None else ()), "stack")
+    lines = ["| " + " | ".join(head) + " |", "| " + " | ".join("---" for _ in head) + " |"]
+    for row in property_rows(state.stack, stated_values(scenario), true, "-"):
+        cells = (row.name, row.target, row.stated, *((row.true,) if true is not None else ()), row.stack)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
 
 
 def visibility(chaser: ChaserState) -> str:

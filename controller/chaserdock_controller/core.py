@@ -15,7 +15,7 @@ from .guidance.stage import GuidanceStage
 from .ingest.stage import IngestStage
 from .interfaces import TickInputs, TickOutputs
 from .nmpc.stage import PlanningStage
-from .output.message_builders import safety_message, target_message
+from .output.message_builders import target_message
 from .output.stage import OutputStage
 from .parameters import estimator_of, nmpc_parameters
 
@@ -44,15 +44,10 @@ class ControllerCore:
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
         observation = self.ingest.run(inputs, self.output.history)
-        estimation = self.estimation.run(observation)
-        failures = self.planning.monitor.failures(observation.time_ns)
-        unsafe = self.planning.unsafe(observation.time_ns)
-        guidance = self.guidance.run(observation, estimation, failures, unsafe)
+        estimation = self.estimation.run(observation, self.guidance.machine.inspecting())
+        guidance = self.guidance.run(observation, estimation, self.planning.history)
         plan = self.planning.run(observation, estimation, guidance)
-        out = self.output.run(observation, estimation, guidance, plan)
-        if (monitor := self.planning.passive_safety) is not None:
-            out.safety = {i: safety_message(i, observation, monitor, guidance) for i in monitor.certificates}
-        return out
+        return self.output.run(observation, estimation, guidance, plan)
 
     def estimate(self, inputs: TickInputs) -> TargetEstimate:
         """Run ingest and estimation only, in place of ``step``."""

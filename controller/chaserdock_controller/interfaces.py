@@ -5,10 +5,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Protocol
 
 from chaserdock_models.arrays import Array
+from chaserdock_models.geometry_errors import GeometryParameter
 from chaserdock_models.mounting import MountedChaser
+from chaserdock_models.passive_safety import CoastCertificate
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import (
     CameraCalibration,
@@ -34,7 +36,7 @@ from .estimation.identification.composite import MassProperties
 from .estimation.target_body import TargetBody
 from .estimation.types import RelativePose, TargetState
 from .guidance.phases import Phase
-from .nmpc.plan_monitor import ChaserPlan
+from .nmpc.plan_monitor import ChaserPlan, PlanningFailure
 from .nmpc.types import NmpcPlan
 
 LogEntry = tuple[Level, str]
@@ -128,6 +130,20 @@ class IdentifiedStack:
     informative: Callable[[], tuple[tuple[int, int], ...]]
 
 
+@dataclass(frozen=True, eq=False)
+class EstimatedShape:
+    """Errors of the target's known geometry: ``parameters``, their estimated values (k,) and covariance (k, k), both in the
+    parameters' standard deviations; number of ``views``, the share of directions that they cover, and whether this tick brought
+    one (``changed``)."""
+
+    parameters: tuple[GeometryParameter, ...]
+    values: Array
+    covariance: Array
+    views: int
+    coverage: float
+    changed: bool
+
+
 @dataclass(frozen=True)
 class TargetEstimation:
     """Result of estimation. ``at_effect``: the target at ``Observation.effective_ns``, if its pose is known.
@@ -137,7 +153,8 @@ class TargetEstimation:
     ``motion_covariances``: (6, 6) of a chaser's position and velocity relative to the target, WRF, unless passive safety is off.
     ``relative``: poses of the chasers relative to the target, if estimated with covariance.
     ``visible_to``: chasers with a sighting of the target. ``latched``: chasers whose latch holds the target; ``body``: the
-    target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are.
+    target and these chasers as one rigid body. ``stack``: their mass properties as identified, if they are. ``shape``: errors of
+    the known geometry, once they are estimated.
     """
 
     target: TargetState
@@ -153,6 +170,7 @@ class TargetEstimation:
     body: TargetBody
     events: tuple[LogEntry, ...]
     stack: IdentifiedStack | None = None
+    shape: EstimatedShape | None = None
 
     @property
     def known(self) -> bool:
@@ -209,6 +227,8 @@ class HorizonReference:
     min_distance_target_m: Array
     corridors: Array | None
     attached: frozenset[int]
+    boxes: Array | None = None
+    box_clearance_m: Array | None = None
 
 
 @dataclass(frozen=True)
@@ -224,10 +244,32 @@ class GuidanceResult:
 
 
 @dataclass(frozen=True)
+class PlanCertificate:
+    """Passive safety of a chaser's newest plan: the worst coast, and the time (s) from the plan's beginning to its loss of thrust."""
+
+    coast: CoastCertificate
+    loss_s: float
+    safe: bool
+
+
+class PlanningHistory(Protocol):
+    """What guidance learns about the plans of earlier ticks."""
+
+    def failures(self, time_ns: int) -> Mapping[int, PlanningFailure]:
+        """Return the chasers that have to retreat at ``time_ns`` because planning has failed."""
+        ...
+
+    def unsafe(self, time_ns: int) -> Mapping[int, str]:
+        """Return why chasers lack passive safety at ``time_ns``."""
+        ...
+
+
+@dataclass(frozen=True)
 class PlanResult:
     """Result of planning: the plan of ``chasers``, row by row; None without a usable solve. ``wall_s``: time of the solve.
 
-    ``flyable``: the plan of each chaser that may be flown, an earlier one for a while after a failed solve.
+    ``flyable``: the plan of each chaser that may be flown, an earlier one for a while after a failed solve. ``certificates``: passive
+    safety of the newest plans, where it is monitored.
     """
 
     chasers: tuple[int, ...]
@@ -235,3 +277,4 @@ class PlanResult:
     wall_s: float
     events: tuple[LogEntry, ...]
     flyable: Mapping[int, ChaserPlan]
+    certificates: Mapping[int, PlanCertificate]

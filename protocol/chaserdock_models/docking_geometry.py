@@ -33,6 +33,8 @@ class PoseLimits(Protocol):
     def angle_deg(self) -> float: ...
     @property
     def lateral_speed_m_s(self) -> float: ...
+    @property
+    def rate_deg_s(self) -> float | None: ...
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,8 @@ class PortView:
     """State of a probe's tip relative to its port, in the port's rotating frame.
 
     ``gap_m``: along the axis, positive outside. ``lateral_m``: distance from the axis. ``closing_m_s``: speed towards
-    the port. ``angle_rad``: between the chaser's attitude and its docked attitude.
+    the port. ``angle_rad``: between the chaser's attitude and its docked attitude. ``rate_rad_s``: of the chaser relative to the
+    target.
     """
 
     gap_m: float
@@ -48,14 +51,17 @@ class PortView:
     angle_rad: float
     closing_m_s: float
     lateral_speed_m_s: float
+    rate_rad_s: float = 0.0
 
     def fault(self, limits: PoseLimits, closing_m_s: float = math.inf) -> str:
         """Describe the first violated limit with its values; empty if all hold."""
+        rate_deg_s = math.inf if limits.rate_deg_s is None else limits.rate_deg_s
         for name, value, limit, unit in (
             ("lateral", self.lateral_m * 1e3, limits.lateral_m * 1e3, "mm"),
             ("angle", math.degrees(self.angle_rad), limits.angle_deg, "deg"),
             ("lateral speed", self.lateral_speed_m_s * 1e3, limits.lateral_speed_m_s * 1e3, "mm/s"),
             ("closing speed", self.closing_m_s * 1e3, closing_m_s * 1e3, "mm/s"),
+            ("rate", math.degrees(self.rate_rad_s), rate_deg_s, "deg/s"),
         ):
             if value > limit:
                 return f"{name} {value:.2f} {unit}, at most {limit:g}"
@@ -100,7 +106,14 @@ def view_of(
         angle_rad=float(rotations.angle_between(attitude, chaser.q_wxyz)),
         closing_m_s=-speed,
         lateral_speed_m_s=float(np.linalg.norm(velocity - speed * axis)),
+        rate_rad_s=_relative_rate(chaser, target),
     )
+
+
+def _relative_rate(chaser: BodyState, target: BodyState) -> float:
+    """Return the magnitude of the rate of a chaser relative to the target, rad/s."""
+    own = rotations.rotate(chaser.q_wxyz, chaser.omega_rad_s)
+    return float(np.linalg.norm(own - rotations.rotate(target.q_wxyz, target.omega_rad_s)))
 
 
 def segments_apart(a: Array, b: Array, c: Array, d: Array) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .arrays import Array
+from .arrays import Array, IntArray
 from .relative_motion import cw_transition
 
 STEP_S = 10.0
@@ -56,6 +56,7 @@ class CoastModel:
         self._step_s = duration_s / max(1, math.ceil(duration_s / step_s))
         self._times_s = np.arange(round(duration_s / self._step_s) + 1) * self._step_s
         self._transitions = cw_transition(mean_motion_rad_s, self._times_s)
+        self._by_axis = np.ascontiguousarray(self._transitions.transpose(1, 0, 2))
         # The acceleration of a coast turns with the orbit: in a step it changes by less than n dt of itself.
         self._sagitta_share = max(_SAGITTA_SHARE, (1.0 + mean_motion_rad_s * self._step_s) / 8.0)
 
@@ -64,7 +65,8 @@ class CoastModel:
 
         ``covariance`` (6, 6): of a state's error, the same for all states of the plan.
         """
-        found = self.closest(states, covariance, keep_out_m)
+        columns = self._candidates(states, covariance, keep_out_m)
+        found = self._closest_in(columns, states, covariance, keep_out_m)
         loss = int(np.argmin(found.margin_sigmas))
         return CoastCertificate(
             float(found.margin_sigmas[loss]), float(found.distance_m[loss]), float(found.time_s[loss]), loss
@@ -72,23 +74,57 @@ class CoastModel:
 
     def closest(self, states: Array, covariance: Array, keep_out_m: float) -> ClosestApproaches:
         """Return the approach with the smallest margin of the coast from each of the states (M, 6); arguments as in ``certify``."""
-        # One product of matrices: (K 6, 6) by (6, M).
-        coasts = (self._transitions.reshape(-1, 6) @ states.T).T.reshape(len(states), -1, 6)
-        here, step = coasts[:, :-1, :3], np.diff(coasts[:, :, :3], axis=1)
+        return self._closest_in(np.arange(len(self._times_s) - 1), states, covariance, keep_out_m)
+
+    def _candidates(self, states: Array, covariance: Array, keep_out_m: float) -> IntArray:
+        """Return the steps of the coasts that can contain the smallest margin of all states; arguments as in ``certify``.
+
+        In a step the distance is at least that of the nearer end, less half of the step and the bulge; the standard deviation is
+        at most the root of the trace of the covariance.
+        """
+        coasts = self._by_axis @ states.T
+        step_m, change_m_s = (
+            np.sqrt(np.square(np.diff(part, axis=1)).sum(axis=0)) for part in (coasts[:3], coasts[3:])
+        )
+        distance_m = np.sqrt(np.square(coasts[:3]).sum(axis=0))
+        ends_m = np.minimum(distance_m[:-1], distance_m[1:])
+        bulge_m = self._sagitta_share * self._step_s * change_m_s
+        room_m = (ends_m - 0.5 * step_m - bulge_m).min(axis=1) - keep_out_m
+        rows = self._by_axis[:3]
+        trace = (rows @ covariance * rows).sum(axis=(0, 2))
+        sigma_m = np.sqrt(np.maximum(np.maximum(trace[:-1], trace[1:]), 1e-18))
+        bound = np.where(room_m > 0.0, room_m / sigma_m, -np.inf)
+        first = np.array([np.argmin(bound)])
+        least = self._closest_in(first, states, covariance, keep_out_m).margin_sigmas.min()
+        return np.flatnonzero(bound <= least + 1e-9 * abs(least))
+
+    def _closest_in(
+        self, columns: IntArray, states: Array, covariance: Array, keep_out_m: float
+    ) -> ClosestApproaches:
+        """Return ``closest`` within these steps (L,) of the coasts."""
+        # One product of matrices: (L 6, 6) by (6, M).
+        begin, end = (
+            (self._transitions[k].reshape(-1, 6) @ states.T).T.reshape(len(states), -1, 6)
+            for k in (columns, columns + 1)
+        )
+        here, step = begin[:, :, :3], end[:, :, :3] - begin[:, :, :3]
         length2 = np.maximum(np.einsum("mki,mki->mk", step, step), 1e-30)
         share = np.clip(-np.einsum("mki,mki->mk", here, step) / length2, 0.0, 1.0)
         nearest = here + share[..., None] * step
-        bulge = self._sagitta_share * self._step_s * np.linalg.norm(np.diff(coasts[:, :, 3:], axis=1), axis=2)
+        change = end[:, :, 3:] - begin[:, :, 3:]
+        bulge = self._sagitta_share * self._step_s * np.linalg.norm(change, axis=2)
         chord = np.linalg.norm(nearest, axis=2)
         away = np.maximum(chord - bulge, 0.0)
-        rows = self._transitions[:, :3]
-        spread = rows @ covariance @ rows.transpose(0, 2, 1)
         line = nearest / np.maximum(chord, 1e-9)[..., None]
-        variance = np.maximum(_variance_along(line, spread[:-1]), _variance_along(line, spread[1:]))
+        variance = np.zeros_like(chord)
+        for k in (columns, columns + 1):
+            rows = self._transitions[k, :3]
+            spread = rows @ covariance @ rows.transpose(0, 2, 1)
+            variance = np.maximum(variance, _variance_along(line, spread))
         sigma = np.sqrt(np.maximum(variance, 1e-18))
         margins = (away - keep_out_m) / sigma
         every, k = np.arange(len(states)), np.argmin(margins, axis=1)
-        times_s = self._times_s[k] + share[every, k] * self._step_s
+        times_s = self._times_s[columns[k]] + share[every, k] * self._step_s
         return ClosestApproaches(margins[every, k], away[every, k], times_s)
 
 

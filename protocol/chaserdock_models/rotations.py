@@ -168,6 +168,9 @@ def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float) -> Array:
 def skew(v: ArrayLike) -> Array:
     """Return the matrix (..., 3, 3) with ``skew(v) @ w == cross(v, w)``."""
     v = np.asarray(v, dtype=float)
+    if v.ndim == 1:  # the usual case, without the overhead of arrays
+        a, b, c = v.tolist()
+        return np.array([[0.0, -c, b], [c, 0.0, -a], [-b, a, 0.0]])
     zero = np.zeros_like(v[..., 0])
     x, y, z = v[..., 0], v[..., 1], v[..., 2]
     rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]

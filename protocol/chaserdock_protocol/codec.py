@@ -222,7 +222,7 @@ def vector(array: Any) -> Any:
     return tuple(array.ravel().tolist())
 
 
-_LATER_FIELDS = frozenset({"given_thrusters_N_s"})
+_LATER_FIELDS = frozenset({"given_thrusters_N_s", "geometry"})
 
 
 def without_wall_time(message: Message) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def defect_of(lease: Lease, rate_hz: float) -> str:
     if not lease.holder:
         return ""
     if commander_of(lease.term) != lease.holder:
-        return f"term {lease.term} belongs to {commander_of(lease.term) or 'nobody'}, not to {lease.holder}"
+        return f"term {lease.term} belongs to {commander_of(lease.term) or 'no controller'}, not to {lease.holder}"
     # A command may arrive, and renew the lease, before its tick.
     latest = lease.tick + 2 * longest_lease_ticks(rate_hz)
     if not lease.from_tick <= lease.tick <= lease.until_tick < latest:

@@ -34,7 +34,17 @@ ThrusterState = Literal["healthy", "stuck_off", "stuck_on", "weak"]
 Counts = Annotated[dict[Text, Count], Meta(max_length=1024)]
 Names = Annotated[dict[Text, Text], Meta(max_length=1024)]
 OperatorCommandName = Literal[
-    "approach", "hold", "retreat", "abort", "goto", "calibrate", "identify", "detumble", "isolate", "restore"
+    "approach",
+    "hold",
+    "retreat",
+    "abort",
+    "goto",
+    "calibrate",
+    "inspect",
+    "identify",
+    "detumble",
+    "isolate",
+    "restore",
 ]
 Level = Literal["info", "warning", "error"]
 Square3 = Annotated[tuple[float, ...], Meta(min_length=9, max_length=9)]
@@ -47,6 +57,7 @@ PhaseName = Literal[
     "searching",
     "hold",
     "calibrate",
+    "inspect",
     "approach",
     "docked",
     "retreat",
@@ -78,6 +89,36 @@ class PoseSolution(Struct, frozen=True, kw_only=True):
     q_wxyz: Quaternion
     covariance: Square6
     reprojection_rms_px: float
+
+
+Parameters = Annotated[tuple[float, ...], Meta(max_length=64)]
+SquareOfParameters = Annotated[tuple[float, ...], Meta(max_length=64 * 64)]
+
+
+class GeometryMeasurement(Struct, frozen=True, kw_only=True):
+    """What one image tells about the k errors of the target's known geometry, whatever its pose.
+
+    ``information``: row-major (k, k); ``vector``: it times the estimate (k,). In units of the errors' prior standard deviations, in
+    the order of ``GeometryEstimate.names``.
+    """
+
+    information: SquareOfParameters
+    vector: Parameters
+
+
+class GeometryEstimate(Struct, frozen=True, kw_only=True):
+    """Errors of the target's known geometry as estimated from ``views`` images, which cover a share of all directions.
+
+    ``names``: of the k errors: a joint and a body axis about which it is turned (rad), ``scale`` (share) or ``rim`` (m).
+    ``sigmas``: prior standard deviations. ``values`` and row-major ``covariance`` (k, k): of the estimate, in the same units.
+    """
+
+    names: Annotated[tuple[Text, ...], Meta(max_length=64)]
+    sigmas: Parameters
+    values: Parameters
+    covariance: SquareOfParameters
+    views: Count
+    coverage: float
 
 
 class CameraCalibration(Struct, frozen=True, kw_only=True):
@@ -313,7 +354,8 @@ class Sighting(Message, frozen=True, kw_only=True):
     """Target poses that a chaser measured in one image; empty ``solutions`` if it detected nothing.
 
     The best solution comes first; a second one follows if a single small marker is ambiguous.
-    ``corners_px``: u, v of the four corners of each used marker, in the distorted image.
+    ``corners_px``: u, v of the four corners of each used marker, in the distorted image. ``geometry``: by shape only, in images
+    whose view was rendered anew.
     """
 
     chaser: ChaserId
@@ -323,6 +365,7 @@ class Sighting(Message, frozen=True, kw_only=True):
     corners_px: Annotated[tuple[float, ...], Meta(max_length=8192)]
     rejected_ids: MarkerIds
     detail: Text = ""
+    geometry: GeometryMeasurement | None = None
     wall_estimate_s: float = 0.0
 
 
@@ -398,7 +441,8 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     Without a majority of leases a controller commands nothing: it lets the chaser ``wait``, or gives its lease back (``yield``).
     ``isolated``: thrusters whose shut-off valve an operator closed. ``trusted``: thrusters that an operator declared
     healthy, which overrides the chaser's fault detection. ``free``: no contact or latch, so that the motion identifies
-    thruster faults. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
+    thruster faults. ``geometry``: newest estimate of the target's geometry, by which the chaser corrects what it knows; when it
+    has changed, and once a second. ``term``, ``commander`` (the sender) and its ``instance``: see ``Lease``.
     """
 
     chaser: ChaserId
@@ -412,6 +456,7 @@ class WrenchCommand(Message, frozen=True, kw_only=True):
     trusted: Thrusters = ()
     free: bool = True
     latch: Latch = "keep"
+    geometry: GeometryEstimate | None = None
     term: Count = 0
     commander: Text = ""
     instance: Text = ""
@@ -550,6 +595,7 @@ class OperatorCommand(Message, frozen=True, kw_only=True):
     at which it was accepted or rejected, so that the log holds all inputs.
 
     ``calibrate`` rotates the chaser while it observes the target, which makes its camera mounting observable.
+    ``inspect`` flies once around the target, whose geometry is estimated from the images meanwhile.
     ``detumble`` stops the tumble of the target with the thrusters of the latched chasers that it is sent to.
     ``isolate`` closes the shut-off valve of ``thruster``; ``restore`` opens it and declares the thruster healthy.
     """

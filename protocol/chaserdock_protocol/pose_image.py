@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images without a picture, for the perception ``statistical``: one row of pixels that are the bytes of nine numbers.
+"""Pose images for the perception ``statistical``: one row of pixels that are the bytes of nine numbers.
 
 They are the pose of the target in the camera and what the perception draws its errors from. World and chaser exchange
 them as ``mono8`` images, so that everything but rendering and detection stays as it is.

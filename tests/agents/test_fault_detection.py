@@ -213,7 +213,7 @@ def test_noisy_odometry_takes_longer_and_finds_the_same(thruster: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_bump_or_a_pull_is_no_thruster(seed: int) -> None:
-    """What touches the chaser pushes as no thruster does: nobody is blamed."""
+    """A contact pushes as no thruster does: no thruster is reported."""
     case = Case("tetra12", seed)
     rng = np.random.default_rng(seed)
     pull = rng.normal(size=6) * ([0.05] * 3 + [0.002] * 3)

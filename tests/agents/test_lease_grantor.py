@@ -119,7 +119,7 @@ def test_lost_holder_loses_the_lease_within_the_tick(grantor: LeaseGrantor) -> N
     assert (lease.holder, lease.term, lease.from_tick, lease.from_revision) == ("standby", 2, 5, 1)
     lease = stated(grantor, tick(5, {}, revision=2))
     assert (lease.holder, lease.until_tick) == ("", 4)
-    assert "nobody holds" in str(grantor.refusal(command(5, "standby", "s1", 2)))
+    assert "no controller holds" in str(grantor.refusal(command(5, "standby", "s1", 2)))
     assert stated(grantor, tick(6, {"controller": "c2"})).term == 3  # started again: another instance
 
 
@@ -201,7 +201,7 @@ def test_repeated_expiry_doubles_the_lease() -> None:
         ({"holder": "", "term": 0, "until_tick": 0}, None),  # granted to nobody
         ({"holder": "contRoller"}, "belongs to controller"),
         ({"term": 2}, "belongs to standby"),
-        ({"term": 0}, "belongs to nobody"),
+        ({"term": 0}, "belongs to no controller"),
         ({"until_tick": 0}, "from tick 0 to 0, stated in tick 1"),
         ({"from_tick": 2}, "from tick 2"),
         ({"until_tick": 200}, "to 200"),

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Perception `model`: acquisition without a prior, tracking of a turning target, loss, ambiguous shapes."""
 
+import itertools
+
 import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import make_perception, tracker_mesh
 from chaserdock_agents.chaser.perception.model import tracking
 from chaserdock_agents.chaser.perception.model.acquisition import Acquisition, spread_rotations
+from chaserdock_agents.chaser.perception.model.alignment import Pyramid
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
 from chaserdock_agents.chaser.perception.refine import PoseInCamera
 from chaserdock_models import rotations
@@ -48,34 +51,60 @@ def test_nothing_is_acquired_without_a_target(acquisition, image):
     assert acquisition.find(image) == ()
 
 
-def test_turning_target_is_tracked_lost_in_the_dark_and_acquired_again(acquisition):
+def drifting(number, pose):
+    turn = rotations.to_matrix(rotations.exp(np.array([0.001, 0.002, 0.0015]) * number))
+    return PoseInCamera(pose.position + 5e-4 * number * np.array([1.0, 0.0, -2.0]), turn @ pose.rotation)
+
+
+def test_turning_target_is_acquired_over_images_tracked_lost_in_the_dark_and_acquired_again(acquisition):
     scene, perception = Scene(CAMERA), ModelPerception(CAMERA, mesh_of(), acquisition)
-    pose, light = random_view(np.random.default_rng(3), 2.0, CAMERA)
+    pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
     light = Light((-0.5, -0.4, -1.0))
-    status = []
-    for number in range(18):
-        turn = rotations.to_matrix(rotations.exp(np.array([0.002, 0.004, 0.003]) * number))
-        moved = PoseInCamera(pose.position + 1e-3 * number * np.array([1.0, 0.0, -2.0]), turn @ pose.rotation)
-        dark = 8 <= number < 12
+    numbers = iter(range(200))
+
+    def seen(dark=False):
+        number = next(numbers)
+        moved = drifting(number, pose)
         result = perception.estimate(SPACE if dark else scene.image(moved, light, number))
-        status.append(len(result.solutions))
-        if result.solutions:
-            best = result.solutions[0]
+        for best in result.solutions[:1]:
             assert angle_deg(best, moved) < 0.6
             assert np.linalg.norm(best.position_irf_m - moved.position) < 0.02
-    assert min(status[:8]) == 1
-    assert max(status[8:12]) == 0
-    assert status[-1] == 1
+        return len(result.solutions)
+
+    def images_until_seen(most):
+        return next((n for n in range(most) if seen()), most)
+
+    assert 2 < images_until_seen(40) < 40
+    assert [seen() for _ in range(10)] == [1] * 10
+    assert [seen(dark=True) for _ in range(4)] == [0] * 4
+    assert 2 < images_until_seen(60) < 60
+    assert [seen() for _ in range(3)] == [1] * 3
+
+
+def test_acquisition_is_spread_over_short_steps_and_its_result_is_that_of_one_call(acquisition):
+    pose, _ = random_view(np.random.default_rng(3), 2.0, CAMERA)
+    image = Scene(CAMERA).image(pose, Light((-0.5, -0.4, -1.0)), 1)
+    found = []
+
+    def search():
+        found.extend((yield from acquisition.search(Pyramid(image, CAMERA))))
+
+    times_ms = list(search())
+    assert 0.0 < min(times_ms) <= max(times_ms) <= 40.0
+    assert sum(times_ms) > 100.0
+    (alone, _), (spread, _) = acquisition.find(image)[0], found[0]
+    assert np.array_equal(alone.pose.position, spread.pose.position)
 
 
 def test_symmetric_target_gives_hypotheses_of_which_one_is_right():
     boxes = (BOXES[0], Box((0.16, 1.2, 0.012), shade=0.25))
     scene, perception = Scene(CAMERA, boxes=boxes), ModelPerception(CAMERA, mesh_of(boxes))
     pose, light = random_view(np.random.default_rng(12), 2.5, CAMERA)
-    for number in range(2):
-        solutions = perception.estimate(scene.image(pose, light, number)).solutions
+    found = (perception.estimate(scene.image(pose, light, number)).solutions for number in range(60))
+    for solutions in itertools.islice((s for s in found if s), 2):
         assert 2 <= len(solutions) <= 4
         assert min(angle_deg(s, pose) for s in solutions) < 2.0
+    assert next(found)
 
 
 def test_scenario_selects_it_and_other_images_are_refused():

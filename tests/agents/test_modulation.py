@@ -83,7 +83,7 @@ def test_nothing_is_lost_when_every_tick_asks_for_something_else(rate_hz: int, s
 @pytest.mark.parametrize(("rate_hz", "carrier_hz"), [(10, 10), (15, 10), (30, 10), (15, 15), (30, 15)])
 @given(seed=st.integers(0, 2**31))
 @quick
-def test_what_is_off_beyond_a_minimum_pulse_was_asked_for_after_the_pulse_was_sent(
+def test_off_time_beyond_a_minimum_pulse_follows_a_later_demand(
     rate_hz: int, carrier_hz: int, seed: int
 ) -> None:
     """Thrusts new every tick: given less asked, over any second, is within a minimum pulse but for what the thrusts of

@@ -71,7 +71,7 @@ def jpeg(image: np.ndarray) -> bytes:
 
 
 def checked(sighting: Sighting) -> Sighting:
-    """Whatever the eye says can be sent."""
+    """Every result of a perception can be encoded."""
     return codec.decode(Sighting, codec.encode(sighting))
 
 
@@ -110,7 +110,7 @@ BAD: list[tuple[str, Image]] = [
 
 
 @pytest.mark.parametrize(("what", "image"), BAD, ids=[b[0] for b in BAD])
-def test_a_bad_image_is_told_and_seen_as_nothing(perception: Perception, what: str, image: Image) -> None:
+def test_bad_image_is_reported_and_gives_no_solution(perception: Perception, what: str, image: Image) -> None:
     sighting = checked(look(perception, image, None))
     assert sighting.status == "bad_image"
     assert sighting.solutions == ()

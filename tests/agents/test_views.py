@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What markers look like from a pose, by kernel: to the bit what NumPy's plain formulae say, on every instruction set."""
+"""Appearance of markers by kernel equals NumPy's plain formulae bit for bit on every instruction set."""
 
 from __future__ import annotations
 

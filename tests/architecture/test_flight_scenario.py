@@ -48,7 +48,7 @@ FORBIDDEN_TYPES = {
     ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth, TruthValues,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
-    "simulation",
+    "simulation", "world",
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
     "renderer", "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",
@@ -110,7 +110,7 @@ def test_the_walk_reaches_nested_fields_and_finds_truth() -> None:
 def test_every_field_that_is_not_shared_is_known_to_be_truth_or_bookkeeping() -> None:
     """A new key of the full scenario is hidden unless it is declared in the flight scenario."""
     only_full = set(Scenario.model_fields) - set(FlightScenario.model_fields)
-    assert only_full - {"extends", "steady_until_s"} <= FORBIDDEN_ANYWHERE
+    assert only_full - {"extends", "steady_until_s", "world"} <= FORBIDDEN_ANYWHERE
 
 
 # -- values -----------------------------------------------------------------------------------------------

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Architecture rules: who imports whom, and that flight software cannot reach ground truth."""
+"""Architecture rules: which packages import which, and that flight software cannot reach ground truth."""
 
 from __future__ import annotations
 
@@ -67,6 +67,7 @@ def test_there_are_no_import_cycles() -> None:
     [
         ("zenoh", {"chaserdock_protocol.transport.zenoh_network"}),
         ("pybullet", {"chaserdock_world.physics.bullet"}),
+        ("mujoco", {"chaserdock_world.physics.mujoco_engine"}),
     ],
 )
 def test_one_module_imports_the_library(library: str, homes: set[str]) -> None:
@@ -95,7 +96,7 @@ TRUTHS = {name for name in vars(topics) if name.startswith("TRUTH")}
 
 
 @pytest.mark.parametrize("path", FLYING, ids=short)
-def test_what_flies_does_not_even_mention_the_truth(path: Path) -> None:
+def test_flight_software_does_not_mention_the_truth(path: Path) -> None:
     for node in ast.walk(tree_of(path)):
         named = (
             node.attr
@@ -135,7 +136,7 @@ def test_there_is_a_truth_to_keep_away_from() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(TRUTHS))
-def test_what_flies_cannot_subscribe_the_truth(node: Node, name: str) -> None:
+def test_flight_software_cannot_subscribe_the_truth(node: Node, name: str) -> None:
     topic = getattr(topics, name)
     with pytest.raises(PermissionError, match=f"{node.role} may not read truth/"):
         node.subscribe(topic)
@@ -149,14 +150,14 @@ def test_what_flies_cannot_subscribe_the_truth(node: Node, name: str) -> None:
 
 
 @pytest.mark.parametrize("expression", ["**", "truth/**", "world/tick", "*/body/target"])
-def test_what_flies_cannot_subscribe_expressions(node: Node, expression: str) -> None:
+def test_flight_software_cannot_subscribe_expressions(node: Node, expression: str) -> None:
     heard: list[object] = []
     with pytest.raises(PermissionError, match="may not read"):
         node.subscribe_raw(expression, heard.append)
     assert heard == []
 
 
-def test_what_flies_can_subscribe_what_is_meant_for_it(node: Node) -> None:
+def test_flight_software_can_subscribe_its_inputs(node: Node) -> None:
     node.subscribe(topics.TICK)
     node.subscribe(topics.ODOMETRY, 0)
     with pytest.raises(PermissionError):

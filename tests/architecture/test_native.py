@@ -7,6 +7,7 @@ import ctypes
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +16,22 @@ import numpy as np
 import pytest
 from chaserdock_agents.chaser.perception import corners, refine
 from chaserdock_agents.chaser.perception import native as perception_native
+from chaserdock_controller.estimation.joint import JointEstimator
+from chaserdock_controller.estimation.joint import kernels as joint_kernels
+from chaserdock_controller.estimation.joint import native as joint_native
 from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
 from chaserdock_controller.nmpc import native as nmpc_native
 from chaserdock_models import native
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import KernelLibrary
 from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS, X86_64, source_digest
-from chaserdock_models.targets import target_model
+from chaserdock_models.shape_distance import box_table
+from chaserdock_models.targets import Box, target_model
 from chaserdock_world.rendering import native as rendering_native
 from chaserdock_world.rendering import scene_geometry as faces
 from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
+from flight_cases import scenario
+from joint_cases import SyntheticFlight, navigation, parameters
 from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap
 from nmpc_kernels import build_rows
 from numpy.typing import NDArray
@@ -124,6 +131,30 @@ def test_every_instruction_set_draws_the_same_image(number: int, monkeypatch: py
     np.testing.assert_array_equal(drawn(), expected)
 
 
+@pytest.mark.parametrize("number", LEVELS)
+def test_every_instruction_set_estimates_the_same_bits(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three chasers, as the covariance then ends within a vector."""
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+
+    def estimated() -> list[Array]:
+        errors = navigation("lab")
+        flight = SyntheticFlight(scenario(), errors, 3, 1)
+        estimator = JointEstimator(parameters(scenario(), errors), 3)
+        for _ in range(8):
+            estimator.update(flight.inputs())
+            flight.step()
+        state = estimator.state
+        assert state is not None
+        return [state.position_m, state.q_wxyz, state.extra, state.covariance]
+
+    expected = estimated()
+    own = joint_native.function
+    monkeypatch.setattr(joint_kernels, "function", lambda name, result=None: own(name, result, number))
+    for ours, theirs in zip(estimated(), expected, strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 @pytest.mark.parametrize("corner", [np.nan, np.inf, -np.inf, 1e300, -1e9])
 def test_corners_that_lie_nowhere_are_not_good(corner: float) -> None:
     image = np.full((48, 64), 200, dtype=np.uint8)
@@ -212,15 +243,18 @@ def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached(
 
 
 def test_working_memory_is_enough() -> None:
-    """Nothing is written behind the memory that a tick asks for, with as many rows as there can be."""
-    n, d = 3, PARAMS.stages
-    doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(ctypes.c_int64(n), ctypes.c_int64(d))
+    """No kernel writes beyond its output, with the largest number of rows."""
+    n, d, params = 3, PARAMS.stages, replace(PARAMS, boxes=2)
+    sizes = (ctypes.c_int64(value) for value in (n, d, params.boxes))
+    doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(*sizes)
     guarded = np.full(doubles + 64, 7.0)
     rng = np.random.default_rng(1)
     states = np.array([at_rest(0.3 * rng.normal(size=3)) for _ in range(n)])
     corridors = np.tile([1.0, 0, 0, 0.5, 0.0], (n, d + 1, 1))
-    problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors})
-    solver = make_solver("rti", PARAMS, n)
+    boxes = np.tile(box_table((Box((0.2, 0.2, 0.2)), Box((0.1, 0.1, 0.1)))), (d + 1, 1, 1))
+    shapes = {"boxes": boxes, "box_clearance_m": np.full(n, 0.3)}
+    problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors, **shapes})
+    solver = make_solver("rti", params, n)
     solver._workspace = guarded  # pyright: ignore[reportAttributeAccessIssue]
     plan = solver.solve(problem, 0.0)
     assert plan.iterations.all()

@@ -18,7 +18,7 @@ from source_tree import ROOT
 needs_gcc = pytest.mark.skipif(not sanitizers.available(), reason=f"needs {sanitizers.NEEDED}")
 INPUTS = 1000
 # Sizes of working memory, which the targets of their kernels call.
-WORKSPACES = {"qp_workspace", "tick_workspace"}
+WORKSPACES = {"qp_workspace", "tick_workspace", "predict_workspace", "innovate_workspace"}
 
 
 @pytest.mark.parametrize("folder", NATIVE_FOLDERS)

@@ -26,7 +26,7 @@ PROCESSES = ("controller", "chaser/0", "chaser/1")
 
 
 @pytest.fixture(scope="module")
-def said() -> dict[str, list[tuple[int, RawSample]]]:
+def published() -> dict[str, list[tuple[int, RawSample]]]:
     """Return the messages of every process in the golden flight, with their ticks."""
     out: dict[str, list[tuple[int, RawSample]]] = {name: [] for name in PROCESSES}
     for record in read_log(LOG):
@@ -66,13 +66,13 @@ def keep(process: str, messages: list[tuple[int, RawSample]], recorded: Recorded
 
 @pytest.mark.parametrize("process", PROCESSES)
 def test_our_own_processes_conform_in_the_golden_flight(
-    process: str, said: dict[str, list[tuple[int, RawSample]]]
+    process: str, published: dict[str, list[tuple[int, RawSample]]]
 ) -> None:
     recorded = read_turns(LOG, process, 1000)
     assert len(recorded.turns) == 18
-    ledger = keep(process, said[process], recorded)
+    ledger = keep(process, published[process], recorded)
     assert [f.line() for f in ledger.findings.values()] == []
-    assert ledger.messages == len(said[process])
+    assert ledger.messages == len(published[process])
 
 
 def changed(raw: RawSample, **fields: Any) -> RawSample:
@@ -114,14 +114,14 @@ def test_violation_is_found(
     violation: Callable[[RawSample], list[RawSample]],
     where: str,
     what: str,
-    said: dict[str, list[tuple[int, RawSample]]],
+    published: dict[str, list[tuple[int, RawSample]]],
 ) -> None:
     recorded = read_turns(LOG, "controller", 1000)
     # At tick 5; always for presence and farewell, which have no tick.
     always = key in ("controller/presence", "controller/farewell")
     messages = [
         (tick, new)
-        for tick, raw in said["controller"]
+        for tick, raw in published["controller"]
         for new in (violation(raw) if raw.key == key and (always or tick == 5) else [raw])
     ]
     lines = [f.line() for f in keep("controller", messages, recorded).findings.values()]

@@ -68,7 +68,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_every_page_is_there_and_asks_nobody_else(site: Path) -> None:
+def test_every_page_exists_and_loads_nothing_from_elsewhere(site: Path) -> None:
     for page in PAGES:
         assert (site / page.with_suffix(".html").name).is_file()
     for page in site.rglob("*.html"):

@@ -129,9 +129,9 @@ def test_foreign_controller_flies_to_success(tmp_path: Path) -> None:
         hand.processes["foreign"] = subprocess.Popen(
             command, cwd=tmp_path, env={**os.environ, **SINGLE_THREADED}, stdout=words, stderr=words
         )
-        status, said = hand.said("world", timeout_s=300)
+        status, said = hand.output_of("world", timeout_s=300)
         assert status == 0, said
-        assert hand.said("recorder")[0] == 0
+        assert hand.output_of("recorder")[0] == 0
         assert hand.processes["foreign"].wait(timeout=30) == 0, (tmp_path / "foreign.txt").read_text()
     finally:
         hand.end()

@@ -238,7 +238,7 @@ def test_verdict_is_two_sided(ratio: float, text: str) -> None:
 
 
 @given(st.floats(1e-6, 1e6))
-def test_verdict_treats_smaller_and_larger_alike(ratio: float) -> None:
+def test_verdict_is_symmetric_in_smaller_and_larger(ratio: float) -> None:
     assert (verdict(ratio) == "met") == (verdict(1.0 / ratio) == "met") == (1 / 1.35 <= ratio <= 1.35)
 
 

@@ -47,10 +47,18 @@ def test_the_rigid_stack_keeps_its_momentum_and_moves_as_in_the_physics_engine()
     stack = RigidStack(scenario)
     with StackMission(scenario, no_sight, silent_from_s=0.0) as mission:
         start = stack.rates()
+        peaks = np.zeros((2, 2))
         for _ in range(45):
-            stack.step(stack.damping())
-            mission.step()
+            flown = stack.step(stack.damping())
+            loads = mission.step().loads.values()
+            force_N, torque_N_m = (
+                max(getattr(x, name) for x in loads) for name in ("peak_force_N", "peak_torque_N_m")
+            )
+            found = [[flown.peak_force_N, flown.peak_torque_N_m], [force_N, torque_N_m]]
+            peaks = np.maximum(peaks, found)
         body, _, motion = mission.truth(mission.states())
         speed, rate = motion.rates(body)
     assert stack.rates()[1] < 0.8 * start[1]
     np.testing.assert_allclose(stack.rates(), [speed, rate], rtol=0.05)
+    assert peaks[0, 0] > 2.0
+    np.testing.assert_allclose(peaks[0], peaks[1], rtol=0.1)

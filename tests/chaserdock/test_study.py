@@ -166,7 +166,7 @@ def test_study_with_images_flies_the_estimator(baseline: StudyResult) -> None:
 
 
 def test_delay_makes_long_horizons_fail_first() -> None:
-    """What the table's row T = 10 looks like: with a delay of half a second it diverges, T = 3 does not."""
+    """With a delay of half a second T = 10 diverges, T = 3 does not."""
 
     def worst(horizon_s: float, delay_s: float) -> float:
         s = scenario("paper-single", "duration_s=40.0", f"controller.horizon_s={horizon_s}")
@@ -178,7 +178,7 @@ def test_delay_makes_long_horizons_fail_first() -> None:
 
 
 @pytest.mark.parametrize(
-    ("changed", "said"),
+    ("changed", "message"),
     [
         ({"delay_s": -0.1}, "x: delay_s must be finite, not negative"),
         ({"delay_s": math.nan}, "x: delay_s must be finite, not negative"),
@@ -190,8 +190,8 @@ def test_delay_makes_long_horizons_fail_first() -> None:
         ({"overrides": ("duration_s=3.0",)}, r"x: duration_s \(3\) ends before settling_s \(20\)"),
     ],
 )
-def test_bad_cases_are_named(changed: dict[str, Any], said: str) -> None:
-    with pytest.raises(StudyError, match=said):
+def test_bad_cases_are_named(changed: dict[str, Any], message: str) -> None:
+    with pytest.raises(StudyError, match=message):
         fly_case(StudyCase(name="x", scenario=str(SCENARIOS / "paper-single.toml"), **changed))
 
 

@@ -460,7 +460,7 @@ def test_token_is_random_or_that_of_the_environment(monkeypatch: pytest.MonkeyPa
         page_token()
 
 
-def test_viewer_without_a_router_says_so_and_can_be_stopped() -> None:
+def test_viewer_without_a_router_reports_it_and_can_be_stopped() -> None:
     endpoint = f"tcp/127.0.0.1:{unused_port()}"
     process = chaserdock("view", "-m", "client", "-e", endpoint, stdout=PIPE, stderr=STDOUT, text=True)
     try:

@@ -128,7 +128,7 @@ def test_scene_moves_and_click_starts_docking(hand: ByHand, tmp_path: Path) -> N
         wait_for(page, r"abort chaser 0 .*(accepted|refused)")
         time.sleep(1.0)
         hand.processes["world"].send_signal(signal.SIGTERM)
-        hand.said("recorder", LONG_S)
+        hand.output_of("recorder", LONG_S)
         wait_for(page, "ended early")
     log = tmp_path / "mission.mcap"
     (asked,) = [
@@ -188,7 +188,7 @@ def fly(hand: ByHand, out: Path, mode: str, seconds: int, *, watched: bool) -> P
         start_flight(hand, out, mode, *SHORT, f"duration_s={seconds}.0")
         hand.start("controller", "controller")
     for name in ("world", "recorder"):
-        status, said = hand.said(name, LONG_S)
+        status, said = hand.output_of(name, LONG_S)
         assert status == 0 or mode == "realtime", said
     hand.end()
     hand.processes.clear()

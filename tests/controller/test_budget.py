@@ -36,7 +36,7 @@ def test_as_many_iterations_as_fit_by_what_they_took() -> None:
     assert budget.iterations() == 0
 
 
-def test_it_recovers_from_a_disturbed_solve() -> None:
+def test_solver_recovers_from_a_disturbed_solve() -> None:
     budget = SolveBudget(0.010)
     budget.note(1.0, 1)
     counts = []
@@ -54,7 +54,7 @@ def test_a_budget_of_nothing_is_refused(budget_s: float) -> None:
         SolveBudget(budget_s)
 
 
-def test_who_runs_out_says_so_and_keeps_the_box() -> None:
+def test_solve_out_of_iterations_reports_budget_and_keeps_input_limits() -> None:
     problem_at, states = swap(0.2, 0.4)
     problem = problem_at(states, 0.0)
     chosen = make_solver("rti", PARAMS, 2)
@@ -70,7 +70,7 @@ def test_who_runs_out_says_so_and_keeps_the_box() -> None:
     np.testing.assert_array_equal(short.inputs, make_solver("rti", PARAMS, 2, 4).solve(problem, 0.0).inputs)
 
 
-def test_who_needs_no_iteration_is_solved_within_any_budget() -> None:
+def test_problem_without_active_constraints_needs_no_iteration() -> None:
     problem_at, states = far_start(1)
     states[:, :3] = problem_at(states, 0.0).references[:, 0, :3]
     states[:, 6:10] = problem_at(states, 0.0).references[:, 0, 3:]

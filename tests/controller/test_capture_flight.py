@@ -19,7 +19,7 @@ from chaserdock.evaluation.perception import measurement_model
 from chaserdock.evaluation.transfers import load_shipped
 
 
-def test_it_docks_within_the_issues_bars_and_backs_out_again() -> None:
+def test_docking_meets_its_tolerances_and_backs_out_again() -> None:
     """A seed with fast rates, noise of 2 mm and 0.1 degrees: 5 mm, 1.5 degrees, 1.2 cm/s; momentum to 1e-4."""
     scenario = docking_scenario(1)
     flight = ConservationMission(scenario, measurement_model(scenario, 1, 0.002, math.radians(0.1)))
@@ -141,3 +141,25 @@ def test_a_docking_section_that_cannot_be_flown_is_refused(changes: dict, messag
     with pytest.raises(ScenarioError) as error:
         parse_scenario(values(**changes), "test")
     assert message in str(error.value)
+
+
+def test_probe_latches_on_the_adapter_ring_of_a_mesh() -> None:
+    """`markerless-capture` with measurements of 1 mm and 0.05 degrees in place of images, from the corridor's entry on."""
+    scenario = load_shipped(
+        "markerless-capture",
+        "docking.entry_m=0.12",
+        "limits.min_distance_target_m=0.5",
+        "timeline=[{at_s=0.5, command='approach', chasers=[0]}]",
+    )
+    chaser = scenario.chasers[0].model_copy(
+        update={"position_m": (-0.75, 0.0, -0.1253), "start_offset_m": (0.0, 0.0, 0.0)}
+    )
+    scenario = scenario.model_copy(update={"chasers": (chaser,)})
+    measured = measurement_model(scenario, 1, 0.001, math.radians(0.05))
+    with InProcessMission(scenario, measured) as flight:
+        while flight.phase(0) != "latched":
+            assert flight.time_s < 40.0, flight.events
+            flight.step()
+        touch = next(t for t in flight.touches if t.latched)
+    assert touch.lateral_m < 0.005
+    assert not flight.contacts

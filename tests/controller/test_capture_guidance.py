@@ -98,6 +98,22 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
     assert fastest == pytest.approx(docking.approach_speed_m_s, rel=1e-6)
 
 
+def test_contact_conditions_of_a_preset_limit_the_final_approach() -> None:
+    pilot = Pilot(docking={"final": {"preset": "idss", "lateral_m": 0.02}})
+    final = pilot.scenario.docking.final
+    assert (final.lateral_m, final.angle_deg, final.closing_m_s, final.rate_deg_s) == (0.02, 4.0, 0.10, 0.20)
+    pilot.ask("approach")
+    pilot.fly_to("final")
+    pilot.observed[0] = {"angle_rad": np.radians(3.9), "rate_rad_s": np.radians(0.19)}
+    pilot.fly(2 * DT_S)
+    assert pilot.phase() == "final"
+    drain(pilot.guidance)
+    pilot.observed[0] = {"rate_rad_s": np.radians(0.21)}
+    pilot.fly(2 * DT_S)
+    assert pilot.phase() == "retreat"
+    assert "left the corridor: rate 0.21 deg/s, at most 0.2" in drain(pilot.guidance)[0][2]
+
+
 @pytest.mark.parametrize(
     ("phase", "observed", "why"),
     [
@@ -273,7 +289,7 @@ def test_from_far_beside_the_axis_it_must_come_round_first() -> None:
     assert "beside the port's axis" in reason
 
 
-def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
+def test_two_dock_at_once_and_a_chaser_in_the_way_waits() -> None:
     pilot = Pilot(chasers=4)
     pilot.ask("approach", 0)
     pilot.ask("approach", 1)
@@ -290,7 +306,7 @@ def test_two_dock_at_once_and_who_is_in_the_way_waits() -> None:
     pilot.fly_to("align", 2, limit_s=120.0)
 
 
-def test_keep_out_is_the_corridors_for_who_is_in_it_alone() -> None:
+def test_corridor_replaces_the_keep_out_only_for_the_chaser_in_it() -> None:
     pilot = Pilot(chasers=2)
     limit = pilot.scenario.limits.min_distance_target_m
     assert pilot.guidance.min_distance_target_m(0) == limit

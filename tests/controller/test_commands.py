@@ -54,7 +54,7 @@ def ask(flight: InProcessMission, *wishes: dict[str, Any]) -> list[tuple[bool, s
         ({"command": "goto", "offset_m": (0.1, 0.0, 0.0)}, "the offset is 0.1 m from the target"),
     ],
 )
-def test_what_cannot_be_is_refused(flight: InProcessMission, wish: dict[str, Any], reason: str) -> None:
+def test_impossible_values_are_refused(flight: InProcessMission, wish: dict[str, Any], reason: str) -> None:
     ((accepted, why),) = ask(flight, wish)
     assert not accepted
     assert why.startswith(reason)

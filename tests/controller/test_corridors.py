@@ -72,7 +72,7 @@ def test_the_cone_is_as_wide_as_said_where_said() -> None:
 
 
 @pytest.mark.parametrize(("axis", "angle"), [([0, 2, 0], 0.3), ([0, 1, 0], 0.0), ([0, 1, 0], 1.6)])
-def test_what_is_no_cone_is_refused(axis: list[float], angle: float) -> None:
+def test_invalid_cones_are_refused(axis: list[float], angle: float) -> None:
     with pytest.raises(ValueError, match="must"):
         cone_about(axis, 0.4, 0.1, angle)
 
@@ -96,7 +96,7 @@ def approaching(**changes: Any) -> PhaseMachine:
     return guidance
 
 
-def test_who_approaches_has_its_corridor_and_the_others_keep_their_ball() -> None:
+def test_approaching_chaser_has_a_corridor_and_others_the_spherical_keep_out() -> None:
     guidance = approaching()
     assert guidance.corridor(0) is None  # nobody knows yet where it is
     for i, place in enumerate(([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0])):
@@ -107,7 +107,7 @@ def test_who_approaches_has_its_corridor_and_the_others_keep_their_ball() -> Non
     assert guidance.min_distance_target_m(1) == LIMIT_M
 
 
-def test_who_has_left_its_corridor_keeps_its_distance_like_everybody() -> None:
+def test_chaser_that_left_its_corridor_keeps_the_spherical_keep_out() -> None:
     guidance = approaching()
     for aside, inside in ((BESIDE_LINE_M, True), (0.35, False)):
         guidance.set_position(0, np.array([-0.4, aside, 0.0]))

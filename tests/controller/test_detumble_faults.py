@@ -4,16 +4,23 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.guidance.detumble.control import StackTask
+from chaserdock_controller.guidance.detumble.stack import StackMotion
+from chaserdock_controller.guidance.stage import GuidanceStage
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_controller.redundancy.checkpoint import Checkpoint, CheckpointError
 from chaserdock_models import rotations
 from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.scenario import flight_scenario
 
-from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario
+from chaserdock.evaluation.detumble_flights import StackMission, stack_scenario, with_load_limits
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import ControlledStack, fly_controlled, wrong_knowledge
+from chaserdock.evaluation.rigid_control import ControlledStack, FlightEvents, fly_controlled, wrong_knowledge
 
 
 def test_a_latch_that_opens_frees_its_chaser_which_backs_out_along_its_axis() -> None:
@@ -52,8 +59,68 @@ def test_a_stuck_thruster_is_found_on_the_stack_and_isolated(kind: str, expected
     assert flight.failed == f"chaser 0: thruster 2 {expected}, seen in the motion of the stack, isolated"
 
 
+class WatchedMission(StackMission):
+    """A mission that a second controller follows from ``follow`` on; ``outputs`` of both for every tick since."""
+
+    follower: ControllerCore | None = None
+    outputs: list[tuple[TickOutputs | None, TickOutputs]]
+
+    def follow(self) -> None:
+        """Let a standby join: it starts from the present state of the controller."""
+        state = Checkpoint(self.controller, self._validation).save()
+        self.follower, self.outputs = ControllerCore(flight_scenario(self.scenario), lambda: 0.0), []
+        Checkpoint(self.follower, self._validation).restore(state)
+
+    def _control(self, inputs: TickInputs) -> TickOutputs | None:
+        own = super()._control(inputs)
+        if self.follower is not None:
+            self.outputs.append((own, self.follower.step(inputs)))
+        return own
+
+
+def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same() -> None:
+    limits = "docking.ports.0.force_limit_N=3.0"
+    scenario = stack_scenario(1, (0, 3), [*wrong_knowledge(1, 0.1, False), "detumble.plan_s=6", limits])
+    with WatchedMission(scenario, RenderedImages(scenario)) as mission:
+        while mission.time_s < 1.5:
+            mission.step()
+        mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(2)))
+        while mission.time_s < 3.3:
+            mission.step()
+        mission.follow()
+        while mission.time_s < 5.0:
+            mission.step()
+        assert mission.phase(0) == "detumble"
+        fired = 0.0
+        for own, other in mission.outputs:
+            assert own is not None
+            assert {i: w.thrusts_N for i, w in own.wrenches.items()} == {
+                i: w.thrusts_N for i, w in other.wrenches.items()
+            }
+            assert own.stack == other.stack
+            fired += sum(sum(w.thrusts_N) for w in own.wrenches.values())
+        assert fired > 0.0
+        state = Checkpoint(mission.controller, mission._validation).save()
+    other = ControllerCore(flight_scenario(stack_scenario(1, (0, 3))), lambda: 0.0)
+    with pytest.raises(CheckpointError, match="of another mission"):
+        Checkpoint(other, mission._validation).restore(state)
+
+
+def test_a_thruster_that_an_operator_restores_fires_again() -> None:
+    flight = flight_scenario(stack_scenario(1, (0, 3), wrong_knowledge(1)))
+    stage = GuidanceStage(flight)
+    state = ControlledStack(stack_scenario(1, (0, 3), wrong_knowledge(1))).state()
+    failed = replace(state, failed={0: (2, 3), 1: (7,)})
+    stage.thrusters.command(OperatorCommand(command="restore", chaser=0, thruster=3), 0.0)
+    found = stage.with_trusted(failed)
+    assert found is not None
+    assert found.failed == {0: (2,), 1: (7,)}
+
+
 def test_the_others_stop_the_stack_when_a_chaser_dies() -> None:
-    flight = fly_controlled(stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)), 15.0, loss=(1.0, 1))
+    flight = fly_controlled(
+        stack_scenario(2, (0, 1, 2, 3), wrong_knowledge(2)), 15.0, events=FlightEvents(loss=(1.0, 1))
+    )
     assert flight.time_s is not None
     assert flight.failed == ""
 
@@ -75,6 +142,31 @@ def test_a_stopped_stack_turns_to_its_commanded_attitude_and_keeps_it() -> None:
     assert math.degrees(float(rotations.angle_between(stack.stack.q_wxyz, wanted))) < 0.8
     assert math.degrees(stack.stack.rates()[1]) < 0.1
     assert stack.stack.rates()[0] < 0.001
+
+
+def test_no_port_exceeds_its_limits_in_any_physics_step() -> None:
+    """Pulses of one carrier period do not last into the next one, in which others fire; with pulse scatter."""
+    scenario = with_load_limits(stack_scenario(0, (0, 1, 2, 3), wrong_knowledge(0)), 2.5, 0.9)
+    stack = ControlledStack(scenario)
+    before, peaks = np.linalg.norm(stack.state().motion.momentum), np.zeros(2)
+    for k in range(60):
+        observation, estimation = stack.estimate()
+        flown = stack.step(StackTask.STOP if k > 2 else None, observation, estimation)
+        peaks = np.maximum(peaks, [flown.peak_force_N, flown.peak_torque_N_m])
+    assert (peaks < [2.5, 0.9]).all()
+    assert (peaks > [1.5, 0.6]).all()
+    assert np.linalg.norm(stack.state().motion.momentum) < 0.75 * before
+
+
+def test_a_stack_at_rest_is_stopped_again_before_it_exceeds_the_limits() -> None:
+    """Where disturbances act, the estimate is late and the thrusters take time."""
+    stack = ControlledStack(stack_scenario(1, (0, 3)))
+    state, limit_rad_s = stack.state(), math.radians(0.05)
+    for share, moves in ((0.4, False), (0.7, True)):
+        angular = state.body.inertia_kg_m2 @ (share * limit_rad_s * np.array([0.6, 0.0, 0.8]))
+        at = replace(state, motion=StackMotion(np.zeros(3), angular))
+        assert stack.control.moves_again(at) == moves
+        assert stack.control.is_stopped(at) != moves
 
 
 def hold(stack: ControlledStack, seconds: float) -> None:

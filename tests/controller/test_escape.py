@@ -174,7 +174,7 @@ def test_unsafe_chaser_aborts_onto_a_safe_coast_and_takes_commands_from_there() 
     np.testing.assert_allclose(machine.chasers[0].move.at(np.array([3.0]))[0][0], [0.5, -30.0, 0.0])
 
 
-def test_unsafe_chaser_in_the_final_corridor_goes_on() -> None:
+def test_unsafe_chaser_in_the_final_corridor_continues() -> None:
     limits = {
         "passive_safety": "enforce",
         "min_distance_target_m": KEEP_OUT_M,

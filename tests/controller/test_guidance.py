@@ -66,7 +66,7 @@ def test_nothing_is_accepted_before_the_target_is_found() -> None:
     assert guidance.chasers[0].since_s == 2.0
 
 
-def test_who_holds_stays_at_its_nominal_offset() -> None:
+def test_holding_chaser_stays_at_its_nominal_offset() -> None:
     guidance = holding()
     for i, nominal in enumerate(([-1.0, 0.0, 0.0], [0.0, -1.2, 0.0])):
         np.testing.assert_array_equal(reference(guidance, i, 50.0), nominal)
@@ -74,7 +74,7 @@ def test_who_holds_stays_at_its_nominal_offset() -> None:
 
 
 @pytest.mark.parametrize("chaser", [2, 200])
-def test_commands_for_nobody_are_refused(chaser: int) -> None:
+def test_commands_for_unknown_chasers_are_refused(chaser: int) -> None:
     answer = holding().command(operator("approach", chaser), 1.0)
     assert not answer.accepted
     assert answer.reason == f"there is no chaser {chaser}; this mission has 0 to 1"
@@ -232,7 +232,7 @@ def test_an_approach_does_not_go_through_the_target() -> None:
     assert not guidance.command(operator("approach"), end).accepted
 
 
-def test_losing_the_target_stops_whoever_moves() -> None:
+def test_losing_the_target_stops_moving_chasers() -> None:
     guidance = holding()
     guidance.command(operator("approach", 0), 10.0)
     guidance.target_lost(30.0)
@@ -269,7 +269,7 @@ COMMANDS = st.one_of(
 
 @given(st.lists(st.tuples(COMMANDS, st.floats(0.1, 40.0)), max_size=8))
 @quick
-def test_whatever_is_asked_the_reference_is_smooth_and_slow(
+def test_reference_is_smooth_and_slow_for_any_commands(
     asked: list[tuple[tuple[Any, Any], float]],
 ) -> None:
     guidance, now = holding(), 1.0
@@ -336,7 +336,7 @@ def blind_phases(seen: Callable[[float], bool], command: str = "") -> list[tuple
     return out
 
 
-def test_an_approach_holds_while_nobody_sees_and_then_goes_on() -> None:
+def test_approach_holds_while_the_target_is_out_of_sight_and_continues() -> None:
     events = blind_phases(lambda s: not 5.0 < s < 15.0)
     assert [(what, why.partition(": ")[2]) for _, what, why in events] == [
         ("hold", ""),
@@ -352,7 +352,7 @@ def test_a_moment_without_sight_changes_nothing() -> None:
     assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 7.9)] == ["hold", "approach"]
 
 
-def test_who_was_told_otherwise_does_not_approach_again_by_itself() -> None:
+def test_commanded_chaser_does_not_resume_its_approach() -> None:
     assert [what for _, what, _ in blind_phases(lambda s: not 5.0 < s < 15.0, "hold")] == [
         "hold",
         "approach",

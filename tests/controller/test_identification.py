@@ -17,7 +17,7 @@ from chaserdock_controller.estimation.identification.composite import (
     prior_of,
     properties_of,
 )
-from chaserdock_controller.estimation.identification.faults import StackFaultDetector, apply_fault
+from chaserdock_controller.estimation.identification.fault_recovery import FaultTolerantIdentification
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -119,7 +119,7 @@ def test_the_transition_is_the_derivative_of_the_prediction(seed: int) -> None:
         residuals = []
         for sign in (1.0, -1.0):
             moved = Stack(seed).filter()
-            moved.correct(sign * shift, 0.0)
+            moved._estimate = moved._corrected(moved._estimate, sign * shift)
             moved.predict(pulses, STEP_S)
             innovation = moved.update(states)
             assert innovation is not None
@@ -138,30 +138,36 @@ def reference_innovation(seed: int, pulses: dict[int, Array], states: dict[int, 
     return innovation.matrix
 
 
-def run(stack: Stack, target: TargetBody, seconds: float, dead: tuple[int, int] | None = None):
-    """Identify a stack from pulses; ``dead``: chaser and thruster that never fires. Return filter, mean NIS and faults."""
-    found, nis, faults = stack.filter(target), [], []
-    detector = StackFaultDetector(found.usable, len(found.covariance), np.full(len(found.usable), 1.5))
+def run(
+    stack: Stack,
+    target: TargetBody,
+    seconds: float,
+    failure: tuple[int, int, str] | None = None,
+    at_s: float = 0.0,
+):
+    """Identify a stack from pulses; ``failure``: chaser, thruster and kind, from ``at_s`` on until it is found. Return filter, mean
+    NIS and what was found with its time."""
+    found, nis, faults = FaultTolerantIdentification(stack.filter(target), np.full(12, 1.5)), [], []
+    suspects = np.ones(len(found.filter.usable), dtype=bool)
     pulses: dict[int, Array] = {}
     for k in range(round(seconds / STEP_S)):
         if k:
-            detector.predict(found.predict(pulses, STEP_S))
-        innovation = found.update(stack.states())
-        assert innovation is not None
-        nis.append(found.nis)
-        fault = detector.update(innovation, np.ones(len(found.usable), dtype=bool))
+            found.predict(pulses, STEP_S)
+        fault = found.update(stack.states(), suspects)
+        nis.append(found.filter.nis)
         if fault is not None:
-            faults.append((k * STEP_S, fault[0]))
-            apply_fault(found, fault[1])
+            faults.append((k * STEP_S, fault))
+            suspects[found.filter.usable.index((fault.chaser, fault.thruster))] = False
         if k % 5 == 0:
             pulses = stack.pulses(0.1)
+            for _, fault in faults:
+                pulses[fault.chaser][fault.thruster] = 0.0
         given = {i: j.copy() for i, j in pulses.items()}
-        if dead is not None:
-            given[dead[0]][dead[1]] = 0.0
-            if faults:
-                pulses[dead[0]][dead[1]] = 0.0
+        if failure is not None and k * STEP_S >= at_s:
+            chaser, thruster, kind = failure
+            given[chaser][thruster] = 1.5 * STEP_S if kind == "stuck_on" and not faults else 0.0
         stack.step(given)
-    return found, float(np.mean(nis)), faults
+    return found.filter, float(np.mean(nis)), faults
 
 
 def wrong_target() -> TargetBody:
@@ -183,14 +189,22 @@ def test_wrong_knowledge_becomes_right_with_consistent_covariance(seed: int) -> 
     assert np.abs(off[4:]).max() < 0.08 * 25.0
 
 
-def test_a_dead_thruster_is_named_and_the_mass_stays_known() -> None:
-    """The centre of mass may be centimetres off afterwards (docs/detumble.md)."""
-    stack = Stack(3)
-    dead = (3, int(np.flatnonzero(FREE)[2]))
-    found, _, faults = run(stack, wrong_target(), 12.0, dead)
-    assert [(f.chaser, f.thruster, f.kind) for _, f in faults] == [(*dead, "stuck_off")]
+@pytest.mark.parametrize(
+    ("seed", "kind", "at_s"), [(3, "stuck_off", 0.0), (4, "stuck_off", 5.0), (3, "stuck_on", 5.0)]
+)
+def test_after_a_failure_the_mass_properties_are_as_well_known_as_without(
+    seed: int, kind: str, at_s: float
+) -> None:
+    stack = Stack(seed)
+    thruster = int(np.flatnonzero(FREE)[2])
+    found, _, faults = run(stack, wrong_target(), 12.0, (3, thruster, kind), at_s)
+    assert [(f.chaser, f.thruster, f.kind) for _, f in faults] == [(3, thruster, kind)]
     error = found.stack.values - properties_of(stack.body)
-    assert abs(error[0]) < 0.1 * stack.body.mass_kg
+    assert error @ np.linalg.solve(found.stack.covariance, error) / 10.0 < 2.5
+    off = found.target(BODY).values - properties_of(target_alone())
+    assert abs(off[0]) < 0.05 * 150.0
+    assert np.linalg.norm(off[1:4]) < 0.01
+    assert np.abs(off[4:]).max() < 0.1 * 25.0
 
 
 def test_pulses_that_are_thought_to_tell_nothing_gain_nothing() -> None:

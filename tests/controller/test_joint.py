@@ -12,8 +12,8 @@ import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.estimator import JointInputs, relative_pose
 from chaserdock_controller.estimation.joint.measurements import (
-    linearize_odometry,
-    linearize_sighting,
+    linearize,
+    measurement,
     mounting_of,
     predict_sighting,
 )
@@ -30,9 +30,11 @@ from chaserdock_controller.estimation.joint.state import (
     empty_state,
     inject,
 )
+from chaserdock_controller.estimation.joint.update import update
 from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE
 from chaserdock_controller.estimation.types import Shock
 from chaserdock_models import rotations
+from chaserdock_models import scalar_rotations as so3
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from flight_cases import scenario
@@ -97,18 +99,20 @@ def test_jacobians_agree_with_finite_differences(seed: int) -> None:
         0.0  # attitude drift: the residual is linear at zero
     )
     state = replace(state, extra=extra)
-    for z, at in (
-        (
-            linearize_sighting(state, 1, sighting, 1, mounting, p),
-            lambda s: linearize_sighting(s, 1, sighting, 1, mounting, p),
-        ),
-        (linearize_odometry(state, 1, odometry, p), lambda s: linearize_odometry(s, 1, odometry, p)),
+    for measured in (
+        measurement(2, 1, None, sighting, 1, mounting, p),
+        measurement(2, 1, odometry, None, 0, mounting, p),
+        measurement(2, 1, odometry, sighting, 1, mounting, p),
     ):
+        z = linearize(state, measured)
         numeric = np.empty((len(z.residual), TARGET + 2 * CHASER))
         for k in range(numeric.shape[1]):
             e = np.zeros(numeric.shape[1])
             e[k] = STEP
-            numeric[:, k] = (at(inject(state, -e)).residual - at(inject(state, e)).residual) / (2 * STEP)
+            numeric[:, k] = (
+                linearize(inject(state, -e), measured).residual
+                - linearize(inject(state, e), measured).residual
+            ) / (2 * STEP)
         np.testing.assert_allclose(z.by_target, numeric[:, :TARGET], atol=2e-5)
         np.testing.assert_allclose(z.by_chaser, numeric[:, block(1)], atol=2e-5)
         assert not numeric[:, block(0)].any()
@@ -132,6 +136,35 @@ def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None
             predict(replace(state, covariance=unit), round(PERIOD_S * 1e9), impulses, p).covariance - noise
         )
         np.testing.assert_allclose(grown, np.outer(column, column), atol=1e-3)
+
+
+@pytest.mark.parametrize("chasers", [1, 2])
+def test_update_is_that_of_a_kalman_filter(chasers: int) -> None:
+    """Mean and covariance by the textbook's formulas, with the dense Jacobian of all measurements of a chaser."""
+    p = parameters(SCENARIO, navigation("orbit"))
+    rng = np.random.default_rng(chasers)
+    size = TARGET + chasers * CHASER
+    spread = 0.01 * rng.normal(size=(size, size))
+    state = replace(random_state(4, chasers), covariance=spread @ spread.T, updates=p.iterated_updates)
+    flight, last = SyntheticFlight(SCENARIO, p.navigation, chasers, 5), chasers - 1
+    odometry, sighting = flight.inputs().odometry[last], flight.inputs().sightings[last]
+    mounting, wide = mounting_of(p.camera), replace(p, gate_sighting=np.inf, gate_odometry=np.inf)
+    after, report = update(state, {last: odometry}, {last: sighting}, mounting, wide)
+    assert report.accepted == (last,)
+
+    markers, solution = len(sighting.marker_ids), sighting.solutions[0]
+    z = linearize(state, measurement(chasers, last, odometry, solution, markers, mounting, p))
+    h = np.zeros((18, size))
+    h[:, :TARGET], h[:, block(last)] = z.by_target, z.by_chaser
+    gain = np.linalg.solve(h @ state.covariance @ h.T + z.noise, h @ state.covariance).T
+    error, reset = gain @ z.residual, np.eye(size)
+    for part in (slice(6, 9), slice(block(last).start + 6, block(last).start + 9)):
+        reset[part, part] = so3.right_jacobian(error[part])
+    kept = np.eye(size) - gain @ h
+    expected = reset @ (kept @ state.covariance @ kept.T + gain @ z.noise @ gain.T) @ reset.T
+    np.testing.assert_allclose(difference(state, after), error, atol=1e-9)
+    np.testing.assert_allclose(after.covariance, expected, atol=1e-9)
+    np.testing.assert_array_equal(after.covariance, after.covariance.T)
 
 
 def test_gates_are_quantiles_of_chi_square() -> None:

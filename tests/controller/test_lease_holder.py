@@ -55,7 +55,7 @@ def standby(*leases: Lease) -> LeaseHolder:
         ([lease(1, 5), lease(2, 5)], 6, {"since": {"controller": 6, "standby": 5, "chaser/2": 5}}, True),
     ],
 )
-def test_who_commands_a_tick(
+def test_commander_of_a_tick(
     leases: list[Lease], number: int, changes: dict[str, Any], claimed: bool
 ) -> None:
     holder = standby(*leases)
@@ -116,7 +116,7 @@ def test_lockstep_decides_with_all_leases_and_real_time_as_they_come() -> None:
         assert role.leads
 
 
-def test_real_time_commander_goes_on_until_it_processes_a_tick_without_leases() -> None:
+def test_real_time_commander_continues_until_a_tick_without_leases() -> None:
     role = HotStandby("standby", realtime=True)
     role.join("s")
     role.update(tick(3))

@@ -64,123 +64,134 @@ def ticks() -> dict[int, list[ReceivedMessage]]:
                 for i in message.chasers:
                     out.setdefault(message.tick, []).append(granted(message, i, "controller", 1))
             out.setdefault(message.tick, []).append(ReceivedMessage(r.topic, r.place, message, 0))
-    last = max(tick for tick, came in out.items() if any(r.topic is topics.TICK for r in came))
-    return {tick: came for tick, came in sorted(out.items()) if tick <= last}
+    last = max(tick for tick, messages in out.items() if any(r.topic is topics.TICK for r in messages))
+    return {tick: messages for tick, messages in sorted(out.items()) if tick <= last}
 
 
 def member(scenario: Scenario, name: str, instance: str) -> ControllerProcess:
-    made = ControllerProcess(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
-    made.heartbeat = cast(Any, SilentHeartbeat())
-    made.standby.join(instance)
-    return made
+    process = ControllerProcess(cast(Node, ReplayNode(name)), scenario, ControllerCore(scenario, lambda: 0.0))
+    process.heartbeat = cast(Any, SilentHeartbeat())
+    process.standby.join(instance)
+    return process
 
 
-def hear(process: ControllerProcess, *messages: ReceivedMessage) -> list[tuple[Any, Any]]:
-    """Hands a controller messages; what it says to them, without what is measured by the wall clock."""
-    tape = cast(ReplayNode, process.node)
+def deliver(process: ControllerProcess, *messages: ReceivedMessage) -> list[tuple[Any, Any]]:
+    """Deliver messages to a controller; return what it publishes, without wall times."""
+    node = cast(ReplayNode, process.node)
     for message in messages:
-        tape.put(message)
+        node.put(message)
     before = None
-    while tape._pending or before != (process.done_tick, len(process.standby._held), process.standby.leads):
+    while node._pending or before != (process.done_tick, len(process.standby._held), process.standby.leads):
         before = process.done_tick, len(process.standby._held), process.standby.leads
         process.listen()
-    return [(t, m) for t, _, m in tape.take_published()]
+    return [(t, m) for t, _, m in node.take_published()]
 
 
-def words(said: list[tuple[Any, Any]]) -> list[ReceivedMessage]:
-    return [ReceivedMessage(t, None, m, 0) for t, m in said if t is topics.STATE]
+def state_messages(published: list[tuple[Any, Any]]) -> list[ReceivedMessage]:
+    return [ReceivedMessage(t, None, m, 0) for t, m in published if t is topics.STATE]
 
 
-def flown(said: list[tuple[Any, Any]]) -> list[Any]:
-    """What is commanded and estimated, but for who says it."""
+def outputs(published: list[tuple[Any, Any]]) -> list[Any]:
+    """Return the commands and estimates without their commander."""
     out = []
-    for topic, message in said:
+    for topic, message in published:
         if topic in (topics.WRENCH, topics.TARGET, topics.PLAN, topics.REFERENCE):
             fields = without_wall_time(message)
             out.append({k: v for k, v in fields.items() if k not in ("term", "commander")})
     return out
 
 
-def named(came: list[ReceivedMessage], holder: str, term: int, revision: int = 1) -> list[ReceivedMessage]:
-    """A tick again, and that all chasers have granted their leases to the only controller that is left."""
-    tick = next(r.message for r in came if r.topic is topics.TICK)
+def reassigned(
+    messages: list[ReceivedMessage], holder: str, term: int, revision: int = 1
+) -> list[ReceivedMessage]:
+    """Return a repeated tick, for which all chasers have granted their leases to the remaining controller."""
+    tick = next(r.message for r in messages if r.topic is topics.TICK)
     tick = msgspec.structs.replace(tick, revision=revision, controllers={holder: BOTH[holder]})
     again = ReceivedMessage(topics.TICK, None, tick, 0)
     return [again, *(granted(tick, i, holder, term) for i in tick.chasers)]
 
 
-def under(came: list[ReceivedMessage], holder: str, term: int) -> list[ReceivedMessage]:
-    """The messages of a tick in which another controller commands."""
-    return [*named(came, holder, term, 0), *(r for r in came if r.topic not in (topics.TICK, topics.LEASE))]
+def commanded_by(messages: list[ReceivedMessage], holder: str, term: int) -> list[ReceivedMessage]:
+    """Return the messages of a tick in which another controller commands."""
+    return [
+        *reassigned(messages, holder, term, 0),
+        *(r for r in messages if r.topic not in (topics.TICK, topics.LEASE)),
+    ]
 
 
-def test_a_standby_says_nothing_and_then_the_same(scenario: Scenario, ticks: Any) -> None:
-    """Handed over before a tick was worked out by anybody, and after the standby had worked it out already."""
-    for heard_the_word in (False, True):
+def test_standby_is_silent_and_then_publishes_the_same(scenario: Scenario, ticks: Any) -> None:
+    """Take over before a tick was processed, and after the standby had processed it."""
+    for received_state in (False, True):
         first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
-        said: list[tuple[Any, Any]] = []
+        published: list[tuple[Any, Any]] = []
         for tick in list(ticks)[:12]:
-            said = hear(first, *ticks[tick])
-            assert flown(said)
-            shadowed = hear(second, *ticks[tick], *(words(said) if tick < 11 or heard_the_word else []))
-            assert not flown(shadowed)
-        said_second = hear(second, *named(ticks[11], "standby", 2))
-        assert flown(said_second) == flown(said)
-        commands = [m for t, m in said_second if t is topics.WRENCH]
+            published = deliver(first, *ticks[tick])
+            assert outputs(published)
+            standby_output = deliver(
+                second, *ticks[tick], *(state_messages(published) if tick < 11 or received_state else [])
+            )
+            assert not outputs(standby_output)
+        published_second = deliver(second, *reassigned(ticks[11], "standby", 2))
+        assert outputs(published_second) == outputs(published)
+        commands = [m for t, m in published_second if t is topics.WRENCH]
         assert {(m.term, m.commander, m.instance) for m in commands} == {(2, "standby", "s")}
-        assert not flown(hear(first, *named(ticks[11], "standby", 2)))  # the other has understood
+        assert not outputs(deliver(first, *reassigned(ticks[11], "standby", 2)))
         for tick in list(ticks)[12:15]:
-            again = under(ticks[tick], "standby", 2)
-            assert not flown(hear(first, *again))
-            assert flown(hear(second, *again))
+            again = commanded_by(ticks[tick], "standby", 2)
+            assert not outputs(deliver(first, *again))
+            assert outputs(deliver(second, *again))
 
 
-def test_in_lockstep_a_standby_waits_for_the_word_and_takes_ticks_in_their_order(
+def test_in_lockstep_a_standby_waits_for_state_messages_and_keeps_the_order_of_ticks(
     scenario: Scenario, ticks: Any
 ) -> None:
     first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
-    said = {tick: hear(first, *ticks[tick]) for tick in range(6)}
-    for tick in range(6):  # everything before a single word of the commander's
-        hear(second, *ticks[tick])
+    published = {tick: deliver(first, *ticks[tick]) for tick in range(6)}
+    for tick in range(6):  # before any state message of the commander
+        deliver(second, *ticks[tick])
     assert second.done_tick == -1
     for tick in range(6):
-        hear(second, *[w for w in words(said[tick]) if not w.message.state])
+        deliver(second, *[w for w in state_messages(published[tick]) if not w.message.state])
         assert second.done_tick == tick
-    before, after = (flown(hear(c, *ticks[6], *named(ticks[6], c.name, 2))) for c in (first, second))
+    before, after = (
+        outputs(deliver(c, *ticks[6], *reassigned(ticks[6], c.name, 2))) for c in (first, second)
+    )
     assert before == after
 
 
-def test_who_comes_late_takes_the_state_over_and_goes_on_alike(scenario: Scenario, ticks: Any) -> None:
+def test_late_standby_restores_the_state_and_publishes_the_same(scenario: Scenario, ticks: Any) -> None:
     first, late = member(scenario, "controller", "c"), member(scenario, "standby", "s")
     state = None
     for tick in list(ticks)[:14]:
         if tick == 10:
-            first.standby._state_sent_to = {}  # it has heard of the other one just now
-        said = hear(first, *ticks[tick])
+            first.standby._state_sent_to = {}  # the standby has just joined
+        published = deliver(first, *ticks[tick])
         if tick >= 9:
-            hear(late, *ticks[tick], *words(said))
-        full = [w for w in words(said) if w.message.state]
+            deliver(late, *ticks[tick], *state_messages(published))
+        full = [w for w in state_messages(published) if w.message.state]
         state = full[-1] if full else state
     assert state is not None
     assert late.done_tick == 13
     tick = list(ticks)[14]
-    before = flown(hear(first, *ticks[tick]))
-    hear(late, *ticks[tick])
-    assert flown(hear(late, *named(ticks[tick], "standby", 2))) == before
+    before = outputs(deliver(first, *ticks[tick]))
+    deliver(late, *ticks[tick])
+    assert outputs(deliver(late, *reassigned(ticks[tick], "standby", 2))) == before
     for tick in list(ticks)[15:18]:
-        changed = under(ticks[tick], "standby", 2)
-        assert flown(hear(late, *changed)) == flown(hear(first, *ticks[tick]))
+        changed = commanded_by(ticks[tick], "standby", 2)
+        assert outputs(deliver(late, *changed)) == outputs(deliver(first, *ticks[tick]))
 
 
-def test_who_is_named_before_any_state_came_begins_anew_and_says_so(scenario: Scenario, ticks: Any) -> None:
+def test_standby_that_takes_over_without_state_reports_it_and_reinitializes(
+    scenario: Scenario, ticks: Any
+) -> None:
     late = member(scenario, "standby", "s")
-    assert not flown(hear(late, *ticks[9]))
-    said = hear(late, *named(ticks[9], "standby", 2))
-    assert any(t is topics.EVENT and m.what.startswith("takes over without any state") for t, m in said)
-    assert [m.tick for t, m in said if t is topics.WRENCH] == [9, 9]
+    assert not outputs(deliver(late, *ticks[9]))
+    published = deliver(late, *reassigned(ticks[9], "standby", 2))
+    assert any(t is topics.EVENT and m.what.startswith("takes over without any state") for t, m in published)
+    assert [m.tick for t, m in published if t is topics.WRENCH] == [9, 9]
 
 
-def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Scenario, ticks: Any) -> None:
+def test_standby_follows_the_operator_commands_of_the_commander(scenario: Scenario, ticks: Any) -> None:
     first, second = member(scenario, "controller", "c"), member(scenario, "standby", "s")
     answers: list[Any] = []
     for tick in list(ticks)[:14]:
@@ -188,8 +199,8 @@ def test_what_operators_asked_of_the_commander_the_standby_does_too(scenario: Sc
             first.operate(
                 OperatorCommand(command="goto", chaser=0, offset_m=(-1.2, 0.0, 0.0)), answers.append
             )
-        said = hear(first, *ticks[tick])
-        hear(second, *ticks[tick], *words(said))
+        published = deliver(first, *ticks[tick])
+        deliver(second, *ticks[tick], *state_messages(published))
     assert [a.accepted for a in answers] == [True]
     assert second.core.guidance.chasers[0].phase == first.core.guidance.chasers[0].phase == "goto"
 
@@ -206,7 +217,7 @@ def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(scenario: Sce
     one, saved = memory(scenario)
     other, restored = memory(scenario)
     for tick in list(ticks)[:20]:
-        hear(one, *ticks[tick])
+        deliver(one, *ticks[tick])
     state = saved.save()
     assert 1000 < len(state) < 200_000
     restored.restore(state)
@@ -222,7 +233,7 @@ def test_a_restored_checkpoint_is_bounded_and_equals_the_saved_one(scenario: Sce
 def test_an_invalid_checkpoint_is_refused_completely(scenario: Scenario, ticks: Any, spoil: str) -> None:
     one, saved = memory(scenario)
     for tick in list(ticks)[:5]:
-        hear(one, *ticks[tick])
+        deliver(one, *ticks[tick])
     state = saved.save()
     values = msgspec.msgpack.decode(state)
     array = values["composite"]["body"]["inertia_kg_m2"]
@@ -323,7 +334,7 @@ def test_missed_ticks_make_a_follower_ask_for_the_state() -> None:
         assert not standby.needs_state(4 + missed, 3 + missed)
 
 
-def test_words_are_of_one_tick_in_lockstep_and_of_all_in_real_time() -> None:
+def test_state_messages_cover_one_tick_in_lockstep_and_all_in_real_time() -> None:
     hold = OperatorCommand(command="hold", chaser=0)
     for realtime, expected in ((False, ()), (True, (hold,))):
         standby = HotStandby("standby", realtime=realtime)
@@ -332,7 +343,7 @@ def test_words_are_of_one_tick_in_lockstep_and_of_all_in_real_time() -> None:
         assert not standby.take_leader_commands(5)
 
 
-def test_a_word_is_a_message_like_any_other() -> None:
+def test_state_message_is_encoded_like_any_other() -> None:
     assert topics.may_read("controller", topics.STATE)
     assert not topics.may_read("chaser", topics.STATE)
     assert topics.STATE.kind is ControllerState

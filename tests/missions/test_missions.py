@@ -41,7 +41,7 @@ def test_digest_is_independent_of_start_order(short_flight: Path, tmp_path: Path
         time.sleep(1.0)
         by_hand.start("world", "world", TWO, *sets(*SHORT))
         for name in ("world", "chaser/0", "chaser/1", "controller", "recorder"):
-            status, output = by_hand.said(name)
+            status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
     finally:
         by_hand.end()
@@ -125,7 +125,7 @@ def test_interrupted_world_names_missing_processes(tmp_path: Path) -> None:
         world = by_hand.start("world", "world", TWO, *sets(*SHORT))
         time.sleep(3.0)
         world.send_signal(signal.SIGINT)
-        status, output = by_hand.said("world", timeout_s=20)
+        status, output = by_hand.output_of("world", timeout_s=20)
     finally:
         by_hand.end()
     assert status == 1

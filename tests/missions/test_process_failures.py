@@ -142,7 +142,7 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
         status, output = finished("command", "retreat", "9", *reach, timeout_s=60)
         assert (status, "there is no chaser 9" in output) == (1, True), output
         for name in ("world", "chaser/0", "chaser/1", "controller", "recorder"):
-            status, output = by_hand.said(name)
+            status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
     finally:
         by_hand.end()

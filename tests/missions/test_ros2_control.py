@@ -74,11 +74,11 @@ def test_node_of_ros_flies_a_chaser_to_a_point(tmp_path: Path) -> None:
             **where,
         )
         hand.start("world", "world", str(SCENARIO), "--mode", "realtime", *sets(*OVERRIDES))
-        status, said = hand.said("world", timeout_s=120)
+        status, said = hand.output_of("world", timeout_s=120)
         assert status == 0, said
-        assert hand.said("control")[0] == 0
-        assert hand.said("bridge")[0] == 0
-        assert hand.said("recorder")[0] == 0
+        assert hand.output_of("control")[0] == 0
+        assert hand.output_of("bridge")[0] == 0
+        assert hand.output_of("recorder")[0] == 0
     finally:
         ZenohSession.get_instance("127.0.0.1", ros_port).close()
         hand.end()

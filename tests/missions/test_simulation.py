@@ -76,7 +76,7 @@ _HARSH = (
 )
 
 
-def test_a_seed_repeats_every_byte_whatever_the_hash_seed(tmp_path: Path) -> None:
+def test_a_seed_repeats_every_byte_for_any_hash_seed(tmp_path: Path) -> None:
     contents = []
     for k in range(2):
         simulate_elsewhere(tmp_path / str(k), *BRIEF, *_HARSH, env={"PYTHONHASHSEED": str(k)})

@@ -142,7 +142,7 @@ def test_foreign_ticks_are_ignored_and_their_publisher_is_named(tmp_path: Path) 
                 session.put(topics.TICK.key_of(), codec.encode(tick), encoding=encoding_of(Tick))
             time.sleep(1.0)
         for name in ("world", "controller", "recorder", "chaser/0", "chaser/1"):
-            status, output = by_hand.said(name)
+            status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
             if name != "world":
                 assert f"foreign publisher: session {intruder} publishes on world/tick" in output

@@ -138,7 +138,7 @@ def test_restarted_controller_stands_by_and_takes_over_again(tmp_path: Path) -> 
         wait_for(log, lambda e: e.process == "controller" and e.what == "restored the leader's state")
         by_hand.processes["standby"].kill()
         for name in ("world", "controller", "recorder", *(f"chaser/{i}" for i in range(4))):
-            status, output = by_hand.said(name)
+            status, output = by_hand.output_of(name)
             assert status == 0, f"{name}: {output}"
     finally:
         by_hand.end()

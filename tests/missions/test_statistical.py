@@ -82,7 +82,7 @@ def both() -> tuple[Measured, Measured]:
     return measured
 
 
-def test_it_sees_the_target_where_images_show_it(both: tuple[Measured, Measured]) -> None:
+def test_statistical_perception_sees_the_target_where_images_show_it(both: tuple[Measured, Measured]) -> None:
     images, statistical = both
     assert np.mean(np.array(images.seen) == statistical.seen) > 0.96
     assert np.mean(statistical.markers) == pytest.approx(np.mean(images.markers), rel=0.15)

@@ -343,7 +343,7 @@ def test_normalize_keeps_the_direction(q: Array, scale: float) -> None:
         np.array([np.inf, np.nan, 0.0, 0.0]),
     ],
 )
-def test_what_is_no_quaternion_cannot_be_normalized(q: Array) -> None:
+def test_invalid_quaternion_cannot_be_normalized(q: Array) -> None:
     with pytest.raises(ValueError, match="cannot be normalized"):
         rotations.normalize(q)
 

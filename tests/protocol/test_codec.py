@@ -27,7 +27,7 @@ def named(sample: msgspec.Struct) -> str:
 
 
 def plain(message: msgspec.Struct) -> dict[str, Any]:
-    """What a reader that knows nothing of our types sees, as one who wants to write the same would send it."""
+    """Return the value as a reader without our types decodes it."""
     return msgpack.unpackb(codec.encode(message))
 
 
@@ -60,6 +60,8 @@ def test_there_is_a_sample_of_every_message() -> None:
     parts = {
         m.CameraCalibration,
         m.DrawnBody,
+        m.GeometryEstimate,
+        m.GeometryMeasurement,
         m.MassEstimate,
         m.PoseSolution,
         m.ProbeTouch,

@@ -56,7 +56,7 @@ def message(kind: type[msgspec.Struct], tick: int, chaser: int = 0) -> Any:
 def heard(
     on: FaultLayer, topic: Topic, kind: type[msgspec.Struct], ticks: range, chaser: int = 0
 ) -> list[Any]:
-    """What comes of a message a tick; a LostMessage as the negative tick."""
+    """Return the ticks of the messages that arrive, one sent a tick; a LostMessage as the negative tick."""
     out = []
     for tick in ticks:
         sent = message(kind, tick, chaser)
@@ -171,7 +171,7 @@ def test_cut_off_from_everybody() -> None:
     assert heard(layer("chaser/1", cut), topics.IMAGE, Image, range(10, 11), 1) == [10]
 
 
-def test_what_the_test_bed_needs_is_never_faulty() -> None:
+def test_messages_of_the_test_bed_are_never_faulty() -> None:
     on = layer("chaser/0", fault(kind="cut", process="chaser/0", duration_s=10.0))
     for topic, sample in ((topics.TICK, "Tick"), (topics.END, "MissionEnd")):
         sent = msgspec.structs.replace(next(s for k, s in BY_TYPE.items() if k.__name__ == sample), tick=12)

@@ -64,7 +64,7 @@ def test_noise_that_the_scenario_admits_is_no_jump() -> None:
     turn=st.floats(-0.4, 0.4),
 )
 @settings(derandomize=True, deadline=None, max_examples=50)
-def test_a_jump_is_taken_out_and_told_once_and_so_is_its_end(
+def test_jump_is_excluded_and_its_begin_and_end_are_reported_once(
     off: tuple[float, float, float], turn: float
 ) -> None:
     watch, events_at = OdometryValidation(SCENARIO), []
@@ -96,14 +96,14 @@ def test_agreement() -> None:
     assert events_at == [(40, "warning"), (70, "info")]
 
 
-def test_who_sees_nothing_does_not_disagree() -> None:
+def test_chaser_without_sightings_does_not_disagree() -> None:
     agreement = SensorConsistency()
     assert [agreement.update(t / 10, (), ()) for t in range(50)] == [[]] * 50
 
 
 @pytest.mark.parametrize("gap", [1, 2, 5])
 def test_the_limit_grows_with_the_time_between(gap: int) -> None:
-    """What full thrust can do in the time is no jump."""
+    """A displacement that full thrust can cause in the time is no jump."""
     body = SCENARIO.chaser
     dt = gap / SCENARIO.time.rate_hz
     watch = OdometryValidation(SCENARIO)

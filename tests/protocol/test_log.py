@@ -53,7 +53,7 @@ def written(path: Path, ticks: int = 20) -> list[tuple[str, m.Message, int]]:
 # -- round trip -------------------------------------------------------------------------------------------
 
 
-def test_what_is_written_is_read_in_order(tmp_path: Path) -> None:
+def test_messages_are_read_in_the_order_written(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     expected = written(path)
     records = list(read_log(path))
@@ -239,7 +239,7 @@ def test_every_topic_gets_its_schema(tmp_path: Path) -> None:
         assert summary.schemas[channel.schema_id].data == m.schema_of(keys[channel.topic].kind)
 
 
-def test_equal_messages_give_equal_messages_whatever_the_wall_clock(tmp_path: Path) -> None:
+def test_log_digest_does_not_depend_on_the_wall_clock(tmp_path: Path) -> None:
     a, b = tmp_path / "a.mcap", tmp_path / "b.mcap"
     written(a)
     written(b)
@@ -348,7 +348,7 @@ def test_files_that_are_no_log_are_one_clear_line(tmp_path: Path) -> None:
             count_messages(other)
 
 
-def test_a_log_without_scenario_says_so(tmp_path: Path) -> None:
+def test_log_without_scenario_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path)
     record(writer, topics.ACK, None, m.RecorderAck(tick=1), 1)

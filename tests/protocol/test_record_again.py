@@ -34,7 +34,7 @@ def start_recorder(folder: Path, port: int, namespace: str, *options: str) -> su
 
 
 def by_key(log: Path) -> dict[str, list[tuple[str, bytes]]]:
-    """Encodings and payloads of a log, key by key, in their order; without what its own recorder said."""
+    """Encodings and payloads of a log, key by key, in their order; without what its own recorder wrote."""
     out: dict[str, list[tuple[str, bytes]]] = defaultdict(list)
     for _, raw in stored_samples(log):
         out[raw.key].append((raw.encoding, raw.payload))
@@ -69,7 +69,7 @@ def test_played_and_recorded_again_is_the_same(tmp_path: Path, options: tuple[st
         assert read_scenario(path)[1]["run_id"] == read_scenario(GOLDEN)[1]["run_id"]
 
 
-def test_nobody_listens(tmp_path: Path) -> None:
+def test_play_without_a_recorder_is_refused(tmp_path: Path) -> None:
     arguments = ("--namespace", "nobody", "-l", "tcp/127.0.0.1:0", "--timeout", "0.5")
     status, said = finished("log", "play", str(GOLDEN), *arguments)
     assert (status, "Traceback" in said) == (2, False)

@@ -110,7 +110,7 @@ def test_a_key_with_a_place_needs_one_and_one_without_takes_none() -> None:
             topic.key_of(None if "{" in topic.key else 0)
 
 
-def test_nobody_who_flies_may_read_the_truth() -> None:
+def test_flight_roles_may_not_read_the_truth() -> None:
     truths = [t for t in TOPICS if t.key.startswith("truth")]
     assert {t.key for t in truths} == {
         "truth/body/{process}",
@@ -139,7 +139,7 @@ def test_everyone_writes_on_their_own_branch_only() -> None:
             assert [r for r in ROLES if topics.may_write(r, topic)] == [topic.writer]
 
 
-def test_the_log_may_hold_everything_and_nobody_reads_own_topics_back() -> None:
+def test_recorder_reads_every_topic_and_no_role_reads_its_own() -> None:
     for topic in TOPICS:
         assert topics.may_read("recorder", topic)
         if topic.writer != "any":

@@ -12,12 +12,16 @@ from docking_cases import world
 
 
 @pytest.fixture
-def worlds() -> Iterator[Any]:
-    """Return a function that opens worlds of ``docking_cases``; all are closed at the end of the test."""
+def worlds(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """Return a function that opens worlds of ``docking_cases``; all are closed at the end of the test.
+
+    They are PyBullet's, or those of the engine that an indirect parameter names (``engine_cases.both``).
+    """
     opened: list[Physics] = []
+    engine = getattr(request, "param", "pybullet")
 
     def make(**changes: Any) -> Physics:
-        opened.append(world(**changes))
+        opened.append(world(world={"engine": engine}, **changes))
         return opened[-1]
 
     yield make

@@ -12,7 +12,8 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import TARGET, Physics
-from docking_cases import CHASER_INERTIA, CHASER_KG, TARGET_INERTIA, TARGET_KG, scenario
+from docking_cases import CHASER_INERTIA, CHASER_KG, REACH_M, TARGET_INERTIA, TARGET_KG, scenario
+from engine_cases import both
 
 HZ = 960
 
@@ -44,6 +45,7 @@ def latch_of(physics: Physics) -> ProbeLatch:
     return physics.latches["chaser/0"]
 
 
+@both
 @pytest.mark.parametrize("omega", [(0.0, 0.0, 0.0), (0.015, 0.045, 0.03), (0.045, 0.135, 0.09)])
 def test_armed_latch_closes_holds_and_conserves_momentum(
     worlds: Any, omega: tuple[float, float, float]
@@ -71,6 +73,7 @@ def test_armed_latch_closes_holds_and_conserves_momentum(
     assert 0.004 < touch.closing_m_s < 0.012
 
 
+@both
 def test_latched_bodies_move_as_one_until_release(worlds: Any) -> None:
     physics = worlds(omega_rad_s=(0.0, 0.0, 0.0))
     physics.command_latch(0, "arm", 0)
@@ -89,6 +92,7 @@ def test_latched_bodies_move_as_one_until_release(worlds: Any) -> None:
     assert float((relative(physics)[0] - held[0])[0]) == pytest.approx(-0.056, abs=0.005)
 
 
+@both
 @pytest.mark.parametrize(
     ("changes", "reason"),
     [
@@ -111,6 +115,21 @@ def test_probe_outside_tolerances_bounces(worlds: Any, changes: dict[str, float]
     assert float(relative(physics)[0][0]) < before  # it moves away
 
 
+@both
+def test_a_touch_is_as_soft_as_the_documentation_states(worlds: Any) -> None:
+    """At 1 cm/s: 0.3 mm deep, and back at about a third of the speed (docs/docking.md)."""
+    physics = worlds(omega_rad_s=(0.0, 0.0, 0.0))
+    depth, speed = 0.0, 0.0
+    for _ in range(HZ // 2):
+        before = float(relative(physics)[0][0])
+        physics.advance(1, {})
+        tip = float(relative(physics)[0][0])
+        depth, speed = max(depth, tip + REACH_M + 0.2), (tip - before) * HZ
+    assert depth == pytest.approx(3e-4, abs=3e-5)
+    assert -speed == pytest.approx(0.0035, abs=0.0004)
+
+
+@both
 def test_unarmed_latch_does_not_close(worlds: Any) -> None:
     physics = worlds()
     physics.advance(HZ, {})
@@ -131,6 +150,7 @@ def test_latch_command_acts_at_its_effective_step(worlds: Any) -> None:
     assert not latch_of(physics).armed
 
 
+@both
 def test_body_contact_is_not_a_probe_touch(worlds: Any) -> None:
     """Sideways on: the chaser's flank meets the target."""
     physics = worlds()

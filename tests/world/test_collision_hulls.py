@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from chaserdock_models.meshes import Material, MeshPart, TriangleMesh
 from chaserdock_models.satellites import box, lathe, satellite
+from chaserdock_world.physics.bullet_engine import BulletEngine
 from chaserdock_world.physics.collision_hulls import MOST_PIECES, collision_hulls, connected_surfaces
 from chaserdock_world.physics.simulation import TARGET, Physics
 from scipy.spatial import ConvexHull
@@ -58,7 +59,8 @@ def test_rays_find_the_ring_and_pass_through_it() -> None:
             chasers=[{"position_m": [-3.0, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}],
         )
     )
-    state = physics.state(TARGET)
+    engine, state = physics._engine, physics.state(TARGET)
+    assert isinstance(engine, BulletEngine)
     ring = next(p for p in satellite("geo_servicer").parts if p.name == "adapter_ring").vertices_m
     low, high = ring.min(axis=0), ring.max(axis=0)
     _, y0, z0 = (low + high) / 2
@@ -67,7 +69,7 @@ def test_rays_find_the_ring_and_pass_through_it() -> None:
         for angle in np.linspace(0.0, 2.0 * np.pi, 12, endpoint=False):
             y, z = y0 + radius * np.cos(angle), z0 + radius * np.sin(angle)
             at = np.array([[-1.0, y, z], [1.0, y, z]]) + state.position_m
-            hit = pybullet.rayTest(*at.tolist(), physicsClientId=physics._client)[0]
+            hit = pybullet.rayTest(*at.tolist(), physicsClientId=engine._client)[0]
             assert hit[3][0] - state.position_m[0] == pytest.approx(
                 depth, abs=2e-3
             )  # Bullet's margin is 1 mm

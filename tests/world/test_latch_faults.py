@@ -13,6 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_world.physics.compliant_latch import ENGAGED_M
 from chaserdock_world.physics.simulation import TARGET, Physics
 from docking_cases import CHASER_KG, HZ, TARGET_KG, balance, latch, momenta
+from engine_cases import both
 
 PULL = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 TARGET_SHARE = TARGET_KG / (TARGET_KG + CHASER_KG)
@@ -46,6 +47,7 @@ def total(physics: Physics) -> tuple[Array, Array]:
 # -- strength ---------------------------------------------------------------------------------------------------
 
 
+@both
 @pytest.mark.parametrize("play_m", [0.0, 0.0001], ids=["rigid", "play"])
 @pytest.mark.parametrize(
     ("key", "unit", "limit", "axis", "share"),
@@ -104,6 +106,7 @@ def test_play_of_the_angle(worlds: Any) -> None:
     assert turn_deg(physics) - begin == pytest.approx(1.0, abs=0.1)
 
 
+@both
 @pytest.mark.parametrize("wrench", [np.zeros(6), np.array([0.3, 0.5, -0.2, 0.05, 0.1, 0.02])])
 def test_load_of_a_latch_with_play_is_what_the_chaser_lacks(worlds: Any, wrench: Array) -> None:
     physics = worlds(
@@ -166,6 +169,7 @@ def test_a_latch_that_slips_too_far_is_out_of_its_port(worlds: Any) -> None:
     assert text == f"slipped {ENGAGED_M * 1e3:.0f} mm, out of its port"
 
 
+@both
 def test_a_latch_slips_in_rotation(worlds: Any) -> None:
     physics = worlds(omega_rad_s=STILL, fault=[fault("latch_slip", 0.5, 20.0, torque_N_m=0.01)])
     latch(physics)
@@ -198,6 +202,7 @@ def test_a_stuck_latch_does_not_close(worlds: Any) -> None:
     assert [t.refused for t in physics.latches["chaser/0"].touches] == ["latch stuck"]
 
 
+@both
 def test_a_stuck_latch_opens_when_it_is_free_again(worlds: Any) -> None:
     physics = worlds(omega_rad_s=STILL, fault=[fault("latch_stuck", 1.0, 1.0)])
     latch(physics)

@@ -159,7 +159,7 @@ def again(members: Membership, name: str, *heard: str) -> None:
     assert announce(members, name, *heard, instance=f"{name}-2")
 
 
-def test_joining_chaser_disconnects_nobody_in_flight() -> None:
+def test_joining_chaser_disconnects_no_other() -> None:
     members, heard = flying(2)
     again(members, "chaser/1", "world", "controller")
     heard["chaser/1"] = "chaser/1-2"
@@ -170,7 +170,7 @@ def test_joining_chaser_disconnects_nobody_in_flight() -> None:
     assert members.connected(heard) == {"chaser/0", "chaser/1", "controller"}
 
 
-def test_joining_controller_disconnects_nobody_and_waits_for_all() -> None:
+def test_joining_controller_disconnects_no_other_and_waits_for_all() -> None:
     members, heard = flying(2)
     again(members, "controller", "world", "chaser/0")
     heard["controller"] = "controller-2"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The PyBullet simulation against analytical physics and the controller model: motion, forces, contacts."""
+"""The simulation against analytical physics and the controller model: motion, forces, contacts."""
 
 from __future__ import annotations
 
@@ -14,17 +14,19 @@ from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics, prescribed_state
+from engine_cases import both
 from world_cases import HZ, STEP_S, scenario
 
 HALF = np.sqrt(0.5)
 
 
 @pytest.fixture
-def worlds() -> Iterator[Any]:
+def worlds(request: pytest.FixtureRequest) -> Iterator[Any]:
     opened: list[Physics] = []
+    engine = getattr(request, "param", "pybullet")
 
     def make(**changes: Any) -> Physics:
-        opened.append(Physics(scenario(**changes)))
+        opened.append(Physics(scenario(world={"engine": engine}, **changes)))
         return opened[-1]
 
     yield make
@@ -101,6 +103,7 @@ def test_prescribed_target_is_exact_at_every_step(worlds: Any, steps: int) -> No
     np.testing.assert_array_equal(state13(prescribed_state(physics._scenario, t)), state13(s))
 
 
+@both
 def test_static_target_does_not_move(worlds: Any) -> None:
     physics = worlds(target={"motion": "static", "position_m": [0.5, 0.0, 0.0]})
     physics.advance(HZ, {})
@@ -108,6 +111,7 @@ def test_static_target_does_not_move(worlds: Any) -> None:
     np.testing.assert_array_equal(state13(s), [0.5, 0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0])
 
 
+@both
 def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
     chasers = [
         {
@@ -131,6 +135,7 @@ def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
 # -- forces -----------------------------------------------------------------------------------------------
 
 
+@both
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2), (0.4, -1.1, 2.0)])
 def test_force_accelerates_along_body_axes(worlds: Any, axis: int, turn: tuple[float, ...]) -> None:
@@ -142,13 +147,14 @@ def test_force_accelerates_along_body_axes(worlds: Any, axis: int, turn: tuple[f
     s = physics.state("chaser/0")
     a = 1.5 / 30.0 * rotations.to_matrix(q)[:, axis]
     np.testing.assert_allclose(s.velocity_m_s, a * 2.0, rtol=0, atol=1e-9)
-    # Bullet moves with the velocity at the step's end: half a step ahead.
+    # The engines move with the velocity at the step's end: half a step ahead.
     np.testing.assert_allclose(
         s.position_m, [-5.0, 0.0, 0.0] + a * 2.0 * (1.0 + STEP_S / 2), rtol=0, atol=1e-9
     )
     np.testing.assert_allclose(s.omega_rad_s, np.zeros(3), rtol=0, atol=1e-12)
 
 
+@both
 def test_force_rotates_with_the_body(worlds: Any) -> None:
     """A quarter turn later a push along body x is one along world y."""
     physics = worlds()
@@ -164,6 +170,7 @@ def test_force_rotates_with_the_body(worlds: Any) -> None:
     np.testing.assert_allclose(gained / np.linalg.norm(gained), [0.0, 1.0, 0.0], rtol=0, atol=1e-3)
 
 
+@both
 def test_wrench_does_not_persist(worlds: Any) -> None:
     physics = worlds()
     physics.advance(10, {"chaser/0": np.ones(6)})
@@ -174,6 +181,7 @@ def test_wrench_does_not_persist(worlds: Any) -> None:
     np.testing.assert_allclose(physics.state("chaser/0").velocity_m_s, s.velocity_m_s, rtol=0, atol=1e-15)
 
 
+@both
 @pytest.mark.parametrize("split", [1, 7, 128])
 def test_grouping_of_steps_does_not_change_the_result(worlds: Any, split: int) -> None:
     wrench = {"chaser/0": np.array([0.5, -0.2, 0.1, 0.01, -0.02, 0.005])}
@@ -230,6 +238,7 @@ def test_controller_model_matches_the_simulation(
 # -- contacts ---------------------------------------------------------------------------------------------
 
 
+@both
 def test_contact_is_reported_when_bodies_touch_and_not_before(worlds: Any) -> None:
     start = {"start_velocity_m_s": [0.5, 0.0, 0.0]}
     chaser = {"position_m": [-0.6, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]}
@@ -248,6 +257,7 @@ def test_contact_is_reported_when_bodies_touch_and_not_before(worlds: Any) -> No
     assert physics.advance(HZ, {}) == set()
 
 
+@both
 @pytest.mark.parametrize("speed_m_s", [0.01, 0.1, 1.0])
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.6, 0.6, 0.2)])
 def test_gentle_and_short_contacts_are_reported(
@@ -263,6 +273,7 @@ def test_gentle_and_short_contacts_are_reported(
     assert physics.state("chaser/0").velocity_m_s[0] < 0.5 * speed_m_s
 
 
+@both
 def test_contact_between_chasers_is_reported(worlds: Any) -> None:
     chasers = [
         {
@@ -281,6 +292,7 @@ def test_contact_between_chasers_is_reported(worlds: Any) -> None:
     assert touched == {("chaser/0", "chaser/1")}
 
 
+@both
 def test_moving_prescribed_target_contacts_a_chaser_in_its_way(worlds: Any) -> None:
     physics = worlds(
         target={"velocity_m_s": [-0.3, 0.0, 0.0], "omega_rad_s": [0.0, 0.0, 0.0]},

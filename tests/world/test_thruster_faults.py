@@ -97,7 +97,7 @@ def test_chaser_detects_a_commanded_thruster_fault_in_a_mission(tmp_path: Path) 
         status, said = finished("thruster-fault", "0", "44", "stuck_on", *reach)
         assert (status, "there is no thruster 44" in said) == (1, True), said
         for name in by_hand.processes:
-            status, said = by_hand.said(name)
+            status, said = by_hand.output_of(name)
             assert status == 0, f"{name}: {said}"
     finally:
         by_hand.end()

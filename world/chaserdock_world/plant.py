@@ -25,7 +25,7 @@ _LARGEST_SIGMA = 3.0
 
 @dataclass(frozen=True, eq=False)
 class PrincipalFrame:
-    """Principal axes at the centre of mass, in which Bullet integrates: ``q_wxyz`` (4,) principal to body axes, and the
+    """Principal axes at the centre of mass, in which an engine integrates: ``q_wxyz`` (4,) principal to body axes, and the
     centre of mass ``offset_m`` (3,) in body axes."""
 
     q_wxyz: Array

@@ -33,6 +33,7 @@ from chaserdock_world.lockstep.tick_barrier import TickBarrier
 from chaserdock_world.physics.simulation import Physics
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
+from chaserdock_world.requirements import require_packages
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import (
     drawn_truth,
@@ -65,11 +66,13 @@ def main(options: ProcessOptions) -> int:
 
 
 def load_world_scenario(options: ProcessOptions) -> Scenario:
-    """Return the scenario of the options, with overrides and seed; raises ScenarioError."""
+    """Return the scenario of the options, with overrides and seed; raises ScenarioError and MissingPackageError."""
     if options.scenario is None:
         raise ScenarioError("the world needs a scenario file")
     overrides = options.overrides if options.seed is None else (*options.overrides, f"seed={options.seed}")
-    return load_scenario(options.scenario, overrides)
+    scenario = load_scenario(options.scenario, overrides)
+    require_packages(scenario)
+    return scenario
 
 
 def refuse_second_world(node: Node) -> None:

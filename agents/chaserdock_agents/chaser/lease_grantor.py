@@ -47,7 +47,7 @@ class LeaseGrantor:
     def update(self, tick: Tick) -> Lease | None:
         """Take the next tick: keep the lease or grant the next one; return what to state, None if this chaser takes no part.
 
-        An older tick than the last would give the lease to whom that lists; see ``ChaserProcess``, which ignores it.
+        An older tick than the last would give the lease to a controller that it lists; see ``ChaserProcess``, which ignores it.
         """
         if self.chaser not in tick.chasers:
             return None
@@ -108,7 +108,7 @@ class LeaseGrantor:
     def refusal(self, command: WrenchCommand) -> str | None:
         """Return why a command must not be executed: its sender does not hold the lease. None if it does."""
         if not self.is_of_holder(command):
-            holder = self.holder or "nobody"
+            holder = self.holder or "no controller"
             return (
                 f"stale term: {command.commander} {command.instance} sent it, {holder} holds term {self.term}"
             )

@@ -46,7 +46,7 @@ from .fallback import FallbackState, LastCommand, clearance_m, fallback_wrench, 
 from .lease_grantor import LeaseGrantor
 from .local_damping import LocalDamping
 from .perception import make_perception
-from .sighting import look, prediction_from
+from .sighting import apply_geometry, look, prediction_from
 
 
 def main(options: ProcessOptions) -> int:
@@ -120,7 +120,7 @@ class ChaserProcess:
             else None
         )
         self._was_detumbling = self._is_damping = False
-        self._perception = make_perception(self.scenario)
+        self.perception = make_perception(self.scenario)
 
     def open(self, instance: str, realtime: bool, stall_s: float = DEFAULT_STALL_S) -> None:
         """Advertise and subscribe the topics, then start the heartbeat."""
@@ -273,7 +273,7 @@ class ChaserProcess:
             return
         self._processed_images.append(image.tick)
         started_s = self.node.host.now_s()
-        sighting = look(self._perception, image, prediction_from(self.sighting))
+        sighting = look(self.perception, image, prediction_from(self.sighting))
         elapsed_s = self.node.host.now_s() - started_s
         if sighting.status == "bad_image" and (self.sighting is None or self.sighting.status != "bad_image"):
             self._publish_warning("bad image", sighting.detail, image.tick, image.sim_time_ns)
@@ -373,6 +373,9 @@ class ChaserProcess:
         known = self._last.target
         self._remember(command)
         self._was_detumbling = command.mode == "detumble"
+        # Before the reply, so that the next image is seen with it in lock-step.
+        if (refused := apply_geometry(self.perception, command.geometry)) is not None:
+            self._publish_warning("geometry refused", refused, command.tick, command.sim_time_ns)
         if self._thrusters is not None:
             self._thrusters.avoid_plumes(known)
             self._thrusters.apply_command(command)

@@ -13,6 +13,7 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.transport import Node, ReceivedMessage
 
 from .process import ChaserProcess
+from .sighting import apply_geometry
 
 
 def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage]) -> Iterator[Published]:
@@ -23,6 +24,10 @@ def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage
     for received in recorded:
         number, seq = received.message.chaser, received.message.seq
         is_sighting = received.topic is topics.SIGHTING
+        if received.topic is topics.WRENCH:
+            if number in chasers:
+                apply_geometry(chasers[number][1].perception, received.message.geometry)
+            continue
         if number not in chasers or (is_sighting and seq < last_seq.get(number, -1)):
             node = ReplayNode(f"chaser/{number}")
             chaser = ChaserProcess(cast(Node, node), scenario, number)
@@ -37,4 +42,4 @@ def play_perception(scenario: FlightScenario, recorded: Iterable[ReceivedMessage
         yield from (published for published in node.take_published() if published[0] is topics.SIGHTING)
 
 
-PERCEPTION = Stage("chaser", (topics.IMAGE,), (topics.SIGHTING,), play_perception)
+PERCEPTION = Stage("chaser", (topics.IMAGE, topics.WRENCH), (topics.SIGHTING,), play_perception)

@@ -8,10 +8,10 @@ from typing import Any
 import cv2
 import numpy as np
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import Image, PoseSolution, Sighting
+from chaserdock_protocol.messages import GeometryEstimate, GeometryMeasurement, Image, PoseSolution, Sighting
 from numpy.typing import NDArray
 
-from .perception import PerceptionMethod
+from .perception import GeometryInformation, PerceptionMethod
 
 Prediction = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Predicted pose of the target: position (3,) in IRF and rotation (4,) TRF to IRF."""
@@ -91,7 +91,34 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         marker_ids=tuple(int(i) for i in seen.marker_ids),
         corners_px=vector(np.asarray(seen.corners_px, dtype=float)),
         rejected_ids=tuple(int(i) for i in seen.rejected_ids),
+        geometry=_geometry(seen.geometry),
     )
+
+
+def _geometry(told: GeometryInformation | None) -> GeometryMeasurement | None:
+    if told is None:
+        return None
+    return GeometryMeasurement(information=vector(told.matrix), vector=vector(told.vector))
+
+
+def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | None) -> str | None:
+    """Correct what a perception knows of the target's geometry, if it uses it; return why that was refused."""
+    correct = getattr(perception, "correct_geometry", None)
+    if estimate is None or correct is None:
+        return None
+    k, sigmas = len(estimate.names), np.array(estimate.sigmas)
+    if (
+        {len(estimate.values), len(sigmas)} != {k}
+        or len(estimate.covariance) != k * k
+        or not (sigmas > 0.0).all()
+    ):
+        return f"{k} names with {len(estimate.values)} values and {len(estimate.covariance)} covariances"
+    covariance = np.array(estimate.covariance).reshape(k, k) / np.outer(sigmas, sigmas)
+    try:
+        correct(np.array(estimate.values) / sigmas, covariance)
+    except ValueError as error:
+        return str(error)
+    return None
 
 
 def prediction_from(sighting: Sighting | None) -> Prediction | None:

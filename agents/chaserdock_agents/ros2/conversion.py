@@ -29,7 +29,7 @@ _ZERO, _IDENTITY = (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0)
 
 
 class InvalidImage(ValueError):
-    """An image whose bytes are not what its header says."""
+    """An image whose bytes are not as its header states."""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import msgspec
 import numpy as np
@@ -27,6 +28,7 @@ from .joint.prediction import disturbance
 from .joint.state import POSITION_DRIFT, JointState
 from .measurements import SightingConverter
 from .mekf import Mekf
+from .target_shape import ShapeEstimation, shape_parameters
 from .types import Estimator, TargetState
 
 _NO_DISTURBANCE = np.zeros(6)
@@ -45,17 +47,22 @@ class EstimationStage:
         self._mean_motion_rad_s = 0.0 if orbit is None else orbit.elements.mean_motion_rad_s
         self._camera = scenario.camera_model()
         self._converter = SightingConverter(self._camera)
+        parameters = shape_parameters(scenario)
+        self.shape = ShapeEstimation(parameters) if parameters else None
         enabled = scenario.detumble.identification.enabled
-        self._identification = StackIdentification(scenario) if enabled else None
+        self.identification = StackIdentification(scenario) if enabled else None
 
-    def run(self, observation: Observation) -> TargetEstimation:
-        """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the identification
-        of the stack, whose result the estimator takes from the next tick on."""
+    def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
+        """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the geometry by the
+        images of ``inspecting`` chasers, and the identification of the stack, whose result the estimator takes from the next tick
+        on."""
         estimation = self._estimate(observation)
-        if self._identification is None:
+        if self.shape is not None:
+            estimation = replace(estimation, shape=self.shape.update(observation, inspecting))
+        if self.identification is None:
             return estimation
-        estimation = self._identification.identified(observation, estimation)
-        refined = self._identification.refined_target(observation)
+        estimation = self.identification.identified(observation, estimation)
+        refined = self.identification.refined_target(observation)
         if refined is not None:
             self.composite.refine_target(refined)
         return estimation

@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
-from chaserdock_protocol.scenario.checks import angle_deg
+from chaserdock_protocol.scenario.checks import angle_deg, shape_distance_m
 from numpy.typing import ArrayLike
 
 from .approach_cone import BESIDE_LINE_M
@@ -52,13 +52,33 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     return ""
 
 
+def why_not_inspect(scenario: FlightScenario, offset_m: Array, at_rest: bool) -> str:
+    """Check that a chaser can fly around the target."""
+    if not at_rest:
+        return "the chaser moves; hold first"
+    distance_m, own_m = scenario.inspection.distance_m, float(np.linalg.norm(offset_m))
+    if reason := why_not_offset(scenario, (distance_m, 0.0, 0.0)):
+        return reason
+    if own_m > 2.0 * distance_m:
+        return f"the chaser is {own_m:.3g} m from the target; fly to less than twice inspection.distance_m ({distance_m:g} m) first"
+    return ""
+
+
 def why_not_offset(scenario: FlightScenario, offset_m: ArrayLike) -> str:
     """Check the distance of an offset (3,), TRF, from the target."""
     distance = float(np.linalg.norm(offset_m))
     nearest = scenario.limits.min_distance_target_m
     if not nearest < distance <= scenario.limits.max_reference_distance_m:
         return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
-    return ""
+    return why_not_off_shape(scenario, offset_m)
+
+
+def why_not_off_shape(scenario: FlightScenario, offset_m: ArrayLike) -> str:
+    """Check the distance of an offset (3,), TRF, from the cuboids of the target's shape."""
+    least_m = scenario.limits.min_distance_shape_m
+    if not least_m or (distance_m := shape_distance_m(scenario, offset_m)) >= least_m:
+        return ""
+    return f"the offset is {distance_m:.3g} m from the target's shape; allowed are at least {least_m:.3g} m"
 
 
 def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:

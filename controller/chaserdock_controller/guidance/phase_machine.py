@@ -43,7 +43,7 @@ from .phases import (
     trigger_of,
 )
 from .pointing import CALIBRATION_S, calibration_turns
-from .trajectories import Escape, Motion, glide, move_to, stay, stop
+from .trajectories import Circuit, Escape, Motion, circuit, glide, move_to, stay, stop
 
 _ABORT_SPEED_FACTOR = 2.0
 _GOTO_SPEED_FACTOR = 2.0
@@ -68,6 +68,7 @@ class PhaseMachine:
         self._changes: list[PhaseChange] = []
         self.chasers = [ChaserGuidance(Phase.ACQUIRE, 0.0, stay(c.position_m, 0.0)) for c in scenario.chasers]
         self._pending_goals: dict[int, Array] = {}
+        self._pending_inspections: set[int] = set()
         self._docks = [dock_of(scenario, i) for i in range(len(scenario.chasers))]
         self._cones = [cone_of(scenario, i) for i in range(len(scenario.chasers))]
         self._observed: dict[int, DockingObservation] = {}
@@ -234,6 +235,7 @@ class PhaseMachine:
 
     def set_pending_goals(self, commands: Sequence[OperatorCommand]) -> None:
         """Note the goals of one tick's commands together, so that two chasers can swap their places."""
+        self._pending_inspections = {c.chaser for c in commands if c.command == "inspect"}
         self._pending_goals = {
             c.chaser: np.asarray(c.offset_m)
             for c in commands
@@ -282,6 +284,9 @@ class PhaseMachine:
                 self._transition(i, trigger, now_s, stop(self._in_trf(i, now_s), now_s))
             case Trigger.COMMAND_CALIBRATE:
                 self._transition(i, trigger, now_s, c.move)
+            case Trigger.COMMAND_INSPECT:
+                self._transition(i, trigger, now_s, self._circuit(i, now_s))
+                self.chasers[i] = replace(self.chasers[i], faces=True)
             case Trigger.COMMAND_APPROACH if dock is None:
                 self._transition(
                     i, trigger, now_s, move_to(self._in_trf(i, now_s), self.dock_offset(i), now_s, speed)
@@ -307,6 +312,8 @@ class PhaseMachine:
             return failure.text()
         if command.command == "calibrate":
             return validation.why_not_calibrate(self._scenario, c.phase, c.move.over_at(now_s))
+        if command.command == "inspect" and c.phase is Phase.HOLD:
+            return self._why_not_inspect(i, now_s)
         if next_phase(c.phase, trigger_of(command.command), by_capture) is None:
             return f"in phase {c.phase} permitted: {', '.join(permitted_commands(c.phase, by_capture))}"
         if command.command == "detumble":
@@ -332,6 +339,35 @@ class PhaseMachine:
             reason = reason or validation.why_not_in_cone(self._scenario, i, np.asarray(command.offset_m))
             return reason or self._why_not_safe(i, np.asarray(command.offset_m), now_s)
         return ""
+
+    # -- inspection ------------------------------------------------------------------------------------------------
+
+    def inspecting(self) -> frozenset[int]:
+        """Return the chasers that fly around the target."""
+        return frozenset(i for i, c in enumerate(self.chasers) if c.phase is Phase.INSPECT)
+
+    def _circuit(self, i: int, now_s: float) -> Circuit:
+        section = self._scenario.inspection
+        start = self._in_trf(i, now_s).at(np.array([now_s]))[0][0]
+        return circuit(start, section.axis, section.distance_m, now_s, section.speed_m_s)
+
+    def _why_not_inspect(self, i: int, now_s: float) -> str:
+        """Return why a chaser may not fly around the target, or an empty string."""
+        c = self.chasers[i]
+        path = self._circuit(i, now_s)
+        if reason := validation.why_not_inspect(self._scenario, path.from_m, c.move.over_at(now_s)):
+            return reason
+        others = {j: o for j, o in enumerate(self.chasers) if j != i}
+        if any(o.phase is Phase.INSPECT and o.since_s != now_s for o in others.values()):
+            return "another chaser flies around the target already: command all of them at one time"
+        places = path.at(np.linspace(now_s, now_s + path.duration_s, 181))[0]
+        for j, other in others.items():
+            if other.phase is Phase.INSPECT or j in self._pending_inspections:
+                continue
+            apart = float(np.linalg.norm(places - other.move.goal_m, axis=1).min())
+            if apart < self._scenario.limits.min_distance_chasers_m:
+                return f"the way around the target comes within {apart:.3g} m of chaser {j}"
+        return self._why_not_safe(i, path.goal_m, now_s)
 
     # -- the stack of the target and latched chasers ---------------------------------------------------------------
 
@@ -390,6 +426,9 @@ class PhaseMachine:
         c, approach = self.chasers[i], self._scenario.approach
         if c.phase is Phase.CALIBRATE and now_s - c.since_s >= CALIBRATION_S:
             self._transition(i, Trigger.CALIBRATION_COMPLETE, now_s, c.move, "the manoeuvre is complete")
+        elif c.phase is Phase.INSPECT and c.move.over_at(now_s):
+            self._transition(i, Trigger.INSPECTION_COMPLETE, now_s, stay(c.move.goal_m, now_s))
+            self.chasers[i] = replace(self.chasers[i], faces=False)
         elif c.phase in (Phase.RETREAT, Phase.ABORT, Phase.GOTO) and c.move.over_at(now_s):
             self._continue_move(i, now_s)
         elif self._docks[i] is None and c.phase in (Phase.APPROACH, Phase.DOCKED) and c.move.over_at(now_s):
@@ -546,6 +585,11 @@ class PhaseMachine:
         if not self.in_corridor(i):
             return limit
         return 0.0 if self._is_held(i) else min(limit, dock.keep_out_m())
+
+    def min_distance_shape_m(self, i: int) -> float:
+        """Return the distance from the cuboids of the target's shape that a chaser's plan keeps; 0 in its corridor and at its port."""
+        free = self.corridor(i) is None and not self.in_corridor(i) and not self._is_held(i)
+        return self._scenario.limits.min_distance_shape_m if free else 0.0
 
     def latch(self, i: int) -> Latch:
         """Return the latch command: armed from the final approach on, open before and when backing out."""

@@ -17,6 +17,7 @@ class Phase(StrEnum):
     SEARCHING = "searching"
     HOLD = "hold"
     CALIBRATE = "calibrate"
+    INSPECT = "inspect"
     APPROACH = "approach"
     DOCKED = "docked"
     RETREAT = "retreat"
@@ -46,12 +47,14 @@ class Trigger(StrEnum):
     COMMAND_APPROACH = "command approach"
     COMMAND_APPROACH_BLOCKED = "command approach, corridor occupied"
     COMMAND_CALIBRATE = "command calibrate"
+    COMMAND_INSPECT = "command inspect"
     COMMAND_GOTO = "command goto"
     COMMAND_RETREAT = "command retreat"
     COMMAND_ABORT = "command abort"
     COMMAND_IDENTIFY = "command identify"
     COMMAND_DETUMBLE = "command detumble"
     CALIBRATION_COMPLETE = "calibration complete"
+    INSPECTION_COMPLETE = "inspection complete"
     MOVE_COMPLETE = "move complete"
     NEXT_ATTEMPT = "move complete, attempts left"
     WITHIN_TOLERANCE = "within docking tolerance"
@@ -91,30 +94,32 @@ ATTACHED = (_P.LATCHED, _P.VERIFIED, _P.IDENTIFY, *DETUMBLING)
 APPROACHING = (_P.WAIT, *CORRIDOR, *ATTACHED, _P.DOCKED)
 """Phases that an ``approach`` command leads through."""
 _MOVING = (_P.RETREAT, _P.ABORT, _P.GOTO)
-_FREE = (_P.HOLD, _P.CALIBRATE, *_MOVING)
+_FREE = (_P.HOLD, _P.CALIBRATE, _P.INSPECT, *_MOVING)
 
 TRANSITIONS = (
     Transition((_P.ACQUIRE,), _T.TARGET_ACQUIRED, _P.HOLD),
     Transition((_P.ACQUIRE, _P.HOLD), _T.TARGET_UNKNOWN, _P.SEARCHING),
     Transition((_P.SEARCHING,), _T.TARGET_SETTLED, _P.GOTO),
-    Transition((_P.CALIBRATE, *_MOVING), _T.TARGET_LOST, _P.HOLD),
+    Transition((_P.CALIBRATE, _P.INSPECT, *_MOVING), _T.TARGET_LOST, _P.HOLD),
     Transition((_P.APPROACH,), _T.TARGET_LOST, _P.HOLD, by_capture=False),
     Transition(CORRIDOR, _T.TARGET_LOST, _P.RETREAT, by_capture=True),
     Transition((_P.APPROACH,), _T.SIGHT_LOST, _P.HOLD, by_capture=False),
     Transition((_P.HOLD,), _T.SIGHT_REGAINED, _P.APPROACH, by_capture=False),
     Transition((_P.ALIGN, _P.APPROACH, _P.FINAL), _T.SIGHT_LOST, _P.RETREAT, by_capture=True),
-    Transition((_P.CALIBRATE, *_MOVING), _T.COMMAND_HOLD, _P.HOLD),
+    Transition((_P.CALIBRATE, _P.INSPECT, *_MOVING), _T.COMMAND_HOLD, _P.HOLD),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_HOLD, _P.HOLD, by_capture=False),
     Transition((_P.WAIT, _P.ALIGN, _P.APPROACH, _P.FINAL), _T.COMMAND_HOLD, _P.HOLD, by_capture=True),
     Transition((_P.HOLD,), _T.COMMAND_CALIBRATE, _P.CALIBRATE),
     Transition((_P.CALIBRATE,), _T.CALIBRATION_COMPLETE, _P.HOLD),
+    Transition((_P.HOLD,), _T.COMMAND_INSPECT, _P.INSPECT),
+    Transition((_P.INSPECT,), _T.INSPECTION_COMPLETE, _P.HOLD),
     Transition(_FREE, _T.COMMAND_GOTO, _P.GOTO),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_GOTO, _P.GOTO, by_capture=False),
     Transition((_P.WAIT, _P.ALIGN), _T.COMMAND_GOTO, _P.GOTO, by_capture=True),
-    Transition((_P.HOLD, _P.CALIBRATE, _P.ABORT, _P.GOTO), _T.COMMAND_RETREAT, _P.RETREAT),
+    Transition((_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.ABORT, _P.GOTO), _T.COMMAND_RETREAT, _P.RETREAT),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_RETREAT, _P.RETREAT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR, *ATTACHED), _T.COMMAND_RETREAT, _P.RETREAT, by_capture=True),
-    Transition((_P.HOLD, _P.CALIBRATE, _P.RETREAT, _P.GOTO), _T.COMMAND_ABORT, _P.ABORT),
+    Transition((_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.RETREAT, _P.GOTO), _T.COMMAND_ABORT, _P.ABORT),
     Transition((_P.APPROACH, _P.DOCKED), _T.COMMAND_ABORT, _P.ABORT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR, *ATTACHED), _T.COMMAND_ABORT, _P.ABORT, by_capture=True),
     Transition(_MOVING, _T.MOVE_COMPLETE, _P.HOLD),
@@ -138,10 +143,10 @@ TRANSITIONS = (
     Transition(DETUMBLING, _T.DETUMBLE_FAILED, _P.VERIFIED, by_capture=True),
     Transition((*CORRIDOR, *ATTACHED), _T.ATTEMPT_FAILED, _P.RETREAT, by_capture=True),
     Transition((_P.RETREAT,), _T.NEXT_ATTEMPT, _P.ALIGN, by_capture=True),
-    Transition((_P.HOLD, _P.CALIBRATE, _P.GOTO), _T.PLANNING_FAILED, _P.RETREAT),
+    Transition((_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.GOTO), _T.PLANNING_FAILED, _P.RETREAT),
     Transition((_P.APPROACH, _P.DOCKED), _T.PLANNING_FAILED, _P.RETREAT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR), _T.PLANNING_FAILED, _P.RETREAT, by_capture=True),
-    Transition((_P.HOLD, _P.CALIBRATE, _P.RETREAT, _P.GOTO), _T.SAFETY_LOST, _P.ABORT),
+    Transition((_P.HOLD, _P.CALIBRATE, _P.INSPECT, _P.RETREAT, _P.GOTO), _T.SAFETY_LOST, _P.ABORT),
     Transition((_P.APPROACH, _P.DOCKED), _T.SAFETY_LOST, _P.ABORT, by_capture=False),
     Transition((_P.WAIT, *CORRIDOR), _T.SAFETY_LOST, _P.ABORT, by_capture=True),
 )
@@ -157,6 +162,7 @@ _COMMANDS = {
     "hold": Trigger.COMMAND_HOLD,
     "approach": Trigger.COMMAND_APPROACH,
     "calibrate": Trigger.COMMAND_CALIBRATE,
+    "inspect": Trigger.COMMAND_INSPECT,
     "goto": Trigger.COMMAND_GOTO,
     "retreat": Trigger.COMMAND_RETREAT,
     "abort": Trigger.COMMAND_ABORT,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from chaserdock_models import rotations
@@ -19,10 +20,10 @@ from chaserdock_controller.interfaces import (
     GuidanceResult,
     LogEntry,
     Observation,
+    PlanningHistory,
     ReferencePose,
     TargetEstimation,
 )
-from chaserdock_controller.nmpc.plan_monitor import PlanningFailure
 
 from .chaser_state import ChaserGuidance
 from .detumble.control import DetumbleControl, StackState, StackTask
@@ -57,24 +58,22 @@ class GuidanceStage:
         self,
         observation: Observation,
         estimation: TargetEstimation,
-        failures: Mapping[int, PlanningFailure],
-        unsafe: Mapping[int, str] | None = None,
+        history: PlanningHistory,
     ) -> GuidanceResult:
-        """Return what every chaser is to do in this tick. ``failures``: chasers for which planning has failed; ``unsafe``: why
-        chasers whose passive safety is enforced have to abort."""
+        """Return what every chaser is to do in this tick; ``history``: how planning went in the ticks before."""
         self._follow_estimate(observation, estimation)
         self._follow_relative_states(estimation)
-        self.machine.update_planning(observation.time_s, failures)
+        self.machine.update_planning(observation.time_s, history.failures(observation.time_ns))
         commands = (*self.machine.due_commands(observation.time_s), *observation.commands)
         stack = None
         if self.machine.thrusting() or any(c.command in ("detumble", "identify") for c in commands):
-            stack = self.detumble.state(observation, estimation)
+            stack = self.with_trusted(self.detumble.state(observation, estimation))
         replies = self._apply_commands(commands, observation, stack)
         references: dict[int, ReferencePose] = {}
         if estimation.known:
             for i in sorted(observation.odometry):
                 references[i] = self._update_chaser(i, observation, estimation)
-        self.machine.update_safety(observation.time_s, unsafe or {})
+        self.machine.update_safety(observation.time_s, history.unsafe(observation.time_ns))
         abort_margins = self._update_abort_margins(observation)
         self._update_stack(observation, stack)
         thrusts = self._detumble_commands(observation, stack)
@@ -241,6 +240,16 @@ class GuidanceStage:
         if observed is not None:
             self.machine.update_docking(i, now_s, observed)
         return self.references.reference(i, pose)
+
+    def with_trusted(self, stack: StackState | None) -> StackState | None:
+        """Return the stack's state without failures of thrusters that an operator has restored."""
+        if stack is None or not stack.failed:
+            return stack
+        failed = {
+            i: tuple(k for k in thrusters if k not in self.thrusters.trusted(i))
+            for i, thrusters in stack.failed.items()
+        }
+        return replace(stack, failed=failed)
 
     def _isolated(self, i: int, estimation: TargetEstimation) -> tuple[int, ...]:
         """Return the thrusters that an operator or the motion of the stack has isolated."""

@@ -188,7 +188,72 @@ class Escape(Struct, frozen=True, eq=False, tag=True):
         return positions, velocities, accelerations
 
 
-Motion = Move | Glide | Escape
+class Circuit(Struct, frozen=True, eq=False, tag=True):
+    """One turn about an axis through TRF's origin, from rest to rest: the angle follows the polynomial of least jerk.
+
+    ``from_m`` (3,): start; ``axis`` (3,): unit vector. The distance from the origin changes to ``distance_m`` over the first quarter
+    of the time, as smoothly. The end is the start at that distance.
+    """
+
+    start_s: float
+    from_m: Array
+    axis: Array
+    distance_m: float
+    duration_s: float
+
+    @property
+    def goal_m(self) -> Array:
+        """Return the end position (3,)."""
+        return self.from_m * (self.distance_m / float(np.linalg.norm(self.from_m)))
+
+    def over_at(self, time_s: float) -> bool:
+        """Return whether the turn is complete."""
+        return time_s >= self.start_s + self.duration_s
+
+    def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
+        """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
+        t = np.asarray(times_s, dtype=float) - self.start_s
+        angle, rate, angular = (2.0 * math.pi * x for x in _least_jerk(t, self.duration_s))
+        start_m = float(np.linalg.norm(self.from_m))
+        change = (self.distance_m - start_m) / start_m
+        factor, speed, acceleration = (change * x for x in _least_jerk(t, 0.25 * self.duration_s))
+        factor = 1.0 + factor
+        along = self.axis * float(self.axis @ self.from_m)
+        across, beside = self.from_m - along, np.cross(self.axis, self.from_m)
+        cosine, sine = np.cos(angle)[:, None], np.sin(angle)[:, None]
+        p = along + cosine * across + sine * beside
+        ahead = cosine * beside - sine * across
+        v = rate[:, None] * ahead
+        a = angular[:, None] * ahead - rate[:, None] ** 2 * (p - along)
+        k, k1, k2 = factor[:, None], speed[:, None], acceleration[:, None]
+        return k * p, k1 * p + k * v, k2 * p + 2.0 * k1 * v + k * a
+
+
+def _least_jerk(t: Array, duration_s: float) -> tuple[Array, Array, Array]:
+    """Return the fifth-degree polynomial of least jerk from 0 to 1 at times (K,), with its first and second derivative."""
+    x = np.clip(t / duration_s, 0.0, 1.0)
+    value = x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+    first = 30.0 * x**2 * (1.0 - x) ** 2 / duration_s
+    second = 60.0 * x * (1.0 - x) * (1.0 - 2.0 * x) / duration_s**2
+    return value, first, second
+
+
+def circuit(from_m: ArrayLike, axis: ArrayLike, distance_m: float, now_s: float, speed_m_s: float) -> Circuit:
+    """Return a turn from rest at ``from_m`` (3,) about ``axis`` (3,), any length, as fast as ``speed_m_s`` at the equator.
+
+    The duration does not depend on the start, so that chasers that begin together keep their angles to each other. Raises ValueError
+    for a speed or a distance that is not positive.
+    """
+    if not (speed_m_s > 0.0 and distance_m > 0.0):
+        raise ValueError(f"speed and distance must be positive, not {speed_m_s} and {distance_m}")
+    unit = np.asarray(axis, dtype=float)
+    duration_s = 1.875 * 2.0 * math.pi * distance_m / speed_m_s
+    return Circuit(
+        now_s, np.asarray(from_m, dtype=float), unit / np.linalg.norm(unit), distance_m, duration_s
+    )
+
+
+Motion = Move | Glide | Escape | Circuit
 
 
 def glide(

@@ -10,7 +10,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.passive_safety import CoastCertificate, CoastModel
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.interfaces import LogEntry, TargetEstimation
+from chaserdock_controller.interfaces import LogEntry, PlanCertificate, TargetEstimation
 
 ORBITS = 2.0
 FREE_SPACE_S = 600.0
@@ -41,7 +41,7 @@ class PassiveSafetyMonitor:
         self._armed: set[int] = set()
         self._first_ns: dict[int, int] = {}
         self._since: dict[int, tuple[bool, int]] = {}
-        self.certificates: dict[int, CoastCertificate] = {}
+        self.certificates: dict[int, PlanCertificate] = {}
 
     def update(
         self, chasers: Sequence[int], states: Array, estimation: TargetEstimation, time_ns: int = 0
@@ -64,21 +64,13 @@ class PassiveSafetyMonitor:
             own = states[row]
             relative = np.concatenate([own[:, :3] - moving, own[:, 3:6] - target.velocity_m_s], axis=1)
             found = self._coast.certify(relative, covariance, self._keep_out_m)
-            self.certificates[i] = found
-            safe = self.is_safe(found)
+            safe = found.margin_sigmas >= self._sigmas
+            self.certificates[i] = PlanCertificate(found, found.loss * self._step_s, safe)
             self._follow(i, safe, time_ns)
             if self._safe.get(i) != safe and (i not in self._safe or self._persists(i, time_ns)):
                 self._safe[i] = safe
                 events.append(("info" if safe else "warning", self._text(i, found, safe)))
         return tuple(events)
-
-    def is_safe(self, found: CoastCertificate) -> bool:
-        """Return whether a plan with this certificate counts as passively safe."""
-        return found.margin_sigmas >= self._sigmas
-
-    def loss_s(self, found: CoastCertificate) -> float:
-        """Return the time from the beginning of a plan to the loss of thrust of its certificate."""
-        return found.loss * self._step_s
 
     def unsafe(self, time_ns: int) -> dict[int, str]:
         """Return why chasers have to abort at ``time_ns``: their plans are not safe for `PERSISTENT_S`.
@@ -87,7 +79,7 @@ class PassiveSafetyMonitor:
         converged, plans are safe at times only.
         """
         return {
-            i: self._text(i, self.certificates[i], False)
+            i: self._text(i, self.certificates[i].coast, False)
             for i, (safe, _) in self._since.items()
             if i in self._armed and not safe and self._persists(i, time_ns)
         }

@@ -17,6 +17,8 @@ from chaserdock_controller.interfaces import (
     HorizonReference,
     LogEntry,
     Observation,
+    PlanCertificate,
+    PlanningHistory,
     PlanResult,
     TargetEstimation,
 )
@@ -25,12 +27,27 @@ from . import make_solver
 from .budget import Bounded, SolveBudget
 from .lost_chasers import with_lost_chasers
 from .passive_safety import PassiveSafetyMonitor
-from .plan_monitor import PlanMonitor
+from .plan_monitor import PlanMonitor, PlanningFailure
 from .types import NmpcInput, NmpcParameters, NmpcPlan
 
 _ATTACHED_FACTOR, _ATTACHED_MARGIN = 1.2, 1e-3
 _CANCELLED_SHARE = 0.5
 """Largest share of an input limit that cancels a disturbance."""
+
+
+class PlanHistory(PlanningHistory):
+    """Failures and passive safety of the plans so far, for the guidance of the next tick."""
+
+    def __init__(self, monitor: PlanMonitor, passive_safety: PassiveSafetyMonitor | None) -> None:
+        self._monitor, self._passive_safety = monitor, passive_safety
+
+    def failures(self, time_ns: int) -> Mapping[int, PlanningFailure]:
+        """Return the chasers that have to retreat at ``time_ns`` because planning has failed."""
+        return self._monitor.failures(time_ns)
+
+    def unsafe(self, time_ns: int) -> Mapping[int, str]:
+        """Return why chasers lack passive safety at ``time_ns``; whether they abort is guidance's matter."""
+        return {} if self._passive_safety is None else self._passive_safety.unsafe(time_ns)
 
 
 class PlanningStage:
@@ -47,9 +64,10 @@ class PlanningStage:
         self._min_distance_chasers_m = scenario.limits.min_distance_chasers_m
         self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
         self.monitor = PlanMonitor()
-        self.passive_safety = None
+        self._passive_safety = None
         if scenario.limits.passive_safety != "off":
-            self.passive_safety = PassiveSafetyMonitor(scenario)
+            self._passive_safety = PassiveSafetyMonitor(scenario)
+        self.history = PlanHistory(self.monitor, self._passive_safety)
         self._last_solve_ns: int | None = None
         self._budget: SolveBudget | None = None
         if realtime and c.solve_budget_s is not None:
@@ -70,7 +88,7 @@ class PlanningStage:
         horizon = guidance.horizon
         if horizon is None:
             self.monitor.update((), None, observation.time_ns, observation.effective_ns)
-            return PlanResult((), None, 0.0, (), {})
+            return PlanResult((), None, 0.0, (), {}, self._certificates())
         limits = {i: observation.input_limits[i] for i in horizon.chasers}
         disturbances = {i: _bounded(estimation.disturbances[i], limits[i]) for i in horizon.chasers}
         left = {i: limits[i] - np.abs(disturbances[i]) for i in horizon.chasers}
@@ -95,15 +113,15 @@ class PlanningStage:
         if plan is not None:
             plan = _without(plan, [disturbances[i] for i in horizon.chasers])
         self.monitor.update(horizon.chasers, plan, observation.time_ns, observation.effective_ns)
-        if self.passive_safety is not None and plan is not None:
-            events += self.passive_safety.update(
+        if self._passive_safety is not None and plan is not None:
+            events += self._passive_safety.update(
                 horizon.chasers, plan.states, estimation, observation.time_ns
             )
-        return PlanResult(horizon.chasers, plan, wall_s, events, self.monitor.plans(observation.time_ns))
+        flyable = self.monitor.plans(observation.time_ns)
+        return PlanResult(horizon.chasers, plan, wall_s, events, flyable, self._certificates())
 
-    def unsafe(self, time_ns: int) -> Mapping[int, str]:
-        """Return why chasers have to abort at ``time_ns`` for lack of passive safety; whether they do is guidance's matter."""
-        return {} if self.passive_safety is None else self.passive_safety.unsafe(time_ns)
+    def _certificates(self) -> dict[int, PlanCertificate]:
+        return {} if self._passive_safety is None else dict(self._passive_safety.certificates)
 
     def problem(
         self, horizon: HorizonReference, states: Mapping[int, Array], input_limits: Mapping[int, Array]
@@ -123,6 +141,8 @@ class PlanningStage:
             min_distance_chasers_m=self._min_distance_chasers_m,
             input_max=limits,
             corridors=horizon.corridors,
+            boxes=horizon.boxes,
+            box_clearance_m=horizon.box_clearance_m,
         )
 
 

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+import numpy as np
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import (
     Event,
+    GeometryEstimate,
     Level,
     MassEstimate,
     PassiveSafety,
@@ -22,13 +24,14 @@ from chaserdock_protocol.messages import (
 from chaserdock_controller.estimation.identification.composite import MassProperties
 from chaserdock_controller.interfaces import (
     Directive,
+    EstimatedShape,
     GuidanceResult,
     IdentifiedStack,
     Observation,
+    PlanCertificate,
     PlanResult,
     TargetEstimation,
 )
-from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan
 
 
@@ -72,6 +75,19 @@ def target_message(observation: Observation, estimation: TargetEstimation) -> Ta
             for r in estimation.relative
             if r.chaser in estimation.disturbances
         ),
+    )
+
+
+def geometry_estimate(shape: EstimatedShape) -> GeometryEstimate:
+    """Return the estimated errors of the geometry in their units."""
+    sigmas = np.array([p.sigma for p in shape.parameters])
+    return GeometryEstimate(
+        names=tuple(p.name for p in shape.parameters),
+        sigmas=vector(sigmas),
+        values=vector(sigmas * shape.values),
+        covariance=vector(shape.covariance * np.outer(sigmas, sigmas)),
+        views=shape.views,
+        coverage=shape.coverage,
     )
 
 
@@ -141,19 +157,18 @@ def solver_message(observation: Observation, solver: str, result: PlanResult) ->
 
 
 def safety_message(
-    chaser: int, observation: Observation, monitor: PassiveSafetyMonitor, guidance: GuidanceResult
+    chaser: int, observation: Observation, guidance: GuidanceResult, certificate: PlanCertificate
 ) -> PassiveSafety:
-    """Return the certificate of a chaser's newest plan, which must have one."""
-    found = monitor.certificates[chaser]
+    """Return the certificate of a chaser's newest plan."""
     return PassiveSafety(
         tick=observation.tick,
         sim_time_ns=observation.time_ns,
         chaser=chaser,
-        margin_sigmas=found.margin_sigmas,
-        distance_m=found.distance_m,
-        closest_s=found.time_s,
-        loss_s=monitor.loss_s(found),
-        safe=monitor.is_safe(found),
+        margin_sigmas=certificate.coast.margin_sigmas,
+        distance_m=certificate.coast.distance_m,
+        closest_s=certificate.coast.time_s,
+        loss_s=certificate.loss_s,
+        safe=certificate.safe,
         enforced=chaser in guidance.abort_margins,
         abort_margin_sigmas=guidance.abort_margins.get(chaser),
     )

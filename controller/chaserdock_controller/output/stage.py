@@ -10,7 +10,7 @@ from chaserdock_models.braking import brake_wrench
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.setpoint_tracking import Setpoint, track_setpoint
 from chaserdock_protocol.codec import vector
-from chaserdock_protocol.messages import WrenchCommand
+from chaserdock_protocol.messages import GeometryEstimate, WrenchCommand
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import CommandHistory
@@ -27,8 +27,10 @@ from chaserdock_controller.interfaces import (
 
 from .message_builders import (
     event_message,
+    geometry_estimate,
     plan_message,
     reference_message,
+    safety_message,
     solver_message,
     stack_message,
     target_message,
@@ -55,6 +57,9 @@ class OutputStage:
         out = TickOutputs(target=target_message(observation, estimation), replies=list(guidance.replies))
         if estimation.stack is not None and observation.tick % self._scenario.time.rate_hz == 0:
             out.stack = stack_message(observation, estimation.stack)
+        shape = estimation.shape
+        renewed = shape is not None and (shape.changed or observation.tick % self._scenario.time.rate_hz == 0)
+        geometry = geometry_estimate(shape) if shape is not None and renewed else None
         events = [*observation.events, *estimation.events, *guidance.events, *result.events]
         for i in sorted(observation.odometry):
             directive = guidance.directives[i]
@@ -63,15 +68,16 @@ class OutputStage:
             command = directive.direct
             if command is None:
                 command = self._planned_or_safe(i, observation, estimation, guidance, result, events, out)
-            out.wrenches[i] = self._send(i, observation, guidance, command)
+            out.wrenches[i] = self._send(i, observation, guidance, command, geometry)
         for i, reason in observation.invalid.items():
             if i not in self._without_plan:
                 events.append(("error", f"chaser {i}: invalid odometry, coasting: {reason}"))
             self._without_plan.add(i)
             command = guidance.directives[i].direct
             assert command is not None
-            out.wrenches[i] = self._send(i, observation, guidance, command)
+            out.wrenches[i] = self._send(i, observation, guidance, command, geometry)
         self.history.forget_before(observation.time_ns)
+        out.safety = {i: safety_message(i, observation, guidance, c) for i, c in result.certificates.items()}
         out.solver = solver_message(observation, self._scenario.controller.solver, result)
         out.events = [event_message(observation, level, text) for level, text in events]
         return out
@@ -114,7 +120,12 @@ class OutputStage:
         )
 
     def _send(
-        self, i: int, observation: Observation, guidance: GuidanceResult, command: DirectCommand
+        self,
+        i: int,
+        observation: Observation,
+        guidance: GuidanceResult,
+        command: DirectCommand,
+        geometry: GeometryEstimate | None,
     ) -> WrenchCommand:
         thrusts = command.thrusts_N
         # The limits hold on all axes at once; commanded thrusters need none but their own.
@@ -137,6 +148,7 @@ class OutputStage:
             isolated=directive.isolated,
             trusted=directive.trusted,
             free=directive.free,
+            geometry=geometry,
         )
 
 

@@ -19,14 +19,17 @@ from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation import Mekf
 from chaserdock_controller.estimation.baseline import PaperEstimator, PaperParameters
 from chaserdock_controller.estimation.filter_update import FilterState
+from chaserdock_controller.estimation.identification.stage import IdentificationState
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.estimator import JointFilterState, JointTickRecord
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.replay import ReplayBuffer
 from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
+from chaserdock_controller.guidance.detumble.planner import ActivePlan
 from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan, PlanningFailure
@@ -82,7 +85,29 @@ class ThrusterCommandState(Struct, forbid_unknown_fields=True):
     _last_commands: dict[tuple[int, int], tuple[float, OperatorCommand]]
 
 
+class SafetyState(Struct, forbid_unknown_fields=True):
+    """Waiting of the stack for chasers that back out, and margins of the best aborts where passive safety is enforced."""
+
+    _waits: bool
+    _abort_margins: dict[int, float]
+
+
+class StackControlState(Struct, forbid_unknown_fields=True):
+    _judged: tuple[tuple[tuple[int, ...], tuple[bool, ...]] | None, str]
+    _pulse: tuple[int, int | None]
+
+
+class StackPlanState(Struct, forbid_unknown_fields=True):
+    active: ActivePlan | None
+
+
+class SequencerState(Struct, forbid_unknown_fields=True):
+    _pending_N_s: Array
+    _thrusts_N: Array
+
+
 class CompositeState(Struct, forbid_unknown_fields=True):
+    _target_alone: TargetBody
     body: TargetBody
     latched: frozenset[int]
     _changed: bool
@@ -103,6 +128,10 @@ class LostChaserState(Struct, forbid_unknown_fields=True):
 
 class OdometryState(Struct, forbid_unknown_fields=True):
     _known: dict[int, Known]
+
+
+class ShapeState(Struct, forbid_unknown_fields=True):
+    filter: ShapeFilter
 
 
 class ConsistencyState(Struct, forbid_unknown_fields=True):
@@ -151,7 +180,7 @@ class PaperState(Struct, forbid_unknown_fields=True, tag=True):
 
 class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline that are not yet due.
-    ``plans``: warm starts of the NMPC solver, inputs by chaser."""
+    ``identification``: None without it. ``plans``: warm starts of the NMPC solver, inputs by chaser."""
 
     sightings: SightingState
     planning: PlanningState
@@ -161,12 +190,18 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     timeline_left: int
     thruster_reports: ThrusterReportState
     thruster_commands: ThrusterCommandState
+    safety: SafetyState
+    stack_control: StackControlState
+    stack_plan: StackPlanState
+    sequencer: SequencerState
     composite: CompositeState
     history: CommandHistoryState
     searches: SearchState
     lost_chasers: LostChaserState
     odometry: OdometryState
     consistency: ConsistencyState
+    identification: IdentificationState | None
+    shape: ShapeState | None
     estimator: JointEstimatorState | MekfState | PaperState | None
     plans: dict[int, Array]
 
@@ -180,7 +215,7 @@ class Checkpoint:
     def _parts(self) -> dict[str, tuple[Any, type[Struct]]]:
         """Return the objects whose attributes are copied, and what is copied of them, by field of the checkpoint."""
         core = self._core
-        return {
+        parts: dict[str, tuple[Any, type[Struct]]] = {
             "sightings": (vars(core.estimation)["_converter"], SightingState),
             "planning": (core.planning, PlanningState),
             "plan_monitor": (core.planning.monitor, PlanMonitorState),
@@ -188,6 +223,10 @@ class Checkpoint:
             "guidance": (core.guidance.machine, GuidanceState),
             "thruster_reports": (core.ingest.thrusters, ThrusterReportState),
             "thruster_commands": (core.guidance.thrusters, ThrusterCommandState),
+            "safety": (core.guidance, SafetyState),
+            "stack_control": (core.guidance.detumble, StackControlState),
+            "stack_plan": (core.guidance.detumble.planner, StackPlanState),
+            "sequencer": (core.guidance.detumble.sequencer, SequencerState),
             "composite": (core.estimation.composite, CompositeState),
             "history": (core.output.history, CommandHistoryState),
             "searches": (core.guidance.search, SearchState),
@@ -195,16 +234,21 @@ class Checkpoint:
             "odometry": (self._odometry, OdometryState),
             "consistency": (core.estimation.consistency, ConsistencyState),
         }
+        if core.estimation.shape is not None:
+            parts["shape"] = (core.estimation.shape, ShapeState)
+        return parts
 
     def save(self) -> bytes:
         """Return the state now. Raises CheckpointError when it contains something other than data."""
-        parts: dict[str, Any] = {name: _read(*part) for name, part in self._parts().items()}
-        frame = self._warm_starts()
+        parts: dict[str, Any] = {"shape": None}
+        parts |= {name: _read(*part) for name, part in self._parts().items()}
+        frame, identification = self._warm_starts(), self._core.estimation.identification
         try:
             return encode(
                 ControllerCheckpoint(
                     **parts,
                     timeline_left=len(vars(self._core.guidance.machine)["_timeline"]),
+                    identification=None if identification is None else identification.save(),
                     estimator=_estimator_state(self._core.estimator),
                     plans=dict(frame.plans) if frame is not None else {},
                 )
@@ -222,6 +266,10 @@ class Checkpoint:
         chasers = len(self._core.scenario.chasers)
         if len(state.guidance.chasers) != chasers or not 0 <= state.timeline_left <= len(timeline):
             raise CheckpointError("the state is of another mission")
+        count = None if self._core.estimation.shape is None else len(self._core.estimation.shape.parameters)
+        if count != (None if state.shape is None else len(state.shape.filter.vector)):
+            raise CheckpointError("the state is of another mission")
+        self._restore_identification(state.identification)
         for name, (owner, _) in self._parts().items():
             _write(owner, getattr(state, name))
         vars(self._core.guidance.machine)["_timeline"] = timeline[len(timeline) - state.timeline_left :]
@@ -230,6 +278,16 @@ class Checkpoint:
         frame = self._warm_starts()
         if frame is not None:
             frame.plans = state.plans
+
+    def _restore_identification(self, state: IdentificationState | None) -> None:
+        identification = self._core.estimation.identification
+        if (identification is None) != (state is None):
+            raise CheckpointError("the state is of another mission")
+        if identification is not None and state is not None:
+            try:
+                identification.load(state)
+            except ValueError as error:
+                raise CheckpointError(f"identification: {error}") from None
 
     def _warm_starts(self) -> Any:
         """Return the object that holds the solver's warm starts; None for an installed solver."""

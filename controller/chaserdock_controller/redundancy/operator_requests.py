@@ -30,7 +30,7 @@ class OperatorRequests:
         return requests
 
     def refuse(self, tick: Tick, commander: str) -> None:
-        """Refuse all requests: ``commander`` commands, or nobody if it is empty."""
+        """Refuse all requests: ``commander`` commands, or none if it is empty."""
         reason = f"{commander or 'no controller'} commands now: repeat the command"
         for command, reply in self.take():
             reply(

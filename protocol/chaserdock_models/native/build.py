@@ -25,6 +25,7 @@ NATIVE_FOLDERS = (
     "world/chaserdock_world/rendering/native",
     "agents/chaserdock_agents/chaser/perception/native",
     "controller/chaserdock_controller/nmpc/native",
+    "controller/chaserdock_controller/estimation/joint/native",
 )
 # Sources that every library contains in addition to those of its own folder.
 _SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -31,9 +31,46 @@ class Corridor(Section):
     angle_deg: Positive = Field(default=4.0, description="Attitude error, degrees.")
     lateral_speed_m_s: Positive = Field(default=0.02, description="Lateral speed of the probe's tip, m/s.")
     closing_m_s: Positive = Field(default=0.04, description="Closing speed, m/s.")
+    rate_deg_s: Positive | None = Field(
+        default=None, description="Rate relative to the target, degrees/s. Not set: not checked."
+    )
 
 
-class Final(Corridor):
+CONTACT_CONDITIONS: dict[str, dict[str, float]] = {
+    "idss": {
+        "lateral_m": 0.10,
+        "angle_deg": 4.0,
+        "lateral_speed_m_s": 0.04,
+        "closing_m_s": 0.10,
+        "rate_deg_s": 0.20,
+    },
+    "atv": {"lateral_m": 0.10, "closing_m_s": 0.10},
+}
+"""Contact conditions by preset. ``idss``: International Docking System Standard, Interface Definition Document, revision E, October
+2016, table 3.3.1.1-2 (closing 0.05 to 0.10 m/s; the smaller bound is not checked); low-impact docking systems as NASA's NDS follow
+it. ``atv``: ESA, "One hour to docking", 24 February 2011 (blogs.esa.int/orion): within 10 cm, and at less than 10 cm/s; it states
+nothing else."""
+
+Preset = Literal["none", "idss", "atv"]
+_PRESET_TEXT = (
+    "Contact conditions of a docking system, in place of the defaults of the keys that it states; keys that are given override it "
+    "([docking.md](docking.md#contact-conditions-of-docking-systems))."
+)
+
+
+class _ContactConditions(Corridor):
+    """Limits at contact that a preset can fill in."""
+
+    preset: Preset = Field(default="none", description=_PRESET_TEXT)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _fill_in_preset(cls, values: Any) -> Any:
+        stated = CONTACT_CONDITIONS.get(values.get("preset")) if isinstance(values, dict) else None
+        return values if stated is None else stated | values
+
+
+class Final(_ContactConditions):
     """Limits over the last `final_m`. The closing speed is checked once the chaser has slowed down."""
 
     lateral_m: Positive = Field(default=0.008, description="Lateral offset of the probe's tip, m.")
@@ -42,7 +79,7 @@ class Final(Corridor):
     closing_m_s: Positive = Field(default=0.016, description="Closing speed, m/s.")
 
 
-class Tolerances(Corridor):
+class Tolerances(_ContactConditions):
     """Errors at contact up to which the latch closes."""
 
     lateral_m: Positive = Field(default=0.01, description="Lateral offset of the probe's tip, m.")

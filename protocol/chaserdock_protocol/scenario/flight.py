@@ -21,6 +21,7 @@ from .detumble import Detumble
 from .docking import Docking
 from .errors import invalid
 from .fields import Name, Section
+from .inspection import Inspection
 from .migrations import FORMAT
 from .navigation import NavigationSection
 from .orbit import Orbit
@@ -66,6 +67,7 @@ class FlightScenario(Section):
     controller: Controller = Controller()
     limits: Limits = Limits()
     approach: Approach = Approach()
+    inspection: Inspection = Inspection()
     docking: Docking = Docking()
     detumble: Detumble = Detumble()
     chasers: tuple[FlightChaser, ...] = Field(min_length=1, max_length=16)

@@ -18,6 +18,7 @@ from .schema import FlightChaser
 from .simulation import SimulationSection
 from .thrusters import ThrusterFailure
 from .truth import TruthSection
+from .world import WorldSection
 
 
 class Chaser(FlightChaser):
@@ -100,6 +101,7 @@ class Scenario(FlightScenario):
     thruster_failure: tuple[ThrusterFailure, ...] = ()
     fault: tuple[Fault, ...] = Field(default=(), max_length=100)
     success: Success = Success()
+    world: WorldSection = WorldSection()
     truth: TruthSection = TruthSection()
     simulation: SimulationSection = SimulationSection()
 

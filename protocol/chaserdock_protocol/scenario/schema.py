@@ -70,6 +70,14 @@ class EstimatorSection(Section):
         description="`joint`: filter of target, chasers, sensors and disturbances. `mekf`: filter of the target, with odometry "
         "taken as exact. `paper`: the paper's average. Or an installed plugin.",
     )
+    target_acceleration_noise: Positive | None = Field(
+        default=None,
+        description="Of `joint`: square root of the spectral density of the target's unmodelled acceleration, m/s²/√Hz. Not set: 1e-4 "
+        "for `torque_free`, otherwise 5e-6. Far away it decides how well the relative velocity is known.",
+    )
+    target_angular_noise: Positive | None = Field(
+        default=None, description="The same of its angular acceleration, rad/s²/√Hz."
+    )
 
 
 class PerceptionSection(Section):
@@ -158,6 +166,11 @@ class Limits(Section):
         description="Standard deviations of a chaser's estimated position relative to the target that are added to "
         "`min_distance_target_m`, at most 0.1 m in all.",
     )
+    min_distance_shape_m: NotNegative = Field(
+        default=0.0,
+        description="Smallest distance of a chaser's centre from each cuboid of the target's shape (bus, panels, booms), m, outside "
+        "of its corridor, in addition to `min_distance_target_m`, which may then be smaller or 0. 0: off. Needs the solver `rti`.",
+    )
     min_distance_chasers_m: NotNegative = Field(
         default=0.35, description="Smallest distance between chasers, m."
     )
@@ -242,6 +255,7 @@ class TimelineEntry(Section):
     command: OperatorCommandName = Field(
         description="`approach`: dock. `hold`: stop at the present place. `retreat`: return to the reference position. "
         "`abort`: the same, twice as fast. `goto`: fly to `offset_m`. `calibrate`: manoeuvre to calibrate the camera. "
+        "`inspect`: fly around the target and estimate its geometry. "
         "`identify`: fire pulses that show the mass properties of the stack. `detumble`: stop the target with latched chasers. "
         "`isolate`, `restore`: close or open the shut-off valve of `thruster`."
     )

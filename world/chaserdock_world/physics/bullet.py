@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import ctypes
 import os
-import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from chaserdock_protocol.errors import MissingPackageError
+from chaserdock_world.requirements import require_pybullet
 
 
 @contextmanager
@@ -33,17 +32,10 @@ def silenced() -> Iterator[None]:
         os.close(null)
 
 
-try:
-    with silenced():
-        import pybullet
-        from pybullet_utils.bullet_client import BulletClient
-except ModuleNotFoundError as error:
-    here = f"Python {sys.version_info.major}.{sys.version_info.minor} on {sys.platform} {platform.machine()}"
-    raise MissingPackageError(
-        "the world needs PyBullet, which is not installed; it has wheels for Python 3.11 on Linux x86_64 only (this is "
-        f"{here}); elsewhere run the other processes, and the world on such a machine or in a container",
-        name=error.name,
-    ) from None
+require_pybullet()
+with silenced():
+    import pybullet
+    from pybullet_utils.bullet_client import BulletClient
 
 __all__ = ["connect", "pybullet", "silenced"]
 

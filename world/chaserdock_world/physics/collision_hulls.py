@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Convex pieces of a mesh for collisions: Bullet needs convex shapes.
+"""Convex pieces of a mesh for collisions: the engines need convex shapes.
 
 Each connected surface of a part is cut in two across its longest direction until the convex hull of a piece is at most
 ``tolerance_m`` in front of it, or until there are ``MOST_PIECES`` of it. A cuboid, a cylinder and the like stay one piece; a

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Correction torque that makes Bullet's integration of rotation second order.
+"""Correction torque that makes an engine's integration of rotation second order.
 
-Bullet evaluates the gyroscopic torque omega x I omega at the beginning of a step, so that angular momentum drifts in
+The engines evaluate the gyroscopic torque omega x I omega at the beginning of a step, so that angular momentum drifts in
 proportion to the step. The midpoint rule evaluates it in the middle of the step; the difference is applied as an external
 torque.
 """
@@ -17,9 +17,9 @@ def _gyroscopic_torque(inertia: Sequence[float], a: float, b: float, c: float) -
     return (b * c * (ic - ib), c * a * (ia - ic), a * b * (ib - ia))
 
 
-def _rotate_to_body(xyzw: Sequence[float], omega_world: Sequence[float]) -> tuple[float, float, float]:
+def _rotate_to_body(q_wxyz: Sequence[float], omega_world: Sequence[float]) -> tuple[float, float, float]:
     """Return a rate in body axes: q* omega q."""
-    x, y, z, w = xyzw
+    w, x, y, z = q_wxyz
     u, v, s = omega_world
     tx, ty, tz = 2.0 * (v * z - s * y), 2.0 * (s * x - u * z), 2.0 * (u * y - v * x)
     return (u + w * tx + ty * z - tz * y, v + w * ty + tz * x - tx * z, s + w * tz + tx * y - ty * x)
@@ -27,17 +27,17 @@ def _rotate_to_body(xyzw: Sequence[float], omega_world: Sequence[float]) -> tupl
 
 def midpoint_torque(
     inertia: Sequence[float],
-    xyzw: Sequence[float],
+    q_wxyz: Sequence[float],
     omega_world: Sequence[float],
     torque: Sequence[float],
     step_s: float,
 ) -> tuple[float, float, float]:
     """Return the torque (3,), N m, body axes, to add to ``torque`` (body axes) for one step of ``step_s``.
 
-    ``inertia``: principal moments, kg m^2; ``xyzw``: attitude body to world in Bullet's order; ``omega_world``: rate in
+    ``inertia``: principal moments, kg m^2; ``q_wxyz``: attitude body to world; ``omega_world``: rate in
     world axes, rad/s. Plain floats, as this runs for every body in every physics step.
     """
-    a, b, c = _rotate_to_body(xyzw, omega_world)
+    a, b, c = _rotate_to_body(q_wxyz, omega_world)
     ia, ib, ic = inertia
     # _gyroscopic_torque, twice, without the calls.
     ab, bc, ca = ib - ia, ic - ib, ia - ic
@@ -51,7 +51,7 @@ def midpoint_torque(
 
 def midpoint_torque_of_rates(
     inertia: Sequence[float],
-    xyzw: Sequence[float],
+    q_wxyz: Sequence[float],
     omega_world: Sequence[float],
     omega_world_before: Sequence[float],
 ) -> tuple[float, float, float]:
@@ -60,6 +60,6 @@ def midpoint_torque_of_rates(
     The rate in the middle of the step is extrapolated from that of the previous step, ``omega_world_before``.
     """
     middle = [a + 0.5 * (a - b) for a, b in zip(omega_world, omega_world_before, strict=True)]
-    gx, gy, gz = _gyroscopic_torque(inertia, *_rotate_to_body(xyzw, omega_world))
-    nx, ny, nz = _gyroscopic_torque(inertia, *_rotate_to_body(xyzw, middle))
+    gx, gy, gz = _gyroscopic_torque(inertia, *_rotate_to_body(q_wxyz, omega_world))
+    nx, ny, nz = _gyroscopic_torque(inertia, *_rotate_to_body(q_wxyz, middle))
     return (gx - nx, gy - ny, gz - nz)

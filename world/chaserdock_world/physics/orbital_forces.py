@@ -16,7 +16,7 @@ from chaserdock_world.orbit import TargetOrbit
 
 
 class OrbitalForces:
-    """Forces and torques of an orbit on bodies that Bullet integrates with steps of ``step_s``."""
+    """Forces and torques of an orbit on bodies that an engine integrates with steps of ``step_s``."""
 
     def __init__(self, orbit: TargetOrbit, step_s: float, steps_per_tick: int) -> None:
         self._orbit, self._step_s, self._steps_per_tick = orbit, step_s, steps_per_tick
@@ -41,7 +41,7 @@ class OrbitalForces:
     ) -> list[float]:
         """Return the force (3,), WRF, at a body's centre of mass.
 
-        Bullet takes the velocity at the end of a step for the whole step. So the acceleration is that at the middle of the
+        The engines take the velocity at the end of a step for the whole step. So the acceleration is that at the middle of the
         step, with the velocity there from the acceleration of the last step: else the Coriolis force adds energy.
         """
         h = 0.5 * self._step_s
@@ -55,9 +55,9 @@ class OrbitalForces:
         return [mass_kg * (a + d) for a, d in zip(found, drag, strict=True)]
 
     def torque(
-        self, q_xyzw: Sequence[float], omega_world: Sequence[float], moments: Scalars3
+        self, q_wxyz: Sequence[float], omega_world: Sequence[float], moments: Scalars3
     ) -> tuple[float, ...]:
-        """Return the torque (3,) about a body's principal axes, in these, from Bullet's attitude and rate in world axes."""
-        x, y, z, w = q_xyzw
+        """Return the torque (3,) about a body's principal axes, in these, from its attitude and its rate in world axes."""
+        w, x, y, z = q_wxyz
         a, b, c = rotated_components(w, -x, -y, -z, *omega_world)
         return relative_torque(self._frame, (w, x, y, z), (a, b, c), moments)

@@ -45,7 +45,7 @@ class IntervalLoads:
 
 @dataclass
 class PortLoadRecorder:
-    """Collects the loads at one port. ``q_port_wxyz`` (4,): axes of the port in Bullet's frame of the target."""
+    """Collects the loads at one port. ``q_port_wxyz`` (4,): axes of the port in the engine's frame of the target."""
 
     q_port_wxyz: Array
     step_s: float
@@ -55,20 +55,20 @@ class PortLoadRecorder:
     def add(
         self,
         reaction: Sequence[float],
-        target_xyzw: Sequence[float],
-        chaser_xyzw: Sequence[float],
+        q_target_wxyz: Sequence[float],
+        q_chaser_wxyz: Sequence[float],
         closing: bool,
     ) -> None:
         """Add the load of a step.
 
-        ``reaction`` (6,): force in world axes and torque about the tip in the axes of Bullet's frame of the chaser, exerted on
-        the port; ``*_xyzw`` (4,): attitudes at the beginning of the step, Bullet's order. ``closing``: a latch closes in it.
+        ``reaction`` (6,): force in world axes and torque about the tip in the axes of the engine's frame of the chaser, exerted on
+        the port; ``q_*_wxyz`` (4,): attitudes at the beginning of the step. ``closing``: a latch closes in it.
         """
         if closing:
             x, y, z = reaction[:3]
             self._closing_impulse_N_s += (x * x + y * y + z * z) ** 0.5 * self.step_s
         else:
-            self._rows.append((*reaction, *target_xyzw, *chaser_xyzw))
+            self._rows.append((*reaction, *q_target_wxyz, *q_chaser_wxyz))
 
     def take(self) -> IntervalLoads:
         """Return the loads since the last call."""
@@ -76,9 +76,11 @@ class PortLoadRecorder:
         self._rows, self._closing_impulse_N_s = [], 0.0
         if not len(rows):
             return IntervalLoads(closing_impulse_N_s=impulse)
-        q_port = rotations.multiply(_wxyz(rows[:, 6:10]), self.q_port_wxyz)
+        q_port = rotations.multiply(rotations.normalize(rows[:, 6:10]), self.q_port_wxyz)
         force = rotations.rotate_inverse(q_port, rows[:, :3])
-        torque = rotations.rotate_inverse(q_port, rotations.rotate(_wxyz(rows[:, 10:]), rows[:, 3:6]))
+        torque = rotations.rotate_inverse(
+            q_port, rotations.rotate(rotations.normalize(rows[:, 10:]), rows[:, 3:6])
+        )
         return IntervalLoads(
             force_N=force[-1],
             torque_N_m=torque[-1],
@@ -89,11 +91,6 @@ class PortLoadRecorder:
             peak_bending_N_m=_largest(torque[:, 1:]),
             closing_impulse_N_s=impulse,
         )
-
-
-def _wxyz(xyzw: Array) -> Array:
-    """Return quaternions (K, 4), scalar first, of Bullet's."""
-    return rotations.normalize(xyzw[:, [3, 0, 1, 2]])
 
 
 def _largest(rows: Array) -> float:

@@ -1,18 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rigid-body simulation in PyBullet; the only module that uses its conventions.
+"""Rigid-body simulation of a scenario on one of the engines (engine.py): bodies, disturbances, latches and loads.
 
-PyBullet orders quaternions x, y, z, w and expresses angular velocity in world axes; this module's interface is scalar first
-with body rates. Bullet has no gravity, damping or sleeping; the
-forces of an orbit are applied to every body (orbital_forces.py).
+The interface is in body frames with body rates. The forces of an orbit are applied to every body (orbital_forces.py).
 """
 
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from chaserdock_models import rotations
@@ -27,9 +22,20 @@ from chaserdock_world.orbit import TargetOrbit
 from chaserdock_world.plant import Plant, chaser_plant, target_plant, true_mesh
 from chaserdock_world.random_draws import GaussMarkov, Stream
 
-from .bullet import connect, pybullet
 from .collision_hulls import collision_hulls, triangles_of
 from .compliant_latch import ENGAGED_M, CompliantLatch, Grip
+from .engine import (
+    BodyContact,
+    ContactSpring,
+    EngineSetup,
+    Motion,
+    RigidBodyDefinition,
+    Solid,
+    SolidBox,
+    SolidCapsule,
+    SolidHull,
+)
+from .engine_factory import make_engine
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch, latch_faults
 from .orbital_forces import OrbitalForces
@@ -38,43 +44,26 @@ from .port_loads import PortLoadRecorder, port_attitude
 
 TARGET = "target"
 PROBE_RADIUS_M = 0.006
-_Z_TO_X_XYZW = [0.0, 0.5**0.5, 0.0, 0.5**0.5]
-# A compliant contact: restitution 0.4 and 0.5 mm penetration at 1 cm/s (docs/docking.md).
-_CONTACT = {"contactStiffness": 1e4, "contactDamping": 100.0}
+_Z_TO_X_WXYZ = np.array([0.5**0.5, 0.0, 0.5**0.5, 0.0])
+# A compliant contact: restitution 0.35 and 0.3 mm penetration at 1 cm/s (docs/docking.md).
+_STIFFNESS_N_M, _DAMPING_N_S_M = 1e4, 100.0
+_ZERO = (0.0, 0.0, 0.0)
 
 
 class Physics:
-    """Simulates the bodies of a scenario in its own PyBullet client."""
+    """Simulates the bodies of a scenario on an engine of its own. Raises MissingPackageError without the engine's package."""
 
     def __init__(self, scenario: Scenario) -> None:
         self.step_count = 0
         self._scenario = scenario
         self._prescribed = scenario.target.motion != "torque_free"
-        # Interval at which Bullet's copy of a prescribed target is moved; ``state`` is exact at every step.
+        # Interval at which the engine's copy of a prescribed target is moved; ``state`` is exact at every step.
         self._steps_per_target_update = max(1, scenario.time.physics_hz // 120)
-        self._bullet = connect()
-        self._client: int = self._bullet._client  # direct calls: the wrapper is too slow for every step
-        self._bullet.setGravity(0, 0, 0)
-        self._bullet.setTimeStep(1.0 / scenario.time.physics_hz)
         chasers = {f"chaser/{i}": i for i in range(len(scenario.chasers))}
         self.plants = {TARGET: target_plant(scenario)}
         self.plants |= {name: chaser_plant(scenario, i) for name, i in chasers.items()}
-        self._bodies: dict[str, int] = {TARGET: self._add_target(scenario)}
-        for name, i in chasers.items():
-            self._bodies[name] = self._add_chaser(scenario, i)
-        # Bodies that Bullet integrates.
-        self._free = {name: self.plants[name] for name in chasers}
-        if not self._prescribed:
-            self._free[TARGET] = self.plants[TARGET]
-        self._orbital: OrbitalForces | None = None
-        if scenario.orbit is not None:
-            step_s, per_tick = 1.0 / scenario.time.physics_hz, scenario.timing.steps_per_tick
-            self._orbital = OrbitalForces(TargetOrbit(scenario.orbit), step_s, per_tick)
-        self.plumes = None if scenario.plume is None else PlumeLoads(scenario, scenario.plume)
-        self._noise = {
-            name: _disturbance_noise(scenario, i) for name, i in chasers.items() if _has_noise(scenario)
-        }
-        self._names = {number: name for name, number in self._bodies.items()}
+        self._bodies = {name: number for number, name in enumerate(self.plants)}
+        self._names = tuple(self.plants)
         hz, docking = scenario.time.physics_hz, scenario.docking
         ports = docking.ports if docking.kind == "capture" else ()
         self.latches = {
@@ -83,16 +72,30 @@ class Physics:
             )
             for p in ports
         }
+        definitions = [self._target_definition(), *(self._chaser_definition(i) for i in chasers.values())]
+        joints = tuple((self._bodies[TARGET], self._bodies[name]) for name in self.latches)
+        setup = EngineSetup(definitions, 1.0 / hz, self._contact_spring(), joints)
+        self._engine = make_engine(scenario.world.engine, setup)
+        # Bodies that the engine integrates.
+        self._free = {name: self.plants[name] for name in chasers}
+        if not self._prescribed:
+            self._free[TARGET] = self.plants[TARGET]
+        self._orbital: OrbitalForces | None = None
+        if scenario.orbit is not None:
+            self._orbital = OrbitalForces(
+                TargetOrbit(scenario.orbit), 1.0 / hz, scenario.timing.steps_per_tick
+            )
+        self.plumes = None if scenario.plume is None else PlumeLoads(scenario, scenario.plume)
+        self._noise = {
+            name: _disturbance_noise(scenario, i) for name, i in chasers.items() if _has_noise(scenario)
+        }
         self.port_loads = {name: self._load_recorder(name, p.chaser) for name, p in self.latches.items()}
-        if self.latches:
-            # Else the solver stops early, and joint reactions lag behind changes of thrust by a few steps.
-            self._bullet.setPhysicsEngineParameter(solverResidualThreshold=0.0)
-        self._joints: dict[str, int] = {}
+        self._joints: list[str] = []  # chasers with a rigid joint, in the order in which they latched
         self._compliant: dict[str, CompliantLatch] = {}
         self._openings: list[tuple[int, str]] = []
         self._closing = False  # a latch closed in the last step: its joint acts first in the next one
-        # Pose and rates of every free body at the beginning of the last step, in Bullet's conventions.
-        self._before: dict[int, tuple[Any, Any]] = {}
+        # Motion of every free body at the beginning of the last step.
+        self._before: dict[int, Motion] = {}
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -106,108 +109,55 @@ class Physics:
             q_port = rotations.multiply(rotations.conjugate(frame.q_wxyz), q_port)
         return PortLoadRecorder(q_port, 1.0 / self._scenario.time.physics_hz)
 
-    def _add(self, shape: int, plant: Plant, mass_kg: float, body_state: BodyState) -> int:
-        state = body_state if plant.frame is None else plant.frame.from_body(body_state)
-        body = self._bullet.createMultiBody(
-            baseMass=mass_kg,
-            baseCollisionShapeIndex=shape,
-            basePosition=state.position_m.tolist(),
-            baseOrientation=_xyzw(state.q_wxyz),
-        )
-        self._bullet.changeDynamics(body, -1, linearDamping=0.0, angularDamping=0.0, maxJointVelocity=1e6)
-        if mass_kg > 0:
-            self._bullet.changeDynamics(body, -1, localInertiaDiagonal=list(plant.moments_kg_m2))
-        if self._scenario.docking.kind == "capture":
-            self._bullet.changeDynamics(body, -1, **_CONTACT)
-        self._set_velocity(body, state)
-        return body
+    def _contact_spring(self) -> ContactSpring | None:
+        """Return the contact of docking by capture; bodies that are not meant to touch are hard."""
+        if self._scenario.docking.kind != "capture":
+            return None
+        target, chaser = self.plants[TARGET].mass_kg, self._scenario.chaser.mass_kg
+        return ContactSpring(_STIFFNESS_N_M, _DAMPING_N_S_M, target * chaser / (target + chaser))
 
-    def _set_velocity(self, body: int, state: BodyState) -> None:
-        omega_world = rotations.rotate(state.q_wxyz, state.omega_rad_s)
-        pybullet.resetBaseVelocity(body, state.velocity_m_s.tolist(), omega_world.tolist(), self._client)
-
-    def _add_target(self, scenario: Scenario) -> int:
-        plant = self.plants[TARGET]
-        mass = 0.0 if self._prescribed else plant.mass_kg
+    def _target_definition(self) -> RigidBodyDefinition:
+        scenario, plant = self._scenario, self.plants[TARGET]
         model, mesh = scenario.target_model(), true_mesh(scenario)
         hulls = collision_hulls(mesh) if model.hulls and mesh is not None else []
-        shape = self._hull_shape(hulls, plant) if hulls else self._box_shape(model, plant)
-        return self._add(shape, plant, mass, prescribed_state(scenario, 0.0))
+        solids = _hull_solids(hulls, plant) if hulls else _box_solids(model, plant)
+        mass_kg = 0.0 if self._prescribed else plant.mass_kg
+        state = self._engine_state(TARGET, prescribed_state(scenario, 0.0))
+        return RigidBodyDefinition(mass_kg, plant.moments_kg_m2, solids, state)
 
-    def _box_shape(self, model: TargetModel, plant: Plant) -> int:
-        boxes = model.boxes
-        places = [_place(plant, list(box.position_m), _xyzw(np.asarray(box.q_wxyz))) for box in boxes]
-        return self._bullet.createCollisionShapeArray(
-            shapeTypes=[pybullet.GEOM_BOX] * len(boxes),
-            halfExtents=[[s / 2 for s in box.size_m] for box in boxes],
-            collisionFramePositions=[position for position, _ in places],
-            collisionFrameOrientations=[xyzw for _, xyzw in places],
-        )
-
-    def _hull_shape(self, hulls: Sequence[Array], plant: Plant) -> int:
-        """Return a shape of convex pieces: Bullet makes one of every object of an OBJ file."""
-        lines, first = [], 1
-        for number, hull in enumerate(hulls):
-            vertices = hull if plant.frame is None else plant.frame.place(hull, rotations.IDENTITY)[0]
-            faces = triangles_of(hull)
-            lines.append(f"o piece_{number}")
-            lines += [f"v {x!r} {y!r} {z!r}" for x, y, z in vertices.tolist()]
-            lines += [f"f {a} {b} {c}" for a, b, c in (faces + first).tolist()]
-            first += len(vertices)
-        with tempfile.TemporaryDirectory(prefix="chaserdock-") as folder:
-            path = Path(folder) / "hulls.obj"
-            path.write_text("\n".join(lines) + "\n")
-            return self._bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path))
-
-    def _add_chaser(self, scenario: Scenario, i: int) -> int:
-        body, plant = scenario.chaser, self.plants[f"chaser/{i}"]
+    def _chaser_definition(self, i: int) -> RigidBodyDefinition:
+        scenario, body, plant = self._scenario, self._scenario.chaser, self.plants[f"chaser/{i}"]
         half = [s / 2 for s in body.size_m]
-        box_m, box_xyzw = _place(plant, [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+        solids: list[Solid] = [SolidBox(half, *_place(plant, np.zeros(3), rotations.IDENTITY))]
         if scenario.docking.kind == "capture":
             # The probe: a massless capsule from the body's front to the tip.
             length = body.probe_reach_m - half[0] - PROBE_RADIUS_M
-            probe_m, probe_xyzw = _place(plant, [half[0] + length / 2, 0.0, 0.0], _Z_TO_X_XYZW)
-            shape = self._bullet.createCollisionShapeArray(
-                shapeTypes=[pybullet.GEOM_BOX, pybullet.GEOM_CAPSULE],
-                halfExtents=[half, [0.0, 0.0, 0.0]],
-                radii=[0.0, PROBE_RADIUS_M],
-                lengths=[0.0, length],
-                collisionFramePositions=[box_m, probe_m],
-                collisionFrameOrientations=[box_xyzw, probe_xyzw],
-            )
-        else:
-            place = {"collisionFramePosition": box_m, "collisionFrameOrientation": box_xyzw}
-            place = {} if plant.frame is None else place
-            shape = self._bullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=half, **place)
+            middle = np.array([half[0] + length / 2, 0.0, 0.0])
+            solids.append(SolidCapsule(PROBE_RADIUS_M, length, *_place(plant, middle, _Z_TO_X_WXYZ)))
         position, attitude = scenario.start_pose(i)
         state = BodyState(position, np.asarray(scenario.chasers[i].start_velocity_m_s), attitude, np.zeros(3))
-        return self._add(shape, plant, plant.mass_kg, state)
+        state = self._engine_state(f"chaser/{i}", state)
+        return RigidBodyDefinition(plant.mass_kg, plant.moments_kg_m2, solids, state)
 
     def state(self, name: str) -> BodyState:
         """Return the current state of a body; that of a prescribed target is exact."""
         if name == TARGET and self._prescribed:
             return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
-        body = self._bodies[name]
-        client = self._client
-        pose = pybullet.getBasePositionAndOrientation(body, client)
-        return self._body_state(name, pose, pybullet.getBaseVelocity(body, client))
+        return self._body_state(name, self._engine.motion(self._bodies[name]))
 
-    def _body_state(self, name: str, pose: Any, rates: Any) -> BodyState:
-        """Return the state of a body's frame from Bullet's pose, velocity and rate."""
-        state, frame = _state_of(pose, rates), self.plants[name].frame
+    def _body_state(self, name: str, motion: Motion) -> BodyState:
+        """Return the state of a body's frame from the engine's motion of it."""
+        state, frame = _state_of(motion), self.plants[name].frame
         return state if frame is None else frame.to_body(state)
 
-    def _bullet_state(self, name: str, state: BodyState) -> BodyState:
-        """Return the state of the frame that Bullet integrates from that of a body's frame."""
+    def _engine_state(self, name: str, state: BodyState) -> BodyState:
+        """Return the state of the frame that the engine integrates from that of a body's frame."""
         frame = self.plants[name].frame
         return state if frame is None else frame.from_body(state)
 
     def place(self, name: str, state: BodyState) -> None:
         """Set the state of a body. Contacts are not checked."""
-        body, state = self._bodies[name], self._bullet_state(name, state)
-        position, attitude = state.position_m.tolist(), _xyzw(state.q_wxyz)
-        pybullet.resetBasePositionAndOrientation(body, position, attitude, self._client)
-        self._set_velocity(body, state)
+        self._engine.place(self._bodies[name], self._engine_state(name, state))
 
     def next_change(self, step: int) -> int | None:
         """Return the first step after ``step`` at which a disturbance changes, None if all are constant."""
@@ -215,7 +165,7 @@ class Physics:
         return (step // per_tick + 1) * per_tick if self._noise else None
 
     def _wrench_on(self, name: str, wrench: Array) -> Array:
-        """Return force and torque (6,), in Bullet's frame of a body, of its actuators and its present disturbances."""
+        """Return force and torque (6,), in the engine's frame of a body, of its actuators and its present disturbances."""
         plant = self.plants[name]
         if plant.disturbance.any():
             wrench = wrench + plant.disturbance
@@ -238,36 +188,30 @@ class Physics:
         step_s = 1.0 / self._scenario.time.physics_hz
         moves = self._prescribed and self._scenario.target.motion != "static"
         touched: set[tuple[str, str]] = set()
-        frame, client = pybullet.LINK_FRAME, self._client
-        force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
-        pose_of, rates_of = pybullet.getBasePositionAndOrientation, pybullet.getBaseVelocity
-        step, contact_points = pybullet.stepSimulation, pybullet.getContactPoints
-        before, jointed = self._before, set[int]()
+        engine, before, jointed = self._engine, self._before, set[int]()
+        motion_of, push = engine.motion, engine.push
         for _ in range(steps):
             if self.latches:
                 jointed = self._update_joints()
-            # Bullet clears external forces after every step.
             for body, inertia, force, torque in loads:
-                pose, rates = pose_of(body, client), rates_of(body, client)
+                motion = motion_of(body)
                 if body in jointed:
-                    last = before.get(body, (pose, rates))[1]
-                    x, y, z = midpoint_torque_of_rates(inertia, pose[1], rates[1], last[1])
+                    last = before.get(body, motion)
+                    x, y, z = midpoint_torque_of_rates(inertia, motion[1], motion[3], last[3])
                 else:
-                    x, y, z = midpoint_torque(inertia, pose[1], rates[1], torque, step_s)
-                before[body] = pose, rates
-                if any(force):
-                    force_on(body, -1, force, (0, 0, 0), frame, client)
-                torque_on(body, -1, (torque[0] + x, torque[1] + y, torque[2] + z), frame, client)
+                    x, y, z = midpoint_torque(inertia, motion[1], motion[3], torque, step_s)
+                before[body] = motion
+                push(body, force, (torque[0] + x, torque[1] + y, torque[2] + z))
                 if self._orbital is not None:
-                    self._apply_orbital(self._orbital, body, pose, rates)
+                    self._apply_orbital(self._orbital, body, motion)
             if self._compliant:
                 self._apply_compliant_latches()
-            step(client)
+            engine.step()
             self.step_count += 1
             if self._joints:
                 self._record_loads()
             # A bounce may last a single step, so contacts are checked after each.
-            if contact_points(physicsClientId=client):
+            if engine.touching():
                 touched.update(self._process_contacts())
             if moves and self.step_count % self._steps_per_target_update == 0:
                 self.place(TARGET, self.state(TARGET))
@@ -289,25 +233,26 @@ class Physics:
         attached = (*self._joints, *self._compliant)
         return {self._bodies[name] for name in (*attached, TARGET)} if attached else set()
 
-    def _apply_orbital(self, orbital: OrbitalForces, body: int, pose: Any, rates: Any) -> None:
-        """Apply the loads of the orbit to a body for one step; ``pose``, ``rates``: Bullet's."""
-        name = self._names[body]
+    def _apply_orbital(self, orbital: OrbitalForces, body: int, motion: Motion) -> None:
+        """Apply the loads of the orbit to a body for one step."""
+        name, (position, q_wxyz, velocity, omega_world) = self._names[body], motion
         plant = self.plants[name]
         orbital.set_step(self.step_count)
-        force = orbital.force(body, plant.mass_kg, pose[0], rates[0], name != TARGET)
-        torque = orbital.torque(pose[1], rates[1], plant.moments_kg_m2)
-        pybullet.applyExternalForce(body, -1, force, pose[0], pybullet.WORLD_FRAME, self._client)
-        pybullet.applyExternalTorque(body, -1, torque, pybullet.LINK_FRAME, self._client)
+        force = orbital.force(body, plant.mass_kg, position, velocity, name != TARGET)
+        torque = orbital.torque(q_wxyz, omega_world, plant.moments_kg_m2)
+        self._engine.push_at(body, force, _ZERO, position)
+        self._engine.push(body, _ZERO, torque)
 
     def _record_loads(self) -> None:
         """Record the loads at the ports with rigid joints in the last step; open latches that they are too large for."""
         closing, self._closing = self._closing, False
-        for name, joint in tuple(self._joints.items()):
-            self._record_load(name, pybullet.getConstraintState(joint, self._client), closing)
+        target = self._bodies[TARGET]
+        for name in tuple(self._joints):
+            self._record_load(name, self._engine.reaction(target, self._bodies[name]), closing)
 
     def _record_load(self, name: str, reaction: Sequence[float], closing: bool = False) -> None:
-        target_xyzw, chaser_xyzw = (self._before[self._bodies[n]][0][1] for n in (TARGET, name))
-        self.port_loads[name].add(reaction, target_xyzw, chaser_xyzw, closing)
+        q_target, q_chaser = (self._before[self._bodies[n]][1] for n in (TARGET, name))
+        self.port_loads[name].add(reaction, q_target, q_chaser, closing)
         strength = self._scenario.truth.latch
         for load, limit, unit in (
             (math.hypot(*reaction[:3]), strength.strength_N, "N"),
@@ -326,17 +271,15 @@ class Physics:
 
     def _apply_compliant_latches(self) -> None:
         """Apply the loads of latches with play, and of those that slip, to target and chasers for one step."""
-        force_on, torque_on = pybullet.applyExternalForce, pybullet.applyExternalTorque
         reach_m, target = self._scenario.chaser.probe_reach_m, self.state(TARGET)
         for name, compliant in tuple(self._compliant.items()):
             slip = self.latches[name].fault_at("latch_slip", self.step_count)
             grip = Grip() if slip is None else slip.grip
             force, torque, tip = compliant.load(target, self.state(name), reach_m, grip)
             for body, sign in ((self._bodies[TARGET], 1.0), (self._bodies[name], -1.0)):
-                force_on(body, -1, (sign * force).tolist(), tip.tolist(), pybullet.WORLD_FRAME, self._client)
-                torque_on(body, -1, (sign * torque).tolist(), pybullet.WORLD_FRAME, self._client)
-            x, y, z, w = self._before[self._bodies[name]][0][1]
-            self._record_load(name, [*force, *rotations.rotate_inverse([w, x, y, z], torque)])
+                self._engine.push_at(body, (sign * force).tolist(), (sign * torque).tolist(), tip.tolist())
+            q_chaser = self._before[self._bodies[name]][1]
+            self._record_load(name, [*force, *rotations.rotate_inverse(q_chaser, torque)])
             if name in self._compliant and compliant.slipped_m > ENGAGED_M:
                 self._open(name, f"slipped {compliant.slipped_m * 1e3:.0f} mm, out of its port")
 
@@ -358,19 +301,22 @@ class Physics:
     def _find_contacts(self) -> tuple[tuple[tuple[str, str], ...], set[str]]:
         """Return ``contacts``, and the chasers whose probe tip touches the target."""
         pairs, tips = set(), set()
-        for c in self._bullet.getContactPoints():
-            # Bullet stops bodies at a distance (c[8]) of zero up to rounding, so the force (c[9]) is checked as well.
-            if not (c[8] <= 0.0 or c[9] > 0.0):
-                continue
-            for name, other, point in ((c[1], c[2], c[5]), (c[2], c[1], c[6])):
-                if self._names[other] == TARGET and self._is_tip(self._names[name], point):
-                    tips.add(self._names[name])
-                    break
+        for contact in self._engine.contacts():
+            if (tip := self._touching_tip(contact)) is not None:
+                tips.add(tip)
             else:
-                pairs.add(tuple(sorted((self._names[c[1]], self._names[c[2]]))))
+                pairs.add(tuple(sorted((self._names[contact.a], self._names[contact.b]))))
         return tuple(sorted((a, b) for a, b in pairs)), tips
 
-    def _is_tip(self, name: str, point_m: tuple[float, float, float]) -> bool:
+    def _touching_tip(self, contact: BodyContact) -> str | None:
+        """Return the chaser whose probe tip touches the target in a contact, or None."""
+        a, b = self._names[contact.a], self._names[contact.b]
+        for name, other, point in ((a, b, contact.point_a_m), (b, a, contact.point_b_m)):
+            if other == TARGET and self._is_tip(name, point):
+                return name
+        return None
+
+    def _is_tip(self, name: str, point_m: Sequence[float]) -> bool:
         """Return whether a point (3,), WRF, of a chaser's surface is on the round end of its probe."""
         if name not in self.latches:
             return False
@@ -393,7 +339,7 @@ class Physics:
     def _update_latches(self, tips: set[str]) -> None:
         """Pass the contacts of the last step to the latches of these chasers."""
         for name in sorted(tips):
-            chaser, target = (self._body_state(n, *self._before[self._bodies[n]]) for n in (name, TARGET))
+            chaser, target = (self._body_state(n, self._before[self._bodies[n]]) for n in (name, TARGET))
             latch = self.latches[name]
             q_off = np.asarray(self._scenario.chasers[latch.chaser].q_wxyz)
             reach_m = self._scenario.chaser.probe_reach_m
@@ -412,13 +358,13 @@ class Physics:
             self._add_joint(name)
             self._closing = True
         # The contact spring would work against the latch.
-        self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 0)
+        self._engine.set_collisions(self._bodies[TARGET], self._bodies[name], False)
 
     def _detach(self, name: str) -> None:
         if name in self._joints:
             self._remove_joint(name)
         self._compliant.pop(name, None)
-        self._bullet.setCollisionFilterPair(self._bodies[TARGET], self._bodies[name], -1, -1, 1)
+        self._engine.set_collisions(self._bodies[TARGET], self._bodies[name], True)
 
     def _compliant_latch(self, name: str) -> CompliantLatch:
         """Return a latch that holds a chaser where it is."""
@@ -437,32 +383,21 @@ class Physics:
         chaser = self.state(name)
         tip = np.array([self._scenario.chaser.probe_reach_m, 0.0, 0.0])
         tip_world = chaser.position_m + rotations.rotate(chaser.q_wxyz, tip)
-        chaser, target = self._bullet_state(name, chaser), self._bullet_state(TARGET, self.state(TARGET))
+        chaser, target = self._engine_state(name, chaser), self._engine_state(TARGET, self.state(TARGET))
         if self.plants[name].frame is not None:
             tip = rotations.rotate_inverse(chaser.q_wxyz, tip_world - chaser.position_m)
         relative = rotations.multiply(rotations.conjugate(target.q_wxyz), chaser.q_wxyz)
-        a, b = self._bodies[TARGET], self._bodies[name]
-        self._joints[name] = self._bullet.createConstraint(
-            parentBodyUniqueId=a,
-            parentLinkIndex=-1,
-            childBodyUniqueId=b,
-            childLinkIndex=-1,
-            jointType=pybullet.JOINT_FIXED,
-            jointAxis=[0, 0, 0],
-            parentFramePosition=rotations.rotate_inverse(
-                target.q_wxyz, tip_world - target.position_m
-            ).tolist(),
-            childFramePosition=tip.tolist(),
-            parentFrameOrientation=_xyzw(relative),
-            childFrameOrientation=[0.0, 0.0, 0.0, 1.0],
-        )
+        port = rotations.rotate_inverse(target.q_wxyz, tip_world - target.position_m)
+        self._engine.join(self._bodies[TARGET], self._bodies[name], port, tip, relative)
+        self._joints.append(name)
 
     def _remove_joint(self, name: str) -> None:
-        self._bullet.removeConstraint(self._joints.pop(name))
+        self._joints.remove(name)
+        self._engine.separate(self._bodies[TARGET], self._bodies[name])
 
     def close(self) -> None:
-        """Disconnect the PyBullet client."""
-        self._bullet.disconnect()
+        """Free the engine."""
+        self._engine.close()
 
 
 def _has_noise(scenario: Scenario) -> bool:
@@ -478,18 +413,28 @@ def _disturbance_noise(scenario: Scenario, chaser: int) -> tuple[GaussMarkov, Ar
     return noise, np.repeat([sigma.force_noise_N, sigma.torque_noise_N_m], 3)
 
 
-def _place(plant: Plant, position_m: list[float], xyzw: list[float]) -> tuple[list[float], list[float]]:
-    """Return position and attitude (Bullet's order) of a part in Bullet's frame of a body, from those in the body's frame."""
-    if plant.frame is None:
-        return position_m, xyzw
-    position, q = plant.frame.place(np.array(position_m), np.array([xyzw[3], *xyzw[:3]]))
-    return position.tolist(), _xyzw(q)
+def _place(plant: Plant, position_m: Array, q_wxyz: Array) -> tuple[Array, Array]:
+    """Return the pose of a part in the engine's frame of a body from that in the body's frame."""
+    return (position_m, q_wxyz) if plant.frame is None else plant.frame.place(position_m, q_wxyz)
 
 
-def _state_of(pose: Any, rates: Any) -> BodyState:
-    """Return a body's state from Bullet's pose and its velocity and rate in world axes."""
-    (position, xyzw), (velocity, omega_world) = pose, rates
-    q = rotations.normalize([xyzw[3], *xyzw[:3]])
+def _box_solids(model: TargetModel, plant: Plant) -> list[SolidBox]:
+    return [
+        SolidBox(
+            [s / 2 for s in box.size_m], *_place(plant, np.array(box.position_m), np.asarray(box.q_wxyz))
+        )
+        for box in model.boxes
+    ]
+
+
+def _hull_solids(hulls: Sequence[Array], plant: Plant) -> list[SolidHull]:
+    return [SolidHull(_place(plant, hull, rotations.IDENTITY)[0], triangles_of(hull)) for hull in hulls]
+
+
+def _state_of(motion: Motion) -> BodyState:
+    """Return the state of the engine's frame of a body."""
+    position, q_wxyz, velocity, omega_world = motion
+    q = rotations.normalize(q_wxyz)
     return BodyState(np.array(position), np.array(velocity), q, rotations.rotate_inverse(q, omega_world))
 
 
@@ -502,8 +447,3 @@ def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:
     position = np.asarray(target.position_m) + velocity * time_s
     attitude = rotations.integrate(target.q_wxyz, omega, time_s)
     return BodyState(position, velocity, attitude, omega)
-
-
-def _xyzw(q_wxyz: Array) -> list[float]:
-    w, x, y, z = np.asarray(q_wxyz, dtype=float).tolist()
-    return [x, y, z, w]

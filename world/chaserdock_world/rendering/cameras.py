@@ -7,6 +7,7 @@ import math
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -33,12 +34,21 @@ from .mesh_markers import with_markers
 from .mesh_renderer import MeshRenderer
 from .rasterizer import Renderer, chaser_boxes
 from .scene_geometry import Obstacle
-from .tinyrenderer import TinyRenderer
+
+if TYPE_CHECKING:
+    from .tinyrenderer import TinyRenderer
 
 # Motion blur: one sample of the exposure per this many pixels of motion, and at most so many.
 _BLUR_STEP_PX, _BLUR_SAMPLES_MAX = 0.5, 16
 
 States = dict[str, BodyState]
+
+
+def _tiny_renderer() -> type[TinyRenderer]:
+    """Return PyBullet's renderer, which needs a package that not every platform has."""
+    from .tinyrenderer import TinyRenderer
+
+    return TinyRenderer
 
 
 class Cameras:
@@ -66,7 +76,7 @@ class Cameras:
             try:
                 if mesh is not None and section.renderer == "exact":
                     return MeshRenderer(camera, mesh, background, effects.point_spread_px, substitutes)
-                kind = Renderer if section.renderer == "exact" else TinyRenderer
+                kind = Renderer if section.renderer == "exact" else _tiny_renderer()
                 return kind(camera, self._target, background, effects.point_spread_px)
             except ValueError as error:
                 raise ScenarioError(f"camera: {error}") from None

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .model.mesh import TrackerMesh
 from .model.perception import ModelPerception
-from .pipeline import Method, Perception, PerceptionResult, TargetPose
+from .pipeline import GeometryInformation, Method, Perception, PerceptionResult, TargetPose
 from .statistical import StatisticalPerception
 
 
@@ -51,6 +51,7 @@ def tracker_mesh(target: FlightTarget) -> TrackerMesh:
 
 
 __all__ = [
+    "GeometryInformation",
     "Method",
     "Perception",
     "PerceptionMethod",

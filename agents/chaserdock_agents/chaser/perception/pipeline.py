@@ -22,19 +22,30 @@ _ENOUGH = 6
 Method = Literal["default", "paper", "paper_iterative"]
 
 
+@dataclass(frozen=True, eq=False)
+class GeometryInformation:
+    """Information of one image about the k errors of the geometry, whatever the pose: ``matrix`` (k, k) and ``vector`` (k,), the
+    matrix times the estimate; in standard deviations of the errors."""
+
+    matrix: Array
+    vector: Array
+
+
 @dataclass(frozen=True)
 class PerceptionResult:
     """Result for one image.
 
     ``solutions``: best first; empty without a trustworthy pose, two if a plane's tilt is ambiguous. ``marker_ids`` (n,)
     and ``corners_px`` (n, 4, 2), distorted image: the used markers. ``rejected_ids``: detected but not used, ascending: not
-    on this target, duplicate, inconsistent with the others, or with an unusable side.
+    on this target, duplicate, inconsistent with the others, or with an unusable side. ``geometry``: what the image tells about the
+    errors of a known shape, by a perception that estimates them.
     """
 
     solutions: tuple[TargetPose, ...]
     marker_ids: NDArray[np.int64]
     corners_px: Array
     rejected_ids: tuple[int, ...]
+    geometry: GeometryInformation | None = None
 
 
 class Perception:

@@ -43,7 +43,7 @@ class StatisticalPerception:
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:
-        """Return one solution, or none if too little of the target is in view. Raises ValueError for a picture."""
+        """Return one solution, or none if too little of the target is in view. Raises ValueError for a rendered image."""
         position, q, seed = decode_pose(image)
         rotation = rotations.to_matrix(q)
         corners = self._table.corners.reshape(-1, 3) @ rotation.T + position

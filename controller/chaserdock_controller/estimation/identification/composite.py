@@ -120,7 +120,7 @@ def prior_of(target: TargetBody, parameters: IdentificationParameters) -> MassPr
 
 
 @dataclass(frozen=True, eq=False)
-class _Estimate:
+class CompositeEstimate:
     """Nominal state of the filter; ``thrusts``: relative errors (N n,) of all thrusters; ``biases`` (N, 3) of the rates."""
 
     position_m: Array
@@ -132,6 +132,15 @@ class _Estimate:
     mounts_wxyz: Array
     thrusts: Array
     biases: Array
+
+
+@dataclass(frozen=True, eq=False)
+class CompositeFilterState:
+    """All that the filter knows after a tick: nominal state, covariance (size, size) of its error, and number of updates."""
+
+    estimate: CompositeEstimate
+    covariance: Array
+    ticks: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +203,16 @@ class CompositeIdentification:
                 *[math.hypot(errors.omega_noise_rad_s, 1e-5)] * 3,
             ]
         )
+
+    def save(self) -> CompositeFilterState:
+        """Return a copy of the state."""
+        return CompositeFilterState(self._estimate, self.covariance.copy(), self.ticks)
+
+    def load(self, state: CompositeFilterState) -> None:
+        """Replace the state by a saved one of a filter with the same chasers. Raises ValueError for another one."""
+        if state.covariance.shape != self.covariance.shape:
+            raise ValueError("the state is of another stack")
+        self._estimate, self.covariance, self.ticks = state.estimate, state.covariance.copy(), state.ticks
 
     # -- layout ----------------------------------------------------------------------------------------------
 
@@ -386,17 +405,6 @@ class CompositeIdentification:
             k = self._mount(row)
             self.covariance[k, k] += np.diag(np.repeat([position_m**2, attitude_rad**2], 3))
 
-    def correct(self, shift: Array, sigma_share: float) -> None:
-        """Shift the error state by ``shift`` (size,), known up to ``sigma_share`` of it."""
-        self._estimate = self._corrected(self._estimate, shift)
-        self.covariance = self.covariance + sigma_share**2 * np.outer(shift, shift)
-
-    def widen(self, factor: float) -> None:
-        """Multiply the standard deviations of the mass properties."""
-        scale = np.ones(len(self.covariance))
-        scale[PROPERTIES] = factor
-        self.covariance = self.covariance * np.outer(scale, scale)
-
     def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None:
         """Widen the motion by an unknown shock with these standard deviations per axis."""
         for part, sigma in ((VELOCITY, velocity_m_s), (RATE, omega_rad_s)):
@@ -458,7 +466,7 @@ class CompositeIdentification:
         )
         return h, residual
 
-    def _corrected(self, x: _Estimate, d: Array) -> _Estimate:
+    def _corrected(self, x: CompositeEstimate, d: Array) -> CompositeEstimate:
         chasers = range(len(self.chasers))
         mounts = d[_MOUNTS : self._scales.start].reshape(-1, 6)
         thrusts = x.thrusts.copy()
@@ -468,7 +476,7 @@ class CompositeIdentification:
             x.body.inertia_kg_m2 + np.tensordot(d[INERTIA], _BASIS, 1),
             x.body.centre_trf_m + d[CENTRE],
         )
-        return _Estimate(
+        return CompositeEstimate(
             x.position_m + d[POSITION],
             x.velocity_m_s + d[VELOCITY],
             rotations.normalize(rotations.multiply(x.q_wxyz, rotations.exp(d[ATTITUDE]))),
@@ -525,7 +533,7 @@ def _inverse(matrix: Array) -> Array:
 
 def _start(
     body: TargetBody, mounts_m: Array, mounts_wxyz: Array, states: Sequence[BodyState], thrusters: int
-) -> _Estimate:
+) -> CompositeEstimate:
     """Return the state of the filter by the first measurements."""
     q = rotations.multiply(states[0].q_wxyz, rotations.conjugate(mounts_wxyz[0]))
     omega = np.mean(
@@ -537,7 +545,7 @@ def _start(
         s.velocity_m_s - rotations.rotate(q, rotations.cross(omega, arm))
         for s, arm in zip(states, arms, strict=True)
     ]
-    return _Estimate(
+    return CompositeEstimate(
         np.mean(places, axis=0),
         np.mean(velocities, axis=0),
         q,

@@ -13,27 +13,33 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from chaserdock_models.arrays import Array, BoolArray
+from chaserdock_models.arrays import Array, BoolArray, IntArray
 
-from .composite import RATE, VELOCITY, CompositeIdentification, StackInnovation, StackPrediction
+from .composite import RATE, VELOCITY, StackInnovation, StackPrediction
 
 _LEAST_GAIN = 25.0
 """Least log-likelihood ratio to the fault-free hypothesis."""
 _LEAST_MARGIN = 6.0
 """Least difference to the best hypothesis about another thruster."""
-_CORRECTION_SIGMA = 0.2
-"""Standard deviation of the effect of a detected failure so far, as a share of it."""
-_DOUBT = 3.0
-"""Factor of the standard deviations of the mass properties after a failure: what it did before its signature began is not known."""
 
 
 @dataclass(frozen=True)
 class StackFault:
-    """A failed thruster of a latched chaser."""
+    """A failed thruster of a latched chaser. ``ticks``: since when it has failed, at the likeliest."""
 
     chaser: int
     thruster: int
     kind: Literal["stuck_off", "stuck_on"]
+    ticks: int
+
+
+@dataclass(frozen=True, eq=False)
+class DetectorState:
+    """Signatures (size, 2 u), log-likelihood ratios (2 u,) and the ticks (2 u,) over which they were summed."""
+
+    signatures: Array
+    gains: Array
+    ticks: IntArray
 
 
 class StackFaultDetector:
@@ -43,10 +49,24 @@ class StackFaultDetector:
         self._thrusters, self._full_N = tuple(thrusters), full_N
         self._signatures = np.zeros((size, 2 * len(self._thrusters)))
         self.gains = np.zeros(2 * len(self._thrusters))
+        self._ticks = np.zeros(2 * len(self._thrusters), dtype=np.int64)
 
     def reset(self) -> None:
         """Begin all tests again."""
-        self._signatures[:], self.gains[:] = 0.0, 0.0
+        self._signatures[:], self.gains[:], self._ticks[:] = 0.0, 0.0, 0
+
+    def save(self) -> DetectorState:
+        """Return a copy of the state."""
+        return DetectorState(self._signatures.copy(), self.gains.copy(), self._ticks.copy())
+
+    def load(self, state: DetectorState) -> None:
+        """Replace the state by a saved one of a detector of the same thrusters. Raises ValueError for another one."""
+        if state.signatures.shape != self._signatures.shape or not (
+            len(state.gains) == len(state.ticks) == len(self.gains)
+        ):
+            raise ValueError("the state is of other thrusters")
+        self._signatures, self.gains = state.signatures.copy(), state.gains.copy()
+        self._ticks = state.ticks.copy()
 
     def predict(self, prediction: StackPrediction) -> None:
         """Propagate the signatures over a tick."""
@@ -58,28 +78,22 @@ class StackFaultDetector:
         for part, rows in ((VELOCITY, slice(0, 3)), (RATE, slice(3, 6))):
             self._signatures[part, :count] += missing[rows]
             self._signatures[part, count:] += beyond[rows]
+        self._ticks = np.where(self._signatures.any(axis=0), self._ticks + 1, 0)
 
-    def update(self, innovation: StackInnovation, suspects: BoolArray) -> tuple[StackFault, Array] | None:
-        """Return a failure that the innovations prove, with its effect on the state; ``suspects`` (u,): thrusters in question."""
+    def update(self, innovation: StackInnovation, suspects: BoolArray) -> StackFault | None:
+        """Return a failure that the innovations prove; ``suspects`` (u,): thrusters in question."""
         shift = innovation.matrix @ self._signatures
         weighted = np.linalg.solve(innovation.covariance, shift)
         self.gains += innovation.residual @ weighted - 0.5 * np.sum(shift * weighted, axis=0)
         self._signatures = self._signatures - innovation.gain @ shift
         again = (self.gains < 0.0) | np.tile(~suspects, 2)
-        self.gains[again], self._signatures[:, again] = 0.0, 0.0
+        self.gains[again], self._signatures[:, again], self._ticks[again] = 0.0, 0.0, 0
         best = int(np.argmax(self.gains))
         count = len(self._thrusters)
         other = np.delete(self.gains, [best % count, best % count + count])
         if self.gains[best] < _LEAST_GAIN or self.gains[best] - other.max(initial=0.0) < _LEAST_MARGIN:
             return None
         chaser, thruster = self._thrusters[best % count]
-        fault = StackFault(chaser, thruster, "stuck_off" if best < count else "stuck_on")
-        effect = self._signatures[:, best].copy()
+        kind, ticks = "stuck_off" if best < count else "stuck_on", int(self._ticks[best])
         self.reset()
-        return fault, effect
-
-
-def apply_fault(identification: CompositeIdentification, effect: Array) -> None:
-    """Remove the effect of a failure that was not known from the state of the filter."""
-    identification.correct(effect, _CORRECTION_SIGMA)
-    identification.widen(_DOUBT)
+        return StackFault(chaser, thruster, kind, ticks)

@@ -5,10 +5,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import BoolArray
 from chaserdock_models.mounting import MountedChaser
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import Odometry
@@ -21,8 +22,9 @@ from chaserdock_controller.estimation.measurements import SightingConverter
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
 
-from .composite import CompositeIdentification, IdentificationParameters, attach, prior_of
-from .faults import StackFault, StackFaultDetector, apply_fault
+from .composite import CompositeIdentification, IdentificationParameters, MassProperties, attach, prior_of
+from .fault_recovery import FaultTolerantIdentification, RecoveryState
+from .faults import StackFault
 from .free_tumble import TumbleIdentification, inertia_ratios
 
 _SHOCK = (0.01, 0.02)
@@ -50,6 +52,17 @@ def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
     )
 
 
+@dataclass(frozen=True, eq=False)
+class IdentificationState:
+    """What a standby controller takes over. ``composite``: the latched chasers in the filter's order, and its state."""
+
+    target: MassProperties
+    failed: dict[int, tuple[int, ...]]
+    reporting: list[int]
+    silent_ticks: dict[int, int]
+    composite: tuple[list[int], RecoveryState] | None
+
+
 class StackIdentification:
     """The filter of the stack that is latched now. ``target``: what is known of the target alone, kept when chasers come and go."""
 
@@ -61,8 +74,7 @@ class StackIdentification:
         self.failed: dict[int, tuple[int, ...]] = {}
         self._converter = SightingConverter(scenario.camera_model())
         self._tumble: TumbleIdentification | None = None
-        self._filter: CompositeIdentification | None = None
-        self._detector: StackFaultDetector | None = None
+        self._composite: FaultTolerantIdentification | None = None
         self._reporting: set[int] = set()
         self._silent_ticks: dict[int, int] = {}
         self._events: list[LogEntry] = []
@@ -71,41 +83,43 @@ class StackIdentification:
         """Take a tick's odometry and pulses; return None while nothing is latched or the target is unknown."""
         latched = estimation.latched
         if not latched:
-            self._filter = None
+            self._composite = None
             return self._run_free(observation, estimation)
         self._tumble = None
         if not estimation.known or not latched & observation.odometry.keys():
-            self._filter = None
+            self._composite = None
             return None
         states = {
             i: body_state(observation.odometry[i]) for i in sorted(latched & observation.odometry.keys())
         }
-        if self._filter is None or set(self._filter.chasers) != latched:
-            self._begin(estimation, states)
+        composite = self._composite
+        if composite is None or set(composite.filter.chasers) != latched:
+            composite = self._composite = self._begin(estimation, states)
         else:
-            self._predict(observation)
-        assert self._filter is not None
-        innovation = self._filter.update(states)
-        if innovation is not None and self._detector is not None:
-            suspects = np.array(
-                [
-                    t not in self.failed.get(i, ()) and self._silent_ticks.get(i, 0) == 0
-                    for i, t in self._filter.usable
-                ],
-                dtype=bool,
-            )
-            found = self._detector.update(innovation, suspects)
-            if found is not None:
-                self._add_fault(*found)
-        self.target = self._filter.target(self._scenario.chaser)
+            self._predict(composite, observation)
+        fault = composite.update(states, self._suspects(composite.filter))
+        if fault is not None:
+            self._add_fault(fault)
+        found = composite.filter
+        self.target = found.target(self._scenario.chaser)
         return IdentifiedStack(
-            stack=self._filter.stack,
+            stack=found.stack,
             target=self.target,
-            chasers=self._filter.mounted,
-            motion=self._filter.motion,
-            thrust_factors=self._filter.thrust_factors,
+            chasers=found.mounted,
+            motion=found.motion,
+            thrust_factors=found.thrust_factors,
             failed=dict(self.failed),
-            informative=self._by_information,
+            informative=partial(self._by_information, found),
+        )
+
+    def _suspects(self, found: CompositeIdentification) -> BoolArray:
+        """Return which thrusters (u,) may be found to have failed: those that have not, of chasers that report their pulses."""
+        return np.array(
+            [
+                thruster not in self.failed.get(i, ()) and self._silent_ticks.get(i, 0) == 0
+                for i, thruster in found.usable
+            ],
+            dtype=bool,
         )
 
     def _run_free(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
@@ -145,7 +159,34 @@ class StackIdentification:
         centre_m = math.sqrt(float(np.trace(self.target.covariance[1:4, 1:4])))
         return self.target.body if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
 
-    def _begin(self, estimation: TargetEstimation, states: Mapping[int, BodyState]) -> None:
+    def save(self) -> IdentificationState:
+        """Return the state for a standby controller. What a free tumble has shown is kept in the target's mass properties."""
+        composite = None
+        if self._composite is not None:
+            composite = list(self._composite.filter.chasers), self._composite.save()
+        return IdentificationState(
+            self.target, dict(self.failed), sorted(self._reporting), dict(self._silent_ticks), composite
+        )
+
+    def load(self, state: IdentificationState) -> None:
+        """Replace the state by a saved one of the same scenario. Raises ValueError, without a change, for another one."""
+        composite = None
+        if state.composite is not None:
+            chasers, saved = state.composite
+            estimate = saved.composite.estimate
+            places = zip(chasers, estimate.mounts_m, estimate.mounts_wxyz, strict=True)
+            still = BodyState(estimate.position_m, np.zeros(3), estimate.q_wxyz, np.zeros(3))
+            composite = self._filter_of(
+                {i: MountedChaser(place, q) for i, place, q in places}, dict.fromkeys(chasers, still), 1
+            )
+            composite.load(saved)
+        self.target, self.failed = state.target, dict(state.failed)
+        self._reporting, self._silent_ticks = set(state.reporting), dict(state.silent_ticks)
+        self._tumble, self._composite = None, composite
+
+    def _begin(
+        self, estimation: TargetEstimation, states: Mapping[int, BodyState]
+    ) -> FaultTolerantIdentification:
         s, chasers = self._scenario, {}
         for i in sorted(estimation.latched):
             own = estimation.own.get(i)
@@ -156,54 +197,58 @@ class StackIdentification:
             )
         # The measured ones first: the filter starts from them.
         chasers = {i: chasers[i] for i in sorted(chasers, key=lambda i: (i not in states, i))}
-        usable = plume_free_thrusters(s, estimation.latched)
-        prior = attach(self.target, chasers, s.chaser)
-        errors = s.navigation.errors()
-        self._filter = CompositeIdentification(
-            prior, chasers, states, s.chaser.thrusters, usable, errors, self._parameters, len(states)
-        )
-        full = np.array([self._full_N[t] for _, t in self._filter.usable])
-        self._detector = StackFaultDetector(self._filter.usable, len(self._filter.covariance), full)
+        return self._filter_of(chasers, states, len(states))
 
-    def _predict(self, observation: Observation) -> None:
-        assert self._filter is not None
-        assert self._detector is not None
-        given = {i: j for i, j in observation.thruster_impulses.items() if i in self._filter.chasers}
+    def _filter_of(
+        self, chasers: Mapping[int, MountedChaser], states: Mapping[int, BodyState], measured: int
+    ) -> FaultTolerantIdentification:
+        s = self._scenario
+        found = CompositeIdentification(
+            attach(self.target, chasers, s.chaser),
+            chasers,
+            states,
+            s.chaser.thrusters,
+            plume_free_thrusters(s, chasers.keys()),
+            s.navigation.errors(),
+            self._parameters,
+            measured,
+        )
+        return FaultTolerantIdentification(found, self._full_N)
+
+    def _predict(self, composite: FaultTolerantIdentification, observation: Observation) -> None:
+        chasers = composite.filter.chasers
+        given = {i: j for i, j in observation.thruster_impulses.items() if i in chasers}
         if given.keys() != self._reporting:
-            self._detector.reset()
+            composite.restart_detection()
         self._reporting = set(given)
         unknown = {}
-        for i in self._filter.chasers:
+        for i in chasers:
             self._silent_ticks[i] = 0 if i in given else self._silent_ticks.get(i, 0) + 1
             # What was commanded before, or is fired without the controller, is not reported.
             if i not in given:
                 early = self._silent_ticks[i] * self._period_s <= _SILENT_S
                 unknown[i] = self._full_N * (self._period_s if early else _SILENT_SHARE * self._period_s)
-        self._detector.predict(self._filter.predict(given, self._period_s, unknown))
-        if any(d.contact and not d.latched for d in observation.docking.values()):
-            self._filter.disturb(*_SHOCK)
+        touched = any(d.contact and not d.latched for d in observation.docking.values())
+        composite.predict(given, self._period_s, unknown, _SHOCK if touched else None)
 
-    def _add_fault(self, fault: StackFault, effect: Array) -> None:
-        assert self._filter is not None
-        apply_fault(self._filter, effect)
+    def _add_fault(self, fault: StackFault) -> None:
         self.failed[fault.chaser] = tuple(sorted({*self.failed.get(fault.chaser, ()), fault.thruster}))
         kind = fault.kind.replace("_", " ")
         text = f"chaser {fault.chaser}: thruster {fault.thruster} {kind}, seen in the motion of the stack, isolated"
         self._events.append(("warning", text))
 
-    def _by_information(self) -> tuple[tuple[int, int], ...]:
-        """Return the thrusters by what a pulse tells about the mass properties, the best first."""
-        assert self._filter is not None
-        errors, stack = self._scenario.navigation.errors(), self._filter.stack
-        count = len(self._filter.chasers) * _WATCH_S / self._period_s
+    def _by_information(self, found: CompositeIdentification) -> tuple[tuple[int, int], ...]:
+        """Return the thrusters by the information of a pulse on the mass properties, the best first."""
+        errors, stack = self._scenario.navigation.errors(), found.stack
+        count = len(found.chasers) * _WATCH_S / self._period_s
         noise = (
             np.repeat([errors.velocity_noise_m_s, errors.omega_noise_rad_s], 3) * math.sqrt(2.0 / count)
             + 1e-7
         )
         largest = float(np.linalg.eigvalsh(stack.body.inertia_kg_m2)[-1])
         scale = np.array([_GOOD[0] * stack.body.mass_kg, *[_GOOD[1]] * 3, *[_GOOD[2] * largest] * 6])
-        gains = self._filter.pulse_gains(float(self._full_N.max()) * _PULSE_S, noise, scale)
-        usable = self._filter.usable
+        gains = found.pulse_gains(float(self._full_N.max()) * _PULSE_S, noise, scale)
+        usable = found.usable
         order = np.argsort(-gains, kind="stable")
         return tuple(usable[k] for k in order if usable[k][1] not in self.failed.get(usable[k][0], ()))
 

@@ -125,8 +125,7 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         first = len(records) - 1
         for sighting in sorted(inputs.sightings, key=lambda s: (s.sim_time_ns, s.chaser)):
             first = min(first, self._insert(sighting))
-        with _BLAS.limit(limits=1, user_api="blas"):
-            self._buffer.replay(first, self._process)
+        self._buffer.replay(first, self._process)
         self._buffer.trim(self.parameters.target.buffer_s)
         return self._reported(self.estimate_at(inputs.time_ns))
 
@@ -275,10 +274,11 @@ def _start(
 ) -> JointFilterState:  # fmt: skip
     """Start the target at the sighting with which most others agree, and apply the others as updates."""
     s = now.hypotheses[0]
-    poses = {
-        i: [sighted_pose(s, i, x, len(sighting.marker_ids), mounting, p) for x in sighting.solutions]
-        for i, sighting in seen.items()
-    }
+    with _BLAS.limit(limits=1, user_api="blas"):
+        poses = {
+            i: [sighted_pose(s, i, x, len(sighting.marker_ids), mounting, p) for x in sighting.solutions]
+            for i, sighting in seen.items()
+        }
 
     def support(i: int, pose: SightedPose) -> int:
         others = (poses[k] for k in poses if k != i)

@@ -10,13 +10,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from chaserdock_models import rotations
-from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
-from chaserdock_controller.estimation import target_hypotheses
 from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
+
+from . import kernels
+from .kernels import CHASER_MEAN, TARGET_MEAN
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 TARGET = 12
@@ -105,35 +105,39 @@ def block(chaser: int) -> slice:
     return slice(TARGET + CHASER * chaser, TARGET + CHASER * (chaser + 1))
 
 
+def packed(state: JointState) -> Array:
+    """Return a new array of target and chasers as the kernels take them, see ``kernels``."""
+    mean = np.empty(TARGET_MEAN + CHASER_MEAN * state.chasers)
+    mean[0:3], mean[3:6] = state.position_m, state.velocity_m_s
+    mean[6:10], mean[10:13] = state.q_wxyz, state.omega_rad_s
+    each = mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
+    each[:, 0:3], each[:, 3:6] = state.positions_m, state.velocities_m_s
+    each[:, 6:10], each[:, 10:13], each[:, 13:] = state.attitudes_wxyz, state.omegas_rad_s, state.extra
+    return mean
+
+
+def mean_fields(mean: Array) -> dict[str, Array]:
+    """Return the fields of ``JointState`` that ``packed`` collects, as views of ``mean``."""
+    each = mean[TARGET_MEAN:].reshape(-1, CHASER_MEAN)
+    return {
+        "position_m": mean[0:3],
+        "velocity_m_s": mean[3:6],
+        "q_wxyz": mean[6:10],
+        "omega_rad_s": mean[10:13],
+    } | {
+        "positions_m": each[:, 0:3],
+        "velocities_m_s": each[:, 3:6],
+        "attitudes_wxyz": each[:, 6:10],
+        "omegas_rad_s": each[:, 10:13],
+        "extra": each[:, 13:],
+    }
+
+
 def inject(state: JointState, error: Array) -> JointState:
     """Return the state corrected by an error vector; the covariance stays."""
-    each = error[TARGET:].reshape(-1, CHASER)
-    return replace(
-        state,
-        position_m=state.position_m + error[POSITION],
-        velocity_m_s=state.velocity_m_s + error[VELOCITY],
-        q_wxyz=so3.normalize(so3.multiply(state.q_wxyz, so3.exp(error[ATTITUDE]))),
-        omega_rad_s=state.omega_rad_s + error[RATE],
-        positions_m=state.positions_m + each[:, POSITION],
-        velocities_m_s=state.velocities_m_s + each[:, VELOCITY],
-        attitudes_wxyz=rotations.normalize(
-            rotations.multiply(state.attitudes_wxyz, rotations.exp(each[:, ATTITUDE]))
-        ),
-        omegas_rad_s=state.omegas_rad_s + each[:, RATE],
-        extra=state.extra + each[:, 12:],
-    )
+    return replace(state, **mean_fields(kernels.inject(packed(state), np.array(error))))
 
 
 def difference(a: JointState, b: JointState) -> Array:
     """Return the error vector that takes the state ``a`` to ``b``."""
-    n = a.chasers
-    error = np.empty(TARGET + CHASER * n)
-    error[:TARGET] = target_hypotheses.difference(a, b)
-    each = error[TARGET:].reshape(n, CHASER)
-    each[:, POSITION] = b.positions_m - a.positions_m
-    each[:, VELOCITY] = b.velocities_m_s - a.velocities_m_s
-    turns = rotations.multiply(rotations.conjugate(a.attitudes_wxyz), b.attitudes_wxyz)
-    each[:, ATTITUDE] = rotations.log(turns)
-    each[:, RATE] = b.omegas_rad_s - a.omegas_rad_s
-    each[:, 12:] = b.extra - a.extra
-    return error
+    return kernels.difference(packed(a), packed(b))

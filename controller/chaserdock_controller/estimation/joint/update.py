@@ -10,6 +10,7 @@ target has moved in an unexpected way: its rates are widened, and if that does n
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -23,11 +24,10 @@ from numpy.typing import NDArray
 from chaserdock_controller.estimation.target_hypotheses import POSE, RATES, TargetRates
 from chaserdock_controller.estimation.types import PoseHypothesis
 
+from . import kernels
 from .measurements import (
     CameraMounting,
-    LinearizedMeasurement,
-    linearize_odometry,
-    linearize_sighting,
+    measurement,
     odometry_noise,
     predict_sighting,
     sighting_covariance,
@@ -53,8 +53,8 @@ from .state import (
     VELOCITY,
     JointState,
     block,
-    difference,
-    inject,
+    mean_fields,
+    packed,
 )
 
 _RATES = (CHANNELS.index("velocity"), CHANNELS.index("rate"))
@@ -74,6 +74,15 @@ class _Channel(NamedTuple):
     number: int
     rows: slice
     gate: float
+
+
+class _Gates(NamedTuple):
+    """Which channels are used, by number; a chaser's counts of rejections and normalized innovations; the log likelihood."""
+
+    fits: dict[int, bool]
+    rejections: list[int]
+    nis: list[float]
+    log_likelihood: float
 
 
 def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParameters) -> JointState:
@@ -175,49 +184,51 @@ def start_target(state: JointState, pose: SightedPose, rates: TargetRates, scale
     )
 
 
-class ReducedCovariance:
-    """A covariance P - W'W during the updates of a tick, of which each adds rows to W.
+class RunningUpdate:
+    """State during the updates of a tick, one chaser after the other; its arrays change, those of ``state`` do not.
 
-    P itself is subtracted from once, at the end, as it is large: the result is that of updates one after the other.
+    covariance (D, D): only the lower triangle is valid. rejections, nis, log_likelihood: as in ``JointState``.
     """
 
-    def __init__(self, covariance: Array, rows: int) -> None:
-        self._covariance, self._w = covariance.copy(), np.empty((rows, len(covariance)))
-        self._rows = 0
+    def __init__(self, state: JointState) -> None:
+        self.state, self.mean, self.covariance = state, packed(state), state.covariance.copy()
+        self.rejections, self.nis = state.rejections.copy(), state.nis.copy()
+        self.log_likelihood = state.log_likelihood
+        self.innovation = kernels.Innovation(state.chasers)
 
-    def innovation(self, i: int, z: LinearizedMeasurement) -> tuple[Array, Array]:
-        """Return H P (k, D) and the innovation covariance (k, k) of a measurement of chaser ``i``."""
-        own, p, w = block(i), self._covariance, self._w[: self._rows]
-        cross = z.by_target @ p[:TARGET] + z.by_chaser @ p[own]
-        if self._rows:
-            seen = w[:, :TARGET] @ z.by_target.T + w[:, own] @ z.by_chaser.T
-            cross -= seen.T @ w
-        s = cross[:, :TARGET] @ z.by_target.T + cross[:, own] @ z.by_chaser.T + z.noise
-        return cross, 0.5 * (s + s.T)
+    def values(self, z: kernels.Measurement) -> list[float]:
+        """Compute the innovation of a measurement; return the squared norm of each channel's residual by its innovation
+        covariance, then the determinant of the sighting's."""
+        self.innovation.innovate(z, self.mean, self.mean, self.covariance)
+        return self.innovation.values.tolist()
 
-    def widen(self, variances: Array) -> None:
-        """Add variances (D,)."""
-        k = np.arange(len(variances))
-        self._covariance[k, k] += variances
+    def correct(self, z: kernels.Measurement, used: NDArray[np.int64], iterations: int) -> None:
+        """Update with the rows ``used`` of the last innovation, linearized ``iterations`` times.
 
-    def subtract(self, white: Array) -> None:
-        """Subtract white' white, with ``white`` (k, D)."""
-        self._w[self._rows : self._rows + len(white)] = white
-        self._rows += len(white)
+        Raises numpy.linalg.LinAlgError for an innovation covariance that is not positive definite.
+        """
+        innovation, prior = self.innovation, self.mean
+        self.mean = np.empty_like(prior)
+        for k in range(iterations):
+            if k:
+                innovation.innovate(z, self.mean, prior, self.covariance)
+            if not innovation.correct(z, used, prior, self.mean):
+                raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
+        innovation.reduce(z, len(used), self.covariance)
 
-    def turn(self, part: slice, correction: Array) -> None:
-        """Make a rotation error relative to the corrected attitude (Sola eq. 287)."""
-        reset, p, w = so3.right_jacobian(correction), self._covariance, self._w[: self._rows]
-        p[part] = reset @ p[part]
-        p[:, part] = p[:, part] @ reset.T
-        w[:, part] = w[:, part] @ reset.T
-
-    def total(self) -> Array:
-        """Return the covariance (D, D)."""
-        w = self._w[: self._rows]
-        out = w.T @ w
-        # In place: with 16 chasers a third large array costs as much time as the product.
-        return np.subtract(self._covariance, out, out=out)
+    def finished(self, updates: int, markers: NDArray[np.int64]) -> JointState:
+        """Return the state after the updates, with these fields."""
+        kernels.complete(self.state.chasers, self.covariance)
+        return replace(
+            self.state,
+            covariance=self.covariance,
+            rejections=self.rejections,
+            nis=self.nis,
+            log_likelihood=self.log_likelihood,
+            updates=updates,
+            markers=markers,
+            **mean_fields(self.mean),
+        )
 
 
 def update(
@@ -230,74 +241,68 @@ def update(
     """Update the state at its time with the odometry and the sightings of the chasers."""
     accepted: list[int] = []
     rejected: list[int] = []
-    chasers = [i for i in sorted(odometry.keys() | sightings.keys()) if state.alive[i]]
-    covariance = ReducedCovariance(state.covariance, 18 * len(chasers))
-    for i in chasers:
+    running = RunningUpdate(state)
+    for i in sorted(odometry.keys() | sightings.keys()):
+        if not state.alive[i]:
+            continue
         sighting = sightings.get(i) if state.target_known else None
-        state, fits = _update_chaser(state, covariance, i, odometry.get(i), sighting, mounting, p)
+        fits = _update_chaser(running, i, odometry.get(i), sighting, mounting, p)
         if sighting is not None and sighting.solutions:
             (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
     markers = state.markers.copy()
     for i in accepted:
         markers[i] = len(sightings[i].marker_ids)
-    updates = state.updates + bool(accepted)
-    state = replace(state, covariance=covariance.total(), updates=updates, markers=markers)
-    return state, UpdateReport(tuple(accepted), tuple(rejected))
+    report = UpdateReport(tuple(accepted), tuple(rejected))
+    return running.finished(state.updates + bool(accepted), markers), report
 
 
 def _update_chaser(
-    prior: JointState,
-    covariance: ReducedCovariance,
+    running: RunningUpdate,
     i: int,
     odometry: Odometry | None,
     sighting: Sighting | None,
     mounting: CameraMounting,
     p: JointParameters,
-) -> tuple[JointState, dict[int, bool]]:
-    """Update with the measurements of one chaser; return the state, and which channels were used."""
-    markers = len(sighting.marker_ids) if sighting is not None else 0
-    solution = _likeliest(prior, covariance, i, sighting, mounting, p)
-    z = _linearize(prior, i, odometry, solution, markers, mounting, p)
+) -> dict[int, bool]:
+    """Update with the measurements of one chaser; return which channels were used."""
+    chasers, markers = running.state.chasers, len(sighting.marker_ids) if sighting is not None else 0
+    solution = _likeliest(running, i, sighting, mounting, p)
+    if odometry is None and solution is None:
+        return {}
+    z = measurement(chasers, i, odometry, solution, markers, mounting, p)
     channels = _channels(odometry is not None, solution is not None, p)
-    cross, s = covariance.innovation(i, z)
-    state, fits = _gate(prior, i, channels, z.residual, s, p)
-    if any(not fits.get(k, True) and prior.rejections[i, k] for k in _RATES):
-        variances = _unexpected_motion(i, cross.shape[1], p)
-        covariance.widen(variances)
-        wider_cross, wider_s = covariance.innovation(i, z)
-        wider_state, wider_fits = _gate(prior, i, channels, z.residual, wider_s, p)
-        if all(fit for k, fit in wider_fits.items() if k != SIGHTING_CHANNEL):
-            cross, s, fits = wider_cross, wider_s, wider_fits
-            state = replace(wider_state, nis=state.nis)
-        else:
-            covariance.widen(-variances)
-    used = [c.rows for c in channels if fits[c.number]]
-    if not used:
-        return state, fits
-    rows = slice(None)
-    if len(used) < len(channels):
-        rows = np.concatenate([np.arange(r.start, r.stop) for r in used])
-    prior = state
-    nonlinear = fits.get(SIGHTING_CHANNEL, False) and prior.updates < p.iterated_updates
-    white, correction = cross[:0], np.zeros(cross.shape[1])
-    for k in range(p.iterations if nonlinear else 1):
-        if k:
-            z = _linearize(state, i, odometry, solution, markers, mounting, p)
-            cross, s = covariance.innovation(i, z)
-        factor = np.linalg.cholesky(s[rows][:, rows])
-        residual = z.residual[rows]
-        if k:
-            e = difference(prior, state)
-            residual = residual + z.by_target[rows] @ e[:TARGET] + z.by_chaser[rows] @ e[block(i)]
-        # The inverse of so small a matrix, well conditioned by the noise, takes a seventh of the time of solving for all columns.
-        inverse = np.linalg.inv(factor)
-        white = inverse @ cross[rows]
-        correction = (inverse @ residual) @ white
-        state = inject(prior, correction)
-    covariance.subtract(white)
-    for part in (ATTITUDE, _attitude_of(i)):
-        covariance.turn(part, correction[part])
-    return state, fits
+    gates = _gate(running, i, channels, running.values(z), p)
+    if any(not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES):
+        gates = _follow_unexpected_motion(running, i, z, channels, gates, p)
+    running.rejections[i], running.nis[i] = gates.rejections, gates.nis
+    running.log_likelihood = gates.log_likelihood
+    used = [row for c in channels if gates.fits[c.number] for row in range(c.rows.start, c.rows.stop)]
+    if used:
+        nonlinear = gates.fits.get(SIGHTING_CHANNEL, False) and running.state.updates < p.iterated_updates
+        running.correct(z, np.array(used), p.iterations if nonlinear else 1)
+    return gates.fits
+
+
+def _follow_unexpected_motion(
+    running: RunningUpdate,
+    i: int,
+    z: kernels.Measurement,
+    channels: Sequence[_Channel],
+    gates: _Gates,
+    p: JointParameters,
+) -> _Gates:
+    """Widen the covariance by a change of a chaser's rates without a command, if all odometry then fits; return the gates.
+
+    The running innovation is afterwards that of the covariance."""
+    diagonal = np.einsum("ii->i", running.covariance)
+    before = diagonal.copy()
+    diagonal += _unexpected_motion(i, len(before), p)
+    wider = _gate(running, i, channels, running.values(z), p)
+    if all(fit for k, fit in wider.fits.items() if k != SIGHTING_CHANNEL):
+        return wider._replace(nis=gates.nis)
+    diagonal[:] = before
+    running.values(z)
+    return gates
 
 
 def _unexpected_motion(i: int, size: int, p: JointParameters) -> Array:
@@ -316,37 +321,28 @@ def _unexpected_motion(i: int, size: int, p: JointParameters) -> Array:
 
 
 def _gate(
-    state: JointState, i: int, channels: Sequence[_Channel], residual: Array, s: Array, p: JointParameters
-) -> tuple[JointState, dict[int, bool]]:
-    """Count which channels fit; return the state with the counts, and by channel whether it is used."""
-    rejections, nis, likelihood = state.rejections.copy(), state.nis.copy(), state.log_likelihood
+    running: RunningUpdate, i: int, channels: Sequence[_Channel], values: Sequence[float], p: JointParameters
+) -> _Gates:
+    """Count which channels fit; ``values`` as ``RunningUpdate.values`` returns them."""
+    rejections, nis, likelihood = (
+        running.rejections[i].tolist(),
+        running.nis[i].tolist(),
+        running.log_likelihood,
+    )
     fits: dict[int, bool] = {}
-    for channel in channels:
-        r, part = residual[channel.rows], s[channel.rows, channel.rows]
-        value = float(r @ np.linalg.solve(part, r)) if len(r) > 3 else _normalized_square3(part, r)
-        fits[channel.number] = _count(rejections, i, channel, value, p)
-        if channel.number == SIGHTING_CHANNEL:
+    for number, _, gate in channels:
+        value = values[number]
+        rejections[number], fits[number] = _count(rejections[number], value, gate, p)
+        if number == SIGHTING_CHANNEL:
             # Bound the penalty: a gross outlier counts as much as one at the gate.
-            likelihood -= 0.5 * (min(value, channel.gate) + float(np.linalg.slogdet(part)[1]))
+            likelihood -= 0.5 * (min(value, gate) + math.log(values[-1]))
         else:
-            k = channel.number - 1
-            nis[i, k] += (min(value, 10.0 * channel.gate) - nis[i, k]) / p.overconfident_ticks
-    return replace(state, rejections=rejections, nis=nis, log_likelihood=likelihood), fits
-
-
-def _normalized_square3(a: Array, b: Array) -> float:
-    """Return b' A^-1 b for a symmetric A (3, 3) and b (3,) by its adjugate, in Python's floats, faster than LAPACK."""
-    (p, q, r), (_, s, t), (_, _, u) = a.tolist()
-    x, y, z = b.tolist()
-    pp, pq, pr = s * u - t * t, r * t - q * u, q * t - r * s
-    qq, qr, rr = p * u - r * r, q * r - p * t, p * s - q * q
-    square = pp * x * x + qq * y * y + rr * z * z + 2.0 * (pq * x * y + pr * x * z + qr * y * z)
-    return square / (p * pp + q * pq + r * pr)
+            nis[number - 1] += (min(value, 10.0 * gate) - nis[number - 1]) / p.overconfident_ticks
+    return _Gates(fits, rejections, nis, likelihood)
 
 
 def _likeliest(
-    state: JointState,
-    covariance: ReducedCovariance,
+    running: RunningUpdate,
     i: int,
     sighting: Sighting | None,
     mounting: CameraMounting,
@@ -358,16 +354,11 @@ def _likeliest(
         return solutions[0] if solutions else None
 
     def log_density(solution: PoseSolution) -> float:
-        z = linearize_sighting(state, i, solution, len(sighting.marker_ids), mounting, p)
-        s = covariance.innovation(i, z)[1]
-        return -0.5 * (float(z.residual @ np.linalg.solve(s, z.residual)) + float(np.linalg.slogdet(s)[1]))
+        markers = len(sighting.marker_ids)
+        values = running.values(measurement(running.state.chasers, i, None, solution, markers, mounting, p))
+        return -0.5 * (values[SIGHTING_CHANNEL] + math.log(values[-1]))
 
     return max(solutions, key=log_density)
-
-
-def _attitude_of(i: int) -> slice:
-    first = TARGET + CHASER * i
-    return slice(first + ATTITUDE.start, first + ATTITUDE.stop)
 
 
 def _channels(has_odometry: bool, has_sighting: bool, p: JointParameters) -> list[_Channel]:
@@ -382,40 +373,9 @@ def _channels(has_odometry: bool, has_sighting: bool, p: JointParameters) -> lis
     return channels
 
 
-def _count(
-    rejections: NDArray[np.int64], i: int, channel: _Channel, value: float, p: JointParameters
-) -> bool:
-    """Update the count of a channel's rejections; return whether the channel is used."""
-    count, limit = int(rejections[i, channel.number]), p.rejections_to_drop
-    if not value <= channel.gate:  # rejects NaN as well
-        rejections[i, channel.number] = min(count + 1, 2 * limit)
-        return False
-    rejections[i, channel.number] = count - 1 if count >= limit else 0
-    return count < limit
-
-
-def _linearize(
-    state: JointState,
-    i: int,
-    odometry: Odometry | None,
-    solution: PoseSolution | None,
-    markers: int,
-    mounting: CameraMounting,
-    p: JointParameters,
-) -> LinearizedMeasurement:
-    parts = []
-    if solution is not None:
-        parts.append(linearize_sighting(state, i, solution, markers, mounting, p))
-    if odometry is not None:
-        parts.append(linearize_odometry(state, i, odometry, p))
-    if len(parts) == 1:
-        return parts[0]
-    a, b = parts
-    noise = np.zeros((18, 18))
-    noise[:6, :6], noise[6:, 6:] = a.noise, b.noise
-    return LinearizedMeasurement(
-        np.concatenate([a.residual, b.residual]),
-        np.concatenate([a.by_target, b.by_target]),
-        np.concatenate([a.by_chaser, b.by_chaser]),
-        noise,
-    )
+def _count(count: int, value: float, gate: float, p: JointParameters) -> tuple[int, bool]:
+    """Return the count of a channel's rejections after a squared residual ``value``, and whether the channel is used."""
+    limit = p.rejections_to_drop
+    if not value <= gate:  # rejects NaN as well
+        return min(count + 1, 2 * limit), False
+    return (count - 1 if count >= limit else 0), count < limit

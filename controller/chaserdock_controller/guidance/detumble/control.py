@@ -34,7 +34,13 @@ from .stack import StackMotion, thruster_wrenches
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
 _STOPPED_SHARE = 0.6
-"""Share of the rest limits below which the stack counts as stopped; above the limits it moves again."""
+"""Share of the rest limits below which the stack counts as stopped."""
+_MOVING_SHARE = 0.5
+"""Share of the rest limits above which a stopped stack moves again.
+
+Disturbances of 5 mN and 0.5 mN m on each of two chasers turn the stack faster by 0.01 degrees/s every second, and the estimate is a
+second late: if the thrusters waited for the limit, the true rate would exceed it. The thrusters fire down to ``_DEADBAND_SHARE``.
+"""
 _SLEW_SHARE = 20.0
 """Share of the rest limits beyond which a stack that turns to its commanded attitude counts as moving."""
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
@@ -98,10 +104,9 @@ class DetumbleControl:
         self._own = wrench_matrix(self._thrusters)
         self._target = scenario.target_model()
         self._plume_free = lru_cache(maxsize=32)(partial(plume_free_thrusters, scenario))
-        plan_s = self._settings.plan_s
-        self.planner = None if plan_s is None else StackPlanner(plan_s)
+        self.planner = StackPlanner(self._settings.plan_s)
         self.sequencer = Sequencer(scenario)
-        self._judged: tuple[object, str] = (None, "")
+        self._judged: tuple[tuple[tuple[int, ...], tuple[bool, ...]] | None, str] = (None, "")
         self._pulse: tuple[int, int | None] = (-1, None)
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
@@ -149,8 +154,7 @@ class DetumbleControl:
 
     def reset(self) -> None:
         """Forget plan and pulses that wait: no chaser stops the stack."""
-        if self.planner is not None:
-            self.planner.reset()
+        self.planner.reset()
         self.sequencer.reset()
 
     def commands(
@@ -187,7 +191,7 @@ class DetumbleControl:
     def _stop(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
         if self.share_of_limits(state) <= _DEADBAND_SHARE:
             return np.zeros(len(thrusters.limits_N))
-        if self.planner is not None:
+        if self.planner.enabled:
             can = spans_all_directions(thrusters.wrenches, thrusters.limits_N)
             planned = self.planner.thrusts(self._problem(state, thrusters), now_ns, can)
             if planned is not None:
@@ -206,7 +210,7 @@ class DetumbleControl:
         return self._feedback(state.motion.momentum - wanted, thrusters)
 
     def _informative(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
-        """Return a pulse of the thruster that tells most about the mass properties, of those that damp the motion."""
+        """Return a pulse of the most informative thruster for the mass properties, of those that damp the motion."""
         thrusts = np.zeros(len(thrusters.limits_N))
         number = now_ns // _PULSE_PERIOD_NS
         if now_ns % _PULSE_PERIOD_NS >= _PULSE_NS:
@@ -259,10 +263,10 @@ class DetumbleControl:
         return self.share_of_limits(state) < _STOPPED_SHARE
 
     def moves_again(self, state: StackState) -> bool:
-        """Return whether a stack at rest moves: faster than the limits, beside the turn to its commanded attitude."""
+        """Return whether a stack at rest moves, beside the turn to its commanded attitude, so that it has to be stopped again."""
         share = self.share_of_limits(state, slewing=True)
         slews = self._slew_rate(state) is not None
-        return share > (_SLEW_SHARE if slews else 1.0)
+        return share > (_SLEW_SHARE if slews else _MOVING_SHARE)
 
     def why_not(
         self, state: StackState | None, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
@@ -292,7 +296,7 @@ class DetumbleControl:
 
     def _why_no_plan(self, state: StackState, thrusters: _Thrusters, reason: str) -> str:
         """Return why these thrusters cannot stop the stack even by a plan that uses its rotation. Judged once for each set."""
-        if self.planner is None:
+        if not self.planner.enabled:
             return reason
         key = (thrusters.chasers, tuple((thrusters.limits_N > 0.0).tolist()))
         if self._judged[0] != key:

@@ -19,19 +19,16 @@ _FIRST_ITERATIONS = 60
 _NEXT_ITERATIONS = 6
 _LONGER = 0.6
 """Share of the planned time that a plan is prolonged by when thrusters are lost, or the stack still moves at its end."""
-_STOPS = 0.5
-"""Share of the rest limits that a plan may leave."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActivePlan:
-    """A plan that begins at ``begin_ns`` and is to end at ``end_ns``; ``limits_N`` (n,): of the thrusters it was made for;
-    ``made_ns``: when it was made."""
+    """A plan made at ``begin_ns`` from there on, which is to end at ``end_ns``; ``limits_N`` (n,): of the thrusters it was made
+    for."""
 
     plan: StackPlan
     begin_ns: int
     end_ns: int
-    made_ns: int
     limits_N: Array
 
     def thrusts_at(self, time_ns: int) -> Array:
@@ -41,10 +38,13 @@ class ActivePlan:
 
 
 class StackPlanner:
-    """Keeps the plan of the stack. ``active`` is None before the first one and after the last."""
+    """Keeps the plan of the stack, if it is ``enabled`` by a time to stop it in.
 
-    def __init__(self, plan_s: float) -> None:
-        self._plan_s = plan_s
+    ``active`` is None before the first plan and after the last.
+    """
+
+    def __init__(self, plan_s: float | None) -> None:
+        self.enabled, self._plan_s = plan_s is not None, plan_s or 0.0
         self.active: ActivePlan | None = None
 
     def reset(self) -> None:
@@ -53,43 +53,37 @@ class StackPlanner:
 
     def trial(self, problem: StackProblem) -> StackPlan:
         """Return a first plan over the whole time."""
-        return self._first(problem, self._plan_s)
+        return self._plan(problem, 0, self._plan_s).plan
 
     def thrusts(self, problem: StackProblem, now_ns: int, feedback_can: bool) -> Array | None:
         """Return the thrusts (n,) of the plan now; None if the feedback is to take over. ``feedback_can``: whether it can."""
         active = self.active
         if active is None or len(active.limits_N) != len(problem.limits_N):
-            active = self._begin(problem, now_ns, self._plan_s)
+            active = self._plan(problem, now_ns, self._plan_s)
         elif np.any(active.limits_N > problem.limits_N + 1e-9):
             left_s = max((active.end_ns - now_ns) / 1e9, _LONGER * self._plan_s)
-            active = self._begin(problem, now_ns, left_s)
+            active = self._plan(problem, now_ns, left_s)
         left_s = (active.end_ns - now_ns) / 1e9
         if feedback_can and left_s < _FEEDBACK_S:
             return None
         if left_s <= 0.5 * active.plan.step_s:
-            active = self._begin(problem, now_ns, _LONGER * self._plan_s)
-        elif now_ns - active.made_ns >= _REPLAN_S * 1e9:
-            active = self._again(problem, active, now_ns)
+            active = self._plan(problem, now_ns, _LONGER * self._plan_s)
+        elif now_ns - active.begin_ns >= _REPLAN_S * 1e9:
+            active = self._plan(problem, now_ns, left_s, active)
         self.active = active
         return np.minimum(active.thrusts_at(now_ns), problem.limits_N)
 
-    def _first(self, problem: StackProblem, duration_s: float) -> StackPlan:
-        step_s = max(_STEP_S, duration_s / _MOST_STEPS)
+    def _plan(
+        self, problem: StackProblem, now_ns: int, duration_s: float, last: ActivePlan | None = None
+    ) -> ActivePlan:
+        """Return a plan from the present state; its first guess is the rest of the ``last`` plan, which ends at the same time."""
+        step_s = max(_STEP_S, duration_s / _MOST_STEPS) if last is None else last.plan.step_s
         count = max(1, round(duration_s / step_s))
-        guess = np.zeros((count, len(problem.limits_N)))
-        return plan_stop(problem, guess, duration_s / count, _FIRST_ITERATIONS)
-
-    def _begin(self, problem: StackProblem, now_ns: int, duration_s: float) -> ActivePlan:
-        plan = self._first(problem, duration_s)
+        step_s = duration_s / count
+        guess, iterations = np.zeros((count, len(problem.limits_N))), _FIRST_ITERATIONS
+        if last is not None:
+            times = now_ns + (np.arange(count) + 0.5) * step_s * 1e9
+            guess, iterations = np.array([last.thrusts_at(int(t)) for t in times]), _NEXT_ITERATIONS
+        plan = plan_stop(problem, guess, step_s, iterations)
         end_ns = now_ns + round(duration_s * 1e9)
-        return ActivePlan(plan, now_ns, end_ns, now_ns, problem.limits_N.copy())
-
-    def _again(self, problem: StackProblem, active: ActivePlan, now_ns: int) -> ActivePlan:
-        """Return a plan from the present state; its first guess is the rest of the last plan."""
-        left_s = (active.end_ns - now_ns) / 1e9
-        count = max(1, round(left_s / active.plan.step_s))
-        step_s = left_s / count
-        times = now_ns + (np.arange(count) + 0.5) * step_s * 1e9
-        guess = np.array([active.thrusts_at(int(t)) for t in times])
-        plan = plan_stop(problem, guess, step_s, _NEXT_ITERATIONS)
-        return ActivePlan(plan, now_ns, active.end_ns, now_ns, problem.limits_N.copy())
+        return ActivePlan(plan, now_ns, end_ns, problem.limits_N.copy())

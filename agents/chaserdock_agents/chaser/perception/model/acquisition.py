@@ -24,7 +24,8 @@ from .alignment import Alignment, Pyramid
 from .lighting import appearance, light_at, points_on, rate_suns
 from .mesh import ShadowMaps, TrackerMesh, spread_directions
 from .rendering import Lighting, PixelWindow, render
-from .tracking import is_valid, levels_of, refine_from_prior, refine_pose, turn_between
+from .steps import LIGHT_MS, Steps, result_of
+from .tracking import is_valid, levels_of, pose_steps, prior_steps, turn_between
 
 _TEMPLATES, _SIDE_PX = 3000, 40
 _SPREAD_PX = 8.0
@@ -39,6 +40,15 @@ MIN_APPEARANCE = 0.85
 """Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a pose."""
 _MIN_AREA_PX, _MIN_CONTRAST = 60, 5.0
 _AMBIGUOUS_SCORE, _DISTINCT_RAD = 0.04, math.radians(8.0)
+_WORSE_START = 0.2
+"""Once a pose has been found, coarse poses with a score lower than its own by this much are not refined."""
+_RATED_AT_ONCE = 25
+_REGION_MS, _SILHOUETTES_MS, _RATE_MS, _APPEARANCE_MS = 10.0, 20.0, 10.0, 10.0
+"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes, to rate suns for
+``_RATED_AT_ONCE`` of them, to compare a synthetic view with the image."""
+
+Found = tuple[Alignment, Lighting]
+"""A pose that passes the gate, and its light."""
 
 
 @dataclass(frozen=True)
@@ -79,41 +89,62 @@ class Acquisition:
         if self._templates is None:
             self._templates = _make_templates(self._mesh)
 
-    def find(self, image: NDArray[np.uint8]) -> tuple[tuple[Alignment, Lighting], ...]:
+    def find(self, image: NDArray[np.uint8]) -> tuple[Found, ...]:
         """Return the alignments that pass the gate, and their light, best first; several if they explain the image about equally
         well."""
-        pyramid = Pyramid(image, self._camera)
-        bright = _brightest_region(pyramid.level(0))
-        found = self._find_in(pyramid, bright)
-        if not found and bright is not None:
-            for slope in _SHARP_PER_PX:
-                found = found or self._find_in(pyramid, _sharp_region(pyramid.level(0), slope))
+        return result_of(self.search(Pyramid(image, self._camera)))
+
+    def search(self, pyramid: Pyramid) -> Steps[tuple[Found, ...]]:
+        """Do what `find` does, in steps."""
+        yield _REGION_MS
+        level = pyramid.level(0)
+        found: tuple[Found, ...] = ()
+        bright = _brightest_region(level)
+        if bright is None:
+            return ()
+        # In front of the Earth the brightest region is the Earth, which leaves the image.
+        behind = _touches_border(bright)
+        if not behind:
+            found = yield from self._search_in(pyramid, bright)
+        for slope in _SHARP_PER_PX:
+            if not found:
+                yield _REGION_MS
+                found = yield from self._search_in(pyramid, _sharp_region(level, slope))
+        if behind and not found:
+            found = yield from self._search_in(pyramid, bright)
         return found
 
-    def _find_in(
-        self, pyramid: Pyramid, region: NDArray[np.uint8] | None
-    ) -> tuple[tuple[Alignment, Lighting], ...]:
-        """Return what `find` does, for a target that covers ``region`` (h, w)."""
+    def _search_in(self, pyramid: Pyramid, region: NDArray[np.uint8] | None) -> Steps[tuple[Found, ...]]:
+        """Do what `search` does, for a target that covers ``region`` (h, w)."""
+        if region is None:
+            return ()
+        candidates = yield from self._candidates(pyramid, region)
         coarse: list[Alignment] = []
-        for pose in self._candidates(pyramid, region) if region is not None else ():
+        for pose in candidates:
             levels = levels_of(pyramid, self._mesh, pose)
+            yield LIGHT_MS
             light = light_at(pyramid, self._mesh, pose, levels[0]) if levels else None
-            aligned = refine_pose(pyramid, self._mesh, pose, light, levels[:1]) if light else None
-            if aligned is not None:
-                coarse.append(aligned)
+            if light is not None:
+                aligned = yield from pose_steps(pyramid, self._mesh, pose, light, levels[:1])
+                coarse += [aligned] if aligned is not None else []
         coarse.sort(key=lambda a: -a.score)
-        fine: list[tuple[Alignment, Lighting]] = []
+        fine: list[Found] = []
         tried: list[PoseInCamera] = []
+        least = 0.0
         for start in coarse:
-            if len(tried) == _FULL:
+            if len(tried) == _FULL or start.score < least:
                 break
             if any(turn_between(start.pose, other) < _DISTINCT_RAD for other in tried):
                 continue
             tried.append(start.pose)
-            refined = refine_from_prior(pyramid, self._mesh, start.pose)
-            if refined is None or not is_valid(refined[0]) or not self._looks_right(pyramid, *refined):
+            refined = yield from prior_steps(pyramid, self._mesh, start.pose)
+            if refined is None or not is_valid(refined[0]):
                 continue
-            if all(turn_between(refined[0].pose, a.pose) >= _DISTINCT_RAD for a, _ in fine):
+            if any(turn_between(refined[0].pose, a.pose) < _DISTINCT_RAD for a, _ in fine):
+                continue
+            yield _APPEARANCE_MS
+            if self._looks_right(pyramid, *refined):
+                least = max(least, start.score - _WORSE_START)
                 fine.append(refined)
         fine.sort(key=lambda found: -found[0].score)
         return tuple(f for f in fine if f[0].score > fine[0][0].score - _AMBIGUOUS_SCORE)
@@ -123,8 +154,9 @@ class Acquisition:
         level = next((k for k in levels[::-1] if k >= _APPEARANCE_LEVEL), levels[0])
         return appearance(pyramid, self._mesh, found.pose, level, light) >= MIN_APPEARANCE
 
-    def _candidates(self, pyramid: Pyramid, region: NDArray[np.uint8]) -> list[PoseInCamera]:
+    def _candidates(self, pyramid: Pyramid, region: NDArray[np.uint8]) -> Steps[list[PoseInCamera]]:
         """Return coarse poses of a target that covers ``region`` (h, w), the most likely first."""
+        yield _SILHOUETTES_MS
         self.prepare()
         assert self._templates is not None
         t, camera = self._templates, self._camera
@@ -143,7 +175,10 @@ class Acquisition:
         common = t.masks @ mask
         union = t.masks.sum(axis=1) + mask.sum() - common
         likely = np.argsort(-common / union)[:_BY_SILHOUETTE]
-        errors = [self._unexplained(int(i), mask, grey, common[i] / union[i]) for i in likely]
+        errors: list[float] = []
+        for some in np.array_split(likely, _BY_SILHOUETTE // _RATED_AT_ONCE):
+            yield _RATE_MS
+            errors += [self._unexplained(int(i), mask, grey, common[i] / union[i]) for i in some]
         poses = []
         for i in likely[np.argsort(errors)[:_BY_LIGHT]]:
             # The same silhouette at another distance: sizes are inversely proportional to it.
@@ -190,6 +225,11 @@ def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
     smooth = cv2.GaussianBlur(image, (0, 0), 1.0)
     bright = cv2.morphologyEx((smooth > level).astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
     return _largest_region(bright)
+
+
+def _touches_border(region: NDArray[np.uint8]) -> bool:
+    """Return whether a mask (h, w) reaches the border of the image."""
+    return any(bool(edge.any()) for edge in (region[0], region[-1], region[:, 0], region[:, -1]))
 
 
 def _largest_region(mask: NDArray[Any]) -> NDArray[np.uint8] | None:

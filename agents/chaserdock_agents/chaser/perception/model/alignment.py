@@ -20,6 +20,7 @@ from chaserdock_models.native import address
 from numpy.typing import NDArray
 
 from ..native import function
+from ..pipeline import GeometryInformation
 from ..refine import PoseInCamera
 from .mesh import TrackerMesh
 from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
@@ -91,7 +92,7 @@ class ControlPoints:
 class Alignment:
     """An aligned pose: ``inlier_share`` of the points in the image, ``correlation``: mean of the points in the image, -1 to 1;
     ``rms_px``: of the inliers, pixels of level 0; ``covariance`` (6, 6): as in `TargetPose`; ``modes`` (k,): estimated errors of
-    the geometry in standard deviations."""
+    the geometry in standard deviations; ``geometry``: what the image alone tells about them."""
 
     pose: PoseInCamera
     inlier_share: float
@@ -100,6 +101,7 @@ class Alignment:
     covariance: Array
     points: ControlPoints
     modes: Array
+    geometry: GeometryInformation
 
     @property
     def score(self) -> float:
@@ -280,14 +282,14 @@ def _alignment(pyramid: Pyramid, points: ControlPoints, modes: Array, found: _Ma
     solved = _solve(_Fit(residual, weight, jacobian, shifts), modes)
     if solved is None:
         return None
-    step, covariance = solved
+    step, covariance, geometry = solved
     if len(modes):
         turn = rotations.to_matrix(rotations.exp(step[3:6]))
         pose = PoseInCamera(pose.position + step[:3], pose.rotation @ turn)
     rms = math.sqrt(float(np.average(residual**2, weights=weight))) * 2.0**points.level
     seen = found.weight >= 0.0
     share, correlation = float(used.sum()) / found.inside, float(found.correlation[seen].mean())
-    return Alignment(pose, share, correlation, rms, covariance, points, modes + step[6:])
+    return Alignment(pose, share, correlation, rms, covariance, points, modes + step[6:], geometry)
 
 
 @dataclass(frozen=True)
@@ -301,8 +303,9 @@ class _Fit:
     shifts: Array
 
 
-def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array] | None:
-    """Return the step (6 + k,) of pose and modes, and the covariance (6, 6) of the pose; None for a pose that is not observable.
+def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array, GeometryInformation] | None:
+    """Return the step (6 + k,) of pose and modes, the covariance (6, 6) of the pose, and the information about the modes; None for
+    a pose that is not observable.
 
     The errors of the geometry have their standard deviations, 1, as prior knowledge around 0; ``modes`` (k,) is where the fit is
     linearized. Control points near to each other err together, which divides their information.
@@ -313,6 +316,7 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array] | None:
     weight = fit.weight / (correlated * max(chi_square, 1.0))
     information = rows.T @ (rows * weight[:, None])
     right = rows.T @ (weight * fit.residual)
+    geometry = _without_pose(information, right, modes)
     information[6:, 6:] += np.eye(len(modes))
     right[6:] -= modes
     scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
@@ -321,4 +325,13 @@ def _solve(fit: _Fit, modes: Array) -> tuple[Array, Array] | None:
         return None
     inverse = (vectors / values) @ vectors.T * np.outer(scale, scale)
     covariance = inverse[:6, :6]
-    return inverse @ right, 0.5 * (covariance + covariance.T)
+    return inverse @ right, 0.5 * (covariance + covariance.T), geometry
+
+
+def _without_pose(information: Array, right: Array, modes: Array) -> GeometryInformation:
+    """Return the information about the modes (k,) of a fit (6 + k, 6 + k) that is linearized at ``modes``: its Schur complement."""
+    of_pose = np.linalg.pinv(information[:6, :6], hermitian=True)
+    gain = information[6:, :6] @ of_pose
+    matrix = information[6:, 6:] - gain @ information[:6, 6:]
+    matrix = 0.5 * (matrix + matrix.T)
+    return GeometryInformation(matrix, right[6:] - gain @ right[:6] + matrix @ modes)

@@ -7,6 +7,7 @@ with cast shadows and highlights (native/light.c). The best one is refined betwe
 
 from __future__ import annotations
 
+import math
 from ctypes import c_double, c_int64
 from dataclasses import dataclass
 
@@ -29,6 +30,8 @@ _LEAST_AMBIENT = 0.02
 """Least ambient level as a share of the directed one."""
 _GREY_NOISE = 3.0
 _NEIGHBOURS_RAD, _FINE_TEXELS = (0.12, 0.05), 96
+_COMPARED, _DISTINCT_RAD = 8, 0.35
+"""Number of directions that are compared by synthetic views, and their least distance."""
 _LIKELY = 0.08
 """Increase of the mean squared residual, as a share of its least, at which a direction weighs 1/e in the mean of the likely ones."""
 
@@ -42,14 +45,37 @@ class LitPoints:
 
 
 def light_at(
-    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int, previous: Lighting | None = None
+    pyramid: Pyramid,
+    mesh: TrackerMesh,
+    pose: PoseInCamera,
+    level: int,
+    previous: Lighting | None = None,
+    by_view: bool = False,
 ) -> Lighting | None:
     """Return the light, in grey levels, that the image shows on a target at ``pose``; None if too little of it is in view.
 
-    With ``previous``, only directions near that light are tried.
+    With ``previous``, only directions near that light are tried. With ``by_view``, a synthetic view in each of several likely
+    lights decides: on few textured faces, directions far apart explain the points about equally well, but not the shadows' edges.
     """
     points = lit_points(pyramid, mesh, pose, level)
-    return fit_light(mesh, points, previous) if points else None
+    if points is None:
+        return None
+    if previous is None and by_view:
+        lights = likely_lights(mesh, points)
+        previous = max(lights, key=lambda light: appearance(pyramid, mesh, pose, level, light))
+    return fit_light(mesh, points, previous)
+
+
+def likely_lights(mesh: TrackerMesh, points: LitPoints) -> list[Lighting]:
+    """Return the light of the best directions that are at least ``_DISTINCT_RAD`` apart, likely ones first."""
+    rated, towards = rate_suns(points, mesh.suns), mesh.suns.to_sun_trf
+    chosen: list[int] = []
+    for k in np.argsort(rated[:, 0]).tolist():
+        if len(chosen) < _COMPARED and all(
+            towards[k] @ towards[other] < math.cos(_DISTINCT_RAD) for other in chosen
+        ):
+            chosen.append(k)
+    return [Lighting(points.rotation @ towards[k], float(rated[k, 2]), float(rated[k, 1])) for k in chosen]
 
 
 def lit_points(

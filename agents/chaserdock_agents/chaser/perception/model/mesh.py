@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from ctypes import c_double, c_int64
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.meshes import Material, TriangleMesh, with_geometry_errors
+from chaserdock_models.geometry_errors import error_modes
+from chaserdock_models.meshes import Material, TriangleMesh
 from chaserdock_models.native import address
 from chaserdock_models.satellites import BOX_TRIANGLES
 from chaserdock_models.targets import Box, cuboid_corners
@@ -117,7 +118,7 @@ class TrackerMesh:
 
     @classmethod
     def of_mesh(cls, mesh: TriangleMesh, joint_sigma_rad: float, scale_sigma: float) -> TrackerMesh:
-        """Return the tracker mesh of a body's mesh; modes: the scale of the body, and a turn of each joint about each axis."""
+        """Return the tracker mesh of a body's mesh; modes: those of `error_modes`."""
         counts = np.cumsum([0, *(len(part.vertices_m) for part in mesh.parts)])
         triangles = np.concatenate(
             [p.triangles + first for p, first in zip(mesh.parts, counts[:-1], strict=True)]
@@ -126,22 +127,24 @@ class TrackerMesh:
             [_surface(p.material) for p in mesh.parts], [len(p.triangles) for p in mesh.parts], axis=0
         )
 
-        def vertices(of: TriangleMesh) -> Array:
-            return np.concatenate([part.vertices_m for part in of.parts])
+        known = np.concatenate([part.vertices_m for part in mesh.parts])
+        modes = error_modes(mesh, joint_sigma_rad, scale_sigma)
+        return cls(known, triangles.astype(np.int64), surfaces[:, 0], modes, surfaces[:, 1:3], surfaces[:, 3])
 
-        known = vertices(mesh)
-        turns = (
-            [{joint: joint_sigma_rad * axis} for joint in mesh.joints for axis in np.eye(3)]
-            if joint_sigma_rad
-            else []
+    def corrected(self, mean: Array, covariance: Array) -> TrackerMesh:
+        """Return the mesh after its modes have been estimated: ``mean`` (k,) and ``covariance`` (k, k), standard deviations of now.
+
+        Its modes are the columns of the lower Cholesky factor of the covariance. The coarse shadow maps are kept.
+        """
+        factor = np.linalg.cholesky(covariance)
+        new = replace(
+            self,
+            vertices_m=self.vertices_m + np.einsum("k,kni->ni", mean, self.modes_m),
+            modes_m=np.einsum("kj,kni->jni", factor, self.modes_m),
         )
-        modes = [vertices(with_geometry_errors(mesh, 0.0, turn)) - known for turn in turns]
-        if scale_sigma > 0.0:
-            modes.append(vertices(with_geometry_errors(mesh, scale_sigma, {})) - known)
-        stacked = np.array(modes).reshape(len(modes), len(known), 3)
-        return cls(
-            known, triangles.astype(np.int64), surfaces[:, 0], stacked, surfaces[:, 1:3], surfaces[:, 3]
-        )
+        if "suns" in self.__dict__:
+            new.__dict__["suns"] = self.suns
+        return new
 
     @cached_property
     def contiguous(self) -> tuple[Array, NDArray[np.int64], Array, Array]:

@@ -3,27 +3,32 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from numpy.typing import ArrayLike, NDArray
 
-from ..pipeline import PerceptionResult
+from ..pipeline import GeometryInformation, PerceptionResult
 from ..pnp import TargetPose
 from ..refine import PoseInCamera
 from .acquisition import Acquisition
 from .alignment import Alignment, Pyramid
+from .geometry import GeometryCorrection
 from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
+from .steps import Steps
 from .tracking import (
     is_valid,
+    key_view_ms,
     levels_of,
-    refine_from_prior,
-    refine_from_starts,
+    prior_steps,
     refine_pose,
+    start_steps,
     starts_around,
     track_points,
     turn_between,
@@ -35,8 +40,11 @@ _KEY_TURN_RAD = 0.04
 """Points of a view are not reused when the target has turned by more since."""
 _LOST_AFTER = 3
 """Number of images in a row without a valid pose after which a track ends."""
-_ACQUIRE_EVERY = 5
-"""After a failed acquisition, the next one runs at the fifth image: it takes as long as many images."""
+_PER_IMAGE_MS = 30.0
+"""Expected CPU time per image, beyond which work is continued at the next one; a first step may take longer."""
+_POINTS_MS = 6.0
+_MOST_WAITING = 120
+"""Number of images that wait until an acquisition has ended; beyond, it is given up for one of the newest image."""
 _WORSE = 0.1
 """An ambiguous pose is dropped when its score falls this far below the best one's."""
 
@@ -65,6 +73,8 @@ class PoseTrack:
 class ModelPerception:
     """Estimates the pose of the target from its shape. Stateful: equal sequences of images give equal results.
 
+    Work that takes longer than the time of an image is spread over several: an acquisition, or starts around a lost pose. Until it
+    ends, images wait and give no solution; then the target is tracked through them, several at each new image, up to the newest one.
     One instance belongs to one camera; ``acquisition``, of the same camera and mesh, may be shared. ``solutions`` are ambiguous
     poses, the best first, and without markers.
     """
@@ -73,12 +83,39 @@ class ModelPerception:
         self.camera, self.mesh = camera, mesh
         self._acquisition = acquisition or Acquisition(camera, mesh)
         self._tracks: tuple[PoseTrack, ...] = ()
-        self._until_acquisition = 0
+        self._waiting: deque[NDArray[np.uint8]] = deque()
+        self._work: Steps[None] | None = None
+        self._next_ms = 0.0
+        self._uncorrected = mesh
+        self._correction: GeometryCorrection | None = None
 
     def prepare(self) -> None:
         """Compute what depends on the mesh alone; takes one to two seconds, which the first image would take otherwise."""
         self._acquisition.prepare()
         _ = self.mesh.suns
+
+    def correct_geometry(self, mean: Array, covariance: Array) -> None:
+        """Correct the mesh by its estimated errors (k,) with covariance (k, k), in its standard deviations; tracks go on.
+
+        Raises ValueError for another number of errors than the mesh has, or a covariance that is not positive definite.
+        """
+        k = len(self._uncorrected.modes_m)
+        if mean.shape != (k,) or covariance.shape != (k, k) or not np.linalg.eigvalsh(covariance)[0] > 0.0:
+            raise ValueError(f"the mesh has {k} errors; {len(mean)} or their covariance do not fit")
+        if self._correction is not None and self._correction.is_of(mean):
+            return
+        self._correction = GeometryCorrection(mean, covariance)
+        self.mesh = self._correction.applied(self._uncorrected)
+        if self._tracks:
+            self._work = None  # begins again, with this mesh
+        self._tracks = tuple(
+            replace(t, last=replace(t.last, modes=np.zeros(k)), age=_KEY_EVERY) for t in self._tracks
+        )
+
+    def reset(self) -> None:
+        """Forget all tracks: the next image is searched without a prior."""
+        self._tracks, self._work = (), None
+        self._waiting.clear()
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
@@ -91,42 +128,83 @@ class ModelPerception:
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
             got = f"{image.dtype} {image.shape}" if isinstance(image, np.ndarray) else type(image).__name__
             raise ValueError(f"expected a uint8 image of {shape}, got {got}")
-        if self._tracks:
-            pyramid = Pyramid(image, self.camera)
-            updated = [advance(pyramid, self.mesh, track) for track in self._tracks]
-            self._tracks = _distinct([t for t in updated if t.missed < _LOST_AFTER])
-            self._until_acquisition = 0
-        elif self._until_acquisition > 0:
-            self._until_acquisition -= 1
-        else:
-            self._tracks = tuple(PoseTrack(*found) for found in self._acquisition.find(image))
-            self._until_acquisition = _ACQUIRE_EVERY - 1
-        valid = [_target_pose(t.last) for t in self._tracks if t.missed == 0]
-        return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
+        if len(self._waiting) == _MOST_WAITING:
+            self._waiting.clear()
+            self._work, self._tracks = None, ()
+        self._waiting.append(image)
+        self._work_on()
+        # Poses in an earlier image are no solutions of this one.
+        tracks = () if self._waiting else self._tracks
+        valid = [_target_pose(t.last) for t in tracks if t.missed == 0]
+        geometry = self._geometry() if tracks else None
+        return PerceptionResult(tuple(valid), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), (), geometry)
+
+    def _geometry(self) -> GeometryInformation | None:
+        """Return what the image tells about the errors of the mesh before corrections: if the view of the only track is new."""
+        if len(self._tracks) != 1 or self._tracks[0].age or self._tracks[0].missed:
+            return None
+        found = self._tracks[0].last.geometry
+        if not len(found.vector):
+            return None
+        return found if self._correction is None else self._correction.of_uncorrected(found)
+
+    def _work_on(self) -> None:
+        """Take the next steps, as many as the time of one image allows, and at least one."""
+        spent_ms = 0.0
+        while self._waiting:
+            if self._work is None:
+                if not self._tracks:  # the newest image is nearest to those to come
+                    self._waiting = deque([self._waiting[-1]])
+                self._work, self._next_ms = self._process(self._waiting[0]), 0.0
+            if spent_ms > 0.0 and spent_ms + self._next_ms > _PER_IMAGE_MS:
+                return
+            spent_ms += self._next_ms
+            try:
+                self._next_ms = next(self._work)
+            except StopIteration:
+                self._work = None
+                self._waiting.popleft()
+
+    def _process(self, image: NDArray[np.uint8]) -> Steps[None]:
+        """Update the tracks by an image, or acquire the target in it."""
+        pyramid = Pyramid(image, self.camera)
+        if not self._tracks:
+            found = yield from self._acquisition.search(pyramid)
+            self._tracks = tuple(PoseTrack(*one) for one in found)
+            return
+        updated: list[PoseTrack] = []
+        for track in self._tracks:
+            updated.append((yield from advance(pyramid, self.mesh, track)))
+        self._tracks = _distinct([t for t in updated if t.missed < _LOST_AFTER])
 
 
-def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> PoseTrack:
-    """Return a track after the next image: with the points of its view while they hold, else by a new one, else from several
-    starts."""
+def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[PoseTrack]:
+    """Return a track after the next image: with the points of its view while they hold, else by a new view, else from a rough
+    prior; before it is lost, from several starts."""
     prior, modes = track.predicted(), track.last.modes
     missed = replace(track, missed=track.missed + 1)
     fresh = track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
     if fresh and not track.missed:
+        yield _POINTS_MS
         found = track_points(pyramid, track.last.points, prior, modes)
         if is_valid(found):
             return PoseTrack(found, track.light, track.last.pose, track.age + 1)
     levels = levels_of(pyramid, mesh, prior)
-    light = light_at(pyramid, mesh, prior, levels[0], track.light) if levels else None
+    if not levels:
+        return missed
+    yield key_view_ms(pyramid, mesh, prior, levels[-1])
+    light = light_at(pyramid, mesh, prior, levels[0], track.light)
     if light is None:
         return missed
     found = refine_pose(pyramid, mesh, prior, light, levels[-1:], modes=modes)
     if is_valid(found):
         return PoseTrack(found, light, track.last.pose)
-    refined = refine_from_prior(pyramid, mesh, prior, modes)
+    refined = yield from prior_steps(pyramid, mesh, prior, modes)
     if refined and is_valid(refined[0]):
         return PoseTrack(*refined)
-    light = refined[1] if refined else light
-    found = refine_from_starts(pyramid, mesh, starts_around(prior), light)
+    if missed.missed < _LOST_AFTER:
+        return missed
+    found = yield from start_steps(pyramid, mesh, starts_around(prior), refined[1] if refined else light)
     return PoseTrack(found, light) if is_valid(found) else missed
 
 

@@ -16,6 +16,7 @@ from .alignment import Alignment, ControlPoints, Pyramid, align, control_points,
 from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
+from .steps import LIGHT_MS, VIEWS_MS, Steps, level_ms, result_of
 
 MIN_INLIER_SHARE = 0.66
 """Gate: a smaller share of inliers rejects a pose."""
@@ -69,8 +70,22 @@ def refine_pose(
     modes: Array | None = None,
 ) -> Alignment | None:
     """Align the mesh with an image from ``prior``, level by level; None without an alignment at the last level."""
+    return result_of(pose_steps(pyramid, mesh, prior, light, levels, first_reach_px, modes))
+
+
+def pose_steps(
+    pyramid: Pyramid,
+    mesh: TrackerMesh,
+    prior: PoseInCamera,
+    light: Lighting,
+    levels: tuple[int, ...],
+    first_reach_px: int = _FIRST_REACH_PX,
+    modes: Array | None = None,
+) -> Steps[Alignment | None]:
+    """Do what `refine_pose` does, one level in each step."""
     pose, alignment = prior, None
     for number, k in enumerate(levels):
+        yield level_ms(_area_px(pyramid, mesh, pose, k))
         points = control_points(pyramid, k, mesh, pose, light)
         alignment = (
             None
@@ -85,7 +100,14 @@ def refine_pose(
 def refine_from_prior(
     pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> tuple[Alignment, Lighting] | None:
-    """Return the pose near ``prior`` and the light, neither of which needs to be known well; None without an alignment.
+    """Return the pose near ``prior`` and the light, neither of which needs to be known well; None without an alignment."""
+    return result_of(prior_steps(pyramid, mesh, prior, modes))
+
+
+def prior_steps(
+    pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
+) -> Steps[tuple[Alignment, Lighting] | None]:
+    """Do what `refine_from_prior` does, in steps.
 
     The outline and the borders of materials give a coarse pose by light from everywhere; from it follows the light, which improves
     the coarse pose, which improves the light.
@@ -94,14 +116,15 @@ def refine_from_prior(
     if not levels:
         return None
     pose, light = prior, _EVEN_LIGHT
-    for _ in range(2):
-        coarse = refine_pose(pyramid, mesh, pose, light, levels[:1], modes=modes)
+    for by_view in (False, True):
+        coarse = yield from pose_steps(pyramid, mesh, pose, light, levels[:1], modes=modes)
         pose = coarse.pose if coarse else pose
-        found = light_at(pyramid, mesh, pose, levels[0])
+        yield LIGHT_MS + by_view * VIEWS_MS
+        found = light_at(pyramid, mesh, pose, levels[0], by_view=by_view)
         if found is None:
             return None
         light = found
-    fine = refine_pose(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
+    fine = yield from pose_steps(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
     return (fine, light) if fine else None
 
 
@@ -127,20 +150,37 @@ def refine_from_starts(
     pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
 ) -> Alignment | None:
     """Return the best alignment from several starts: all at the coarsest level, the best three at all levels."""
+    return result_of(start_steps(pyramid, mesh, starts, light))
+
+
+def start_steps(
+    pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
+) -> Steps[Alignment | None]:
+    """Do what `refine_from_starts` does, in steps."""
     coarse: list[Alignment] = []
     for start in starts:
         levels = levels_of(pyramid, mesh, start)
-        found = refine_pose(pyramid, mesh, start, light, levels[:1])
+        found = yield from pose_steps(pyramid, mesh, start, light, levels[:1])
         if found is not None:
             coarse.append(found)
     coarse.sort(key=lambda a: -a.score)
     best: Alignment | None = None
     for candidate in coarse[:3]:
         levels = levels_of(pyramid, mesh, candidate.pose)
-        found = refine_pose(pyramid, mesh, candidate.pose, light, levels)
+        found = yield from pose_steps(pyramid, mesh, candidate.pose, light, levels)
         if found is not None and (best is None or found.score > best.score):
             best = found
     return best
+
+
+def key_view_ms(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
+    """Return the expected CPU time to estimate the light near a previous one and to align a view of one level."""
+    return LIGHT_MS + level_ms(_area_px(pyramid, mesh, pose, level))
+
+
+def _area_px(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
+    found = window_of(pyramid, level, mesh, pose)
+    return float(found[0].height * found[0].width) if found else 0.0
 
 
 def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:

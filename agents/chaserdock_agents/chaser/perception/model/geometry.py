@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Estimated errors of the geometry: correct the tracker mesh by them, and state what an image tells about them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from chaserdock_models.arrays import Array
+
+from ..pipeline import GeometryInformation
+from .mesh import TrackerMesh
+
+
+@dataclass(frozen=True, eq=False)
+class GeometryCorrection:
+    """Estimated errors (k,) of a mesh in its standard deviations, and their covariance (k, k)."""
+
+    mean: Array
+    covariance: Array
+
+    @cached_property
+    def factor(self) -> Array:
+        """Lower Cholesky factor (k, k) of the covariance: its columns are the modes of the corrected mesh."""
+        return np.linalg.cholesky(self.covariance)
+
+    def is_of(self, mean: Array) -> bool:
+        """Return whether this is the correction by ``mean`` (k,)."""
+        return np.array_equal(self.mean, mean)
+
+    def applied(self, mesh: TrackerMesh) -> TrackerMesh:
+        """Return the mesh, of which these are the errors, after the correction."""
+        return mesh.corrected(self.mean, self.covariance)
+
+    def of_uncorrected(self, found: GeometryInformation) -> GeometryInformation:
+        """Return information about the errors of the corrected mesh as information about those of the mesh before.
+
+        With e = mean + C x for errors x of the corrected mesh, information L about x is C^-T L C^-1 about e.
+        """
+        back = np.linalg.inv(self.factor)
+        matrix = back.T @ found.matrix @ back
+        return GeometryInformation(matrix, back.T @ found.vector + matrix @ self.mean)

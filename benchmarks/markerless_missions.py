@@ -1,0 +1,317 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Missions with perception by shape: ``python benchmarks/markerless_missions.py [--only PART] [--flights N] [--first SEED]
+[--set KEY=VALUE] [--results FILE] [--quick] [--json FILE]``.
+
+Complete missions in one process (``chaserdock.evaluation.in_process``), with rendered images. The seed draws the errors of the
+target's geometry, of sensors and of images.
+
+- ``docking``: ``markerless-docking`` to its end;
+- ``capture``: ``markerless-capture`` until the docking is verified, or to its end.
+
+A flight's line states how it ended; the figures are the worst over flights, and times are CPU times of this process by part.
+``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it. ``--quick``: one flight
+of 30 s, which cannot dock.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from chaserdock_agents.chaser.perception import make_perception
+from chaserdock_agents.chaser.sighting import look
+from chaserdock_controller.interfaces import TickInputs, TickOutputs
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import Sighting
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_world.physics.simulation import TARGET
+from chaserdock_world.rendering.cameras import States
+from chaserdock_world.rendering.pose_cameras import make_cameras
+from common import Figures, append_line, commit, make_parser, read_lines, run_parts
+
+from chaserdock.evaluation.in_process import InProcessMission, TickRecord
+from chaserdock.evaluation.transfers import load_shipped
+
+SCENARIOS = {"docking": "markerless-docking", "capture": "markerless-capture"}
+QUICK = ("duration_s=30.0", "steady_until_s=30.0", "timeline=[]")
+PROGRESS_S = 5.0
+STEADY_RAD = math.radians(0.3)
+
+
+class MissionOutcome(msgspec.Struct, frozen=True):
+    """How one flight ended.
+
+    ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in the steady interval.
+    ``estimate_*``: of the target's estimate from its first sighting on, RMS and most; ``nees``: mean, 6 expected.
+    ``seen_share``: of the images, by chaser. ``unseen_s``: longest time without a sighting after the first, by chaser.
+    ``*_ms``: CPU time per tick by part; ``image_*_ms``: of the perception, per image. ``touch_m``, ``touch_deg``: at the latch.
+    """
+
+    seed: int
+    cause: str
+    success: bool
+    time_s: float
+    contacts: list[tuple[str, str]]
+    steady_position_m: float
+    steady_orientation_rad: float
+    estimate_rms_m: float
+    estimate_rms_rad: float
+    estimate_max_m: float
+    estimate_max_rad: float
+    nees: float
+    first_seen_s: list[float]
+    seen_share: list[float]
+    unseen_s: list[float]
+    image_mean_ms: float
+    image_p99_ms: float
+    image_max_ms: float
+    render_ms: float
+    perception_ms: float
+    controller_ms: float
+    tick_ms: float
+    touch_m: float | None = None
+    touch_deg: float | None = None
+    retreats: list[str] = msgspec.field(default_factory=list)
+
+
+class TimedImages:
+    """Render each chaser's image and run its perception on it, and keep the CPU times of both."""
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._ticks_per_image = scenario.timing.ticks_per_image
+        self._cameras = make_cameras(scenario)
+        self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
+        self.render_s: list[float] = []
+        self.perception_s: list[float] = []
+        self.seen: list[list[bool]] = [[] for _ in scenario.chasers]
+
+    def __call__(self, chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
+        begin_s = time.process_time()
+        image = self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
+        drawn_s = time.process_time()
+        sighting = look(self._perceptions[chaser], image, None)
+        self.perception_s.append(time.process_time() - drawn_s)
+        self.render_s.append(drawn_s - begin_s)
+        self.seen[chaser].append(sighting.status == "seen")
+        return sighting
+
+
+class TimedMission(InProcessMission):
+    """A mission that keeps the CPU times of its controller."""
+
+    controller_s = 0.0
+
+    def _control(self, inputs: TickInputs) -> TickOutputs | None:
+        begin_s = time.process_time()
+        outputs = super()._control(inputs)
+        self.controller_s += time.process_time() - begin_s
+        return outputs
+
+
+def estimate_error(record: TickRecord) -> tuple[float, float, float] | None:
+    """Return the error of the target's estimate: m, rad, and normalized squared; None before the first sighting."""
+    estimate = record.outputs.target if record.outputs is not None else None
+    if estimate is None or estimate.status == "none":
+        return None
+    truth = record.states[TARGET]
+    position = truth.position_m - np.array(estimate.position_m)
+    turn = rotations.log(rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), truth.q_wxyz))
+    nees = math.nan
+    if len(estimate.covariance):
+        covariance = np.array(estimate.covariance).reshape(12, 12)
+        e = np.concatenate([position, turn])
+        nees = float(e @ np.linalg.solve(pose_covariance(covariance), e))
+    return float(np.linalg.norm(position)), float(np.linalg.norm(turn)), nees
+
+
+def pose_covariance(covariance: Array) -> Array:
+    """Return the covariance (6, 6) of position and rotation out of that (12, 12) of the state."""
+    pose = np.r_[0:3, 6:9]
+    return covariance[np.ix_(pose, pose)]
+
+
+def fly(seed: int, scenario: Scenario) -> MissionOutcome:
+    """Fly one mission."""
+    images = TimedImages(scenario)
+    capture, wanted = scenario.docking.kind == "capture", scenario.success.latched
+    rows, errors, next_s = [], [], PROGRESS_S
+    begin_s = time.process_time()
+    with TimedMission(scenario, images) as flight:
+        while flight.tick < scenario.ticks:
+            record = flight.step()
+            errors.append([record.tracking_errors[i] for i in flight.chasers])
+            rows.append(estimate_error(record))
+            phases = [flight.phase(i) for i in flight.chasers]
+            if record.time_s >= next_s:
+                next_s += PROGRESS_S
+                print_progress(seed, record, images, rows[-1], phases)
+            if capture and all(phases[i] == "verified" for i in wanted):
+                break
+        total_s = time.process_time() - begin_s
+        return outcome(seed, flight, images, errors, rows, total_s)
+
+
+def print_progress(
+    seed: int,
+    record: TickRecord,
+    images: TimedImages,
+    error: tuple[float, float, float] | None,
+    phases: list[str],
+) -> None:
+    position_m, angle_rad, nees = error or (math.nan,) * 3
+    tracking = ", ".join(
+        f"{phase} {1e3 * e[0]:.1f} mm {math.degrees(e[1]):.2f} deg"
+        for phase, e in zip(phases, record.tracking_errors.values(), strict=True)
+    )
+    print(
+        f"  {seed}: {record.time_s:.0f} s; estimate {1e3 * position_m:.2f} mm {math.degrees(angle_rad):.3f} deg, NEES {nees:.1f}; "
+        f"{tracking}; perception {1e3 * np.mean(images.perception_s):.1f} ms, most {1e3 * max(images.perception_s):.0f} ms",
+        file=sys.stderr,
+        flush=True,
+    )
+
+
+def longest_gap(seen: list[bool]) -> int:
+    """Return the largest number of images in a row without a sighting, after the first one."""
+    longest = now = 0
+    for value in seen[seen.index(True) :] if True in seen else []:
+        now = 0 if value else now + 1
+        longest = max(longest, now)
+    return longest
+
+
+def outcome(
+    seed: int,
+    flight: TimedMission,
+    images: TimedImages,
+    errors: list[list[tuple[float, float]]],
+    rows: list[tuple[float, float, float] | None],
+    total_s: float,
+) -> MissionOutcome:
+    scenario, capture = flight.scenario, flight.scenario.docking.kind == "capture"
+    done = "verified" if capture else "docked"
+    wanted = scenario.success.latched if capture else scenario.success.docked
+    missing = [i for i in wanted if flight.phase(i) != done]
+    tick_s = np.arange(len(errors)) / scenario.timing.rate_hz
+    until_s = scenario.steady_until_s or scenario.duration_s
+    late = (tick_s >= scenario.settling_s) & (tick_s <= until_s)
+    steady = np.array(errors)[late] if late.any() else np.full((1, 1, 2), np.nan)
+    rms = np.sqrt(np.mean(steady**2, axis=0)).max(axis=0)
+    known = np.array([r for r in rows if r is not None] or [(math.nan,) * 3])
+    retreats = [text for i in flight.chasers for text in flight.retreats(i)]
+    touch = next((t for t in flight.touches if t.latched), None)
+    if flight.contacts:
+        cause = f"collision {sorted(flight.contacts)[0]}"
+    elif missing:
+        cause = f"not {done}: " + ", ".join(f"chaser {i} in {flight.phase(i)}" for i in missing)
+    else:
+        cause = done + (f" after {len(retreats)} retreats" if retreats else "")
+    ticks, per_image = len(errors), 1e3 * np.array(images.perception_s)
+    image_s = 1.0 / scenario.timing.rate_hz * scenario.timing.ticks_per_image
+    return MissionOutcome(
+        seed=seed,
+        cause=cause,
+        success=not missing and not flight.contacts,
+        time_s=flight.time_s,
+        contacts=sorted(flight.contacts),
+        steady_position_m=float(rms[0]),
+        steady_orientation_rad=float(rms[1]),
+        estimate_rms_m=float(np.sqrt(np.mean(known[:, 0] ** 2))),
+        estimate_rms_rad=float(np.sqrt(np.mean(known[:, 1] ** 2))),
+        estimate_max_m=float(known[:, 0].max()),
+        estimate_max_rad=float(known[:, 1].max()),
+        nees=float(np.nanmean(known[:, 2])),
+        first_seen_s=[s.index(True) * image_s if True in s else math.inf for s in images.seen],
+        seen_share=[float(np.mean(s)) for s in images.seen],
+        unseen_s=[longest_gap(s) * image_s for s in images.seen],
+        image_mean_ms=float(per_image.mean()),
+        image_p99_ms=float(np.percentile(per_image, 99)),
+        image_max_ms=float(per_image.max()),
+        render_ms=1e3 * sum(images.render_s) / ticks,
+        perception_ms=1e3 * sum(images.perception_s) / ticks,
+        controller_ms=1e3 * flight.controller_s / ticks,
+        tick_ms=1e3 * total_s / ticks,
+        touch_m=None if touch is None else touch.lateral_m,
+        touch_deg=None if touch is None else math.degrees(touch.angle_rad),
+        retreats=retreats,
+    )
+
+
+def line_of(o: MissionOutcome) -> str:
+    """Return one line for people."""
+    text = (
+        f"{o.seed}: {o.cause} at {o.time_s:.1f} s; steady {1e3 * o.steady_position_m:.2f} mm "
+        f"{math.degrees(o.steady_orientation_rad):.3f} deg; estimate {1e3 * o.estimate_rms_m:.2f} mm "
+        f"{math.degrees(o.estimate_rms_rad):.3f} deg, NEES {o.nees:.1f}; {o.tick_ms:.0f} ms a tick"
+    )
+    if o.touch_m is not None and o.touch_deg is not None:
+        text += f"; contact {1e3 * o.touch_m:.2f} mm {o.touch_deg:.2f} deg"
+    return text + "".join(f"; retreat: {reason}" for reason in o.retreats)
+
+
+def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | None) -> Figures:
+    """Fly the seeds of a part that are not in ``results``, and return the figures of all."""
+    outcomes = []
+    key = {"part": part, "changes": list(changes)}
+    known = {
+        line["outcome"]["seed"]: msgspec.convert(line["outcome"], MissionOutcome)
+        for line in read_lines(results)
+        if {k: line[k] for k in key} == key
+    }
+    for seed in seeds:
+        if seed not in known:
+            known[seed] = fly(seed, load_shipped(SCENARIOS[part], f"seed={seed}", *changes))
+            row = {**key, "commit": commit(), "outcome": msgspec.to_builtins(known[seed])}
+            append_line(results, row)
+        outcomes.append(known[seed])
+        print(f"  {line_of(known[seed])}", flush=True)
+
+    def worst(of: Callable[[MissionOutcome], float]) -> float:
+        return max(map(of, outcomes))
+
+    steady = [o.steady_position_m <= 0.003 and o.steady_orientation_rad <= STEADY_RAD for o in outcomes]
+    return {
+        f"{part}_flights": len(outcomes),
+        f"{part}_succeeded": sum(o.success for o in outcomes),
+        f"{part}_collisions": sum(bool(o.contacts) for o in outcomes),
+        f"{part}_steady_within_bar": sum(steady),
+        f"{part}_steady_position_rms_m": worst(lambda o: o.steady_position_m),
+        f"{part}_steady_orientation_rms_rad": worst(lambda o: o.steady_orientation_rad),
+        f"{part}_estimate_rms_m": worst(lambda o: o.estimate_rms_m),
+        f"{part}_estimate_rms_rad": worst(lambda o: o.estimate_rms_rad),
+        f"{part}_nees_mean": float(np.mean([o.nees for o in outcomes])),
+        f"{part}_first_seen_s": worst(lambda o: max(o.first_seen_s)),
+        f"{part}_unseen_s": worst(lambda o: max(o.unseen_s)),
+        f"{part}_image_mean_s": 1e-3 * float(np.mean([o.image_mean_ms for o in outcomes])),
+        f"{part}_image_max_s": 1e-3 * worst(lambda o: o.image_max_ms),
+        f"{part}_render_s_per_tick": 1e-3 * float(np.mean([o.render_ms for o in outcomes])),
+        f"{part}_perception_s_per_tick": 1e-3 * float(np.mean([o.perception_ms for o in outcomes])),
+        f"{part}_controller_s_per_tick": 1e-3 * float(np.mean([o.controller_ms for o in outcomes])),
+        f"{part}_s_per_tick": 1e-3 * float(np.mean([o.tick_ms for o in outcomes])),
+    }
+
+
+def main() -> None:
+    parser = make_parser(__doc__, SCENARIOS)
+    parser.add_argument("--flights", type=int, default=5, help="number of seeds")
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
+    parser.add_argument("--results", type=Path, metavar="FILE", help="append flights; those in it are kept")
+    options = parser.parse_args()
+    flights = 1 if options.quick else options.flights
+    seeds, changes = range(options.first, options.first + flights), tuple(options.set)
+    changes += QUICK if options.quick else ()
+    run_parts(
+        options,
+        {part: (lambda part=part: fly_part(part, seeds, changes, options.results)) for part in SCENARIOS},
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,183 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands for labelled images: ``chaserdock dataset`` and ``chaserdock evaluate …``."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from .help import add_command, command_group
+from .options import JsonOpt, ScenarioArg, SetOpt, complete_scenario, fail, print_result
+
+
+class LayoutOption(StrEnum):
+    """Layouts of datasets."""
+
+    speed = "speed+"
+    bop = "bop"
+    both = "both"
+
+
+class SplitOption(StrEnum):
+    """Parts of a dataset."""
+
+    train = "train"
+    validation = "validation"
+    all = "all"
+
+
+def _show_progress(label: str, total: int, quiet: bool) -> Callable[[int], None]:
+    """Return a function that shows the number of images done on a terminal."""
+    if quiet or not sys.stderr.isatty():
+        return lambda done: None
+    return lambda done: print(
+        f"\r{label} {done} of {total}", end="\n" if done == total else "", file=sys.stderr, flush=True
+    )
+
+
+def dataset(
+    scenario: ScenarioArg,
+    images: Annotated[int, typer.Option(min=1, max=1_000_000, help="number of images")],
+    out: Annotated[Path, typer.Option(help="folder to write; a new one")],
+    layout: Annotated[
+        LayoutOption, typer.Option("--format", help="layout of images and labels")
+    ] = LayoutOption.both,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**32 - 1, help="seed of views, noise and geometry errors")
+    ] = 0,
+    range_m: Annotated[
+        tuple[float, float],
+        typer.Option("--range", metavar="LEAST MOST", help="distance of the target, m, log-uniform"),
+    ] = (1.0, 3.0),
+    offset: Annotated[
+        float,
+        typer.Option(
+            min=0.0, max=1.0, help="largest distance of the target from the middle, share of half the image"
+        ),
+    ] = 0.2,
+    phase: Annotated[
+        tuple[float, float],
+        typer.Option(metavar="LEAST MOST", help="angle at the target between sun and camera, degrees"),
+    ] = (0.0, 120.0),
+    validation: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="share of the images for validation")
+    ] = 0.2,
+    overrides: SetOpt = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
+) -> None:
+    """Export images of random views of a scenario's target with pose labels, in the SPEED+ and BOP formats."""
+    from chaserdock_protocol.scenario import load_scenario
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    from chaserdock.datasets.export import EXACT_CAMERA, export_dataset
+    from chaserdock.datasets.types import Layout
+    from chaserdock.datasets.views import ViewLimits
+
+    limits = ViewLimits(range_m, offset, phase)
+    sets = (EXACT_CAMERA, f"seed={seed}", *(overrides or ()))
+    loaded = load_scenario(find_scenario(scenario), sets)
+    layouts: tuple[Layout, ...] = ("bop", "speed+") if layout is LayoutOption.both else (layout.value,)
+    progress = _show_progress("image", images, quiet)
+    export_dataset(loaded, out, images, limits, layouts, validation, progress)
+    print(f"{out}: {images} images of {loaded.target.model}, {' and '.join(layouts)}, seed {seed}")
+
+
+evaluate = command_group("evaluate", "Score parts of the flight software on data.")
+
+
+@evaluate.callback()
+def group() -> None:
+    """Score parts of the flight software on data."""
+
+
+def perception(
+    folder: Annotated[
+        Path,
+        typer.Argument(
+            metavar="DATASET", help="folder of `chaserdock dataset`, or one in the SPEED+ or BOP format"
+        ),
+    ],
+    name: Annotated[
+        str | None,
+        typer.Option(
+            "--perception",
+            help="model, default, paper, an installed plugin, or MODULE:CLASS; the scenario's by default",
+        ),
+    ] = None,
+    scenario: Annotated[
+        str | None,
+        typer.Option(
+            help="scenario with the target's geometry; for datasets from elsewhere",
+            autocompletion=complete_scenario,
+        ),
+    ] = None,
+    split: Annotated[SplitOption, typer.Option(help="part of the dataset")] = SplitOption.validation,
+    images: Annotated[int | None, typer.Option(min=1, help="use the first images only")] = None,
+    as_json: JsonOpt = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="show no progress")] = False,
+) -> None:
+    """Score a perception on labelled images: SPEED score and ADD."""
+    from chaserdock_protocol.scenario import flight_scenario, load_scenario
+    from chaserdock_protocol.shipped_scenarios import find_scenario
+
+    from chaserdock.datasets.evaluation import perception_of, score_perception
+    from chaserdock.datasets.reading import read_dataset
+
+    data, flight = read_dataset(folder)
+    if scenario is not None:
+        flight = flight_scenario(load_scenario(find_scenario(scenario)))
+    if flight is None:
+        raise fail(f"{folder}: states no target; give --scenario with the geometry of the target")
+    chosen = data.of_split(None if split is SplitOption.all else split.value)[:images]
+    if not chosen:
+        raise fail(f"{folder}: has no images in the split {split.value}; give another --split")
+    method = perception_of(name, flight, data.camera)
+    progress = _show_progress("image", len(chosen), quiet or as_json)
+    figures = score_perception(method, chosen, data.camera, data.shape, progress)
+    used = name or flight.perception.name
+    facts = {"dataset": str(folder), "format": data.layout, "split": split.value, "perception": used}
+    # JSON has no NaN: figures without a single pose are null.
+    values = {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in figures.items()}
+    print_result(
+        as_json, facts | values, _table(f"{used} on {folder} ({data.layout}, {split.value})", figures)
+    )
+
+
+def _table(title: str, f: dict[str, float]) -> list[str]:
+    """Return the lines of a table of figures."""
+    count, found = int(f["images"]), int(f["with_pose"])
+    add = "add_s" if "add_s_right_share" in f else "add"
+    lines = [title, f"images {count}, with a pose {found} ({found / count:.1%})"]
+    lines += [
+        f"SPEED score {year}: {f[f'speed_score_{year}']:.5f} over all images, {f[f'speed_score_{year}_with_pose']:.5f} over poses"
+        for year in ("2019", "2021")
+    ]
+    lines.append(f"{'':24}{'mean':>12}{'p50':>12}{'p95':>12}")
+    rows = [
+        ("attitude error, deg", "attitude_rad", math.degrees(1.0)),
+        ("position error, mm", "position_m", 1e3),
+        ("position, mm per m", "position_share", 1e3),
+        (f"{add.upper().replace('_', '-')}, mm", f"{add}_m", 1e3),
+    ]
+    for label, key, factor in rows:
+        if f"{key}_mean" in f:
+            lines.append(
+                f"{label:24}" + "".join(f"{factor * f[f'{key}_{q}']:12.3f}" for q in ("mean", "p50", "p95"))
+            )
+    if f"{add}_right_share" in f:
+        lines.append(
+            f"{add.upper().replace('_', '-')} below 10 % of {f['diameter_m']:.3f} m: {f[f'{add}_right_share']:.1%} of all images"
+        )
+    lines.append(
+        f"CPU time per image: {1e3 * f['cpu_s_mean']:.1f} ms mean, {1e3 * f['cpu_s_max']:.1f} ms max"
+    )
+    return lines
+
+
+add_command(evaluate, perception)

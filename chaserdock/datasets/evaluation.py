@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Score a perception on a dataset, image by image without memory of the one before."""
+
+from __future__ import annotations
+
+import importlib
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, get_args
+
+import numpy as np
+from chaserdock_agents.chaser.perception import Method, PerceptionMethod, make_perception
+from chaserdock_models.arrays import Array
+from chaserdock_models.camera import Camera
+from chaserdock_protocol.scenario import FlightScenario
+from chaserdock_protocol.scenario.camera import FlightCamera, Intrinsics
+from chaserdock_protocol.scenario.schema import PerceptionSection
+
+from .scores import PoseErrors, pose_errors, summarize
+from .shapes import sampled
+from .types import DatasetError, LabelledImage, PoseLabel, TargetShape, read_grey
+
+
+def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> PerceptionMethod:
+    """Return a perception for the camera of a dataset: by its name in a scenario, or a class ``MODULE:NAME``.
+
+    None is the perception of the flight scenario. Raises DatasetError for a class that cannot be made, PluginError for an unknown
+    name.
+    """
+    if name is not None and ":" in name:
+        return _of_class(name, flight, camera)
+    updated: dict[str, Any] = {"camera": _section_of(camera)}
+    if name is not None:
+        updated["perception"] = PerceptionSection(name=name)
+    used = name or flight.perception.name
+    if used == "statistical":
+        raise DatasetError(f"--perception {used}: needs no images, it draws measurements; give another one")
+    if used in get_args(Method) and not flight.target_model().markers:
+        raise DatasetError(f"--perception {used}: needs markers; the target {flight.target.model!r} has none")
+    return make_perception(flight.model_copy(update=updated))
+
+
+def _of_class(name: str, flight: FlightScenario, camera: Camera) -> PerceptionMethod:
+    module, _, attribute = name.partition(":")
+    try:
+        factory: Callable[..., PerceptionMethod] = getattr(importlib.import_module(module), attribute)
+        return factory(camera, flight.target_model())
+    except Exception as error:  # a user's module may raise anything
+        raise DatasetError(f"--perception {name}: cannot be made: {type(error).__name__}: {error}") from error
+
+
+def _section_of(camera: Camera) -> FlightCamera:
+    c = camera
+    distortion = c.distortion or (0.0,) * 5
+    intrinsics = Intrinsics(
+        width_px=c.width_px, height_px=c.height_px, fx_px=c.fx_px, fy_px=c.fy_px, cx_px=c.cx_px, cy_px=c.cy_px,
+        distortion=distortion,
+    )  # fmt: skip
+    return FlightCamera(intrinsics=intrinsics)
+
+
+def score_perception(
+    perception: PerceptionMethod,
+    images: Sequence[LabelledImage],
+    camera: Camera,
+    shape: TargetShape | None,
+    progress: Callable[[int], None] = lambda done: None,
+) -> dict[str, float]:
+    """Return the figures of `summarize` and the CPU time per image of the best solution of a perception in every image.
+
+    A perception with memory must have ``reset()``, which is called before each image. Raises DatasetError.
+    """
+    reset: Callable[[], None] = getattr(perception, "reset", lambda: None)
+    points = None if shape is None else TargetShape(
+        sampled(shape.points_m), shape.diameter_m, shape.symmetries, shape.continuous
+    )  # fmt: skip
+    errors: list[PoseErrors | None] = []
+    times: list[float] = []
+    for number, image in enumerate(images):
+        pixels = read_grey(image.path, camera)
+        reset()
+        begin_s = time.process_time()
+        solutions = perception.estimate(pixels).solutions
+        times.append(time.process_time() - begin_s)
+        if solutions:
+            best = solutions[0]
+            estimate = PoseLabel(_array(best.position_irf_m), _array(best.q_irf_trf_wxyz))
+            errors.append(pose_errors(estimate, image.label, points))
+        else:
+            errors.append(None)
+        progress(number + 1)
+    return summarize(errors, points) | {
+        "cpu_s_mean": float(np.mean(times)),
+        "cpu_s_max": float(np.max(times)),
+    }
+
+
+def _array(values: Array) -> Array:
+    return np.asarray(values, dtype=float)

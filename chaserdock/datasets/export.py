@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Export a dataset: images of random views with their labels, and what flight software knows, which a perception is made from."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from importlib.metadata import version
+from pathlib import Path
+
+from chaserdock_protocol.errors import errors_of_writing
+from chaserdock_protocol.scenario import Scenario, flight_scenario_json
+
+from .bop import BopWriter, check_camera
+from .speed_plus import SpeedPlusWriter
+from .types import DatasetError, Layout, Split
+from .views import ViewLimits, ViewRenderer
+
+DESCRIPTION = "dataset.json"
+FOLDERS: dict[Layout, str] = {"bop": "bop", "speed+": "speedplus"}
+EXACT_CAMERA = 'navigation.grade="exact"'
+"""Override of a scenario by which its camera has no errors against its calibration."""
+
+
+def export_dataset(
+    scenario: Scenario,
+    folder: Path,
+    images: int,
+    limits: ViewLimits,
+    layouts: tuple[Layout, ...],
+    validation_share: float = 0.2,
+    progress: Callable[[int], None] = lambda done: None,
+) -> None:
+    """Write ``images`` images with labels into a new ``folder``, the last ones, a share of ``validation_share``, for validation.
+
+    Raises DatasetError for a folder that exists and is not empty or cannot be written, and for a camera with errors.
+    """
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise DatasetError(f"{folder}: exists already; give a new folder")
+    if "bop" in layouts:
+        check_camera(scenario.camera_model())
+    renderer = ViewRenderer(scenario, limits)
+    first_validation = images - round(validation_share * images)
+    with errors_of_writing(folder, DatasetError):
+        folder.mkdir(parents=True, exist_ok=True)
+        kinds = {"bop": BopWriter, "speed+": SpeedPlusWriter}
+        made = (renderer.camera, renderer.mesh, renderer.shape)
+        writers = [kinds[k](folder / FOLDERS[k], *made) for k in layouts]
+        for number in range(images):
+            image = renderer.render(number)
+            split: Split = "train" if number < first_validation else "validation"
+            for writer in writers:
+                writer.add(number, split, image)
+            progress(number + 1)
+        for writer in writers:
+            writer.close()
+        (folder / DESCRIPTION).write_text(_description(scenario, images, limits), encoding="utf-8")
+
+
+def _description(scenario: Scenario, images: int, limits: ViewLimits) -> str:
+    facts = {
+        "format": 1,
+        "chaserdock": version("chaserdock"),
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "images": images,
+        "limits": asdict(limits),
+        "flight_scenario": json.loads(flight_scenario_json(scenario)),
+    }
+    return json.dumps(facts, indent=1) + "\n"

@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Array interface of the joint filter's compiled kernels (`native`), with the same names.
+
+A mean is one array: position, velocity, attitude and rate of the target (13), and for each chaser the same and its additive
+states (44). Of a covariance within an update only the lower triangle is valid; ``complete`` fills the other one.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from ctypes import Structure, c_double, c_int64, c_void_p
+from typing import Any
+
+import numpy as np
+from chaserdock_models.arrays import Array
+from chaserdock_models.native import address, scratch
+from numpy.typing import NDArray
+
+from .native import function
+
+TARGET_MEAN, CHASER_MEAN = 13, 44
+MOST_ROWS = 18
+"""Largest number of rows that a chaser measures in a tick: 6 of a sighting, 12 of odometry."""
+_SEEN = 55
+_CHANNELS = 5
+
+
+class Motion(Structure):
+    """`Motion` of native/motion.c."""
+
+    _fields_ = [
+        ("dt", c_double),
+        ("mass", c_double),
+        ("inertia", c_double * 3),
+        *(
+            (name, c_double)
+            for name in (
+                "mean_motion", "fade_position", "fade_attitude", "unknown_s", "control_force_share", "control_torque_share",
+                "control_arm", "force_max", "torque_max", "disturbance_force", "disturbance_torque", "latched_acceleration",
+                "latched_angular_acceleration",
+            )
+        ),
+    ]  # fmt: skip
+
+
+class _Measurement(Structure):
+    _fields_ = [
+        ("n", c_int64),
+        ("i", c_int64),
+        *(
+            (name, c_void_p)
+            for name in ("lens", "axes", "camera", "odometry", "odometry_noise", "sighting", "stated")
+        ),
+        ("white_ratio", c_double),
+        ("view_ratio", c_double),
+    ]
+
+
+class _Innovation(Structure):
+    _fields_ = [
+        *(
+            (name, c_void_p)
+            for name in ("residual", "jacobian", "noise", "s", "cross", "white", "correction", "values")
+        ),
+        ("stride", c_int64),
+    ]
+
+
+class Measurement:
+    """Measurements of chaser ``i`` of ``n``, of which one may be None.
+
+    mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting: pose (7,) in IRF, stated
+    covariance (6, 6), and the ratios of white noise and view error to it.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        i: int,
+        mounting: tuple[Array, Array, Array],
+        odometry: tuple[Array, Array] | None,
+        sighting: tuple[Array, Array, float, float] | None,
+    ) -> None:
+        self.rows = (0 if odometry is None else 12) + (0 if sighting is None else 6)
+        self.chaser, self.n = i, n
+        self._kept = mounting, odometry, sighting  # the kernels use the addresses of these arrays
+        state, noise = (None, None) if odometry is None else map(address, odometry)
+        pose, stated, *ratios = (
+            (None, None, 0.0, 0.0) if sighting is None else (*map(address, sighting[:2]), *sighting[2:])
+        )
+        self.native = _Measurement(n, i, *map(address, mounting), state, noise, pose, stated, *ratios)
+
+
+class Innovation:
+    """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of native/update.c."""
+
+    def __init__(self, n: int) -> None:
+        size = 12 + 43 * n
+        stride = -(-size // 8) * 8
+        self.values: Array = np.empty(_CHANNELS + 1)
+        self._arrays = [
+            np.empty(count)
+            for count in (
+                MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
+            )
+        ] + [self.values]  # fmt: skip
+        self._native = _Innovation(*map(address, self._arrays), stride)
+        self._work = scratch(_work_size("innovate_workspace", n))
+        self._address, self._work_address = ctypes.byref(self._native), address(self._work)
+        self._n = c_int64(n)
+
+    def innovate(self, z: Measurement, mean: Array, prior: Array, covariance: Array) -> None:
+        """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""
+        function("innovate")(
+            ctypes.byref(z.native), address(mean), address(prior), address(covariance), self._address, self._work_address
+        )  # fmt: skip
+
+    def correct(self, z: Measurement, used: NDArray[np.int64], prior: Array, mean: Array) -> bool:
+        """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their covariance is not positive."""
+        return bool(
+            function("correct", c_int64)(
+                self._n, c_int64(z.rows), address(used), c_int64(len(used)), self._address, address(prior), address(mean)
+            )
+        )  # fmt: skip
+
+    def reduce(self, z: Measurement, rows: int, covariance: Array) -> None:
+        """Reduce the covariance by the last correction, of so many rows."""
+        function("reduce")(self._n, c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
+
+
+def _work_size(name: str, n: int) -> int:
+    return function(name, c_int64)(c_int64(n))
+
+
+def complete(n: int, covariance: Array) -> None:
+    """Make a covariance (D, D) symmetric by its lower triangle."""
+    function("complete")(c_int64(n), address(covariance))
+
+
+def predict(
+    motion: Motion,
+    target: Array,
+    target_noise: Array,
+    impulses: Array,
+    orbital: Array,
+    fade_view: Array,
+    prior: Array,
+    alive: NDArray[np.int64],
+    latched: NDArray[np.int64],
+    mean: Array,
+    covariance: Array,
+) -> Array:
+    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of native/covariance.c."""
+    n, out = len(fade_view), np.empty_like(covariance)
+    work = scratch(_work_size("predict_workspace", n))
+    arrays: tuple[NDArray[Any], ...] = (
+        target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,
+    )  # fmt: skip
+    function("predict")(ctypes.byref(motion), c_int64(n), *map(address, arrays))
+    return out
+
+
+def wrench_at_origin(
+    wrench: Array, centre_m: Array, omega_rad_s: Array, mass_kg: float, inertia: Array
+) -> Array:
+    """Return the wrench (6,) that moves a body with its centre of mass at the origin as ``wrench`` moves one with it at
+    ``centre_m`` (3,); see native/motion.c."""
+    out = np.empty(6)
+    function("wrench_at_origin")(
+        address(wrench), address(centre_m), address(omega_rad_s), c_double(mass_kg), address(inertia), address(out)
+    )  # fmt: skip
+    return out
+
+
+def linearize(z: Measurement, mean: Array) -> tuple[Array, Array, Array]:
+    """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k, k)."""
+    k = z.rows
+    out = np.empty(k), np.empty((k, _SEEN)), np.empty((k, k))
+    function("linearize")(ctypes.byref(z.native), address(mean), *map(address, out))
+    return out
+
+
+def predict_sighting(mean: Array, i: int, mounting: tuple[Array, Array, Array]) -> tuple[Array, Array]:
+    """Return the predicted pose (7,) of the target in IRF, and its Jacobian (6, 55) without the view's error."""
+    pose, jacobian = np.empty(7), np.empty((6, _SEEN))
+    function("predict_sighting")(
+        address(mean), c_int64(i), *map(address, mounting), address(pose), address(jacobian)
+    )
+    return pose, jacobian
+
+
+def difference(a: Array, b: Array) -> Array:
+    """Return the error (D,) that takes the mean ``a`` to ``b``."""
+    n = (len(a) - TARGET_MEAN) // CHASER_MEAN
+    error = np.empty(12 + 43 * n)
+    function("difference")(c_int64(n), address(a), address(b), address(error))
+    return error
+
+
+def inject(mean: Array, error: Array) -> Array:
+    """Return the mean corrected by an error (D,)."""
+    out = np.empty_like(mean)
+    n = (len(mean) - TARGET_MEAN) // CHASER_MEAN
+    function("inject")(c_int64(n), address(mean), address(error), address(out))
+    return out

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inspection: the flight around the target, and the fusion of what its images tell about the geometry."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from chaserdock_controller.core import ControllerCore
+from chaserdock_controller.estimation.target_shape import FLOOR_SIGMAS, ShapeFilter, view_cell
+from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.trajectories import circuit
+from chaserdock_controller.ingest.odometry_validation import OdometryValidation
+from chaserdock_controller.redundancy.checkpoint import Checkpoint
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.messages import OperatorCommand
+from chaserdock_protocol.scenario import load_scenario
+from flight_cases import at, drain, scenario
+from harness import ROOT
+
+SECTION = {"distance_m": 1.1, "speed_m_s": 0.1, "axis": [1.0, 2.0, 2.0]}
+
+
+def machine(**changes: Any) -> PhaseMachine:
+    guidance = PhaseMachine(scenario(inspection=SECTION, **changes))
+    guidance.target_acquired(0.0)
+    drain(guidance)
+    return guidance
+
+
+def command(guidance: PhaseMachine, now_s: float, *chasers: int) -> list[Any]:
+    commands = [OperatorCommand(command="inspect", chaser=i) for i in chasers]
+    guidance.set_pending_goals(commands)
+    return [guidance.command(c, now_s) for c in commands]
+
+
+def test_circuit_is_smooth_slow_and_returns_to_its_direction() -> None:
+    start, speed = np.array([0.0, -1.3, 0.4]), 0.1
+    move = circuit(start, (1.0, 1.0, 1.0), 1.1, 5.0, speed)
+    times = np.linspace(5.0, 5.0 + move.duration_s, 4001)
+    p, v, a = move.at(times)
+    step = times[1] - times[0]
+    np.testing.assert_allclose(np.gradient(p, step, axis=0)[1:-1], v[1:-1], atol=1e-5)
+    np.testing.assert_allclose(np.gradient(v, step, axis=0)[1:-1], a[1:-1], atol=1e-5)
+    assert np.linalg.norm(v, axis=1).max() <= 1.02 * speed
+    np.testing.assert_allclose(p[0], start, atol=1e-12)
+    np.testing.assert_allclose(p[-1], start * 1.1 / np.linalg.norm(start), atol=1e-9)
+    np.testing.assert_allclose(move.goal_m, p[-1], atol=1e-9)
+    for k in (0, -1):
+        np.testing.assert_allclose([v[k], a[k]], 0.0, atol=1e-9)
+    distances = np.linalg.norm(p, axis=1)
+    np.testing.assert_allclose(distances[1100:], 1.1, atol=1e-9)
+    assert distances.min() > 1.0999
+
+
+def test_chasers_inspect_together_keep_their_distance_face_the_target_and_hold_afterwards() -> None:
+    guidance = machine()
+    assert all(r.accepted for r in command(guidance, 10.0, 0, 1))
+    assert guidance.inspecting() == {0, 1}
+    assert all(c.faces for c in guidance.chasers)
+    end = max(c.move.start_s + c.move.duration_s for c in guidance.chasers)
+    for t in np.linspace(10.0, end, 200):
+        a, b = (at(c.move, t)[0] for c in guidance.chasers)
+        assert np.linalg.norm(a - b) > 1.0
+    for i in (0, 1):
+        guidance.update_tracking(i, end - 0.1, 0.0, 0.0)
+        assert guidance.chasers[i].phase == "inspect"
+        guidance.update_tracking(i, end, 0.0, 0.0)
+    assert [c.phase for c in guidance.chasers] == ["hold", "hold"]
+    assert not any(c.faces for c in guidance.chasers)
+    np.testing.assert_allclose(at(guidance.chasers[0].move, end + 9.0)[0], [-1.1, 0.0, 0.0], atol=1e-9)
+
+
+def test_inspection_is_refused_with_the_reason() -> None:
+    guidance = machine()
+    (reply,) = command(guidance, 10.0, 0)
+    assert reply.accepted
+    (reply,) = command(guidance, 12.0, 1)
+    assert not reply.accepted
+    assert "command all of them at one time" in reply.reason
+    # About the axis of symmetry of both chasers, the one passes where the other holds.
+    crossing = PhaseMachine(scenario(inspection=SECTION | {"axis": [0.0, 0.0, 1.0]}))
+    crossing.target_acquired(0.0)
+    (reply,) = command(crossing, 10.0, 0)
+    assert not reply.accepted
+    assert "m of chaser 1" in reply.reason
+    near = PhaseMachine(scenario(inspection=SECTION | {"distance_m": 0.1}))
+    near.target_acquired(0.0)
+    (reply,) = command(near, 10.0, 0)
+    assert "the offset is 0.1 m from the target" in reply.reason
+    far = PhaseMachine(scenario(inspection=SECTION | {"distance_m": 0.45}))
+    far.target_acquired(0.0)
+    (reply,) = command(far, 10.0, 0)
+    assert "less than twice inspection.distance_m" in reply.reason
+
+
+def views(true: Array, count: int, seed: int) -> list[tuple[Array, Array, Array]]:
+    """Return directions, information and vectors of views that each tell about three combinations of the parameters."""
+    rng = np.random.default_rng(seed)
+    made = []
+    for _ in range(count):
+        rows = 4.0 * rng.normal(size=(3, len(true)))
+        direction = rng.normal(size=3)
+        told = rows @ true + rng.normal(size=3)
+        made.append((direction / np.linalg.norm(direction), rows.T @ rows, rows.T @ told))
+    return made
+
+
+def test_fusion_is_accurate_and_consistent_and_grows_with_coverage() -> None:
+    nees = []
+    for seed in range(40):
+        true = np.random.default_rng([seed, 1]).normal(size=7)
+        fused, spreads = ShapeFilter.prior(7), []
+        for view in views(true, 30, seed):
+            fused = fused.with_view(*view)
+            spreads.append(np.trace(fused.covariance()))
+        off = fused.mean() - true
+        plain = np.linalg.inv(fused.information)
+        nees.append(off @ np.linalg.solve(plain, off) / 7.0)
+        assert np.all(np.abs(off) < 4.0 * np.sqrt(np.diag(fused.covariance())))
+        assert fused.coverage == len(fused.cells) / 80
+        assert np.all(np.diff(spreads) < 1e-9)
+        assert spreads[-1] < 0.1 * spreads[0]
+    assert 0.7 < np.mean(nees) < 1.3
+    assert np.all(np.linalg.eigvalsh(fused.covariance()) >= FLOOR_SIGMAS**2)
+
+
+def test_a_direction_counts_once_and_a_contradiction_not_at_all() -> None:
+    true = np.array([1.0, -0.5])
+    matrix = 25.0 * np.eye(2)
+    fused = ShapeFilter.prior(2).with_view(np.array([1.0, 0.0, 0.0]), matrix, matrix @ true)
+    np.testing.assert_allclose(fused.mean(), true * 25.0 / 26.0)
+    near = np.array([0.999, 0.02, 0.0])
+    assert view_cell(near / np.linalg.norm(near)) == view_cell(np.array([1.0, 0.0, 0.0]))
+    assert fused.with_view(near / np.linalg.norm(near), matrix, matrix @ true) is fused
+    away = np.array([0.0, 0.0, 1.0])
+    assert fused.with_view(away, matrix, matrix @ (true + 9.0)) is fused
+    assert len(fused.with_view(away, matrix, matrix @ true).cells) == 2
+
+
+@pytest.fixture(scope="module")
+def markerless() -> ControllerCore:
+    return ControllerCore(load_scenario(ROOT / "scenarios/markerless-docking.toml"), now_s=lambda: 0.0)
+
+
+def test_standby_takes_over_the_estimate(markerless: ControllerCore) -> None:
+    shape = markerless.estimation.shape
+    assert shape is not None
+    assert [p.name for p in shape.parameters][-2:] == ["scale", "rim"]
+    k = len(shape.parameters)
+    shape.filter = ShapeFilter.prior(k).with_view(np.array([1.0, 0.0, 0.0]), np.eye(k), np.ones(k))
+    checkpoint = Checkpoint(markerless, OdometryValidation(markerless.scenario))
+    saved = checkpoint.save()
+    shape.filter = ShapeFilter.prior(k)
+    checkpoint.restore(saved)
+    np.testing.assert_array_equal(shape.filter.vector, np.ones(k))
+    assert shape.filter.cells
+
+
+def test_targets_with_markers_have_no_geometry_to_estimate() -> None:
+    assert ControllerCore(scenario(), now_s=lambda: 0.0).estimation.shape is None

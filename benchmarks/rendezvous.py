@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario v-bar r-bar] [--seeds N]``.
 
-One process, with statistical perception. ``--images``: only the last leg, with rendered images and without ranging. Prints time, change of velocity, tracking at the hold points, step of the
-estimate at the first markers, and contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the
-controller's events.
+One process, with statistical perception. ``--images``: only the last leg, with rendered images and without ranging. Prints time, change of
+velocity, tracking at the hold points, step of the estimate at the first markers, and contact. ``--quick``: only the last leg, from the last hold point on. ``--events``:
+print the controller's events.
 """
 
 from __future__ import annotations

@@ -143,9 +143,11 @@ def test_documentation_of_releases(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(make_site, "version", lambda: "0.11.0.dev1")
     out = tmp_path / "site"
     out.mkdir()
+    (out / "index.html").write_text("<article>x</article>")
     assert make_site.build_releases(out) == ["v0.10.0", "v0.9.0"]
     assert (out / "v0.9.0" / "index.html").is_file()
     listed = re.findall(r'href="([^"]+)"', (out / "versions.html").read_text(encoding="utf-8"))
+    assert 'href="versions.html"' in (out / "index.html").read_text(encoding="utf-8")
     assert listed == ["index.html", "v0.10.0/index.html", "v0.9.0/index.html"]
 
 

@@ -2,8 +2,8 @@
 """Removes what no process of a mission loads from the installed packages. Runs in the image layer that installs them.
 
 Removed: PyBullet's models and examples, its OpenGL renderer, pyarrow's Flight and S3, MuJoCo's plugins, test suites, compiler headers
-and static libraries, and the symbols and debug information of shared libraries (150 MB, most of them PyBullet's). Identical files (wheels
-cannot contain symbolic links, so libraries are stored under each of their names) become hard links.
+and static libraries, and the symbols and debug information of shared libraries (150 MB, most of them PyBullet's). Identical files
+(wheels cannot contain symbolic links, so libraries are stored under each of their names) become hard links.
 tests/chaserdock/test_compose.py limits the size of the image and flies a mission in it.
 """
 

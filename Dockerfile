@@ -24,15 +24,18 @@ RUN useradd --uid 10001 --no-create-home --home-dir /tmp chaserdock \
     && for name in router world controller standby recorder operator analysis viewer bridge \
          $(seq -f chaser-%g 0 15); do mkdir /keys/$name; done \
     && chmod -R 1777 /keys
-COPY requirements.txt docker/slim.py /opt/chaserdock/
+COPY requirements.txt docker/mujoco-requirements.txt docker/slim.py /opt/chaserdock/
 RUN pip install --no-cache-dir --require-hashes -r /opt/chaserdock/requirements.txt \
+    && pip install --no-cache-dir --no-deps --require-hashes -r /opt/chaserdock/mujoco-requirements.txt \
     && python /opt/chaserdock/slim.py
 COPY --from=wheel /wheels /opt/chaserdock/wheels
 RUN pip install --no-cache-dir --no-index --no-deps /opt/chaserdock/wheels/*.whl
 COPY docker/as-owner docker/healthy /usr/local/bin/
 USER chaserdock
-# Shows that the image flies.
-RUN chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
+# Shows that the image flies, on MuJoCo where PyBullet has no wheel.
+RUN engine=$([ "$(uname -m)" = x86_64 ] && echo pybullet || echo mujoco) \
+    && chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
+      --set world.engine=$engine \
       --set camera.width_px=640 --set camera.height_px=480 \
       --set success.steady_position_rms_m=0.2 --set success.steady_orientation_rms_deg=10.0 \
     && rm -rf /tmp/warm

@@ -6,11 +6,12 @@ Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
 - ``avoidance``: 20 seeded variations of ``collision-avoidance`` with images of 640 x 360 (``--full-images``: the
   scenario's own, with four times as many pixels), every fourth exactly symmetric;
 - ``swap``: 20 variations of ``swap``, target measured with noise of 2 mm and 0.1 degrees; seed 0 is exactly head-on;
+- ``clutter``, ``clutter-dense``: sixteen chasers at random places fly to random places, all at once, in 100 seeds; exact knowledge;
 - ``swap-images``: the first ``--images`` of them with rendered images;
 - ``tracking``: the paper's tumble with perfect knowledge, with and without feed-forward, with 5 % actuator gain error;
 - ``tracking-images``: the same with rendered images: servicer, two chasers on the paper's target, stronger actuators;
 
-``--first`` and ``--flights`` choose seeds; ``--quick`` flies two variations and shorter runs.
+``--first`` and ``--flights`` choose seeds (20 by default, of ``clutter`` 100); ``--quick`` flies two variations and shorter runs.
 Distances are true, between centres, at every tick.
 """
 
@@ -24,7 +25,15 @@ from common import Figures, make_parser, run_parts
 
 from chaserdock.evaluation.flight_record import FlightRecord, record_flight
 from chaserdock.evaluation.perception import PerceptionModel, RenderedImages, measurement_model
-from chaserdock.evaluation.transfers import avoidance, fly_transfer, load_shipped, swap
+from chaserdock.evaluation.transfers import (
+    CLUTTER,
+    DENSE_CLUTTER,
+    avoidance,
+    clutter,
+    fly_transfer,
+    load_shipped,
+    swap,
+)
 
 NOISE_M, NOISE_RAD = 0.002, math.radians(0.1)
 STEADY_FROM_S = 40.0
@@ -40,13 +49,14 @@ def variations(
     name: str,
     seeds: Iterable[int],
     scenario_of: Callable[[int], Scenario],
-    perception_of: Callable[[Scenario], PerceptionModel],
+    perception_of: Callable[[Scenario], PerceptionModel | None],
+    stay_s: float = math.inf,
 ) -> Figures:
-    """Fly every seed, and return the worst of each figure."""
+    """Fly every seed, and return the worst of each figure; ``stay_s`` as in ``fly_transfer``."""
     outcomes = []
     for seed in seeds:
         scenario = scenario_of(seed)
-        outcomes.append(fly_transfer(seed, scenario, perception_of(scenario)))
+        outcomes.append(fly_transfer(seed, scenario, perception_of(scenario), stay_s))
         print(f"  {outcomes[-1].line()}", flush=True)
     limits = scenario_of(0).limits
     safe = [
@@ -58,6 +68,7 @@ def variations(
         f"{key}_flights": len(outcomes),
         f"{key}_distances_kept": sum(safe),
         f"{key}_reached": sum(not math.isnan(o.reached_s) for o in outcomes),
+        f"{key}_chasers_not_at_goal": sum(o.missed for o in outcomes),
         f"{key}_min_distance_target_m": min(o.to_target_m for o in outcomes),
         f"{key}_min_distance_chasers_m": min(o.between_m for o in outcomes),
         f"{key}_max_time_to_goal_s": max(
@@ -108,22 +119,40 @@ def tracking_with_images(duration_s: float) -> Figures:
     return out
 
 
-PARTS = ("avoidance", "swap", "swap-images", "tracking", "tracking-images")
+PARTS = ("avoidance", "swap", "clutter", "clutter-dense", "swap-images", "tracking", "tracking-images")
+_CLUTTER_STAY_S = 3.0
+"""A flight in clutter ends once all chasers are at their goals for this long."""
 
 
 def main() -> None:
     parser = make_parser(__doc__, PARTS)
     parser.add_argument("--first", type=int, default=0, help="first seed")
-    parser.add_argument("--flights", type=int, default=20, help="number of seeds")
+    parser.add_argument("--flights", type=int, help="number of seeds")
     parser.add_argument("--images", type=int, default=2, help="number of seeds of swap with images")
     parser.add_argument("--full-images", action="store_true", help="avoidance with the scenario's image size")
     options = parser.parse_args()
-    flights, duration_s = (2, 60.0) if options.quick else (options.flights, 120.0)
-    seeds = range(options.first, options.first + flights)
+    duration_s = 60.0 if options.quick else 120.0
+
+    def seeds_of(default: int) -> range:
+        flights = 2 if options.quick else options.flights or default
+        return range(options.first, options.first + flights)
+
+    def in_clutter(name: str, places_m: tuple[float, float, float]) -> Figures:
+        return variations(
+            name,
+            seeds_of(100),
+            lambda seed: clutter(seed, places_m=places_m),
+            lambda _: None,
+            _CLUTTER_STAY_S,
+        )
+
+    seeds = seeds_of(20)
     parts = {
         "avoidance": lambda: variations(
             "avoidance", seeds, lambda seed: avoidance(seed, options.full_images), RenderedImages
         ),
+        "clutter": lambda: in_clutter("clutter", CLUTTER),
+        "clutter-dense": lambda: in_clutter("clutter-dense", DENSE_CLUTTER),
         "swap": lambda: variations("swap", seeds, swap, noisy),
         "swap-images": lambda: variations("swap-images", seeds[: options.images], swap, RenderedImages),
         "tracking": lambda: tracking(duration_s),

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario v-bar r-bar] [--seeds N]``.
 
-One process, with statistical perception, or ``--images``. Prints time, change of velocity, tracking at the hold points, step of the
-estimate at the first markers, and contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the
-controller's events.
+One process, with statistical perception. ``--images``: only the last leg, from 2.5 m on, with rendered images and without ranging.
+``--leg N``: one leg. Prints time, change of velocity, tracking at the hold points, step of the estimate at the first markers, and
+contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the controller's events.
 """
 
 from __future__ import annotations
@@ -16,18 +16,17 @@ from common import Figures, make_parser, print_figures, write_json
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rendezvous import last_leg, rendezvous
+from chaserdock.evaluation.rendezvous import last_leg, leg, rendezvous
 from chaserdock.evaluation.transfers import load_shipped
 
 
 def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
     """Fly one scenario with one seed; return its figures."""
-    overrides = [f"seed={seed}", *options.set]
-    if options.images:
-        overrides.append('perception.name="default"')
-    scenario = load_shipped(name, *overrides)
-    if options.quick:
-        scenario = last_leg(scenario)
+    scenario = load_shipped(name, f"seed={seed}", *options.set)
+    if options.leg is not None:
+        scenario = leg(scenario, options.leg)
+    elif options.quick or options.images:
+        scenario = last_leg(scenario, images=options.images)
     begin_s, shown = time.process_time(), [0]
 
     def report(record: TickRecord, flight: InProcessMission) -> None:
@@ -75,7 +74,13 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--scenario", nargs="+", default=["v-bar", "r-bar"], help="shipped scenarios")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each, from 0")
-    parser.add_argument("--images", action="store_true", help="render images")
+    parser.add_argument("--images", action="store_true", help="last leg with rendered images")
+    parser.add_argument(
+        "--leg",
+        type=int,
+        metavar="N",
+        help="only from the place before command N of the timeline to the next",
+    )
     parser.add_argument("--events", action="store_true", help="print the controller's events")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario key"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Removes what no process of a mission loads from the installed packages. Runs in the image layer that installs them.
 
-Removed: PyBullet's models and examples, its OpenGL renderer, pyarrow's Flight and S3, test suites, compiler headers and static
-libraries, and the symbols and debug information of shared libraries (150 MB, most of them PyBullet's). Identical files (wheels
+Removed: PyBullet's models and examples, its OpenGL renderer, pyarrow's Flight and S3, MuJoCo's plugins, test suites, compiler headers
+and static libraries, and the symbols and debug information of shared libraries (150 MB, most of them PyBullet's). Identical files (wheels
 cannot contain symbolic links, so libraries are stored under each of their names) become hard links.
 tests/chaserdock/test_compose.py limits the size of the image and flies a mission in it.
 """
@@ -25,6 +25,10 @@ UNUSED = (
     "eglRenderer*.so",
     "casadi/include",
     "matplotlib/tests",
+    "mujoco/doc",
+    "mujoco/include",
+    "mujoco/plugin",
+    "mujoco/testdata",
     "pyarrow/*flight*",
     "pyarrow/*s3*",
     "pyarrow/include",

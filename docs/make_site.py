@@ -4,7 +4,8 @@
 Needs the packages of requirements-dev.txt. The pages are written for GitHub. Here their mathematics becomes MathML, and files outside
 docs/ that they link to become pages, so that every link is checked; notebooks are shown with their stored outputs. A warning is an
 error. Every page names the version. ``--releases`` adds the documentation of each tag vX.Y.Z in a folder of that name, each built by
-its own make_site.py, and the page ``versions.html``.
+its own make_site.py, and the page ``versions.html``, to which the first page links. Searching needs a server:
+``python -m http.server -d site``.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ def with_mathematics(text: str) -> str:
             return found[0]
         # One line: an empty one would end the block for Markdown.
         mathml = " ".join(convert(found[3].strip(), display="block").split())
-        return f'<div class="equation">{mathml}</div>'
+        return f'<div class="equation" style="overflow-x: auto; overflow-y: hidden">{mathml}</div>'
 
     parts, last = [], 0
     for found in _FENCE.finditer(text):
@@ -197,6 +198,12 @@ def build_releases(out: Path) -> list[str]:
         f" (this build)</li>{items}</ul></html>\n",
         encoding="utf-8",
     )
+    home = out / "index.html"
+    text = home.read_text(encoding="utf-8")
+    if "</article>" not in text:
+        raise SiteError(f"{home}: no place for the link to versions.html")
+    link = '<p><a href="versions.html">All versions of this documentation</a></p></article>'
+    home.write_text(text.replace("</article>", link, 1), encoding="utf-8")
     return tags
 
 

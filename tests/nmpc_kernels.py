@@ -76,7 +76,7 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
     reach_m (N, D+1): how far admissible inputs can move a chaser from its rollout.
     """
     n, nodes, _ = x.shape
-    width = (nodes - 1) * (n + 2)
+    width = (nodes - 1) * (n + 2 + (0 if problem.boxes is None else problem.boxes.shape[1]))
     rows = HalfSpaceRows(
         np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64)
     )  # fmt: skip

@@ -118,6 +118,7 @@ def trajectories(flight: RecordedFlight, _: Traces) -> Figure:
             axes.scatter(*p[-1], color=colour(i), marker="^", s=22)
         axes.set_title(title)
         axes.set(xlabel="x / m", ylabel="y / m", zlabel="z / m")
+        axes.xaxis.labelpad = axes.yaxis.labelpad = 7.0
         _equal_scale(axes, [paths[i][place] for i in numbers] + ([] if place else [target.position_m]))
         for axis in (axes.xaxis, axes.yaxis, axes.zaxis):
             axis.pane.set_visible(False)
@@ -638,12 +639,22 @@ def _distribution(axes: Axes, values: Array, number: int) -> None:
     axes.plot(ordered[d], share[d], color=colour(number))
 
 
+class _FewTicks(LogLocator):
+    """Ticks at 1, 2 and 5 of each decade; over more than two decades at its beginning only, so that labels do not touch."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        wide = vmin > 0.0 and vmax / vmin > 100.0
+        self.set_params(subs=(1.0,) if wide else (1.0, 2.0, 5.0))
+        return super().tick_values(vmin, vmax)
+
+
 def _time_and_distribution(quantity: str) -> tuple[Figure, Axes, Axes]:
     figure, (left, right) = new_figure(1, 2, height=2.6, width_ratios=[2.2, 1.0])
     left.set(ylabel=quantity, xlabel="time / s", yscale="log")
     right.set(xlabel=quantity, ylabel="cumulative share / %", ylim=(0, 101), xscale="log")
+    left.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
+    right.xaxis.set_major_locator(_FewTicks(numticks=12))
     for axis in (left.yaxis, right.xaxis):
-        axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=12))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
         axis.set_minor_formatter(NullFormatter())
     return figure, left, right

@@ -94,8 +94,14 @@ def report_of(log: Path) -> str:
 def _quantity(value: float | None, unit: str, factor: float = 1.0, digits: int = 3) -> str:
     if value is None:
         return _DASH
-    # "#" keeps trailing zeros; a trailing decimal point is removed.
-    return f"{f'{value * factor:#.{digits}g}'.rstrip('.')} {unit}".rstrip()
+    scaled = value * factor
+    # "#" keeps trailing zeros; a trailing decimal point is removed. Large numbers without exponent.
+    text = f"{scaled:.0f}" if 10**digits <= abs(scaled) < 1e9 else f"{scaled:#.{digits}g}".rstrip(".")
+    return f"{text} {unit}".rstrip()
+
+
+def _count(number: int, thing: str) -> str:
+    return f"{number} {thing}" if number == 1 else f"{number} {thing}s"
 
 
 def _rms(mean_square: float | None, unit: str, factor: float) -> str:
@@ -117,7 +123,7 @@ def _head(flight: RecordedFlight, result: dict[str, Any]) -> str:
     return (
         f"<h1>{escape(s.name)}</h1><p>{escape(s.description)}</p>\n<p>{verdict} "
         f'<span class="faint">{result["sim_time_s"]:.1f} s of {s.duration_s:g} s flown in '
-        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {len(s.chasers)} chaser(s); seed {s.seed}; "
+        f"{result['wall_time_s']:.1f} s, {escape(mode)}; {_count(len(s.chasers), 'chaser')}; seed {s.seed}; "
         f"digest {escape(result['digest'][:16])}</span></p>\n<nav>{links}</nav>"
     )
 

@@ -267,7 +267,7 @@ class _ExternalView:
             y0 = self.size[1] - (2 - place) * (height + _MARGIN_PX)
             cv2.line(image, (x0, y0 + height), (x0 + width, y0 + height), _DIM, 1)
             label = f"{graph.label}, up to {graph.high:.3g}"
-            cv2.putText(image, label, (x0 + 4, y0 + 10), cv2.FONT_HERSHEY_SIMPLEX, 0.36, _INK, 1, cv2.LINE_AA)
+            cv2.putText(image, label, (x0 + 4, y0 + 10), cv2.FONT_HERSHEY_SIMPLEX, 0.42, _INK, 1, cv2.LINE_AA)
             for i, (times_s, values) in graph.series.items():
                 until = times_s <= time_s + 1e-6
                 x = x0 + (times_s[until] - self._begin_s) / self._span_s * width
@@ -282,7 +282,10 @@ class _ExternalView:
         put(f"{self.flight.scenario.name}", _MARGIN_PX + 4, 24, _INK, 0.6)
         put(f"t = {time_s:6.1f} s", _MARGIN_PX + 4, 48, _INK, 0.6)
         if time_s - self._begin_s < _TITLE_SHARE * self._span_s:
-            put(self.flight.scenario.description[: self.size[0] // 10], _MARGIN_PX + 4, 72, _INK, 0.5)
+            for line, text in enumerate(
+                wrapped(self.flight.scenario.description, self.size[0] - 3 * _MARGIN_PX, 0.5)
+            ):
+                put(text, _MARGIN_PX + 4, 72 + 20 * line, _INK, 0.5)
         if (
             self._end_s - time_s < _TITLE_SHARE * self._span_s
             and self._end_s >= float(self.target.time_s[-1]) - 1e-6
@@ -295,6 +298,18 @@ class _ExternalView:
             y = self.size[1] - 14 - 20 * (len(self.numbers) - 1 - line)
             put(f"chaser {i}  {phase:<9}", _MARGIN_PX + 4, y, tint(i).tolist())
             put(error, _MARGIN_PX + 180, y, _INK)
+
+
+def wrapped(text: str, width_px: int, size: float) -> list[str]:
+    """Return the text in lines that are at most ``width_px`` wide as cv2.putText writes them; a longer word is not broken."""
+    lines = [""]
+    for word in text.split():
+        longer = f"{lines[-1]} {word}".lstrip()
+        if lines[-1] and cv2.getTextSize(longer, cv2.FONT_HERSHEY_SIMPLEX, size, 1)[0][0] > width_px:
+            lines.append(word)
+        else:
+            lines[-1] = longer
+    return lines
 
 
 def _phase(phases: list[tuple[float, str]], time_s: float) -> str:

@@ -20,7 +20,8 @@ from .perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""
-_AFTER_CAPTURE_S = 1.0
+IMAGES_FROM_M = 2.5
+_AFTER_CAPTURE_S, _AFTER_COMMAND_S = 1.0, 1.0
 
 
 @dataclass(frozen=True)
@@ -175,14 +176,39 @@ def rendezvous(
     return out
 
 
-def last_leg(scenario: Scenario, wait_s: float = 20.0) -> Scenario:
-    """Return the scenario from its last hold point on: it starts there at rest and flies its last command after ``wait_s``."""
-    *_, hold, last = sorted(scenario.timeline, key=lambda entry: entry.at_s)
-    chaser = scenario.chasers[0].model_copy(update={"position_m": hold.offset_m})
+def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
+    """Return the part of a scenario that begins with command ``index`` of its timeline and ends before the next command but one.
+
+    It starts at rest at the place before, and waits there for ``wait_s``.
+    """
+    timeline = sorted(scenario.timeline, key=lambda entry: entry.at_s)
+    begin_s, following = timeline[index].at_s - wait_s, timeline[index : index + 2]
+    start_m = scenario.chasers[0].position_m if index == 0 else timeline[index - 1].offset_m
+    assert start_m is not None
+    end_s = following[1].at_s + _AFTER_COMMAND_S if len(following) > 1 else scenario.duration_s
     return scenario.model_copy(
         update={
-            "chasers": (chaser, *scenario.chasers[1:]),
-            "timeline": (last.model_copy(update={"at_s": wait_s}),),
-            "duration_s": scenario.duration_s - last.at_s + wait_s,
+            "chasers": (
+                scenario.chasers[0].model_copy(update={"position_m": start_m}),
+                *scenario.chasers[1:],
+            ),
+            "timeline": tuple(e.model_copy(update={"at_s": e.at_s - begin_s}) for e in following),
+            "duration_s": end_s - begin_s,
         }
     )
+
+
+def last_leg(scenario: Scenario, wait_s: float = 20.0, images: bool = False) -> Scenario:
+    """Return the scenario from its last hold point on.
+
+    ``images``: with images and markers in place of statistical perception and ranging, from `IMAGES_FROM_M` on, where a camera
+    of 960 x 540 detects the servicer's markers.
+    """
+    part = leg(scenario, len(scenario.timeline) - 1, wait_s)
+    if not images:
+        return part
+    x, y, z = part.chasers[0].position_m
+    share = IMAGES_FROM_M / math.hypot(x, y)
+    chaser = part.chasers[0].model_copy(update={"position_m": (share * x, share * y, z)})
+    perception = part.perception.model_copy(update={"name": "default"})
+    return part.model_copy(update={"chasers": (chaser,), "perception": perception, "ranging": None})

@@ -20,7 +20,8 @@ from .perception import PerceptionModel
 
 SYMMETRIC_EVERY = 4
 SMALL = {"width_px": 640, "height_px": 360}
-CLUTTER_S = 120.0
+CLUTTER_S = 100.0
+CLUTTER_TIMING = ("time.rate_hz=10", "time.image_hz=10", "time.physics_hz=120")
 _DIAGONAL = 9.0
 """m: stands for a chaser's distance to itself, larger than any between two."""
 
@@ -85,15 +86,22 @@ def swap(seed: int) -> Scenario:
     return scenario.model_copy(update={"chasers": chasers, "target": target})
 
 
-CLUTTER_SHELL_M, CLUTTER_APART_M = (0.8, 1.4), 0.5
-"""Distances from the target, and least distances of places from each other, in `clutter`."""
+CLUTTER, DENSE_CLUTTER = (0.8, 1.4, 0.5), (0.7, 1.15, 0.42)
+"""Smallest and largest distance of places from the target, and least distance from each other, m, in `clutter`."""
 
 
-def clutter(seed: int, chasers: int = 16) -> Scenario:
+def clutter(
+    seed: int,
+    chasers: int = 16,
+    places_m: tuple[float, float, float] = CLUTTER,
+    duration_s: float = CLUTTER_S,
+) -> Scenario:
     """Return a scenario in which chasers at random places around the tumbling target fly to random places, all at once."""
     rng = np.random.default_rng([seed, 0xC107])
-    base = load_shipped("swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={CLUTTER_S}")
-    starts, goals = _places(rng, chasers), _places(rng, chasers)
+    base = load_shipped(
+        "swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={duration_s}", *CLUTTER_TIMING
+    )
+    starts, goals = _places(rng, chasers, places_m), _places(rng, chasers, places_m)
     nominal, entry = base.chasers[0], base.timeline[0]
     made = [
         nominal.model_copy(
@@ -111,13 +119,14 @@ def clutter(seed: int, chasers: int = 16) -> Scenario:
     return base.model_copy(update={"chasers": tuple(made), "timeline": tuple(timeline)})
 
 
-def _places(rng: np.random.Generator, count: int) -> Array:
-    """Return random places (count, 3) in the shell of `clutter`."""
+def _places(rng: np.random.Generator, count: int, places_m: tuple[float, float, float]) -> Array:
+    """Return random places (count, 3); ``places_m`` as in `clutter`."""
+    nearest_m, farthest_m, apart_m = places_m
     places = np.zeros((0, 3))
     while len(places) < count:
         way = rng.normal(size=3)
-        place = way / np.linalg.norm(way) * rng.uniform(*CLUTTER_SHELL_M)
-        if np.all(np.linalg.norm(places - place, axis=1) >= CLUTTER_APART_M):
+        place = way / np.linalg.norm(way) * rng.uniform(nearest_m, farthest_m)
+        if np.all(np.linalg.norm(places - place, axis=1) >= apart_m):
             places = np.vstack([places, place])
     return places
 
@@ -147,8 +156,11 @@ class TransferOutcome:
         )
 
 
-def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel | None) -> TransferOutcome:
-    """Fly to the end, or with ``perception`` None with exact knowledge of the target; distances and goals are checked on ground truth at every tick."""
+def fly_transfer(
+    seed: int, scenario: Scenario, perception: PerceptionModel | None, stay_s: float = math.inf
+) -> TransferOutcome:
+    """Fly to the end, or until all chasers with a goal are there for ``stay_s``; distances and goals are checked on ground truth at
+    every tick. Without ``perception`` the target is known exactly."""
     out = TransferOutcome(seed)
     goals = {i: g for i in range(len(scenario.chasers)) if (g := scenario.goal_of(i)) is not None}
     last_away_s: dict[int, float] = {}
@@ -162,6 +174,9 @@ def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel | No
             if distances[i] > scenario.success.reached_position_m or time_s < sent_s:
                 last_away_s[i] = time_s - sent_s
 
+    def there_for_s(time_s: float) -> float:
+        return min(time_s - sent_s - last_away_s[i] for i, (sent_s, _) in goals.items())
+
     with InProcessMission(scenario, perception) as flight:
         for record in flight.ticks():
             measure(record.time_s, record.states)
@@ -169,6 +184,8 @@ def fly_transfer(seed: int, scenario: Scenario, perception: PerceptionModel | No
             if solver is not None:
                 out.failed += solver.status.count("failed")
                 out.relaxed += solver.status.count("infeasible_relaxed")
+            if there_for_s(record.time_s) >= stay_s:
+                break
         measure(flight.time_s, flight.states())
         out.contacts = len(flight.contacts)
     step_s = 1.0 / scenario.time.rate_hz

@@ -20,12 +20,16 @@ from chaserdock_protocol.topics import Topic
 from msgspec import inspect
 
 UNITS = {
+    "rad2_s2": "rad²/s²",
+    "m2_s2": "m²/s²",
     "kg_m2": "kg m²",
     "rad_s": "rad/s",
     "N_m_s": "N m s",
     "m_s": "m/s",
     "N_m": "N m",
     "N_s": "N s",
+    "rad2": "rad²",
+    "m2": "m²",
     "rad": "rad",
     "deg": "deg",
     "px": "px",

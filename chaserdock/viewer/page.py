@@ -298,8 +298,9 @@ class Page:
         if time.monotonic() - self._images_s < _IMAGES_S:
             return
         enlarged, changed = self._enlarged, False
+        images = state.images_of_one_moment()
         for i in range(len(state.chasers)) if enlarged is None else (enlarged,):
-            image = state.chasers[i].image
+            image = images[i]
             if image is None:
                 continue
             sighting = state.chasers[i].sighting_in(image)

@@ -50,6 +50,8 @@ OF_ALL = (topics.TICK, topics.TARGET, topics.STACK, topics.SOLVER, topics.END)
 """Topics of the state: of each chaser, of the mission. The order is causal within a tick."""
 
 _KEPT = 64
+_IMAGES_KEPT = 4
+_RECENT_NS = 2_000_000_000
 _FIELDS = {
     Odometry: "odometry",
     Reference: "reference",
@@ -94,6 +96,8 @@ class ChaserState:
     thrusters: ThrusterReport | None = None
     _odometries: OrderedDict[int, Odometry] = field(default_factory=OrderedDict)
     _sightings: OrderedDict[int, Sighting] = field(default_factory=OrderedDict)
+    images: OrderedDict[int, Image] = field(default_factory=OrderedDict)
+    """The last images by the time of their exposure, ns."""
 
     def update(self, message: Any) -> None:
         """Store a message of this chaser."""
@@ -102,6 +106,8 @@ class ChaserState:
             keep_newest(self._odometries, message.tick, message)
         elif isinstance(message, Sighting):
             keep_newest(self._sightings, message.sim_time_ns, message)
+        elif isinstance(message, Image):
+            keep_newest(self.images, message.sim_time_ns, message, _IMAGES_KEPT)
 
     def error(self) -> tuple[float, float] | None:
         """Return distance (m) and angle (rad) from the reference, by odometry; None while unknown."""
@@ -117,10 +123,10 @@ class ChaserState:
         return self._sightings.get(image.sim_time_ns)
 
 
-def keep_newest(store: OrderedDict[int, Any], key: int, message: Any) -> None:
-    """Store a message and drop the oldest beyond 64."""
+def keep_newest(store: OrderedDict[int, Any], key: int, message: Any, kept: int = _KEPT) -> None:
+    """Store a message and drop the oldest beyond ``kept``."""
     store[key] = message
-    while len(store) > _KEPT:
+    while len(store) > kept:
         store.popitem(last=False)
 
 
@@ -162,6 +168,23 @@ class MissionState:
                 self.true_body = next((b for b in message.bodies if b.body == TARGET), None)
             case _ if topic in OF_CHASERS and message.chaser < len(self.chasers):
                 self.chasers[message.chaser].update(message)
+
+    def images_of_one_moment(self) -> list[Image | None]:
+        """Return an image of each chaser: of the newest exposure of which all images, and if possible all sightings, have arrived.
+
+        Without such an exposure, and for a chaser whose images have stopped, it is the latest.
+        """
+        images = [c.image for c in self.chasers]
+        newest_ns = max((image.sim_time_ns for image in images if image is not None), default=0)
+        present = [
+            c for c in self.chasers if c.image is not None and c.image.sim_time_ns >= newest_ns - _RECENT_NS
+        ]
+        common = set[int].intersection(*(set(c.images) for c in present)) if present else set[int]()
+        seen = {t for t in common if all(c.sighting_in(c.images[t]) is not None for c in present)}
+        if not common:
+            return images
+        moment_ns = max(seen or common)
+        return [c.images.get(moment_ns, c.image) for c in self.chasers]
 
     def time_s(self) -> float:
         """Return the simulated time of the latest tick."""

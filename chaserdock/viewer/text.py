@@ -39,7 +39,7 @@ def _numbers(chasers: tuple[int, ...]) -> str:
 def chasers(state: MissionState, history: History) -> str:
     """Return a table with one row per chaser."""
     rows = [
-        "| # | phase | error | distance | markers | latency |",
+        "| # | phase | error | distance | seen | latency |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for i, chaser in enumerate(state.chasers):
@@ -48,7 +48,7 @@ def chasers(state: MissionState, history: History) -> str:
         cells = (
             f"**{i}**",
             chaser.reference.phase if chaser.reference is not None else "-",
-            f"{error[0] * 1e3:.2f} mm, {math.degrees(error[1]):.3f}°" if error is not None else "-",
+            f"{error[0] * 1e3:.1f} mm {math.degrees(error[1]):.2f}°" if error is not None else "-",
             f"{distance:.3f} m" if distance is not None else "-",
             visibility(chaser),
             f"{latency:.0f} ms" if latency is not None else "-",
@@ -76,8 +76,7 @@ def visibility(chaser: ChaserState) -> str:
         return "-"
     if chaser.sighting.status != "seen":
         return chaser.sighting.status.replace("_", " ")
-    markers = len(chaser.sighting.marker_ids)
-    return f"{markers} marker{'s' if markers != 1 else ''}"
+    return str(len(chaser.sighting.marker_ids))
 
 
 def faults(state: MissionState, history: History, lost: set[str]) -> str:

@@ -227,6 +227,8 @@ class HorizonReference:
     min_distance_target_m: Array
     corridors: Array | None
     attached: frozenset[int]
+    boxes: Array | None = None
+    box_clearance_m: Array | None = None
 
 
 @dataclass(frozen=True)

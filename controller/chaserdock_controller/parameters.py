@@ -8,7 +8,7 @@ from typing import Any
 
 from chaserdock_protocol import plugins
 from chaserdock_protocol.scenario import ESTIMATORS, FlightScenario
-from chaserdock_protocol.scenario.schema import Controller, Limits
+from chaserdock_protocol.scenario.schema import Controller, EstimatorSection, Limits
 
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.types import Estimator
@@ -16,6 +16,7 @@ from chaserdock_controller.estimation.types import Estimator
 from .estimation import make_estimator
 from .estimation.composite_body import rows_of, stated_properties
 from .estimation.joint import JointEstimator, JointParameters
+from .estimation.joint.parameters import RANGING, SHAPE, TARGET_NOISE
 from .nmpc import NmpcParameters
 
 
@@ -28,6 +29,7 @@ def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
         inertia_kg_m2=((ix, 0.0, 0.0), (0.0, iy, 0.0), (0.0, 0.0, iz)),
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
+        boxes=len(scenario.target_model().boxes) if scenario.limits.min_distance_shape_m else 0,
         **nmpc_settings(scenario.controller, scenario.limits),
     )
 
@@ -38,6 +40,14 @@ def nmpc_settings(controller: Controller, limits: Limits) -> dict[str, Any]:
              "weight_torque", "weight_final_position", "weight_final_orientation")  # fmt: skip
     settings = {name: getattr(controller, name) for name in names}
     return {**settings, "max_reference_distance_m": limits.max_reference_distance_m}
+
+
+def target_noise(estimator: EstimatorSection) -> dict[str, tuple[float, float]]:
+    """Return the process noise of the target for each motion model: the default, or what the scenario states."""
+    stated = (estimator.target_acceleration_noise, estimator.target_angular_noise)
+    return {
+        model: (stated[0] or default[0], stated[1] or default[1]) for model, default in TARGET_NOISE.items()
+    }
 
 
 def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
@@ -75,5 +85,7 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         / min(body.inertia)
         / scenario.time.rate_hz,
         mean_motion_rad_s=0.0 if scenario.orbit is None else scenario.orbit.elements.mean_motion_rad_s,
+        target_noise=target_noise(scenario.estimator),
+        shape=SHAPE if scenario.ranging is None else RANGING,
     )
     return JointEstimator(joint, len(scenario.chasers))

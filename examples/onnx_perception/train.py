@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train the network of onnx_perception.py on a dataset of ``chaserdock dataset``: ``python train.py DATASET [--out landmarks.onnx]``.
 
-A convolutional network of 0.5 million weights maps a crop of 64 x 64 pixels to the places of landmarks. Needs jax and onnx.
+A convolutional network of 0.3 million weights maps a crop of 64 x 64 pixels to the places of landmarks. Needs jax and onnx.
 """
 
 import argparse
@@ -15,14 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 import onnx
 from chaserdock_models import rotations
-from onnx import TensorProto, helper, numpy_helper
+from model_file import FILTERS, HIDDEN, LANDMARKS, network
 from onnx_perception import SIDE, crop, find_region
 
 from chaserdock.datasets.reading import read_dataset
 from chaserdock.datasets.types import read_grey
 
-LANDMARKS, HIDDEN, BATCH, RATE = 12, 256, 64, 2e-3
-FILTERS = ((5, 1, 16), (3, 16, 32), (3, 32, 64), (3, 64, 96))
+BATCH, RATE = 64, 2e-3
 
 
 def landmarks_of(points_m):
@@ -130,42 +129,6 @@ def train(samples, epochs, rng, limit_s=np.inf):
     return weights
 
 
-def network(weights, facts):
-    """Return the ONNX model of weights, with ``facts`` as metadata."""
-    nodes, constants, name = [], [], "image"
-
-    def constant(key, value):
-        constants.append(numpy_helper.from_array(np.array(value, dtype=np.float32), key))
-        return key
-
-    *filters, hidden, last = weights
-    for k, (w, b) in enumerate(filters):
-        side = w.shape[2] // 2
-        inputs = [name, constant(f"w{k}", w), constant(f"b{k}", b)]
-        nodes.append(helper.make_node("Conv", inputs, [f"c{k}"], strides=[2, 2], pads=[side] * 4))
-        name = f"r{k}"
-        nodes.append(helper.make_node("Relu", [f"c{k}"], [name]))
-    nodes.append(helper.make_node("Flatten", [name], ["flat"]))
-    nodes.append(
-        helper.make_node("Gemm", ["flat", constant("wh", hidden[0]), constant("bh", hidden[1])], ["h"])
-    )
-    nodes.append(helper.make_node("Relu", ["h"], ["a"]))
-    nodes.append(
-        helper.make_node("Gemm", ["a", constant("wl", last[0]), constant("bl", last[1])], ["places"])
-    )
-    graph = helper.make_graph(
-        nodes,
-        "landmarks",
-        [helper.make_tensor_value_info("image", TensorProto.FLOAT, ["n", 1, SIDE, SIDE])],
-        [helper.make_tensor_value_info("places", TensorProto.FLOAT, ["n", last[0].shape[1]])],
-        constants,
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
-    helper.set_model_props(model, facts)
-    onnx.checker.check_model(model)
-    return model
-
-
 def spread_of(found, samples, images, camera, landmarks):
     """Return standard deviations (6,) of poses, m per m and rad, from the median errors, and the RMS that 95 % of fits reach."""
     errors, rms = [], []
@@ -188,13 +151,14 @@ def main():
     parser.add_argument("dataset", type=Path)
     parser.add_argument("--out", type=Path, default=Path("landmarks.onnx"))
     parser.add_argument("--epochs", type=int, default=40)
+    parser.add_argument("--images", type=int, help="use the first training images only")
     parser.add_argument("--cpu-limit-s", type=float, default=np.inf)
     options = parser.parse_args()
     data, _ = read_dataset(options.dataset)
     if data.shape is None:
         parser.error(f"{options.dataset}: has no models folder")
     landmarks = landmarks_of(data.shape.points_m)
-    samples = load(data.of_split("train"), data.camera, landmarks)
+    samples = load(data.of_split("train")[: options.images], data.camera, landmarks)
     weights = train(samples, options.epochs, np.random.default_rng(1), options.cpu_limit_s)
     # The errors that the perception states: of training images, turned, so that validation images stay unseen.
     checked = data.of_split("train")[:500]

@@ -48,7 +48,7 @@ FORBIDDEN_TYPES = {
     ThrusterFailure, Success, TruthSection, ChaserTruth, TargetTruth, CameraTruth, SensorTruth, TruthValues,
 }  # fmt: skip
 FORBIDDEN_ANYWHERE = {
-    "simulation",
+    "simulation", "world",
     "seed", "truth", "velocity_m_s", "omega_rad_s", "start_offset_m", "start_rotation_rad", "start_velocity_m_s",
     "thruster_failure", "fault", "reported_failures", "success", "settling_s", "effects",
     "renderer", "sun_direction", "ambient", "eclipse_ambient", "lamp", "eclipses", "earth", "description",

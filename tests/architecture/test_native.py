@@ -7,6 +7,7 @@ import ctypes
 import re
 import shutil
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from chaserdock_models import native
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import KernelLibrary
 from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS, X86_64, source_digest
-from chaserdock_models.targets import target_model
+from chaserdock_models.shape_distance import box_table
+from chaserdock_models.targets import Box, target_model
 from chaserdock_world.rendering import native as rendering_native
 from chaserdock_world.rendering import scene_geometry as faces
 from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
@@ -242,14 +244,17 @@ def test_rows_between_chasers_far_apart_are_left_out_only_where_none_is_reached(
 
 def test_working_memory_is_enough() -> None:
     """No kernel writes beyond its output, with the largest number of rows."""
-    n, d = 3, PARAMS.stages
-    doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(ctypes.c_int64(n), ctypes.c_int64(d))
+    n, d, params = 3, PARAMS.stages, replace(PARAMS, boxes=2)
+    sizes = (ctypes.c_int64(value) for value in (n, d, params.boxes))
+    doubles = nmpc_native.function("tick_workspace", ctypes.c_int64)(*sizes)
     guarded = np.full(doubles + 64, 7.0)
     rng = np.random.default_rng(1)
     states = np.array([at_rest(0.3 * rng.normal(size=3)) for _ in range(n)])
     corridors = np.tile([1.0, 0, 0, 0.5, 0.0], (n, d + 1, 1))
-    problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors})
-    solver = make_solver("rti", PARAMS, n)
+    boxes = np.tile(box_table((Box((0.2, 0.2, 0.2)), Box((0.1, 0.1, 0.1)))), (d + 1, 1, 1))
+    shapes = {"boxes": boxes, "box_clearance_m": np.full(n, 0.3)}
+    problem = NmpcInput(**{**vars(fixed_problem(states, -states[:, :3])), "corridors": corridors, **shapes})
+    solver = make_solver("rti", params, n)
     solver._workspace = guarded  # pyright: ignore[reportAttributeAccessIssue]
     plan = solver.solve(problem, 0.0)
     assert plan.iterations.all()

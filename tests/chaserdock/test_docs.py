@@ -12,6 +12,7 @@ from html.parser import HTMLParser
 from pathlib import Path
 from types import ModuleType
 from typing import Any
+from urllib.parse import unquote
 
 import pytest
 from chaserdock_protocol.scenario import parse_scenario
@@ -40,11 +41,17 @@ class Requests(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
         self.urls: list[str] = []
+        self.links: list[str] = []
+        self.anchors: set[str] = set()
         self.equations = 0
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         values = dict(attrs)
         self.equations += tag == "math"
+        if values.get("id"):
+            self.anchors.add(str(values["id"]))
+        if tag == "a" and values.get("href"):
+            self.links.append(str(values["href"]))
         if tag in ("script", "img", "iframe", "source", "video") and values.get("src"):
             self.urls.append(str(values["src"]))
         if tag == "link" and values.get("rel") not in ("canonical", "next", "prev"):
@@ -72,6 +79,24 @@ def test_every_page_exists_and_loads_nothing_from_elsewhere(site: Path) -> None:
         for url in seen.urls:
             if page.name != "404.html" and not url.startswith("data:"):
                 assert (page.parent / url.partition("?")[0].partition("#")[0]).exists(), (page, url)
+
+
+def test_every_link_leads_to_a_page_and_a_heading_of_the_site(site: Path) -> None:
+    pages: dict[Path, Requests] = {}
+    for page in site.rglob("*.html"):
+        pages[page.resolve()] = Requests()
+        pages[page.resolve()].feed(page.read_text(encoding="utf-8"))
+    checked = 0
+    for page, seen in pages.items():
+        for link in seen.links:
+            if page.name == "404.html" or re.match(r"[a-z]+:", link):
+                continue
+            place, _, anchor = unquote(link).partition("#")
+            to = (page.parent / place).resolve() if place else page
+            assert to.is_file(), (page, link)
+            assert not anchor or to not in pages or anchor in pages[to].anchors, (page, link)
+            checked += 1
+    assert checked > 1000
 
 
 def test_mathematics_is_in_the_page_itself(site: Path) -> None:
@@ -118,9 +143,11 @@ def test_documentation_of_releases(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(make_site, "version", lambda: "0.11.0.dev1")
     out = tmp_path / "site"
     out.mkdir()
+    (out / "index.html").write_text("<article>x</article>")
     assert make_site.build_releases(out) == ["v0.10.0", "v0.9.0"]
     assert (out / "v0.9.0" / "index.html").is_file()
     listed = re.findall(r'href="([^"]+)"', (out / "versions.html").read_text(encoding="utf-8"))
+    assert 'href="versions.html"' in (out / "index.html").read_text(encoding="utf-8")
     assert listed == ["index.html", "v0.10.0/index.html", "v0.9.0/index.html"]
 
 
@@ -156,6 +183,21 @@ def fences(language: str) -> list[tuple[str, str]]:
         ):
             found.append((page.name, block))
     return found
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_page_starts_with_something_to_do(page: Path) -> None:
+    """A command, a program or a numbered step stands within the first lines."""
+    lines = [line for line in page.read_text(encoding="utf-8").splitlines() if line][1:14]
+    to_do = r" *```(sh|python|toml)|.*`(chaserdock|python|pip) |    (chaserdock|python) |1\. "
+    # The page of the reproduction is the output of a command.
+    assert page.name == "reproduction.md" or any(re.match(to_do, line) for line in lines)
+
+
+@pytest.mark.parametrize("page", ["frames.md", "flight_scenario.md"])
+def test_first_program_of_a_page_runs(page: str, capsys: pytest.CaptureFixture[str]) -> None:
+    exec(next(block for name, block in fences("python") if name == page), {})
+    assert capsys.readouterr().out
 
 
 def test_scenarios_in_the_docs_are_right() -> None:

@@ -83,6 +83,8 @@ def test_exported_files_hold_every_message_with_units(tmp_path: Path) -> None:
     field = truth.schema.field("velocity_m_s_x")
     assert field.metadata == {b"unit": b"m/s"}
     assert truth.schema.field("q_w").metadata is None
+    odometry = pq.read_schema(tmp_path / "parquet" / "world_chaser_odometry.parquet")
+    assert odometry.field("velocity_covariance_m2_s2").metadata == {b"unit": "m²/s²".encode()}
     expected = [r.message.velocity_m_s[0] for r in read_log(GOLDEN) if r.topic is topics.TRUTH_BODY]
     assert truth["velocity_m_s_x"].to_pylist() == expected
     images = pq.read_table(tmp_path / "parquet" / "world_chaser_image.parquet")["data"].to_pylist()

@@ -6,8 +6,13 @@ from __future__ import annotations
 import subprocess
 import sys
 import tomllib
+import unittest.mock
+from pathlib import Path
 
 import pytest
+from chaserdock_protocol.errors import MissingPackageError
+from chaserdock_protocol.scenario import load_scenario
+from chaserdock_world.requirements import require_packages
 from harness import ROOT
 from packaging.requirements import Requirement
 
@@ -28,13 +33,48 @@ def without(package: str, *command: str) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize("command", [("world", "single"), ("simulate", "single", "--images")])
-def test_world_without_pybullet_names_the_platforms_that_have_it(command: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(
+    "command",
+    [("world", "single"), ("simulate", "single", "--images"), ("run", "single", "--out", "never-made")],
+)
+def test_world_without_pybullet_names_its_platforms_and_mujoco(command: tuple[str, ...]) -> None:
     done = without("pybullet", *command)
     assert done.returncode == 2
     (line,) = done.stderr.splitlines()
-    assert line.startswith("chaserdock: the world needs PyBullet, which is not installed; it has wheels for")
+    program, _, text = line.partition(": ")
+    assert program == ("world" if command[0] == "world" else "chaserdock")
+    assert text.startswith("the world needs PyBullet, which is not installed; it has wheels for")
     assert "Python 3.11 on Linux x86_64 only" in line
+    assert "pip install 'chaserdock[mujoco]' and set world.engine = \"mujoco\"" in line
+
+
+MUJOCO = """
+extends = "single"
+name = "elsewhere"
+duration_s = 0.4
+[world]
+engine = "mujoco"
+[success]
+"""
+
+
+@pytest.mark.parametrize("options", [(), ("--images",)], ids=["statistical", "images"])
+def test_a_mission_on_mujoco_needs_no_pybullet(tmp_path: Path, options: tuple[str, ...]) -> None:
+    scenario = tmp_path / "elsewhere.toml"
+    scenario.write_text(MUJOCO, encoding="utf-8")
+    done = without("pybullet", "simulate", str(scenario), *options, "--out", str(tmp_path / "out"))
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_pybullets_renderer_without_pybullet_names_another_one() -> None:
+    scenario = load_scenario(
+        ROOT / "scenarios" / "single.toml", ("camera.renderer=pybullet", "world.engine=mujoco")
+    )
+    with (
+        unittest.mock.patch.dict(sys.modules, {"pybullet": None}),
+        pytest.raises(MissingPackageError, match=r'camera.renderer = "pybullet" needs PyBullet.*"exact"'),
+    ):
+        require_packages(scenario)
 
 
 def test_other_commands_need_no_pybullet() -> None:
@@ -48,6 +88,7 @@ def test_other_commands_need_no_pybullet() -> None:
     [
         ("rosbags", "ros2", ("ros2",)),
         ("rosbags", "ros2", ("ros2", "--control")),
+        ("mujoco", "mujoco", ("run", "single", "--set", "world.engine=mujoco", "--out", "never-made")),
         ("rosbags", "ros2", ("log", "export", GOLDEN, "--out", "never-made", "--format", "rosbag2")),
     ],
 )

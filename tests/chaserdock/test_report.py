@@ -27,12 +27,13 @@ from chaserdock_protocol.recording.log import LogError, LogWriter
 from chaserdock_protocol.scenario import load_scenario
 from chaserdock_protocol.shipped_scenarios import find_scenario
 from flight_cases import scenario
-from harness import finished
+from harness import ROOT, finished
 from scipy.stats import chi2
 
 from chaserdock.analysis.chase_camera import Viewpoint, draw
 from chaserdock.analysis.figures import (
     FIGURES,
+    _FewTicks,
     consistency_text,
     docking,
     keep_out,
@@ -43,11 +44,11 @@ from chaserdock.analysis.figures import (
 from chaserdock.analysis.flight import RecordedFlight, ReferenceHistory, load_flight
 from chaserdock.analysis.images import columns_for, pairs, shots
 from chaserdock.analysis.plots import MissingData
-from chaserdock.analysis.report import _chasers, report_of, table, write_report
+from chaserdock.analysis.report import _chasers, _quantity, report_of, table, write_report
 from chaserdock.analysis.scene import scene_of
 from chaserdock.analysis.summary import summary_of, tracking_components, tracking_errors
 from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutcomes, Traces, load_traces
-from chaserdock.analysis.video import _ExternalView, frames, write_video
+from chaserdock.analysis.video import _ExternalView, frames, wrapped, write_video
 
 TICK_NS = 1_000_000_000 // 15
 SIZE = {"width_px": 96, "height_px": 64}
@@ -148,9 +149,8 @@ def page(short_flight: Path) -> Page:
 
 def test_report_has_every_figure_and_no_external_reference(short_flight: Path, page: Page) -> None:
     drawn = {i for i in page.ids if i.startswith("figure-")}
-    assert drawn >= {
-        f"figure-{k.name}" for k in FIGURES if k.name not in ("thrusters", "loads", "passive_safety")
-    }
+    others = ("thrusters", "loads", "passive_safety", "identification")  # not in every log
+    assert drawn >= {f"figure-{k.name}" for k in FIGURES if k.name not in others}
     assert {"replay-section", "events", "scenario", "versions"} <= set(page.ids)
     assert json.loads((short_flight / "summary.json").read_text())["digest"] in page.words
 
@@ -169,6 +169,11 @@ def test_replay_data_equal_the_recorded_motion(short_flight: Path, page: Page) -
     for urls in data["images"]["chasers"].values():
         assert len(urls) == len(data["images"]["times"]) > 0
         assert all(url.startswith("data:image/jpeg;base64,") for url in urls)
+
+
+def test_every_figure_is_described() -> None:
+    text = (ROOT / "docs" / "report.md").read_text(encoding="utf-8")
+    assert [k.name for k in FIGURES if f"`{k.name}`" not in text] == []
 
 
 def test_equal_logs_give_equal_reports(tmp_path: Path) -> None:
@@ -353,6 +358,21 @@ def test_captured_chaser_is_reported_by_its_latch(tmp_path: Path) -> None:
     assert "docked since" in _chasers(flight, summary_of(flight))
 
 
+def test_quantities_have_three_digits_and_no_exponent() -> None:
+    texts = [_quantity(value, "ms", 1e3) for value in (None, 0.0, 2.3e-5, 0.0851, 0.4, 2.3014, 71.0)]
+    assert texts == ["\N{EN DASH}", "0.00 ms", "0.0230 ms", "85.1 ms", "400 ms", "2301 ms", "71000 ms"]
+
+
+def test_labels_of_a_distribution_do_not_touch() -> None:
+    assert list(_FewTicks().tick_values(1.0, 90.0))[:3] != [0.1, 1.0, 10.0]
+    assert [float(v) for v in _FewTicks().tick_values(0.2, 1000.0) if 0.2 <= v <= 1000.0] == [
+        1.0,
+        10.0,
+        100.0,
+        1000.0,
+    ]
+
+
 # -- images and video ---------------------------------------------------------------------------------------
 
 
@@ -444,6 +464,16 @@ def test_external_view_shows_plumes_and_the_simulated_stars(tmp_path: Path) -> N
     assert np.count_nonzero(brighter) > 50
     # Stars: single bright pixels far from the bodies, which are in the middle.
     assert np.count_nonzero(idle[80:300, 10:200].min(axis=2) > 40) > 0
+
+
+def test_description_is_written_in_full_within_the_width() -> None:
+    text = "Four chasers hold around the tumbling target; 0 and 3 dock from 60 s on."
+    lines = wrapped(text, 300, 0.5)
+    assert len(lines) > 1
+    assert " ".join(lines) == text
+    for line in lines:
+        assert cv2.getTextSize(line, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] <= 300
+    assert wrapped(text, 5, 0.5) == text.split()
 
 
 def test_video_is_playable(short_flight: Path, tmp_path: Path) -> None:

@@ -23,9 +23,11 @@ from chaserdock_protocol.messages import (
     BodyTruth,
     CommandReply,
     Event,
+    Image,
     MissionEnd,
     Odometry,
     Reference,
+    Sighting,
     Tick,
 )
 from chaserdock_protocol.recording.log import LogError
@@ -93,6 +95,40 @@ def test_tracking_error_compares_messages_of_one_tick(mission: LoggedMission) ->
     assert state.chasers[0].error() == pytest.approx((0.25, 0.0))
     assert state.keep_out_m(0.1) == 0.5
     assert MissionState.empty(1).keep_out_m(0.1) == 0.1
+
+
+def test_images_are_of_one_moment() -> None:
+    """While images arrive one by one, the newest exposure that all chasers have is shown; who is silent does not hold others up."""
+    state = MissionState.empty(3)
+
+    def image(chaser: int, time_s: float, seen: bool = True) -> None:
+        at = {"chaser": chaser, "sim_time_ns": round(time_s * 1e9)}
+        state.update(topics.IMAGE, Image(width_px=1, height_px=1, encoding="mono8", data=b"0", **at))
+        if seen:
+            state.update(
+                topics.SIGHTING,
+                Sighting(status="nothing", solutions=(), marker_ids=(), corners_px=(), rejected_ids=(), **at),
+            )
+
+    def shown() -> list[float | None]:
+        return [i.sim_time_ns / 1e9 if i is not None else None for i in state.images_of_one_moment()]
+
+    assert shown() == [None, None, None]
+    for chaser in range(3):
+        image(chaser, 1.0)
+    image(0, 1.5)
+    image(1, 1.5)
+    assert shown() == [1.0, 1.0, 1.0]
+    image(2, 1.5, seen=False)
+    assert shown() == [1.0, 1.0, 1.0]
+    for chaser in range(3):
+        image(chaser, 2.0, seen=chaser != 1)
+    assert shown() == [1.0, 1.0, 1.0]
+    for time_s in (2.5, 3.0, 3.5, 4.0, 4.5):
+        image(0, time_s)
+        image(1, time_s)
+    assert shown() == [4.5, 4.5, 2.0]
+    assert MissionState.empty(1).images_of_one_moment() == [None]
 
 
 def test_messages_of_unknown_chasers_are_ignored() -> None:
@@ -217,7 +253,7 @@ def test_log_is_accessible_at_any_time(mission: LoggedMission) -> None:
     assert len(mission.history.series["estimate_error_mm", None]) >= 17
     assert "approach chaser 0: accepted, phase approach" in words.events(mission.history.lines_until(9.0, 99))
     table = words.chasers(mission.at(1.0), mission.history)
-    assert table.count("1 marker") == 2
+    assert table.count("| 1 |") == 2
     assert "| approach |" in table
     assert "| hold |" in table
 

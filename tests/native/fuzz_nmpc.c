@@ -41,7 +41,7 @@ static double *references(int64_t count) {
     return refs;
 }
 
-static Zones *zones(int64_t n, int64_t d) {
+static Zones *zones(int64_t n, int64_t d, int64_t boxes) {
     Zones *z = block(sizeof *z);
     double *corridors = doubles(5 * n * (d + 1), 0.0, 0.5), *between = doubles(n * n, 0.0, 0.8);
     for (int64_t i = 0; i < n * (d + 1); i++) {
@@ -52,7 +52,7 @@ static Zones *zones(int64_t n, int64_t d) {
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < i; j++) between[i * n + j] = between[j * n + i];
     *z = (Zones){n, d, references(n * (d + 1)), doubles(3 * (d + 1), -0.2, 0.2), doubles(n * (d + 1), -0.2, 1.0), between, corridors,
-                 value(0.5, 30.0)};
+                 value(0.5, 30.0), boxes, doubles(15 * boxes * (d + 1), -0.5, 0.5), doubles(n, -0.2, 0.6)};
     return z;
 }
 
@@ -141,7 +141,7 @@ static void plan_cost(void) {
 static void plan_violation(void) {
     const int64_t n = whole(1, 3), d = whole(1, 4);
     double *x = states(n * (d + 1)), *worst = outputs(n);
-    NAME(plan_violation)(zones(n, d), x, worst);
+    NAME(plan_violation)(zones(n, d, whole(0, 2)), x, worst);
     for (int64_t i = 0; i < n; i++) {
         CHECK(worst[i] >= 0.0 || worst[i] != worst[i]);
         for (int64_t k = 0; k <= d; k++)
@@ -150,11 +150,11 @@ static void plan_violation(void) {
 }
 
 static void build_rows(void) {
-    const int64_t n = whole(1, 3), d = whole(1, 4), width = d * (n + 2);
+    const int64_t n = whole(1, 3), d = whole(1, 4), boxes = whole(0, 2), width = d * (n + 2 + boxes);
     double *x = states(n * (d + 1));
     Rows rows = {width, d + 1, doubles(n * (d + 1), 0.0, 5.0), block((size_t)(n * width) * 8), block((size_t)n * 8), outputs(3 * n * width),
                  outputs(n * width)};
-    NAME(build_rows)(zones(n, d), x, &rows);
+    NAME(build_rows)(zones(n, d, boxes), x, &rows);
     for (int64_t i = 0; i < n; i++) {
         CHECK(0 <= rows.n_rows[i] && rows.n_rows[i] <= width);
         for (int64_t m = width * i; m < width * i + rows.n_rows[i]; m++)
@@ -185,15 +185,15 @@ static void solve_qp(void) {
 }
 
 static void solve_tick(void) {
-    const int64_t n = whole(1, 2), d = whole(1, 3), budget = whole(0, 20);
+    const int64_t n = whole(1, 2), d = whole(1, 3), budget = whole(0, 20), boxes = whole(0, 2);
     double *limits = doubles(6 * n, 0.0, 3.0), *inputs = doubles(6 * n * d, -1.0, 1.0), *given;
     for (int64_t i = 0; i < 6 * n; i++) limits[i] = abs_of(limits[i]);
     for (int64_t i = 0; i < 6 * n * d; i++) inputs[i] *= limits[6 * (i / (6 * d)) + i % 6];
     given = copy_of(inputs, 6 * n * d);
     int64_t *code = block((size_t)n * 8), *iterations = block((size_t)n * 8), left = budget;
-    Tick tick = {model(), weights(d), zones(n, d), states(n), doubles(6 * n * d, -1.0, 1.0), limits, doubles(d + 1, 0.0, 1.0),
+    Tick tick = {model(), weights(d), zones(n, d, boxes), states(n), doubles(6 * n * d, -1.0, 1.0), limits, doubles(d + 1, 0.0, 1.0),
                  doubles(n, 1.0, 1e4), inputs, value(0.0, 1e4), budget, code, iterations};
-    NAME(solve_tick)(&tick, outputs(NAME(tick_workspace)(n, d)));
+    NAME(solve_tick)(&tick, outputs(NAME(tick_workspace)(n, d, boxes)));
     for (int64_t i = 0; i < n; i++, left -= iterations[i - 1]) {
         check_answer(code[i], iterations[i], left);
         if (code[i] == BROKEN) CHECK(same_bits(inputs + 6 * d * i, given + 6 * d * i, 6 * d));

@@ -15,7 +15,7 @@ from docking_cases import world
 def worlds(request: pytest.FixtureRequest) -> Iterator[Any]:
     """Return a function that opens worlds of ``docking_cases``; all are closed at the end of the test.
 
-    They are PyBullet's, or those of the engine that an indirect parameter names (``engines.both``).
+    They are PyBullet's, or those of the engine that an indirect parameter names (``engine_cases.both``).
     """
     opened: list[Physics] = []
     engine = getattr(request, "param", "pybullet")

@@ -12,8 +12,8 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.latch import ProbeLatch
 from chaserdock_world.physics.simulation import TARGET, Physics
-from docking_cases import CHASER_INERTIA, CHASER_KG, TARGET_INERTIA, TARGET_KG, scenario
-from engines import both
+from docking_cases import CHASER_INERTIA, CHASER_KG, REACH_M, TARGET_INERTIA, TARGET_KG, scenario
+from engine_cases import both
 
 HZ = 960
 
@@ -113,6 +113,20 @@ def test_probe_outside_tolerances_bounces(worlds: Any, changes: dict[str, float]
     before = float(relative(physics)[0][0])
     physics.advance(HZ // 4, {})
     assert float(relative(physics)[0][0]) < before  # it moves away
+
+
+@both
+def test_a_touch_is_as_soft_as_the_documentation_states(worlds: Any) -> None:
+    """At 1 cm/s: 0.3 mm deep, and back at about a third of the speed (docs/docking.md)."""
+    physics = worlds(omega_rad_s=(0.0, 0.0, 0.0))
+    depth, speed = 0.0, 0.0
+    for _ in range(HZ // 2):
+        before = float(relative(physics)[0][0])
+        physics.advance(1, {})
+        tip = float(relative(physics)[0][0])
+        depth, speed = max(depth, tip + REACH_M + 0.2), (tip - before) * HZ
+    assert depth == pytest.approx(3e-4, abs=3e-5)
+    assert -speed == pytest.approx(0.0035, abs=0.0004)
 
 
 @both

@@ -13,7 +13,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_world.physics.compliant_latch import ENGAGED_M
 from chaserdock_world.physics.simulation import TARGET, Physics
 from docking_cases import CHASER_KG, HZ, TARGET_KG, balance, latch, momenta
-from engines import both
+from engine_cases import both
 
 PULL = np.array([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 TARGET_SHARE = TARGET_KG / (TARGET_KG + CHASER_KG)

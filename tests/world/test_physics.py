@@ -14,7 +14,7 @@ from chaserdock_controller.parameters import nmpc_settings
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_world.physics.simulation import TARGET, BodyState, Physics, prescribed_state
-from engines import both
+from engine_cases import both
 from world_cases import HZ, STEP_S, scenario
 
 HALF = np.sqrt(0.5)

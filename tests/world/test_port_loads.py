@@ -24,7 +24,7 @@ from docking_cases import (
     momenta,
     scenario,
 )
-from engines import both
+from engine_cases import both
 
 HZ = 960
 FIRING = np.array([0.3, 0.5, -0.2, 0.05, 0.1, 0.02])

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The simulated world: PyBullet physics, cameras, ground truth."""
+"""The simulated world: physics, cameras, ground truth."""

@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
-from chaserdock_protocol.scenario.checks import angle_deg
+from chaserdock_protocol.scenario.checks import angle_deg, shape_distance_m
 from numpy.typing import ArrayLike
 
 from .approach_cone import BESIDE_LINE_M
@@ -70,7 +70,15 @@ def why_not_offset(scenario: FlightScenario, offset_m: ArrayLike) -> str:
     nearest = scenario.limits.min_distance_target_m
     if not nearest < distance <= scenario.limits.max_reference_distance_m:
         return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
-    return ""
+    return why_not_off_shape(scenario, offset_m)
+
+
+def why_not_off_shape(scenario: FlightScenario, offset_m: ArrayLike) -> str:
+    """Check the distance of an offset (3,), TRF, from the cuboids of the target's shape."""
+    least_m = scenario.limits.min_distance_shape_m
+    if not least_m or (distance_m := shape_distance_m(scenario, offset_m)) >= least_m:
+        return ""
+    return f"the offset is {distance_m:.3g} m from the target's shape; allowed are at least {least_m:.3g} m"
 
 
 def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_models.shape_distance import box_table, moved
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.estimation.target_body import TargetBody, TargetPath, predict_path
@@ -47,6 +48,8 @@ class ReferenceBuilder:
         self._scenario, self._machine = scenario, machine
         self._step_s = scenario.controller.dt_s
         self._stages = round(scenario.controller.horizon_s / scenario.controller.dt_s)
+        keeps = scenario.limits.min_distance_shape_m > 0.0
+        self._boxes = box_table(scenario.target_model().boxes) if keeps else None
 
     def pose(self, i: int, target: TargetState, now_s: float) -> tuple[Array, Array, Array]:
         """Return a chaser's reference now: position (3,) and attitude (4,) in WRF, offset (3,) in TRF."""
@@ -92,18 +95,23 @@ class ReferenceBuilder:
                 middles.acceleration_m_s2,
             )
         known = {r.chaser: r.covariance for r in relative}
-        distances = [
-            self._machine.min_distance_target_m(i) + self._margin_m(known.get(i, start.covariance))
-            for i in chasers
-        ]
+        margins = np.array([self._margin_m(known.get(i, start.covariance)) for i in chasers])
+        distances = np.array([self._machine.min_distance_target_m(i) for i in chasers]) + margins
+        boxes = clearance = None
+        if self._boxes is not None:
+            boxes = moved(self._boxes, nodes.positions_m, nodes.q_wxyz)
+            kept = np.array([self._machine.min_distance_shape_m(i) for i in chasers])
+            clearance = np.where(kept > 0.0, kept + margins, 0.0)
         return HorizonReference(
             chasers=chasers,
             references=reference.references_on(nodes.positions_m, nodes.q_wxyz, offsets, q_off),
             u_ref=u_ref,
             target_positions=nodes.positions_m,
-            min_distance_target_m=np.array(distances),
+            min_distance_target_m=distances,
             corridors=corridor_rows([self._machine.corridor(i) for i in chasers], nodes.q_wxyz),
             attached=attached,
+            boxes=boxes,
+            box_clearance_m=clearance,
         )
 
     def _offsets(

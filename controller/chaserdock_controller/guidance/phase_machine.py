@@ -49,7 +49,9 @@ _ABORT_SPEED_FACTOR = 2.0
 _GOTO_SPEED_FACTOR = 2.0
 _SEARCH_AFTER_S = 1.0
 _REST_S = 0.5
-"""Time for which a stack must be below its limits to count as stopped, or above them to count as moving."""
+"""Time for which a stack must be below its limits to count as stopped."""
+_MOVING_S = 0.2
+"""Time for which a stopped stack must be above half of them to be stopped again; it drifts meanwhile."""
 _SIGHT_LOSS_S = 3.0
 """An approach stops when no chaser has seen the target for this long."""
 _HELD_MARGIN_M = 0.03
@@ -407,7 +409,7 @@ class PhaseMachine:
             holds = c.phase is Phase.STACK_HOLD
             since = self._inside_since(i, moving if holds else stopped, now_s)
             self.chasers[i] = replace(c, inside_since_s=since)
-            if since is not None and now_s - since >= _REST_S:
+            if since is not None and now_s - since >= (_MOVING_S if holds else _REST_S):
                 trigger = Trigger.STACK_MOVED if holds else Trigger.STACK_STOPPED
                 self._transition(i, trigger, now_s, c.move)
             elif not holds and now_s - c.since_s > timeout_s:
@@ -585,6 +587,11 @@ class PhaseMachine:
         if not self.in_corridor(i):
             return limit
         return 0.0 if self._is_held(i) else min(limit, dock.keep_out_m())
+
+    def min_distance_shape_m(self, i: int) -> float:
+        """Return the distance from the cuboids of the target's shape that a chaser's plan keeps; 0 in its corridor and at its port."""
+        free = self.corridor(i) is None and not self.in_corridor(i) and not self._is_held(i)
+        return self._scenario.limits.min_distance_shape_m if free else 0.0
 
     def latch(self, i: int) -> Latch:
         """Return the latch command: armed from the final approach on, open before and when backing out."""

@@ -32,7 +32,7 @@ def _poses(name: str, array: Array, first: int) -> None:
 
 def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
     """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values expanded:
-    (N, D+1) target distances, (N, N) chaser distances, corridors.
+    (N, D+1) target distances, (N, N) chaser distances, corridors, cuboids.
 
     Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
     length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor, or more than
@@ -58,6 +58,12 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
     to_target = _array("min_distance_target_m", to_target, (n, d + 1))
     corridors = np.zeros((n, d + 1, 5)) if problem.corridors is None else problem.corridors
     corridors = _array("corridors", corridors, (n, d + 1, 5))
+    boxes = np.zeros((d + 1, 0, 15)) if problem.boxes is None else np.asarray(problem.boxes)
+    boxes = _array("boxes", boxes, (d + 1, boxes.shape[1] if boxes.ndim == 3 else 0, 15))
+    if boxes.shape[1] > params.boxes:
+        raise ValueError(f"boxes must be at most {params.boxes}, not {boxes.shape[1]}")
+    clearance = np.zeros(n) if problem.box_clearance_m is None else problem.box_clearance_m
+    clearance = _array("box_clearance_m", clearance, (n,))
     input_max = _array("input_max", problem.input_max, (n, 6))
     u_ref = _array("u_ref", problem.u_ref, (n, d, 6))
     targets = _array("target_positions", problem.target_positions, (d + 1, 3))
@@ -68,6 +74,8 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         ("u_ref", u_ref, True),
         ("target_positions", targets, True),
         ("corridors", corridors, True),
+        ("boxes", boxes, True),
+        ("box_clearance_m", clearance, False),
     ):
         code = sign_of(value)
         if code == 1:
@@ -85,6 +93,8 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         min_distance_chasers_m=between,
         input_max=input_max,
         corridors=corridors,
+        boxes=boxes,
+        box_clearance_m=clearance,
     )
 
 

@@ -113,6 +113,9 @@ class _Zones(Structure):
         ("between", c_void_p),
         ("corridors", c_void_p),
         ("outer", c_double),
+        ("n_boxes", c_int64),
+        ("boxes", c_void_p),
+        ("clearance", c_void_p),
     ]
 
 
@@ -120,10 +123,14 @@ def zones_of(problem: NmpcInput, outer: float) -> _Zones:
     n, nodes, _ = problem.references.shape
     between, corridors = problem.min_distance_chasers_m, problem.corridors
     assert isinstance(between, np.ndarray)
+    boxes, clearance = problem.boxes, problem.box_clearance_m
     assert corridors is not None
+    assert boxes is not None
+    assert clearance is not None
     return _Zones(
         n, nodes - 1, address(problem.references), address(problem.target_positions),
         address(problem.min_distance_target_m), address(between), address(corridors), outer,
+        boxes.shape[1], address(boxes), address(clearance),
     )  # fmt: skip
 
 
@@ -148,9 +155,10 @@ class _Tick(Structure):
     ]
 
 
-def tick_workspace(n: int, d: int) -> Array:
-    """Allocate working memory of `solve_tick` for up to ``n`` chasers and ``d`` stages; for one thread at a time."""
-    return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d)))
+def tick_workspace(n: int, d: int, boxes: int) -> Array:
+    """Allocate working memory of `solve_tick` for up to ``n`` chasers, ``d`` stages and ``boxes`` cuboids; for one thread at a
+    time."""
+    return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d), c_int64(boxes)))
 
 
 def solve_tick(

@@ -52,6 +52,9 @@ def with_lost_chasers(
     corridors = problem.corridors
     if corridors is not None:
         corridors = np.concatenate([corridors, np.zeros((len(lost), *corridors.shape[1:]))])
+    clearance = problem.box_clearance_m
+    if clearance is not None:
+        clearance = np.concatenate([clearance, np.zeros(len(lost))])
     return replace(
         problem,
         states=np.concatenate([problem.states, states]),
@@ -61,4 +64,5 @@ def with_lost_chasers(
         min_distance_chasers_m=between,
         input_max=np.concatenate([problem.input_max, np.full((len(lost), 6), _LIMIT)]),
         corridors=corridors,
+        box_clearance_m=clearance,
     )

@@ -38,7 +38,7 @@ class RtiSolver:
         if max_iterations is not None and max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, not {max_iterations}")
         self.max_iterations = max_iterations
-        self._workspace = tick_workspace(n_chasers, params.stages)
+        self._workspace = tick_workspace(n_chasers, params.stages, params.boxes)
         # Largest displacement of a chaser by stage k for a change of the inputs by 1 N.
         times = params.dt_s * np.arange(params.stages + 1)
         self._reach = REACH_SAFETY * np.sqrt(3.0) / params.mass_kg * times**2

@@ -141,6 +141,8 @@ class PlanningStage:
             min_distance_chasers_m=self._min_distance_chasers_m,
             input_max=limits,
             corridors=horizon.corridors,
+            boxes=horizon.boxes,
+            box_clearance_m=horizon.box_clearance_m,
         )
 
 

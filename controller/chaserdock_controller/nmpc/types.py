@@ -38,7 +38,7 @@ class NmpcParameters:
     The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2, ``weight_orientation``
     on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
     (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
-    body axes. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
+    body axes. ``boxes``: most cuboids of the target's shape in a problem. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
     Raises ValueError, naming the field, for an invalid value.
     """
 
@@ -57,6 +57,7 @@ class NmpcParameters:
     weight_final_orientation: float
     max_reference_distance_m: float
     integrator: str
+    boxes: int = 0
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:
@@ -115,6 +116,9 @@ class NmpcInput:
     target, [axis (3; WRF, unit, from the target outwards; zero: no corridor), half angle (rad, above 0 and below
     pi/2), distance of the apex from the target's centre along the axis (m; may be negative)]. It applies in addition to
     the keep-out ball, which is smaller or 0 for a docking chaser.
+    boxes (D+1, C, 15) or None: cuboids of the target's shape at each stage: centre (3; WRF, m), rotation cuboid to WRF (9,
+    row-major), half edges (3; m). box_clearance_m (N,) or None: distance that each chaser's centre keeps from them; 0 switches it
+    off. Only the back end `rti` keeps it.
     """
 
     states: Array
@@ -125,6 +129,8 @@ class NmpcInput:
     min_distance_chasers_m: Array | float
     input_max: Array
     corridors: Array | None = None
+    boxes: Array | None = None
+    box_clearance_m: Array | None = None
 
 
 @dataclass(frozen=True)

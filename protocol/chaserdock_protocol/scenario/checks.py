@@ -14,7 +14,9 @@ from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.meshes import mass_properties
 from chaserdock_models.port_load import CarriedBody, tumble_load
 from chaserdock_models.satellites import satellite_names
+from chaserdock_models.shape_distance import box_table, signed_distance
 from chaserdock_models.wrench_set import wrench_matrix
+from numpy.typing import ArrayLike
 
 from .faults import check_faults
 from .mounting import nominal_mounting, plume_free_thrusters
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 def check_flight(scenario: FlightScenario) -> None:
     """Check the part of a scenario that flight software receives."""
     _check_references(scenario)
+    _check_shape_distance(scenario)
     _check_named_chasers(scenario)
     _check_perception(scenario)
     if scenario.chaser.actuation == "thrusters":
@@ -114,6 +117,29 @@ def _check_references(scenario: FlightScenario) -> None:
                     f"the positions of chasers.{j} and chasers.{i} are {distance:.3g} m apart, nearer than "
                     f"limits.min_distance_chasers_m ({limits.min_distance_chasers_m:g} m) allows"
                 )
+
+
+def shape_distance_m(scenario: FlightScenario, offset_m: ArrayLike) -> float:
+    """Return the signed distance (m) of an offset (3,), TRF, from the cuboids of the target's shape."""
+    return signed_distance(box_table(scenario.target_model().boxes), offset_m)[0]
+
+
+def _check_shape_distance(scenario: FlightScenario) -> None:
+    least_m = scenario.limits.min_distance_shape_m
+    if not least_m:
+        return
+    if scenario.controller.solver != "rti":
+        raise ValueError(
+            f'limits.min_distance_shape_m: needs controller.solver = "rti", not {scenario.controller.solver!r}'
+        )
+    places = [(f"chasers.{i}.position_m", c.position_m) for i, c in enumerate(scenario.chasers)]
+    places += [(f"timeline.{k}.offset_m", e.offset_m) for k, e in enumerate(scenario.timeline) if e.offset_m]
+    for name, offset_m in places:
+        if (distance_m := shape_distance_m(scenario, offset_m)) < least_m:
+            raise ValueError(
+                f"{name}: {distance_m:.3g} m from the target's shape, nearer than limits.min_distance_shape_m ({least_m:g} m) "
+                "allows"
+            )
 
 
 def _check_hold_points(scenario: FlightScenario) -> None:

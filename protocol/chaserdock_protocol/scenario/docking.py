@@ -66,7 +66,7 @@ class _ContactConditions(Corridor):
     @model_validator(mode="before")
     @classmethod
     def _fill_in_preset(cls, values: Any) -> Any:
-        stated = CONTACT_CONDITIONS.get(values.get("preset")) if isinstance(values, dict) else None
+        stated = CONTACT_CONDITIONS.get(values.get("preset", "none")) if isinstance(values, dict) else None
         return values if stated is None else stated | values
 
 

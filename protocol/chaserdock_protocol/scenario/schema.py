@@ -70,6 +70,14 @@ class EstimatorSection(Section):
         description="`joint`: filter of target, chasers, sensors and disturbances. `mekf`: filter of the target, with odometry "
         "taken as exact. `paper`: the paper's average. Or an installed plugin.",
     )
+    target_acceleration_noise: Positive | None = Field(
+        default=None,
+        description="Of `joint`: square root of the spectral density of the target's unmodelled acceleration, m/s²/√Hz. Not set: 1e-4 "
+        "for `torque_free`, otherwise 5e-6. Far away it decides how well the relative velocity is known.",
+    )
+    target_angular_noise: Positive | None = Field(
+        default=None, description="The same of its angular acceleration, rad/s²/√Hz."
+    )
 
 
 class PerceptionSection(Section):
@@ -157,6 +165,11 @@ class Limits(Section):
         default=3.0,
         description="Standard deviations of a chaser's estimated position relative to the target that are added to "
         "`min_distance_target_m`, at most 0.1 m in all.",
+    )
+    min_distance_shape_m: NotNegative = Field(
+        default=0.0,
+        description="Smallest distance of a chaser's centre from each cuboid of the target's shape (bus, panels, booms), m, outside "
+        "of its corridor, in addition to `min_distance_target_m`, which may then be smaller or 0. 0: off. Needs the solver `rti`.",
     )
     min_distance_chasers_m: NotNegative = Field(
         default=0.35, description="Smallest distance between chasers, m."

@@ -14,14 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.orbit import Scalars3
 from chaserdock_models.rigid_body import BodyState
-from chaserdock_protocol.errors import require_extra
 
-EngineName = Literal["pybullet", "mujoco"]
 Scalars4 = tuple[float, float, float, float]
 Motion = tuple[Scalars3, Scalars4, Scalars3, Scalars3]
 """Position (3,), m, attitude (4,), velocity (3,), m/s, and rate (3,), rad/s, of a body in WRF."""
@@ -51,7 +49,7 @@ class SolidHull:
     """The convex hull of ``vertices_m`` (n, 3) in the frame of the body, and its triangles (m, 3), none for points in a plane."""
 
     vertices_m: Array
-    triangles: Array
+    triangles: IntArray
 
 
 Solid = SolidBox | SolidCapsule | SolidHull
@@ -72,9 +70,10 @@ class RigidBodyDefinition:
 
 @dataclass(frozen=True)
 class ContactSpring:
-    """Compliant contact between two bodies: stiffness along the normal, N/m, and damping, N s/m.
+    """Compliance of each body in a contact: stiffness along the normal, N/m, and damping, N s/m.
 
-    ``mass_kg``: effective mass of the contact, for engines that state contacts per mass.
+    In a contact of two bodies the stiffnesses are in series, half of one, and the dampings add up, as in PyBullet. ``mass_kg``:
+    effective mass of the contact, for engines that state contacts per mass.
     """
 
     stiffness_N_m: float
@@ -163,15 +162,3 @@ class RigidBodyEngine(Protocol):
     def close(self) -> None:
         """Free the engine."""
         ...
-
-
-def make_engine(name: EngineName, setup: EngineSetup) -> RigidBodyEngine:
-    """Return an engine with these bodies. Raises MissingPackageError (see ``requirements.require_packages``)."""
-    if name == "mujoco":
-        require_extra("mujoco", "mujoco")
-        from .mujoco_engine import MujocoEngine
-
-        return MujocoEngine(setup)
-    from .bullet_engine import BulletEngine
-
-    return BulletEngine(setup)

@@ -13,8 +13,9 @@ with the constraint, and d < 1 (MuJoCo, "Computation", Constraint model).
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
-import mujoco
+import mujoco as untyped_mujoco
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
@@ -33,6 +34,8 @@ from .engine import (
     SolidCapsule,
     SolidHull,
 )
+
+mujoco: Any = untyped_mujoco  # has no type stubs
 
 _IMPEDANCE = [0.9999, 0.9999, 0.001, 0.5, 2.0]
 """d of constraints, the largest that MuJoCo takes, whatever the violation."""
@@ -195,7 +198,7 @@ class MujocoEngine:
         del self._model, self._data
 
 
-def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
+def _set_options(spec: Any, step_s: float) -> None:
     option = spec.option
     option.timestep = step_s
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
@@ -213,17 +216,18 @@ def _set_options(spec: mujoco.MjSpec, step_s: float) -> None:
 def _contact_reference(spring: ContactSpring | None, step_s: float) -> list[float]:
     """Return ``solref`` of contacts.
 
-    A spring is that of an implicit step, as in PyBullet: F = k (r + h v) + c v at the end of the step. Hard contacts are
-    critically damped, with the shortest time constant that MuJoCo takes.
+    A spring is that of an implicit step, as in PyBullet: F = k (r + h v) + c v with the velocity at the end of the step. Hard
+    contacts are critically damped, with the shortest time constant that MuJoCo takes.
     """
     if spring is None:
         return [2.0 * step_s, 1.0]
-    damping = spring.damping_N_s_m + step_s * spring.stiffness_N_m
-    mass = spring.mass_kg + step_s * damping
-    return [-spring.stiffness_N_m / mass, -damping / mass]
+    stiffness = spring.stiffness_N_m / 2.0
+    damping = 2.0 * spring.damping_N_s_m + step_s * stiffness
+    mass_kg = spring.mass_kg + step_s * damping
+    return [-stiffness / mass_kg, -damping / mass_kg]
 
 
-def _add_body(spec: mujoco.MjSpec, number: int, body: RigidBodyDefinition, reference: list[float]) -> None:
+def _add_body(spec: Any, number: int, body: RigidBodyDefinition, reference: list[float]) -> None:
     a, b, c = body.moments_kg_m2
     added = spec.worldbody.add_body(
         name=str(number),
@@ -252,7 +256,7 @@ def _add_body(spec: mujoco.MjSpec, number: int, body: RigidBodyDefinition, refer
         )
 
 
-def _geometry(spec: mujoco.MjSpec, name: str, solid: Solid) -> dict[str, object]:
+def _geometry(spec: Any, name: str, solid: Solid) -> dict[str, object]:
     """Return type, size and pose of a solid; a hull is added to ``spec`` as a mesh of this name."""
     kinds = mujoco.mjtGeom
     if isinstance(solid, SolidBox):
@@ -273,7 +277,7 @@ def _thickened(hull: SolidHull) -> Array:
     return np.concatenate([hull.vertices_m + side * _PLANE_HULL_HALF_M * normal for side in (-1.0, 1.0)])
 
 
-def _add_joint(spec: mujoco.MjSpec, a: int, b: int, step_s: float) -> None:
+def _add_joint(spec: Any, a: int, b: int, step_s: float) -> None:
     """Add an inactive joint, stiff enough to stop a relative motion in one step: b = 1 / h, k = 1 / (4 h^2)."""
     spec.add_equality(
         name=f"{a}/{b}",

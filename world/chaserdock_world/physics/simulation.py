@@ -34,8 +34,8 @@ from .engine import (
     SolidBox,
     SolidCapsule,
     SolidHull,
-    make_engine,
 )
+from .engine_factory import make_engine
 from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
 from .latch import ProbeLatch, latch_faults
 from .orbital_forces import OrbitalForces
@@ -45,7 +45,7 @@ from .port_loads import PortLoadRecorder, port_attitude
 TARGET = "target"
 PROBE_RADIUS_M = 0.006
 _Z_TO_X_WXYZ = np.array([0.5**0.5, 0.0, 0.5**0.5, 0.0])
-# A compliant contact: restitution 0.4 and 0.5 mm penetration at 1 cm/s (docs/docking.md).
+# A compliant contact: restitution 0.35 and 0.3 mm penetration at 1 cm/s (docs/docking.md).
 _STIFFNESS_N_M, _DAMPING_N_S_M = 1e4, 100.0
 _ZERO = (0.0, 0.0, 0.0)
 

@@ -38,6 +38,8 @@ SINGLE_MARKER = SightingNoise(white_ratio=1.8, view_ratio=0.22, view_time_s=25.0
 SEVERAL_MARKERS = SightingNoise(white_ratio=0.85, view_ratio=1.3, view_time_s=3.0)
 # Errors of geometry and shading change only with the view, and are alike in the images of several cameras.
 SHAPE = SightingNoise(white_ratio=1.0, view_ratio=2.4, view_time_s=10.0)
+# Range, bearing and attitude of `[ranging]` have white errors of the stated size.
+RANGING = SightingNoise(white_ratio=1.0, view_ratio=0.0, view_time_s=1.0)
 
 
 @dataclass(frozen=True)
@@ -121,7 +123,7 @@ class JointParameters:
         object.__setattr__(self, "camera_turn_rad", turn)
 
     def sighting_noise(self, markers: int) -> SightingNoise:
-        """Return the errors of a sighting of this many markers, 0 for one by shape."""
+        """Return the errors of a sighting of this many markers, 0 for one by shape or by ranging."""
         if markers == 0:
             return self.shape
         return self.single_marker if markers == 1 else self.several_markers

@@ -91,10 +91,10 @@ def predict(
     return replace(moved, time_ns=time_ns, covariance=covariance, **mean_fields(mean))
 
 
-def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.Motion:
+def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionParameters:
     """Return the parameters of a prediction over ``dt``, of which the command is unknown for ``unknown_s``."""
     n = p.navigation
-    return kernels.Motion(
+    return kernels.MotionParameters(
         dt,
         p.body.mass_kg,
         (c_double * 3)(*p.inertia),

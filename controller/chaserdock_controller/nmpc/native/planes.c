@@ -3,7 +3,8 @@
  *
  * A chaser-target constraint becomes the plane tangent to the keep-out ball; a chaser-chaser constraint a separating
  * plane at the midpoint, half the distance to each side; the outer bound a plane tangent to the ball about the
- * reference; an approach corridor the plane tangent to its cone where the chaser is nearest. A row of stage k reads
+ * reference; an approach corridor the plane tangent to its cone where the chaser is nearest; a cuboid of the target's shape the
+ * plane that separates it from the chaser, normal to the line from its nearest point. A row of stage k reads
  * a' dp_k >= c with dp_k the change of the rolled position.
  */
 #include "base.h"
@@ -23,6 +24,8 @@ typedef struct {
     int64_t n, stages;
     const double *references, *targets, *to_target, *between, *corridors; /* as in `NmpcInput`, all expanded */
     double outer;
+    int64_t n_boxes;
+    const double *boxes, *clearance; /* (D+1, n_boxes, 15): centre, rotation to WRF, half edges; (N,) */
 } Zones;
 
 /* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can move a chaser from its
@@ -133,6 +136,56 @@ static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j
     }
 }
 
+/* Signed distance of a point (3) from a cuboid (15), m; n (3) receives its gradient (chaserdock_models.shape_distance). */
+static double box_distance(const double *point, const double *box, double *n) {
+    double r[3], local[3], off[3] = {0}, square = 0.0;
+    subtract3(point, box, r);
+    for (int i = 0; i < 3; i++) {
+        local[i] = madd(box[9 + i], r[2], madd(box[6 + i], r[1], box[3 + i] * r[0]));
+        if (abs_of(local[i]) > box[12 + i]) off[i] = local[i] - (local[i] > 0.0 ? box[12 + i] : -box[12 + i]);
+        square = madd(off[i], off[i], square);
+    }
+    double distance = sqrt_of(square);
+    if (!(distance > 0.0)) {
+        int face = 0;
+        for (int i = 1; i < 3; i++)
+            if (abs_of(local[i]) - box[12 + i] > abs_of(local[face]) - box[12 + face]) face = i;
+        distance = abs_of(local[face]) - box[12 + face];
+        for (int i = 0; i < 3; i++) off[i] = 0.0;
+        off[face] = local[face] >= 0.0 ? 1.0 : -1.0;
+    } else
+        for (int i = 0; i < 3; i++) off[i] /= distance;
+    multiply3(box + 3, off, n);
+    return distance;
+}
+
+/* Distance of a point (3) from the plane with the unit normal n (3) that touches a cuboid (15) from outside, m. */
+static double plane_distance(const double *point, const double *box, const double *n) {
+    double r[3], support = 0.0;
+    subtract3(point, box, r);
+    for (int i = 0; i < 3; i++)
+        support = madd(abs_of(madd(box[9 + i], n[2], madd(box[6 + i], n[1], box[3 + i] * n[0]))), box[12 + i], support);
+    return dot3(n, r) - support;
+}
+
+/* Rows of the separating planes of one cuboid. A rollout that crosses it keeps the normal of its entry side. */
+static void box_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t box, const double *x) {
+    const double clearance = zones->clearance[i];
+    double last[3], n[3];
+    int held = 0;
+    box_distance(x, zones->boxes + 15 * box, last);
+    for (int64_t k = 1; k < rows->nodes; k++) {
+        const double *at = zones->boxes + 15 * (zones->n_boxes * k + box);
+        double gap = box_distance(x + 13 * k, at, n);
+        if (held || gap < INSIDE * clearance || dot3(n, last) < 0.0) {
+            held = 1;
+            copy(last, n, 3);
+        }
+        copy(n, last, 3);
+        push(rows, i, k, n, 1.0, plane_distance(x + 13 * k, at, n) - clearance - MARGIN_M);
+    }
+}
+
 static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const double *x) {
     const int64_t nodes = rows->nodes;
     const double *reference = zones->references + 7 * nodes * i, *corridor = zones->corridors + 5 * nodes * i;
@@ -165,11 +218,13 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
 }
 
 /* Write the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
- * at least D (N + 2). None at stage 0, and none whose distance is NaN. */
+ * at least D (N + 2 + n_boxes). None at stage 0, and none whose distance is NaN. */
 EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *rows) {
     for (int64_t i = 0; i < zones->n; i++) rows->n_rows[i] = 0;
     for (int64_t i = 0; i < zones->n; i++) {
         own_rows(zones, rows, i, x + 13 * rows->nodes * i);
+        if (zones->clearance[i] > 0.0)
+            for (int64_t b = 0; b < zones->n_boxes; b++) box_rows(zones, rows, i, b, x + 13 * rows->nodes * i);
         for (int64_t j = i + 1; j < zones->n; j++)
             if (zones->between[i * zones->n + j] > 0.0)
                 pair_rows(zones, rows, i, j, x + 13 * rows->nodes * i, x + 13 * rows->nodes * j);
@@ -191,6 +246,10 @@ EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *wo
             subtract3(at, zones->targets + 3 * k, r);
             if (dot3(corridor, corridor) > 0.0) worst[i] = max_or_nan(worst[i], -corridor_room(r, corridor, n));
             worst[i] = max_or_nan(worst[i], zones->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
+            for (int64_t b = 0; b < zones->n_boxes && zones->clearance[i] > 0.0; b++) {
+                double gap = box_distance(at, zones->boxes + 15 * (zones->n_boxes * k + b), n);
+                worst[i] = max_or_nan(worst[i], zones->clearance[i] - gap);
+            }
             for (int64_t j = i + 1; j < zones->n; j++) {
                 const double d = zones->between[i * zones->n + j];
                 subtract3(at, x + 13 * (nodes * j + k), r);

@@ -18,16 +18,16 @@ typedef struct {
     int64_t budget, *code, *iterations;
 } Tick;
 
-static int64_t tick_width(int64_t n, int64_t d) { return d * (n + 2); }
+static int64_t tick_width(int64_t n, int64_t d, int64_t boxes) { return d * (n + 2 + boxes); }
 
-EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d) {
-    int64_t width = tick_width(n, d);
+EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d, int64_t boxes) {
+    int64_t width = tick_width(n, d, boxes);
     return n * (14 * (d + 1) + 5 * width + 1) + 144 * n * d + (9 + 9 + 12 + 12) * (d + 1) + 4 * 6 * d + 2 * width +
            12 * d + ipm_workspace(d, width) + width + 40 * 8;
 }
 
 EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
-    const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d);
+    const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d, tick->zones->n_boxes);
     double *x = allocate(&work, 13 * n * (d + 1)), *mats = allocate(&work, 144 * n * d);
     double *reach = allocate(&work, n * (d + 1));
     Rows rows = {width, d + 1, reach, 0, 0, 0, 0};

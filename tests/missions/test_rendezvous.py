@@ -1,0 +1,54 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rendezvous from far range: the estimate that passive safety needs, and the last leg to the verified latch."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from chaserdock.evaluation.in_process import InProcessMission
+from chaserdock.evaluation.perception import RenderedImages
+from chaserdock.evaluation.rendezvous import last_leg, rendezvous
+from chaserdock.evaluation.transfers import load_shipped
+
+
+def test_last_leg_starts_at_the_last_hold_point() -> None:
+    scenario = load_shipped("v-bar")
+    leg = last_leg(scenario)
+    assert leg.chasers[0].position_m == scenario.timeline[-2].offset_m
+    assert [(entry.at_s, entry.command) for entry in leg.timeline] == [(20.0, "approach")]
+    images = last_leg(scenario, images=True)
+    assert images.ranging is None
+    assert images.perception.name == "default"
+    assert np.hypot(*images.chasers[0].position_m[:2]) == pytest.approx(2.5)
+
+
+def test_relative_velocity_at_200_m_is_known_well_enough_for_a_passively_safe_move() -> None:
+    """After 20 s: the errors agree with their covariance, and the move to the first hold point is not refused."""
+    scenario = load_shipped("v-bar", "duration_s=40.0", "timeline=[]")
+    with InProcessMission(scenario, RenderedImages(scenario)) as flight:
+        record = flight.step()
+        while record.time_s < 20.0:
+            record = flight.step()
+        machine = flight.controller.guidance.machine
+        assert machine.escapes is not None
+        known = machine.escapes.relative[0]
+    own, target = record.states["chaser/0"], record.states["target"]
+    error = known.state[3:] - (own.velocity_m_s - target.velocity_m_s)
+    sigma = np.sqrt(np.diag(known.covariance))[3:]
+    assert np.all(np.abs(error) < 4.0 * sigma)
+    assert sigma[1] < 5e-4
+    assert np.linalg.norm(known.target.omega_rad_s) < 3e-5
+
+
+@pytest.mark.slow
+def test_last_leg_of_v_bar_ends_with_a_verified_latch_and_a_hand_over_without_a_jump() -> None:
+    scenario = last_leg(load_shipped("v-bar"))
+    out = rendezvous(scenario, RenderedImages(scenario))
+    assert out.verified_s is not None
+    assert not out.contacts
+    assert out.keep_out_margin_m > 0.0
+    assert out.hand_over is not None
+    assert out.hand_over.step_sigmas < 4.0
+    assert out.contact_lateral_m < scenario.docking.tolerances.lateral_m
+    assert out.contact_closing_m_s < scenario.docking.tolerances.closing_m_s

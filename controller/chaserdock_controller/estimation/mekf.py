@@ -16,7 +16,7 @@ from chaserdock_models.arrays import Matrix3, Vector3
 from .camera_calibration import ERRORS
 from .filter_update import FilterState, process_exposure
 from .hypothesis import predict
-from .parameters import MekfParameters
+from .parameters import Matrix9, MekfParameters
 from .replay import ReplayingFilter, ReplayRecord
 from .target_hypotheses import POSE, is_lost, mixture_covariance, target_state
 from .types import (
@@ -101,11 +101,11 @@ class Mekf(ReplayingFilter[Exposure, FilterState]):
         best = hypotheses[0]
         return target_state(state, time_ns, best, covariance, is_lost(best.covariance, p), p)
 
-    def change_body(self, inertia: Matrix3, centre_trf_m: Vector3) -> None:
+    def change_body(self, inertia: Matrix3, centre_trf_m: Vector3, covariance: Matrix9 = ()) -> None:
         """As ``ReplayingFilter``, but from the time of the last update on: older measurements that arrive later keep the
         model before."""
         self._before.append((self._updated_ns, self.target))
-        super().change_body(inertia, centre_trf_m)
+        super().change_body(inertia, centre_trf_m, covariance)
 
     def cameras(self) -> tuple[CameraError, ...]:
         """Return the estimated calibration errors of all cameras, sorted by chaser, at the newest exposure."""

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N] [--first SEED]
-[--sets 0123 013 03] [--silent | --rigid CASE] [--limits FORCE TORQUE] [--set KEY=VALUE] [--results FILE]``.
+[--sets 0123 013 03] [--silent | --rigid CASE | --vision] [--limits FORCE TORQUE] [--set KEY=VALUE]
+[--results FILE]``.
 
 Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one process with the
 scenario's sensors and statistical perception. Tumbles of 5 to 10 degrees/s and attitudes are drawn from the seed. Five
@@ -21,6 +22,12 @@ one chaser 75 s), ``identify`` (10 s of identifying pulses before it, 30 s in al
 drawn from the seed is stuck off from the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser dies at a
 random moment), ``silent`` (feedback; no controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
 
+``--vision``: no capture; the chasers of each set keep their places around the free target for 60 s, which tumbles at 7 degrees/s
+about an axis drawn from the seed, with the same wrong statements. Prints the errors of the ratios of the inertia (its elements over
+its trace, as a share of the largest moment over the trace) and of the centre of mass, and the normalized squared errors of ratios
+(expected 5), centre (3) and relative poses (6). Sightings are drawn (``chaserdock.evaluation.free_tumble_flights``), or with
+``--set 'perception.name="default"'`` those of images.
+
 ``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it.
 """
 
@@ -40,9 +47,12 @@ from chaserdock.evaluation.detumble_flights import (
     stack_scenario,
     with_load_limits,
 )
+from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, tumble_scenario, watch_tumble
 from chaserdock.evaluation.perception import RenderedImages
 from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_controlled, wrong_knowledge
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
+
+VISION_DEG_S, VISION_S = 7.0, 60.0
 
 
 class DetumbleRow(msgspec.Struct, frozen=True):
@@ -254,11 +264,60 @@ def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
     return figures
 
 
+class VisionRow(msgspec.Struct, frozen=True):
+    """One tumble without capture in the results file."""
+
+    chasers: str
+    settings: str
+    outcome: TumbleOutcome
+
+
+def vision_figures(name: str, tumbles: list[TumbleOutcome]) -> Figures:
+    """Return the figures of a set of chasers that watch the free target."""
+    out: Figures = {f"{name}_tumbles": len(tumbles)}
+    for key, unit, values in (
+        ("ratio_error", "share", [t.ratio_error for t in tumbles]),
+        ("stated_error", "share", [t.stated_error for t in tumbles]),
+        ("centre_error", "m", [t.centre_m for t in tumbles]),
+        ("ratio_nees", "of_5", [t.ratio_nees for t in tumbles]),
+        ("centre_nees", "of_3", [t.centre_nees for t in tumbles]),
+        ("pose_nees", "of_6", [t.nees for t in tumbles]),
+    ):
+        out |= {f"{name}_{key}_mean_{unit}": float(np.mean(values))}
+        out |= percentiles(values, f"{name}_{key}", unit, "median", "max")
+    return out
+
+
+def fly_sets_vision(o: argparse.Namespace, seeds: range) -> Figures:
+    """Watch free tumbles with every set of chasers; return the figures."""
+    settings, figures = f"vision set={sorted(o.set)}", {}
+    known = {
+        (row["chasers"], row["outcome"]["seed"]): msgspec.convert(row, VisionRow).outcome
+        for row in read_lines(o.results)
+        if row.get("settings") == settings
+    }
+    for chasers in o.sets:
+        tumbles = []
+        for seed in seeds:
+            outcome = known.get((chasers, seed))
+            if outcome is None:
+                outcome = watch_tumble(
+                    tumble_scenario(seed, [int(c) for c in chasers], VISION_DEG_S, o.set), VISION_S
+                )
+                append_line(o.results, msgspec.to_builtins(VisionRow(chasers, settings, outcome)))
+                print(f"{chasers}: {outcome}", file=sys.stderr, flush=True)
+            tumbles.append(outcome)
+        figures |= (part := vision_figures(f"vision_{chasers}", tumbles))
+        print_figures(part)
+    return figures
+
+
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--silent", action="store_true", help="without a controller")
     cases = ("plan", "identify", "fast", "stuck", "reported", "lost", "silent", "limited")
     parser.add_argument("--rigid", choices=cases, help="identification and plan, on one rigid body")
+    parser.add_argument("--vision", action="store_true", help="what the free tumble shows, without a capture")
     parser.add_argument(
         "--limits", type=float, nargs=2, metavar=("FORCE", "TORQUE"), help="of every port, N and N m"
     )
@@ -272,6 +331,9 @@ def main() -> None:
     number = 2 if o.quick else o.tumbles
     if o.silent:
         write_json(o.json, fly_sets_silent(o, range(o.first, o.first + number)))
+        return
+    if o.vision:
+        write_json(o.json, fly_sets_vision(o, range(o.first, o.first + number)))
         return
     if o.rigid:
         write_json(o.json, fly_sets_rigid(o, range(o.first, o.first + number)))

@@ -3,28 +3,32 @@
 
 Parts: ``free``, ``thrusters``, ``capture`` and ``stack`` (open loop, 30 s, ``--quick`` 5 s; the cases of
 ``chaserdock.evaluation.engine_comparison``) print the largest differences of any body and port, the change of momentum on each
-engine where no load acts, and the time per physics step. ``missions`` flies ``four-chaser-docking`` (30 s), ``docking-contact`` and
-``four-chaser-capture`` in ``chaserdock simulate`` on each engine with the perception ``statistical``, and prints their success.
-``--seeds N``: number of seeds of each mission.
+engine where no load acts, and the time per physics step. ``missions`` flies ``four-chaser-docking`` (30 s), ``docking-contact`` (50 s)
+and ``four-chaser-capture`` (75 s) as ``chaserdock simulate`` does, on each engine with the perception ``statistical``, and prints
+their success and, in closed loop, the largest differences of any body. ``--seeds N``: number of seeds of each mission.
 """
 
 from __future__ import annotations
 
 import math
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+from chaserdock_models import rotations
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
-from common import Figures, make_parser, run_parts
+from common import Figures, make_parser, print_figures, run_parts
 
-from chaserdock.analysis.summary import summarize
+from chaserdock.analysis.flight import Track, load_flight
+from chaserdock.analysis.summary import summary_of
 from chaserdock.evaluation.engine_comparison import CASES, ENGINES, difference, fly_case
 from chaserdock.simulation.mission import simulate
 
 MISSIONS = {
     "four-chaser-docking": ("duration_s=30.0",),
-    "docking-contact": (),
-    "four-chaser-capture": (),
+    "docking-contact": ("duration_s=50.0",),
+    "four-chaser-capture": ("duration_s=75.0",),
 }
 WITHOUT_LOADS = ("free", "capture")
 
@@ -48,27 +52,45 @@ def case(name: str, duration_s: float) -> Figures:
 
 
 def missions(seeds: int) -> Figures:
-    """Return how many missions of each scenario succeed on each engine."""
+    """Return how many missions succeed on each engine, and the largest differences of any body between the engines."""
     figures: Figures = {}
     for name, overrides in MISSIONS.items():
-        for engine in ENGINES:
-            successes = 0
-            for seed in range(seeds):
-                failures = failures_of(name, engine, seed, overrides)
-                successes += not failures
+        successes, apart_m, apart_deg = dict.fromkeys(ENGINES, 0), 0.0, 0.0
+        for seed in range(seeds):
+            flights = {}
+            for engine in ENGINES:
+                flights[engine], failures = fly_mission(name, engine, seed, overrides)
+                successes[engine] += not failures
                 print(f"  {name}, {engine}, seed {seed}: {'; '.join(failures) or 'success'}", flush=True)
-            figures[f"{name}_{engine}_success_share"] = successes / seeds
+            distance_m, angle_deg = tracks_apart(*flights.values())
+            apart_m, apart_deg = max(apart_m, distance_m), max(apart_deg, angle_deg)
+        figures |= {f"{name}_{engine}_success_share": n / seeds for engine, n in successes.items()}
+        figures |= {f"{name}_position_m": apart_m, f"{name}_attitude_deg": apart_deg}
+        print_figures({key: value for key, value in figures.items() if key.startswith(name)})
     return figures
 
 
-def failures_of(name: str, engine: str, seed: int, overrides: tuple[str, ...]) -> list[str]:
-    """Fly a mission in this process; return why it is no success."""
+def fly_mission(
+    name: str, engine: str, seed: int, overrides: tuple[str, ...]
+) -> tuple[Mapping[str, Track], list[str]]:
+    """Fly a mission in this process; return the true motion of its bodies, and why it is no success."""
     settings = (*overrides, f"seed={seed}", f"world.engine={engine}", "perception.name=statistical")
     with tempfile.TemporaryDirectory() as folder:
         flight = simulate(shipped_scenario(name), Path(folder), settings)
         if flight.crashes or flight.stalled:
-            return [*flight.crashes.values(), *flight.stalled]
-        return summarize(Path(folder) / "mission.mcap")["failures"]
+            raise SystemExit("\n".join([*flight.crashes.values(), *flight.stalled]))
+        recorded = load_flight(Path(folder) / "mission.mcap")
+        return recorded.truth, summary_of(recorded)["failures"]
+
+
+def tracks_apart(a: Mapping[str, Track], b: Mapping[str, Track]) -> tuple[float, float]:
+    """Return the largest differences of position (m) and attitude (degrees) of any body at one time."""
+    distance_m = angle_rad = 0.0
+    for name, track in a.items():
+        other = b[name]
+        distance_m = max(distance_m, float(np.linalg.norm(track.position_m - other.position_m, axis=1).max()))
+        angle_rad = max(angle_rad, float(np.max(rotations.angle_between(track.q_wxyz, other.q_wxyz))))
+    return distance_m, math.degrees(angle_rad)
 
 
 def main() -> None:

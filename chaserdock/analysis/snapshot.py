@@ -69,9 +69,7 @@ def annotated_image(
             cv2.polylines(canvas, [points], True, _MARKER, 1, cv2.LINE_AA, 4)
         if sighting.solutions:
             _draw_axes(canvas, scenario, sighting, scale)
-    count = len(sighting.marker_ids) if sighting else 0
-    seen = f"{count} marker{'s' if count > 1 else ''}" if count else "no marker"
-    text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen}"
+    text = f"chaser {image.chaser}  {image.sim_time_ns / 1e9:.2f} s  {seen_text(sighting)}"
     (length_px, _), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)
     size = 0.5 * min(1.0, (width_px - 16) / length_px)  # shrink the text on a small image
     cv2.putText(canvas, text, (8, 18), cv2.FONT_HERSHEY_SIMPLEX, size, _TEXT, 1, cv2.LINE_AA)
@@ -90,3 +88,11 @@ def _draw_axes(canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Si
     for k, colour in enumerate(_AXES):
         a, b = ends[0].tolist(), ends[k + 1].tolist()
         cv2.line(canvas, a, b, colour, 2, cv2.LINE_AA, 4)
+
+
+def seen_text(sighting: Sighting | None) -> str:
+    """Return by what a sighting found the target: a number of markers, or its shape."""
+    count = len(sighting.marker_ids) if sighting else 0
+    if count:
+        return f"{count} marker{'s' if count > 1 else ''}"
+    return "seen by its shape" if sighting is not None and sighting.solutions else "no marker"

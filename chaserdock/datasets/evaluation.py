@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 import time
 from collections.abc import Callable, Sequence
 from typing import Any, get_args
@@ -41,9 +41,8 @@ def perception_of(name: str | None, flight: FlightScenario, camera: Camera) -> P
 
 
 def _of_class(name: str, flight: FlightScenario, camera: Camera) -> PerceptionMethod:
-    module, _, attribute = name.partition(":")
     try:
-        factory: Callable[..., PerceptionMethod] = getattr(importlib.import_module(module), attribute)
+        factory: Callable[..., PerceptionMethod] = pkgutil.resolve_name(name)
         return factory(camera, flight.target_model())
     except Exception as error:  # a user's module may raise anything
         raise DatasetError(f"--perception {name}: cannot be made: {type(error).__name__}: {error}") from error

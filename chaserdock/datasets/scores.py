@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from .types import PoseLabel, TargetShape
 
@@ -63,7 +63,7 @@ def add_m(estimate: PoseLabel, truth: PoseLabel, shape: TargetShape) -> float:
     """Return ADD, or ADD-S of a symmetric target, m."""
     a, b = (rotations.rotate(p.q_irf_trf_wxyz, shape.points_m) + p.position_irf_m for p in (estimate, truth))
     if shape.symmetric:
-        return float(np.mean(cKDTree(a).query(b)[0]))
+        return float(np.mean(KDTree(a).query(b)[0]))
     return float(np.mean(np.linalg.norm(a - b, axis=1)))
 
 

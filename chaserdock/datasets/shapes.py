@@ -9,7 +9,7 @@ from collections import defaultdict
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.meshes import Material, TriangleMesh
-from scipy.spatial import ConvexHull, QhullError, cKDTree
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from .types import TargetShape
 
@@ -47,7 +47,7 @@ def _symmetries(mesh: TriangleMesh, tolerance_m: float) -> Array:
     for part in mesh.parts:
         by_material[part.material].append(part.vertices_m)
     clouds = [np.concatenate(parts) for parts in by_material.values()]
-    trees = [cKDTree(cloud) for cloud in clouds]
+    trees = [KDTree(cloud) for cloud in clouds]
 
     def leaves_unchanged(turn: Array) -> bool:
         return all(

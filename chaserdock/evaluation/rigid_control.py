@@ -13,8 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from chaserdock_controller.estimation.identification.composite import properties_of
 from chaserdock_controller.estimation.identification.stage import StackIdentification
+from chaserdock_controller.estimation.mass_properties import properties_of
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime
 from chaserdock_controller.guidance.detumble.control import DetumbleControl, StackState, StackTask
@@ -309,6 +309,9 @@ def wrong_knowledge(seed: int, share: float = 0.3, errors: bool = True) -> list[
         f"target.inertia_kg_m2=[{moment},{moment},{moment}]",
         "target.inertia_products_kg_m2=[0.0,0.0,0.0]",
         "target.centre_of_mass_m=[0.0,0.0,0.0]",
+        "target.mass_sigma_share=0.3",
+        "target.inertia_sigma_share=0.3",
+        "target.centre_of_mass_sigma_m=0.1",
         "detumble.identification.enabled=true",
     ]
     return out + (

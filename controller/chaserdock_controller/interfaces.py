@@ -32,7 +32,7 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 
-from .estimation.identification.composite import MassProperties
+from .estimation.mass_properties import MassProperties
 from .estimation.target_body import TargetBody
 from .estimation.types import RelativePose, TargetState
 from .guidance.phases import Phase

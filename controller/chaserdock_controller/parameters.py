@@ -14,6 +14,7 @@ from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.types import Estimator
 
 from .estimation import make_estimator
+from .estimation.composite_body import rows_of, stated_properties
 from .estimation.joint import JointEstimator, JointParameters
 from .estimation.joint.parameters import RANGING, SHAPE, TARGET_NOISE
 from .nmpc import NmpcParameters
@@ -63,6 +64,7 @@ def estimator_of(scenario: FlightScenario) -> Estimator | JointEstimator:
         motion_model="torque_free" if target.motion == "torque_free" else "constant_rates",
         inertia_ratios=((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)),
         centre_of_mass_trf_m=target.centre_of_mass_m,
+        body_covariance=rows_of(stated_properties(scenario).covariance[1:, 1:]),
         bias_position_m=errors.camera_shift_m,
         bias_attitude_rad=errors.camera_turn_rad,
         bias_focal_share=errors.camera_focal_share,

@@ -82,7 +82,7 @@ def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_
     for number in range(6):
         _, told = seen(mesh, number)
         information, vector = information + told.matrix, vector + told.vector
-    covariance = np.linalg.inv(information)
+    covariance = np.asarray(np.linalg.inv(information), dtype=float)
     mean = covariance @ vector
     # The scale is hardly observable without its effect on the range; the panels are.
     np.testing.assert_allclose(mean[:2], true[:2], atol=0.4)

@@ -133,15 +133,15 @@ def test_satellite_is_tracked_as_known_with_the_uncertainty_of_its_joints_and_sc
     mesh, known = tracker_mesh(target), target.known_mesh()
     assert known is not None
     assert len(mesh.triangles) == known.triangle_count
-    assert len(mesh.modes_m) == 3 * len(known.joints) + 1
+    # Turns of the joints, scale, and the border of the panels' cells.
+    assert len(mesh.modes_m) == 3 * len(known.joints) + 2
+    turns, scale = mesh.modes_m[:-2], mesh.modes_m[-2]
     body = np.concatenate([np.full(len(p.vertices_m), not p.joint) for p in known.parts])
-    assert np.allclose(mesh.modes_m[-1][body], 0.01 * mesh.vertices_m[body])
-    assert np.all(mesh.modes_m[:-1][:, body] == 0.0)
+    assert np.allclose(scale[body], 0.01 * mesh.vertices_m[body])
+    assert np.all(turns[:, body] == 0.0)
     tip = np.abs(mesh.vertices_m[:, 1]).argmax()
     arm = np.linalg.norm(
         mesh.vertices_m[tip]
         - min(known.joints.values(), key=lambda j: np.linalg.norm(mesh.vertices_m[tip] - j))
     )
-    assert np.linalg.norm(mesh.modes_m[:-1, tip], axis=1).max() == pytest.approx(
-        np.deg2rad(1.0) * arm, rel=0.02
-    )
+    assert np.linalg.norm(turns[:, tip], axis=1).max() == pytest.approx(np.deg2rad(1.0) * arm, rel=0.02)

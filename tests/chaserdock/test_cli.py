@@ -101,6 +101,7 @@ def test_help_lists_every_command_in_its_group() -> None:
         "Look at a flight",
         "Logs",
         "Reproduce and compare",
+        "Datasets",
         "Setup",
     ]
     assert [line.rstrip(":") for line in text.splitlines() if re.match(r"[A-Z][a-z ]+:$", line)] == [

@@ -63,6 +63,12 @@ def drawn(vertices: NDArray[Any], triangles: NDArray[Any], shape: tuple[int, int
     return mask > 0
 
 
+def grey(path: str) -> NDArray[np.uint8]:
+    pixels = cv2.imread(path, cv2.IMREAD_GRAYSCALE)
+    assert pixels is not None
+    return np.asarray(pixels, dtype=np.uint8)
+
+
 def overlap(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> float:
     return float((a & b).sum() / (a | b).sum())
 
@@ -84,11 +90,9 @@ def test_bop_layout_read_by_other_code_agrees_with_its_masks(exported: Path) -> 
             k = np.reshape(json.loads((scene / "scene_camera.json").read_text())[number]["cam_K"], (3, 3))
             turn, at = np.reshape(label["cam_R_m2c"], (3, 3)), np.array(label["cam_t_m2c"])
             px, _ = cv2.projectPoints(model.vertices, cv2.Rodrigues(turn)[0], at, k, None)
-            mask = cv2.imread(str(scene / f"mask/{int(number):06d}_000000.png"), cv2.IMREAD_GRAYSCALE) > 0
+            mask = grey(str(scene / f"mask/{int(number):06d}_000000.png")) > 0
             assert overlap(drawn(px[:, 0], model.faces, mask.shape), mask) > 0.97
-            visible = (
-                cv2.imread(str(scene / f"mask_visib/{int(number):06d}_000000.png"), cv2.IMREAD_GRAYSCALE) > 0
-            )
+            visible = grey(str(scene / f"mask_visib/{int(number):06d}_000000.png")) > 0
             (gt_info,) = json.loads((scene / "scene_gt_info.json").read_text())[number]
             assert gt_info["px_count_visib"] == visible.sum() <= gt_info["px_count_all"]
             assert not np.any(visible & ~mask)
@@ -105,7 +109,7 @@ def test_both_layouts_hold_the_same_images_and_labels(exported: Path) -> None:
     assert bop.camera == speed.camera
     assert [i.split for i in speed.images] == ["train"] * 3 + ["validation"]
     for a, b in zip(bop.images, speed.images, strict=True):
-        assert cv2.imread(str(a.path)).tobytes() == cv2.imread(str(b.path)).tobytes()
+        assert np.array_equal(grey(str(a.path)), grey(str(b.path)))
         np.testing.assert_allclose(a.label.position_irf_m, b.label.position_irf_m, atol=1e-12)
         assert rotations.angle_between(a.label.q_irf_trf_wxyz, b.label.q_irf_trf_wxyz) < 1e-7
 
@@ -123,9 +127,9 @@ def test_speed_plus_labels_and_distortion_agree_with_the_mask(tmp_path: Path) ->
             1e-3 * model.vertices, turn, np.array(label["r_Vo2To_vbs_true"]),
             np.array(camera["cameraMatrix"]), np.array(camera["distCoeffs"]),
         )  # fmt: skip
-        mask = cv2.imread(str(root / "synthetic/masks" / label["filename"]), cv2.IMREAD_GRAYSCALE) > 0
+        mask = grey(str(root / "synthetic/masks" / label["filename"])) > 0
         assert overlap(drawn(px[:, 0], model.faces, mask.shape), mask) > 0.95
-        image = cv2.imread(str(root / "synthetic/images" / label["filename"]), cv2.IMREAD_GRAYSCALE)
+        image = grey(str(root / "synthetic/images" / label["filename"]))
         assert image[mask].mean() > 3.0 * image[~mask].mean()
 
 
@@ -285,7 +289,12 @@ def test_export_refuses_what_it_cannot_label(tmp_path: Path) -> None:
         export_dataset(scenario(), tmp_path / "b", 1, LIMITS, ("bop",))
     with pytest.raises(DatasetError, match="remove the errors of the camera"):
         export_dataset(scenario('navigation.grade="lab"'), tmp_path / "c", 1, LIMITS, ("bop",))
-    for wrong in ({"range_m": (2.0, 1.0)}, {"phase_deg": (0.0, 181.0)}, {"offset_share": 1.5}):
+    wrongs: tuple[dict[str, Any], ...] = (
+        {"range_m": (2.0, 1.0)},
+        {"phase_deg": (0.0, 181.0)},
+        {"offset_share": 1.5},
+    )
+    for wrong in wrongs:
         with pytest.raises(DatasetError, match="must be"):
             ViewLimits(**wrong)
 

@@ -1,84 +1,87 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The shape of a target that tumbles freely, from measured poses."""
+"""What the joint filter finds of a target that tumbles freely, from what the chasers' cameras see."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from chaserdock_controller.estimation.identification.composite import (
-    IdentificationParameters,
-    prior_of,
-    properties_of,
-)
-from chaserdock_controller.estimation.identification.free_tumble import TumbleIdentification
-from chaserdock_controller.estimation.target_body import TargetBody
-from chaserdock_controller.estimation.types import CameraPose, Measurement, PoseHypothesis
-from chaserdock_models import rotations
-from chaserdock_models.rigid_body import BodyState, free_rotation
-from chaserdock_protocol.scenario.navigation import NavigationSection
+from chaserdock_controller.estimation.joint.prediction import predict_target
+from chaserdock_controller.estimation.joint.state import JointState, empty_state, start_shape, with_body
+from chaserdock_controller.parameters import estimator_of
+from chaserdock_controller.redundancy.serialization import decode, encode
+from chaserdock_protocol.scenario import Scenario, flight_scenario
 from detumble_cases import target_alone
 
-SIGMA_M, SIGMA_RAD, STEP_S = 0.001, 0.002, 0.2
+from chaserdock.evaluation.detumble_flights import stack_scenario
+from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, watch_tumble
+from chaserdock.evaluation.rigid_control import wrong_knowledge
 
 
-def watch(omega: list[float], seconds: float = 60.0) -> tuple[TumbleIdentification, TargetBody]:
-    """Measure the pose of a tumbling target with two cameras that are turned by 1 mrad, at 5 Hz."""
-    rng, body = np.random.default_rng(1), target_alone()
-    count = round(seconds / STEP_S)
-    qs, omegas, _ = free_rotation([1.0, 0.0, 0.0, 0.0], np.radians(omega), body.inertia_kg_m2, STEP_S, count)
-    errors = [rotations.exp(np.array([1e-3, 0.0, -1e-3])), rotations.exp(np.array([0.0, 1e-3, 0.0]))]
-    covariance = np.diag([SIGMA_M**2] * 3 + [SIGMA_RAD**2] * 3)
-    stated = TargetBody(150.0, 20.0 * np.eye(3), np.zeros(3))
-    found = None
-    for k, (q, rate) in enumerate(zip(qs, omegas, strict=True)):
-        position = -rotations.rotate(q, body.centre_trf_m)
-        measurements = []
-        for i, error in enumerate(errors):
-            turn = rotations.exp(rng.normal(0.0, SIGMA_RAD, 3))
-            measured = rotations.multiply(rotations.multiply(q, error), turn)
-            pose = PoseHypothesis(position + rng.normal(0.0, SIGMA_M, 3), measured, covariance)
-            away = PoseHypothesis(
-                pose.position_m, rotations.multiply(measured, [0.0, 1.0, 0.0, 0.0]), covariance
-            )
-            camera = CameraPose(np.array([1.5, 0.0, 0.0]), np.array([1.0, 0.0, 0.0, 0.0]))
-            measurements.append(Measurement(i, 0, (away, pose), 1, camera))
-        if found is None:
-            moving = -np.cross(rotations.rotate(q, rate), rotations.rotate(q, body.centre_trf_m))
-            start = BodyState(position, moving + 0.003, q, rate + 0.002)
-            sensors = NavigationSection(grade="exact").errors()
-            parameters = IdentificationParameters()
-            found = TumbleIdentification(prior_of(stated, parameters), (0, 1), start, sensors, parameters)
-        found.step(measurements, STEP_S, first=k == 0)
-    assert found is not None
-    return found, body
+def scenario_of(omega_deg_s: list[float], *more: str) -> Scenario:
+    """Return ``detumble`` with two chasers, and a target of which mass, inertia and centre are stated wrong."""
+    scenario = stack_scenario(1, [0, 1], [*wrong_knowledge(1), *more])
+    target = scenario.target.model_copy(update={"omega_rad_s": tuple(np.radians(omega_deg_s).tolist())})
+    return scenario.model_copy(update={"target": target})
 
 
 @pytest.fixture(scope="module")
-def tumble() -> tuple[TumbleIdentification, TargetBody]:
-    return watch([4.0, -3.0, 5.0])
+def tumble() -> TumbleOutcome:
+    return watch_tumble(scenario_of([8.0, -6.0, 10.0]), 20.0)
 
 
-def test_a_tumble_shows_ratios_and_centre_but_not_the_scale(
-    tumble: tuple[TumbleIdentification, TargetBody],
-) -> None:
-    found, body = tumble
-    ratios, covariance = found.ratios
-    true = properties_of(body)[4:]
-    error = ratios - true / true[:3].sum()
-    assert np.abs(error).max() < 0.01 * 25.0 / 60.0
-    nees = error @ np.linalg.pinv(covariance, rcond=1e-6, hermitian=True) @ error / 5.0
-    assert nees < 3.0
-    assert np.linalg.norm(found.target.body.centre_trf_m - body.centre_trf_m) < 0.002
-    trace = np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
-    assert math.sqrt(trace @ found.target.covariance[4:, 4:] @ trace) > 0.1 * 60.0
-    assert math.sqrt(found.target.covariance[0, 0]) == pytest.approx(0.3 * 150.0, rel=0.01)
+def test_a_tumble_shows_ratios_and_centre(tumble: TumbleOutcome) -> None:
+    assert tumble.stated_error > 0.1
+    assert tumble.ratio_error < 0.3 * tumble.stated_error
+    assert tumble.centre_m < 0.003
+    assert tumble.ratio_nees < 20.5  # 0.999 quantile, 5 degrees of freedom
+    assert tumble.centre_nees < 16.3
 
 
-def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(
-    tumble: tuple[TumbleIdentification, TargetBody],
-) -> None:
+def test_relative_poses_are_consistent_although_the_inertia_is_wrong(tumble: TumbleOutcome) -> None:
+    assert 0.5 < tumble.nees < 15.0
+    sure = ("target.inertia_sigma_share=1e-6", "target.centre_of_mass_sigma_m=1e-6")
+    assert watch_tumble(scenario_of([4.0, -3.0, 5.0], *sure), 13.0).nees > 30.0
+
+
+def test_a_spin_about_a_principal_axis_leaves_the_ratios_unknown(tumble: TumbleOutcome) -> None:
+    """The stated axes are right here, so that the target spins about an axis of the stated inertia."""
     axis = np.linalg.eigh(target_alone().inertia_kg_m2)[1][:, 2]
-    found, _ = watch((7.0 * axis).tolist(), 20.0)
-    assert np.trace(found.ratios[1]) > 100.0 * np.trace(tumble[0].ratios[1])
+    values = "{target=true,mass_kg=150.0,inertia_kg_m2=[20.0,22.0,25.0,0.0,0.0,0.0]}"
+    changes = [f"truth.values=[{values}]", "target.inertia_kg_m2=[22.0,20.0,25.0]", f"seed={axis.size}"]
+    spin = watch_tumble(scenario_of([0.0, 0.0, 7.0], *changes), 8.0)
+    assert spin.ratio_error > 0.5 * spin.stated_error
+    assert spin.ratio_nees < 20.5
+
+
+def test_a_change_of_the_body_restarts_its_shape() -> None:
+    """A prediction beyond a latch uses the new body, with the uncertainty that is stated of it."""
+    flight = flight_scenario(scenario_of([4.0, -3.0, 5.0]))
+    p = estimator_of(flight).parameters  # type: ignore[union-attr]
+    state = replace(
+        start_shape(empty_state(0, 2), p.target), target_known=True, omega_rad_s=np.radians([4.0, -3.0, 5.0])
+    )
+    assert with_body(state, p.target) is state
+    rows = tuple(tuple(row) for row in (1e-2 * np.eye(9)).tolist())
+    other = replace(p.target, inertia_ratios=((10.0, 0, 0), (0, 20.0, 0), (0, 0, 25.0)), body_covariance=rows)
+    after = with_body(state, other)
+    assert after.shape is not None
+    assert np.diag(after.shape.inertia) == pytest.approx(np.array([10.0, 20.0, 25.0]) / 55.0)
+    wide, narrow = (
+        predict_target(s, 2_000_000_000, replace(p, target=t))[1]
+        for s, t in ((state, p.target), (after, other))
+    )
+    assert np.trace(wide[9:, 9:]) > 4.0 * np.trace(narrow[9:, 9:])
+    assert math.isfinite(np.trace(wide))
+
+
+def test_a_checkpoint_keeps_the_shape() -> None:
+    p = estimator_of(flight_scenario(scenario_of([4.0, -3.0, 5.0]))).parameters  # type: ignore[union-attr]
+    state = start_shape(empty_state(0, 2), p.target)
+    again = decode(encode(state), JointState)
+    assert state.shape is not None
+    assert again.shape is not None
+    assert again.shape.inertia.tobytes() == state.shape.inertia.tobytes()
+    assert with_body(again, p.target) is again

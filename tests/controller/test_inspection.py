@@ -108,7 +108,7 @@ def views(true: Array, count: int, seed: int) -> list[tuple[Array, Array, Array]
 
 
 def test_fusion_is_accurate_and_consistent_and_grows_with_coverage() -> None:
-    nees = []
+    nees, fused = [], ShapeFilter.prior(7)
     for seed in range(40):
         true = np.random.default_rng([seed, 1]).normal(size=7)
         fused, spreads = ShapeFilter.prior(7), []

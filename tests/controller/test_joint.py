@@ -167,6 +167,18 @@ def test_update_is_that_of_a_kalman_filter(chasers: int) -> None:
     np.testing.assert_array_equal(after.covariance, after.covariance.T)
 
 
+def test_covariance_of_another_size_is_refused() -> None:
+    """A checkpoint may hold anything, and the kernels check no sizes."""
+    p, state = parameters(SCENARIO, navigation("orbit")), random_state(0)
+    wrong = replace(state, covariance=np.eye(TARGET + CHASER))
+    with pytest.raises(ValueError, match=r"2 chasers with a covariance of shape \(55, 55\)"):
+        predict(wrong, 1, np.zeros((2, 6)), p)
+    with pytest.raises(ValueError, match="2 chasers"):
+        update(wrong, {}, {}, mounting_of(p.camera), p)
+    with pytest.raises(ValueError, match="other numbers of chasers"):
+        predict(replace(state, alive=np.ones(1, dtype=bool)), 1, np.zeros((2, 6)), p)
+
+
 def test_gates_are_quantiles_of_chi_square() -> None:
     assert pytest.approx(chi2.ppf(0.9999, 3), rel=1e-12) == GATE_CHI_SQUARE_3
     assert pytest.approx(chi2.ppf(0.9999, 6), rel=1e-12) == GATE_CHI_SQUARE

@@ -33,12 +33,15 @@ static Measurement *measurement_of(int64_t n) {
     return z;
 }
 
-static Innovation *innovation_of(int64_t n) {
-    const int64_t d = size_of(n), stride = (d + 7) / 8 * 8;
+/* Size of an error vector of n chasers, with or without further components. */
+static int64_t any_size(int64_t n) { return size_of(n) + 8 * whole(0, 1); }
+
+static Innovation *innovation_of(int64_t d) {
+    const int64_t stride = (d + 7) / 8 * 8;
     Innovation *out = block(sizeof *out);
     *out = (Innovation){outputs(MOST_ROWS), outputs(MOST_ROWS * SEEN), outputs(MOST_ROWS * MOST_ROWS),
                         outputs(MOST_ROWS * MOST_ROWS), outputs(MOST_ROWS * stride), outputs(MOST_ROWS * stride), outputs(d),
-                        outputs(CHANNELS + 1), stride};
+                        outputs(CHANNELS + 1), stride, d};
     return out;
 }
 
@@ -50,15 +53,15 @@ static void wrench_at_origin(void) {
 }
 
 static void predict(void) {
-    const int64_t n = whole(1, 2), d = size_of(n);
+    const int64_t n = whole(1, 2), d = any_size(n);
     Motion *m = block(sizeof *m);
     fill((double *)m, (int64_t)(sizeof *m / sizeof(double)), 0.01, 1.0);
     int64_t *alive = block((size_t)n * 8), *latched = block((size_t)n * 8);
     for (int64_t i = 0; i < n; i++) alive[i] = whole(0, 1), latched[i] = whole(0, 1);
     double *mean = means(n), *out = outputs(d * d);
-    NAME(predict)(m, n, doubles(144, -1.0, 1.0), covariances(12), doubles(6 * n, -0.1, 0.1), doubles(6 * n, -0.1, 0.1),
+    NAME(predict)(m, n, d, doubles(144, -1.0, 1.0), covariances(12), doubles(6 * n, -0.1, 0.1), doubles(6 * n, -0.1, 0.1),
                   doubles(n, 0.0, 1.0), doubles(CHASER - 12, 0.0, 1.0), alive, latched, mean, covariances(d), out,
-                  outputs(NAME(predict_workspace)(n)));
+                  outputs(NAME(predict_workspace)(n, d)));
     if (!special_drawn) CHECK(all_finite(out, d * d) && all_finite(mean, TARGET_MEAN + CHASER_MEAN * n));
     for (int64_t i = 0; i < d; i++)
         for (int64_t j = 0; j < i; j++) CHECK(same_bits(out + d * i + j, out + d * j + i, 1));
@@ -101,8 +104,9 @@ static void innovate(void) {
     const Measurement *z = measurement_of(n);
     const int k = rows_of(z);
     double *mean = means(n), *prior = chance(0.5) ? mean : means(n);
-    Innovation *out = innovation_of(n);
-    NAME(innovate)(z, mean, prior, covariances(size_of(n)), out, outputs(NAME(innovate_workspace)(n)));
+    const int64_t d = any_size(n);
+    Innovation *out = innovation_of(d);
+    NAME(innovate)(z, mean, prior, covariances(d), out, outputs(NAME(innovate_workspace)(d)));
     if (!special_drawn) CHECK(all_finite(out->s, k * k) && all_finite(out->cross, k * out->stride));
     if (!special_drawn && z->sighting) CHECK(out->values[0] >= 0.0 && out->values[CHANNELS] > 0.0);
     for (int c = 0; c < CHANNELS; c++) CHECK(out->values[c] >= 0.0 || out->values[c] != out->values[c]);
@@ -111,7 +115,7 @@ static void innovate(void) {
 /* Random rows of a random innovation, by a covariance that is not always positive definite. */
 static void correct(void) {
     const int64_t n = whole(1, 2), k = whole(1, MOST_ROWS), size = TARGET_MEAN + CHASER_MEAN * n;
-    Innovation *z = innovation_of(n);
+    Innovation *z = innovation_of(any_size(n));
     int64_t *used = block((size_t)k * sizeof *used), m = 0;
     for (int64_t r = 0; r < k; r++)
         if (chance(0.7)) used[m++] = r;
@@ -124,19 +128,19 @@ static void correct(void) {
 }
 
 static void reduce(void) {
-    const int64_t n = whole(1, 2), m = whole(0, MOST_ROWS), d = size_of(n);
-    Innovation *z = innovation_of(n);
+    const int64_t n = whole(1, 2), m = whole(0, MOST_ROWS), d = any_size(n);
+    Innovation *z = innovation_of(d);
     double *p = covariances(d);
     fill(z->white, m * z->stride, -0.01, 0.01);
     fill(z->correction, d, -0.1, 0.1);
-    NAME(reduce)(n, whole(0, n - 1), m, z, p);
+    NAME(reduce)(whole(0, n - 1), m, z, p);
     for (int64_t i = 0; i < d && !special_drawn; i++) CHECK(finite(p[d * i + i]));
 }
 
 static void complete(void) {
-    const int64_t n = whole(0, 3), d = size_of(n);
+    const int64_t d = any_size(whole(0, 3));
     double *p = doubles(d * d, -1.0, 1.0);
-    NAME(complete)(n, p);
+    NAME(complete)(d, p);
     for (int64_t i = 0; i < d; i++)
         for (int64_t j = 0; j < i; j++) CHECK(same_bits(p + d * i + j, p + d * j + i, 1));
 }

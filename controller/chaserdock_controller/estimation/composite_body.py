@@ -9,13 +9,17 @@ from collections.abc import Mapping
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.mounting import MountedChaser
 from chaserdock_protocol.messages import DockingStatus, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import AppliedImpulse
 
+from .body_shape import BodyShape
 from .joint import JointEstimator
-from .target_body import TargetBody, attach_bodies
+from .mass_properties import MassProperties, attach, prior_of, with_shape
+from .parameters import Matrix9
+from .target_body import TargetBody
 from .types import Estimator, Shock, TargetState
 
 _TOUCH = Shock(0.005, 0.01)
@@ -32,6 +36,19 @@ def target_body(scenario: FlightScenario) -> TargetBody:
     return TargetBody(target.mass_kg, target.inertia_tensor, np.array(target.centre_of_mass_m))
 
 
+def stated_properties(scenario: FlightScenario) -> MassProperties:
+    """Return the scenario's target without any chaser, with the covariance of what is not known of it."""
+    t = scenario.target
+    return prior_of(
+        target_body(scenario), t.mass_sigma_share, t.inertia_sigma_share, t.centre_of_mass_sigma_m
+    )
+
+
+def rows_of(covariance: Array) -> Matrix9:
+    """Return a covariance as ``MekfParameters.body_covariance``."""
+    return tuple(tuple(row) for row in covariance.tolist())
+
+
 def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Array]:
     """Return a chaser's estimated centre (3,) and attitude (4,) in TRF."""
     centre = rotations.rotate_inverse(target.q_wxyz, np.array(odometry.position_m) - target.position_m)
@@ -39,13 +56,14 @@ def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Arra
 
 
 class CompositeBody:
-    """Chasers whose latch holds the target (``latched``), and the body that they form with it."""
+    """Chasers whose latch holds the target (``latched``), and the body that they form with it (``body``), by what is known of the
+    target alone at the last change of a latch."""
 
     def __init__(self, scenario: FlightScenario, estimator: Estimator | JointEstimator) -> None:
         self._scenario = scenario
         self._estimator = estimator
-        self._target_alone = target_body(scenario)
-        self.body = self._target_alone
+        self._target_alone = stated_properties(scenario)
+        self.body = self._target_alone.body
         self.latched: frozenset[int] = frozenset()
         self._changed = False
 
@@ -59,6 +77,8 @@ class CompositeBody:
         """Inform the estimator of contacts, latch changes and impulses of latched chasers, before a tick's sightings."""
         latched = self.latched - docking.keys() | {i for i, status in docking.items() if status.latched}
         changed = latched != self.latched
+        if changed:
+            self._target_alone = self.target
         if changed or any(s.contact and not s.latched for s in docking.values()):
             self._estimator.disturb(_TOUCH)
         else:
@@ -88,9 +108,29 @@ class CompositeBody:
             sigmas[1] = math.hypot(sigmas[1], turned)
         self._estimator.disturb(Shock(sigmas[0], sigmas[1], velocity, omega))
 
-    def refine_target(self, body: TargetBody) -> None:
+    @property
+    def target(self) -> MassProperties:
+        """Return the mass properties of the target alone: while nothing is latched, with the shape that its motion shows."""
+        estimated = self._estimated_shape() if not self.latched else None
+        return self._target_alone if estimated is None else with_shape(self._target_alone, *estimated)
+
+    @property
+    def moving(self) -> TargetBody:
+        """Return the body that moves with the target, with the shape that its motion shows."""
+        estimated = self._estimated_shape()
+        if estimated is None:
+            return self.body
+        shape, _ = estimated
+        return TargetBody(
+            self.body.mass_kg, float(np.trace(self.body.inertia_kg_m2)) * shape.inertia, shape.centre_m
+        )
+
+    def _estimated_shape(self) -> tuple[BodyShape, Array] | None:
+        return self._estimator.shape if isinstance(self._estimator, JointEstimator) else None
+
+    def refine_target(self, target: MassProperties) -> None:
         """Replace the target's mass properties by identified ones, from the next update on."""
-        self._target_alone = body
+        self._target_alone = target
         self._changed = True
 
     def update_body(self, target: TargetState, odometry: Mapping[int, Odometry]) -> None:
@@ -101,12 +141,14 @@ class CompositeBody:
         if not self._changed or not self.latched <= odometry.keys():
             return
         chaser = self._scenario.chaser
-        parts = []
-        for i in sorted(self.latched):
-            centre, attitude = pose_in_target(target, odometry[i])
-            parts.append((chaser.mass_kg, np.asarray(chaser.inertia), centre, attitude))
-        self.body = attach_bodies(self._target_alone, parts)
+        mounted = {i: MountedChaser(*pose_in_target(target, odometry[i])) for i in sorted(self.latched)}
+        stack = attach(self._target_alone, mounted, chaser)
+        self.body = stack.body
         rows = self.body.inertia_kg_m2.tolist()
         centre = self.body.centre_trf_m.tolist()
-        self._estimator.change_body((tuple(rows[0]), tuple(rows[1]), tuple(rows[2])), tuple(centre))
+        inertia = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
+        if isinstance(self._estimator, JointEstimator):
+            self._estimator.change_body(inertia, tuple(centre), rows_of(stack.covariance[1:, 1:]))
+        else:
+            self._estimator.change_body(inertia, tuple(centre))
         self._changed = False

@@ -14,10 +14,11 @@ from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.rigid_body import rk4_step
 
+from .body_shape import RATIO_BASIS, SHAPE, BodyShape
 from .parameters import MekfParameters
 from .types import Array
 
-_EYE3 = np.eye(3)
+_EYE3, _EYE12, _ZERO3 = np.eye(3), np.eye(12), np.zeros(3)
 
 
 def constant_rates(q_wxyz: Array, omega_rad_s: Array, dt_s: float) -> tuple[Array, Array, Array]:
@@ -60,6 +61,93 @@ def torque_free(
         y = rk4_step(derivative, y, dt_s / n)
         y[:4] = so3.normalize(y[:4])
     return y[:4], y[4:7], y[7:].reshape(6, 6)
+
+
+def free_shape(
+    motion: tuple[Array, Array, Array, Array], dt_s: float, shape: BodyShape, mean_motion_rad_s: float = 0.0
+) -> tuple[tuple[Array, Array, Array, Array], Array]:
+    """Return position, velocity, attitude and rate of TRF after ``dt_s``, and the transition (12, 20) by their errors and
+    the error of ``shape``.
+
+    The body rotates freely and its centre of mass moves at constant velocity. ``mean_motion_rad_s``: WRF turns at this rate about
+    its Z axis, as the Hill frame of a circular orbit does, and the gravity gradient acts.
+    """
+    position, velocity, q, omega = motion
+    q_after, omega_after, turned = _rotation(q, omega, dt_s, shape, mean_motion_rad_s)
+    f = np.zeros((12, 12 + SHAPE))
+    f[0:12, 0:12] = _EYE12
+    f[0, 3] = f[1, 4] = f[2, 5] = dt_s
+    f[6:12, 6:17] = turned
+    c = shape.centre_m
+    r, r_after = so3.to_matrix(q), so3.to_matrix(q_after)
+    spin, spin_after = so3.skew(omega), so3.skew(omega_after)
+    centre_velocity = velocity + r @ (spin @ c)
+    centre = position + r @ c + centre_velocity * dt_s
+    # Errors of TRF's origin to those of the centre of mass, transition, and back; the matrix of the way back is 2 - that there.
+    there, back = to_centre(q, omega, c), 2.0 * _EYE12 - to_centre(q_after, omega_after, c)
+    by_centre = f[:, 0:3] @ r + f[:, 3:6] @ (r @ spin)
+    by_centre[0:3] -= r_after
+    by_centre[3:6] -= r_after @ spin_after
+    f[:, 0:12] = f[:, 0:12] @ there
+    f[:, 17:20] = by_centre
+    position_after = centre - r_after @ c
+    return (position_after, centre_velocity - r_after @ (spin_after @ c), q_after, omega_after), back @ f
+
+
+def _rotation(
+    q_wxyz: Array, omega_rad_s: Array, dt_s: float, shape: BodyShape, mean_motion_rad_s: float
+) -> tuple[Array, Array, Array]:
+    """Return attitude, rate and the transition (6, 11) of (dtheta, domega) by themselves and by the ratios of the inertia.
+
+    With W the rate of WRF in TRF axes, which changes by W' = -omega x W, the body turns in space at Omega = omega + W:
+    I Omega' = T - Omega x I Omega, omega' = Omega' + omega x W, and T = 3 n^2 u x I u with u away from the Earth. The change of T with
+    an error (4e-6 1/s^2 at most) is left out of the transition. Attitude and rate by RK4, in the steps of ``torque_free``; the
+    transition of a step to third order, with the derivatives in its middle.
+    """
+    steps = max(1, math.ceil(abs(dt_s) * max(2.0, 10.0 * math.sqrt(float(omega_rad_s @ omega_rad_s)))))
+    inertia, n, h = shape.inertia, mean_motion_rad_s, dt_s / steps
+    inverse = np.linalg.inv(inertia)
+
+    def frame(q: Array) -> tuple[Array, Array]:
+        """Return W and T."""
+        if n == 0.0:
+            return _ZERO3, _ZERO3
+        axes = so3.to_matrix(q)
+        return n * axes[2], 3.0 * n * n * (so3.skew(axes[0]) @ (inertia @ axes[0]))
+
+    def derivative(y: Array) -> Array:
+        w = y[4:]
+        turning, torque = frame(y[:4])
+        total = w + turning
+        alpha = inverse @ (torque - so3.skew(total) @ (inertia @ total))
+        q_rate = 0.5 * so3.multiply(y[:4], np.array([0.0, *w.tolist()]))
+        return np.concatenate([q_rate, alpha if n == 0.0 else alpha + so3.skew(w) @ turning])
+
+    y, transition = np.concatenate([q_wxyz, omega_rad_s]), np.eye(6, 11)
+    for _ in range(steps):
+        middle = y + 0.5 * h * derivative(y)
+        y = rk4_step(derivative, y, h)
+        y[:4] = so3.normalize(y[:4])
+        middle[4:] = 0.5 * (middle[4:] + y[4:] - 0.5 * h * derivative(y)[4:])
+        w = middle[4:]
+        turning, torque = frame(so3.normalize(middle[:4]))
+        total = w + turning
+        spin, momentum = so3.skew(total), inertia @ total
+        alpha = inverse @ (torque - spin @ momentum)
+        a = np.zeros((6, 6))
+        a[:3, :3] = -so3.skew(w)
+        a[:3, 3:] = _EYE3
+        a[3:, 3:] = inverse @ (so3.skew(momentum) - spin @ inertia)
+        if n:
+            turned = so3.skew(turning)
+            a[3:, :3] = (a[3:, 3:] + so3.skew(w)) @ turned
+            a[3:, 3:] -= turned
+        a *= h
+        change = a @ transition
+        change[3:, 6:] -= h * (inverse @ (RATIO_BASIS @ alpha + (RATIO_BASIS @ total) @ spin.T).T)
+        second = a @ change
+        transition = transition + change + 0.5 * second + (a @ second) / 6.0
+    return y[:4], y[4:], transition
 
 
 def to_centre(q_wxyz: Array, omega_rad_s: Array, centre_trf_m: Array) -> Array:

@@ -9,6 +9,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 from chaserdock_models.arrays import Matrix3, Vector3
 
+Matrix9 = tuple[tuple[float, ...], ...]
+BodyPrior = tuple[Matrix3, Vector3, Matrix9]
+"""Inertia, centre of mass and their covariance, as in ``MekfParameters``."""
 MODELS = ("constant_rates", "torque_free")
 GATE_CHI_SQUARE = 27.85634123601289
 """0.9999 quantile of the chi-square distribution with 6 degrees of freedom (tests compare with SciPy)."""
@@ -21,6 +24,8 @@ class MekfParameters:
     motion_model: "constant_rates", or "torque_free" with ``inertia_ratios``, the target's inertia tensor in TRF (rows)
         up to a common factor.
     centre_of_mass_trf_m: the target's centre of mass in TRF.
+    body_covariance: covariance (9, 9), rows, of its centre of mass (m) and of the elements xx, yy, zz, xy, xz, yz of
+        ``inertia_ratios``, of which the joint filter makes states. Empty: both are exact.
     acceleration_noise_m_s2_sqrt_hz, angular_noise_rad_s2_sqrt_hz: square roots of the spectral densities of white
         (angular) acceleration. The true rates are constant, so these values set the filter's memory: larger values
         follow changes faster, smaller values smooth more.
@@ -49,6 +54,7 @@ class MekfParameters:
     motion_model: str = "constant_rates"
     inertia_ratios: Matrix3 = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     centre_of_mass_trf_m: Vector3 = (0.0, 0.0, 0.0)
+    body_covariance: Matrix9 = ()
     acceleration_noise_m_s2_sqrt_hz: float = 1e-4
     angular_noise_rad_s2_sqrt_hz: float = 1e-4
     floor_position_m: float = 2e-4
@@ -95,6 +101,11 @@ class MekfParameters:
         principal = np.linalg.eigvalsh(inertia)
         if principal[0] <= 0.0 or principal[2] > (principal[0] + principal[1]) * (1.0 + 1e-9):
             raise ValueError("inertia_ratios: principal moments of inertia violate the triangle inequality")
+
+    @property
+    def body_prior(self) -> BodyPrior:
+        """Return what is known of the target's body without measurements."""
+        return self.inertia_ratios, self.centre_of_mass_trf_m, self.body_covariance
 
     @property
     def has_bias(self) -> bool:

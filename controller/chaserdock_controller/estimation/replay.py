@@ -10,7 +10,7 @@ from typing import Any, Generic, TypeVar
 
 from chaserdock_models.arrays import Matrix3, Vector3
 
-from .parameters import MekfParameters
+from .parameters import Matrix9, MekfParameters
 from .target_hypotheses import StateT, apply_shocks
 from .types import EstimatorEvent, Shock, TargetState
 
@@ -137,14 +137,19 @@ class ReplayingFilter(Generic[RecordT, StateT]):
         """Apply a sudden change of the target's rates after the newest record."""
         self._buffer.disturb(shock)
 
-    def change_body(self, inertia: Matrix3, centre_trf_m: Vector3) -> None:
+    def change_body(self, inertia: Matrix3, centre_trf_m: Vector3, covariance: Matrix9 = ()) -> None:
         """Model the target from the newest record on as a torque-free rigid body with other mass properties.
 
         ``inertia``: TRF, rows, about the centre of mass, up to a factor. ``centre_trf_m``: centre of mass in TRF.
+        ``covariance``: theirs, as ``MekfParameters.body_covariance``.
         Raises ValueError for an inertia that no rigid body has.
         """
         self.target = replace(
-            self.target, motion_model="torque_free", inertia_ratios=inertia, centre_of_mass_trf_m=centre_trf_m
+            self.target,
+            motion_model="torque_free",
+            inertia_ratios=inertia,
+            centre_of_mass_trf_m=centre_trf_m,
+            body_covariance=covariance,
         )
 
     def drain_events(self) -> list[EstimatorEvent]:

@@ -12,13 +12,14 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.relative_motion import cw_wrench
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.codec import vector
 from chaserdock_protocol.messages import CameraCalibration, Odometry
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.ingest.latency_compensation import predict_state
 from chaserdock_controller.ingest.sensor_consistency import SensorConsistency
-from chaserdock_controller.interfaces import LogEntry, Observation, TargetEstimation
+from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
 
 from .composite_body import CompositeBody
 from .identification.stage import StackIdentification
@@ -96,9 +97,22 @@ class EstimationStage:
             visible_to=visible_to,
             cameras=camera_calibrations(estimator, self._camera),
             latched=self.composite.latched,
-            body=self.composite.body,
+            body=self.composite.moving,
             events=tuple(events),
+            stack=self._free_target(target) if known else None,
         )
+
+    def _free_target(self, target: TargetState) -> IdentifiedStack | None:
+        """Return what the motion of the target shows of its mass properties while no chaser is latched to it."""
+        if (
+            self.composite.latched
+            or not isinstance(self.estimator, JointEstimator)
+            or self.estimator.shape is None
+        ):
+            return None
+        motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
+        found = self.composite.target
+        return IdentifiedStack(found, found, {}, motion, {}, {}, tuple)
 
     def _target_only(self, o: Observation, estimator: Estimator) -> TargetState:
         """Update an estimator that takes odometry as exact."""

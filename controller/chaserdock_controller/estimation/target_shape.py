@@ -56,11 +56,11 @@ class ShapeFilter(Struct, frozen=True, eq=False):
 
     def mean(self) -> Array:
         """Return the estimated parameters (k,)."""
-        return np.linalg.solve(self.information, self.vector)
+        return np.asarray(np.linalg.solve(self.information, self.vector), dtype=float)
 
     def covariance(self) -> Array:
         """Return the covariance (k, k), with what all views have in common, but nowhere larger than the prior."""
-        covariance = np.linalg.inv(self.information)
+        covariance = np.asarray(np.linalg.inv(self.information), dtype=float)
         if not self.cells:
             return covariance
         # Both have the prior information in them: the sum is that of the views and their common errors.

@@ -21,7 +21,7 @@ from chaserdock_protocol.messages import (
     WrenchCommand,
 )
 
-from chaserdock_controller.estimation.identification.composite import MassProperties
+from chaserdock_controller.estimation.mass_properties import MassProperties
 from chaserdock_controller.interfaces import (
     Directive,
     EstimatedShape,

@@ -22,6 +22,7 @@ from chaserdock_controller.estimation.filter_update import FilterState
 from chaserdock_controller.estimation.identification.stage import IdentificationState
 from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.joint.estimator import JointFilterState, JointTickRecord
+from chaserdock_controller.estimation.mass_properties import MassProperties
 from chaserdock_controller.estimation.mekf import Exposure
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.replay import ReplayBuffer
@@ -107,7 +108,7 @@ class SequencerState(Struct, forbid_unknown_fields=True):
 
 
 class CompositeState(Struct, forbid_unknown_fields=True):
-    _target_alone: TargetBody
+    _target_alone: MassProperties
     body: TargetBody
     latched: frozenset[int]
     _changed: bool

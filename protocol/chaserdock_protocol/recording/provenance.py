@@ -19,7 +19,9 @@ _LOCK_FILE = Path(__file__).resolve().parents[3] / "uv.lock"
 @lru_cache
 def installed_versions() -> dict[str, str]:
     """Return the version of every installed distribution, by name."""
-    found = {d.metadata["Name"]: d.version for d in metadata.distributions() if d.metadata["Name"]}
+    # Each access to the metadata of a distribution parses its file.
+    parsed = [d.metadata for d in metadata.distributions()]
+    found = {m["Name"]: m["Version"] for m in parsed if m["Name"]}
     return dict(sorted(found.items(), key=lambda item: item[0].lower()))
 
 

@@ -44,6 +44,9 @@ class MeshKnowledge(Section):
     )
 
 
+Sigma = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
 class FlightTarget(Section):
     """Nominal target of the flight software: shape, motion model, and assumed mass properties."""
 
@@ -75,6 +78,19 @@ class FlightTarget(Section):
         default=(0.0, 0.0, 0.0), description="Centre of mass (TRF), m. Used by `torque_free` only."
     )
 
+    mass_sigma_share: Sigma = Field(
+        default=0.1,
+        description="Standard deviation of the stated mass, as a share of it. Used by `torque_free` only.",
+    )
+    inertia_sigma_share: Sigma = Field(
+        default=0.15,
+        description="Standard deviation of each element of the stated inertia tensor, as a share of the mean moment. Used by "
+        "`torque_free` only.",
+    )
+    centre_of_mass_sigma_m: Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)] = Field(
+        default=0.005,
+        description="Standard deviation of the stated centre of mass per axis, m. Used by `torque_free` only.",
+    )
     knowledge: MeshKnowledge = MeshKnowledge()
 
     @model_validator(mode="after")

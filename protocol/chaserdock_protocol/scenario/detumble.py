@@ -16,8 +16,8 @@ class RestLimits(Section):
 
 
 class Identification(Section):
-    """Mass properties of the stack, identified in flight from the odometry of latched chasers and their pulses. The other keys are
-    standard deviations of what is not known before."""
+    """Mass properties of the stack, identified in flight from the odometry of latched chasers and their pulses. What is not known
+    of the target before: `target.mass_sigma_share`, `target.inertia_sigma_share`, `target.centre_of_mass_sigma_m`."""
 
     enabled: bool = Field(
         default=False,
@@ -27,18 +27,12 @@ class Identification(Section):
     duration_s: Positive = Field(
         default=10.0, description="Length of the manoeuvre that the command `identify` begins, s."
     )
-    mass_share: Positive = Field(
-        default=0.3, description="Of the target's mass, as a share of `target.mass_kg`."
-    )
-    inertia_share: Positive = Field(
-        default=0.3,
-        description="Of each element of its inertia, as a share of the mean moment of `[target]`.",
-    )
-    centre_of_mass_m: Positive = Field(default=0.1, description="Of its centre of mass per axis, m.")
     thrust_share: Positive = Field(
-        default=0.05, description="Of each thruster's thrust, constant in a mission."
+        default=0.05, description="Standard deviation of each thruster's thrust, constant in a mission."
     )
-    pulse_scatter_share: NotNegative = Field(default=0.03, description="Of each pulse's impulse.")
+    pulse_scatter_share: NotNegative = Field(
+        default=0.03, description="Standard deviation of each pulse's impulse."
+    )
 
 
 class Detumble(RestLimits):

@@ -24,15 +24,15 @@ from chaserdock_models.rigid_body import BodyState, RigidBody, free_rotation
 from chaserdock_models.wrench_set import ThrusterMount, wrench_matrix
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 
-from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
+from chaserdock_controller.estimation.mass_properties import INERTIA_ROWS, MassProperties, detach
+from chaserdock_controller.estimation.target_body import TargetBody
 
 POSITION, VELOCITY, ATTITUDE, RATE = (slice(k, k + 3) for k in (0, 3, 6, 9))
 MASS, CENTRE, INERTIA = slice(12, 13), slice(13, 16), slice(16, 22)
 PROPERTIES = slice(12, 22)
 _MOUNTS = 22
-_INERTIA_ROWS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 _BASIS = np.zeros((6, 3, 3))
-for _k, (_i, _j) in enumerate(_INERTIA_ROWS):
+for _k, (_i, _j) in enumerate(INERTIA_ROWS):
     _BASIS[_k, _i, _j] = _BASIS[_k, _j, _i] = 1.0
 
 
@@ -40,83 +40,16 @@ for _k, (_i, _j) in enumerate(_INERTIA_ROWS):
 class IdentificationParameters:
     """Standard deviations of the prior and of the noise.
 
-    mass_share, inertia_share: of the target's stated mass, and of each element of its inertia over the mean moment.
-    centre_m: of its centre of mass per axis. mount_m, mount_rad: of a latched chaser's pose in TRF. thrust_share: of a
-    thruster's thrust, constant. scatter_share: of each pulse. floor_velocity_m_s, floor_omega_rad_s: of the motion per tick.
+    mount_m, mount_rad: of a latched chaser's pose in TRF. thrust_share: of a thruster's thrust, constant. scatter_share: of each
+    pulse. floor_velocity_m_s, floor_omega_rad_s: of the motion per tick.
     """
 
-    mass_share: float = 0.3
-    inertia_share: float = 0.3
-    centre_m: float = 0.1
     mount_m: float = 0.003
     mount_rad: float = 0.005
     thrust_share: float = 0.05
     scatter_share: float = 0.03
     floor_velocity_m_s: float = 1e-6
     floor_omega_rad_s: float = 1e-6
-
-
-@dataclass(frozen=True, eq=False)
-class MassProperties:
-    """A body, and the covariance (10, 10) of mass (kg), centre (m) and inertia (xx, yy, zz, xy, xz, yz; kg m²)."""
-
-    body: TargetBody
-    covariance: Array
-
-    @property
-    def values(self) -> Array:
-        """Return mass, centre and inertia (10,), in the order of the covariance."""
-        return properties_of(self.body)
-
-
-def properties_of(body: TargetBody) -> Array:
-    """Return mass, centre and inertia (10,) of a body."""
-    inertia = [body.inertia_kg_m2[i, j] for i, j in _INERTIA_ROWS]
-    return np.array([body.mass_kg, *body.centre_trf_m, *inertia])
-
-
-def body_of(values: Array) -> TargetBody:
-    """Return the body with this mass, centre and inertia (10,)."""
-    return TargetBody(float(values[0]), np.tensordot(values[4:], _BASIS, 1), values[1:4].copy())
-
-
-def attach(target: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody) -> MassProperties:
-    """Return the mass properties of a target with chasers fixed to it; the chasers' are taken as exact."""
-    return _transformed(target, _parts(chasers, body, 1.0))
-
-
-def detach(stack: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody) -> MassProperties:
-    """Return the mass properties of the target of a stack: those of the stack without the chasers."""
-    return _transformed(stack, _parts(chasers, body, -1.0))
-
-
-def _parts(
-    chasers: Mapping[int, MountedChaser], body: RigidBody, sign: float
-) -> list[tuple[float, Array, Array, Array]]:
-    inertia = sign * np.asarray(body.inertia)
-    return [(sign * body.mass_kg, inertia, c.position_m, c.q_wxyz) for c in chasers.values()]
-
-
-def _transformed(
-    properties: MassProperties, parts: Sequence[tuple[float, Array, Array, Array]]
-) -> MassProperties:
-    values = properties.values
-    steps = np.array([1e-3 * values[0], *[1e-4] * 3, *[1e-3] * 6])
-    jacobian = np.empty((10, 10))
-    for k, step in enumerate(steps):
-        shift = np.zeros(10)
-        shift[k] = step
-        ends = [properties_of(attach_bodies(body_of(values + s * shift), parts)) for s in (1.0, -1.0)]
-        jacobian[:, k] = (ends[0] - ends[1]) / (2.0 * step)
-    body = attach_bodies(properties.body, parts)
-    return MassProperties(body, jacobian @ properties.covariance @ jacobian.T)
-
-
-def prior_of(target: TargetBody, parameters: IdentificationParameters) -> MassProperties:
-    """Return the stated mass properties of a target with the covariance of what is not known of them."""
-    moment = float(np.trace(target.inertia_kg_m2)) / 3.0
-    sigmas = [parameters.mass_share * target.mass_kg, *[parameters.centre_m] * 3]
-    return MassProperties(target, np.diag(np.square([*sigmas, *[parameters.inertia_share * moment] * 6])))
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,27 +299,6 @@ class CompositeIdentification:
         h, residual = np.concatenate([m for m, _ in parts]), np.concatenate([r for _, r in parts])
         return self._update(h, residual, np.diag(np.tile(self._noise, len(rows))))
 
-    def update_poses(self, poses: Mapping[int, tuple[BodyState, Array]]) -> StackInnovation | None:
-        """Take measured poses, by chaser, with their covariances (6, 6): position (WRF) and attitude (axes of the measured body).
-
-        The rates in the states are not used. None without any pose.
-        """
-        self.ticks += 1
-        used = [*range(3), *range(6, 9)]
-        parts = []
-        for row, chaser in enumerate(self.chasers):
-            if chaser in poses:
-                h, residual = self._measurement(row, poses[chaser][0])
-                parts.append((h[used], residual[used], poses[chaser][1]))
-        if not parts:
-            return None
-        noise = np.zeros((6 * len(parts), 6 * len(parts)))
-        for k, (_, _, covariance) in enumerate(parts):
-            noise[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = covariance
-        return self._update(
-            np.concatenate([h for h, _, _ in parts]), np.concatenate([r for _, r, _ in parts]), noise
-        )
-
     def _update(self, h: Array, residual: Array, noise: Array) -> StackInnovation:
         projected = h @ self.covariance
         expected = projected @ h.T + noise
@@ -398,12 +310,6 @@ class CompositeIdentification:
         self.covariance = (kept + kept.T) / 2.0
         self._estimate = self._corrected(self._estimate, gain @ residual)
         return StackInnovation(h, gain, expected, residual)
-
-    def loosen_mounts(self, position_m: float, attitude_rad: float) -> None:
-        """Let the poses of the chasers in TRF walk by these standard deviations per axis."""
-        for row in range(len(self.chasers)):
-            k = self._mount(row)
-            self.covariance[k, k] += np.diag(np.repeat([position_m**2, attitude_rad**2], 3))
 
     def disturb(self, velocity_m_s: float, omega_rad_s: float) -> None:
         """Widen the motion by an unknown shock with these standard deviations per axis."""

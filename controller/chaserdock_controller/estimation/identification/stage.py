@@ -17,21 +17,18 @@ from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.mounting import nominal_mounting, plume_free_thrusters
 from chaserdock_protocol.scenario.thrusters import thrusts_max
 
-from chaserdock_controller.estimation.composite_body import pose_in_target, target_body
-from chaserdock_controller.estimation.measurements import SightingConverter
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.estimation.composite_body import pose_in_target, stated_properties
+from chaserdock_controller.estimation.mass_properties import MassProperties, attach, inertia_ratios
 from chaserdock_controller.interfaces import IdentifiedStack, LogEntry, Observation, TargetEstimation
 
-from .composite import CompositeIdentification, IdentificationParameters, MassProperties, attach, prior_of
+from .composite import CompositeIdentification, IdentificationParameters
 from .fault_recovery import FaultTolerantIdentification, RecoveryState
 from .faults import StackFault
-from .free_tumble import TumbleIdentification, inertia_ratios
 
 _SHOCK = (0.01, 0.02)
 """One sigma of the change of the stack's rates by a touch (m/s, rad/s)."""
 _SILENT_S, _SILENT_SHARE = 1.0, 0.02
 """Thrusters of a chaser that reports none are unknown for this long, and later up to this share of their thrust."""
-_SETTLED_RAD_S = 0.01
 _REFINE_S, _KNOWN_RATIO, _KNOWN_M = 2.0, 0.05, 0.02
 _PULSE_S = 0.3
 _WATCH_S = 1.0
@@ -44,9 +41,6 @@ def parameters_of(scenario: FlightScenario) -> IdentificationParameters:
     """Return the filter's parameters."""
     s = scenario.detumble.identification
     return IdentificationParameters(
-        mass_share=s.mass_share,
-        inertia_share=s.inertia_share,
-        centre_m=s.centre_of_mass_m,
         thrust_share=s.thrust_share,
         scatter_share=s.pulse_scatter_share,
     )
@@ -70,22 +64,22 @@ class StackIdentification:
         self._scenario, self._parameters = scenario, parameters_of(scenario)
         self._period_s = 1.0 / scenario.time.rate_hz
         self._full_N = thrusts_max(scenario.chaser.thrusters)
-        self.target = prior_of(target_body(scenario), self._parameters)
+        self.target = stated_properties(scenario)
         self.failed: dict[int, tuple[int, ...]] = {}
-        self._converter = SightingConverter(scenario.camera_model())
-        self._tumble: TumbleIdentification | None = None
         self._composite: FaultTolerantIdentification | None = None
         self._reporting: set[int] = set()
         self._silent_ticks: dict[int, int] = {}
         self._events: list[LogEntry] = []
 
     def run(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
-        """Take a tick's odometry and pulses; return None while nothing is latched or the target is unknown."""
+        """Take a tick's odometry and pulses; return None while the target is unknown. While nothing is latched, what the estimator
+        finds of the freely tumbling target becomes the prior of the stack."""
         latched = estimation.latched
         if not latched:
             self._composite = None
-            return self._run_free(observation, estimation)
-        self._tumble = None
+            if estimation.stack is not None:
+                self.target = estimation.stack.target
+            return estimation.stack
         if not estimation.known or not latched & observation.odometry.keys():
             self._composite = None
             return None
@@ -122,42 +116,20 @@ class StackIdentification:
             dtype=bool,
         )
 
-    def _run_free(self, observation: Observation, estimation: TargetEstimation) -> IdentifiedStack | None:
-        """Take a tick's sightings of the free target; return None while it is not tracked."""
-        target, first = estimation.target, False
-        if target.status != "tracking":
-            self._tumble = None
-            return None
-        if self._tumble is None:
-            if float(target.covariance[9:, 9:].trace()) > _SETTLED_RAD_S**2:
-                return None
-            motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
-            cameras = range(len(self._scenario.chasers))
-            errors = self._scenario.navigation.errors()
-            self._tumble = TumbleIdentification(self.target, cameras, motion, errors, self._parameters)
-            first = True
-        self._converter.add_odometry(observation.odometry, observation.time_ns)
-        found = self._converter.measurements(observation.sightings)
-        self._tumble.step([m for m in found if m.time_ns == observation.time_ns], self._period_s, first)
-        if any(d.contact for d in observation.docking.values()):
-            self._tumble.disturb(*_SHOCK)
-        self.target = self._tumble.target
-        motion = BodyState(target.position_m, target.velocity_m_s, target.q_wxyz, target.omega_rad_s)
-        return IdentifiedStack(self.target, self.target, {}, motion, {}, {}, tuple)
-
     def identified(self, observation: Observation, estimation: TargetEstimation) -> TargetEstimation:
         """Return the estimation with the identified stack and its events."""
         stack = self.run(observation, estimation)
         events, self._events = self._events, []
         return replace(estimation, stack=stack, events=(*estimation.events, *events))
 
-    def refined_target(self, observation: Observation) -> TargetBody | None:
-        """Return the target's mass properties for the estimator of its motion, now and then, once they are known well enough."""
-        if observation.tick % max(1, round(_REFINE_S / self._period_s)):
+    def refined_target(self, observation: Observation) -> MassProperties | None:
+        """Return the target's mass properties by the motion of the stack for the estimator of its motion, now and then, once they
+        are known well enough."""
+        if self._composite is None or observation.tick % max(1, round(_REFINE_S / self._period_s)):
             return None
         ratios = math.sqrt(float(np.trace(inertia_ratios(self.target)[1])))
         centre_m = math.sqrt(float(np.trace(self.target.covariance[1:4, 1:4])))
-        return self.target.body if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
+        return self.target if ratios < _KNOWN_RATIO and centre_m < _KNOWN_M else None
 
     def save(self) -> IdentificationState:
         """Return the state for a standby controller. What a free tumble has shown is kept in the target's mass properties."""
@@ -182,7 +154,7 @@ class StackIdentification:
             composite.load(saved)
         self.target, self.failed = state.target, dict(state.failed)
         self._reporting, self._silent_ticks = set(state.reporting), dict(state.silent_ticks)
-        self._tumble, self._composite = None, composite
+        self._composite = composite
 
     def _begin(
         self, estimation: TargetEstimation, states: Mapping[int, BodyState]

@@ -16,6 +16,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, Sighting
 from threadpoolctl import ThreadpoolController
 
+from chaserdock_controller.estimation.body_shape import SHAPE, BodyShape
 from chaserdock_controller.estimation.parameters import MekfParameters
 from chaserdock_controller.estimation.replay import ReplayingFilter, ReplayRecord
 from chaserdock_controller.estimation.target_hypotheses import (
@@ -56,6 +57,8 @@ from .state import (
     JointState,
     block,
     empty_state,
+    start_shape,
+    with_body,
 )
 from .update import SightedPose, UpdateReport, sighted_pose, start_chaser, start_target, update
 
@@ -118,6 +121,14 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         """Return the likeliest state after the newest tick."""
         return self._buffer.newest.hypotheses[0] if self._buffer.newest else None
 
+    @property
+    def shape(self) -> tuple[BodyShape, Array] | None:
+        """Return the shape of the body that the target is from now on, and its covariance (8, 8); None if it is not estimated."""
+        state = None if self.state is None else with_body(self.state, self.target)
+        if state is None or state.shape is None:
+            return None
+        return state.shape, state.covariance[-SHAPE:, -SHAPE:]
+
     def update(self, inputs: JointInputs) -> TargetState:
         """Process a tick and return the target's estimate at its time. Ticks must come in order."""
         records, own = self._buffer.records, replace(inputs, sightings=())
@@ -140,7 +151,7 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         if time_ns < state.time_ns:
             raise ValueError(f"no state for {time_ns} ns in the buffer; the oldest is {state.time_ns} ns")
         p = self._with(self.target)
-        predicted = [predict_target(h, time_ns, p) for h in state.hypotheses]
+        predicted = [predict_target(with_body(h, p.target), time_ns, p) for h in state.hypotheses]
         hypotheses, covariances = zip(*predicted, strict=True)
         covariance = mixture_covariance(hypotheses, covariances)
         lost = is_lost(covariance, p.target)
@@ -230,6 +241,7 @@ def process_tick(
 def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -> JointState:
     """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured for long."""
     inputs = record.inputs
+    state = with_body(state, p.target)
     state = predict(state, record.time_ns, inputs.impulses, p, inputs.latched, inputs.covered_s)
     stale = record.time_ns - round(p.restart_after_s * 1e9)
     newest = state.odometry_ns.copy()
@@ -264,6 +276,8 @@ def _check_cameras(
         return replace(now, hypotheses=tuple(with_uncertain_rates(h, p.target) for h in now.hypotheses))
     if collective >= p.target.sustained_rejections:
         rates = rates_of(with_uncertain_rates(now.hypotheses[0], p.target))
+        if p.target.motion_model == "torque_free":
+            now = replace(now, hypotheses=tuple(start_shape(h, p.target) for h in now.hypotheses))
         return _start(before_restart(now), seen, rates, mounting, p, "re-initialised", events)
     return now
 

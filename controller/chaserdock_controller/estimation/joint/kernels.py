@@ -16,6 +16,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.native import address, scratch
 from numpy.typing import NDArray
 
+from chaserdock_controller.estimation.body_shape import SHAPE
+
 from .native import function
 
 TARGET_MEAN, CHASER_MEAN = 13, 44
@@ -25,7 +27,7 @@ _SEEN = 55
 _CHANNELS = 5
 
 
-class Motion(Structure):
+class MotionParameters(Structure):
     """`Motion` of native/motion.c."""
 
     _fields_ = [
@@ -63,10 +65,11 @@ class _Innovation(Structure):
             for name in ("residual", "jacobian", "noise", "s", "cross", "white", "correction", "values")
         ),
         ("stride", c_int64),
+        ("size", c_int64),
     ]
 
 
-class Measurement:
+class ChaserMeasurement:
     """Measurements of chaser ``i`` of ``n``, of which one may be None.
 
     mounting: lens (3,), axes (3, 3), attitude (4,). odometry: (13,) and noise (12, 12). sighting: pose (7,) in IRF, stated
@@ -91,11 +94,10 @@ class Measurement:
         self.native = _Measurement(n, i, *map(address, mounting), state, noise, pose, stated, *ratios)
 
 
-class Innovation:
+class JointInnovation:
     """Memory of the updates of a tick with the covariance (D, D) and a mean; see ``Innovation`` of native/update.c."""
 
-    def __init__(self, n: int) -> None:
-        size = 12 + 43 * n
+    def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
         self.values: Array = np.empty(_CHANNELS + 1)
         self._arrays = [
@@ -104,18 +106,23 @@ class Innovation:
                 MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
             )
         ] + [self.values]  # fmt: skip
-        self._native = _Innovation(*map(address, self._arrays), stride)
-        self._work = scratch(_work_size("innovate_workspace", n))
+        self._native = _Innovation(*map(address, self._arrays), stride, size)
+        self._work = scratch(_work_size("innovate_workspace", size))
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
 
-    def innovate(self, z: Measurement, mean: Array, prior: Array, covariance: Array) -> None:
+    @property
+    def correction(self) -> Array:
+        """Return the last correction (D,)."""
+        return self._arrays[6]
+
+    def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""
         function("innovate")(
             ctypes.byref(z.native), address(mean), address(prior), address(covariance), self._address, self._work_address
         )  # fmt: skip
 
-    def correct(self, z: Measurement, used: NDArray[np.int64], prior: Array, mean: Array) -> bool:
+    def correct(self, z: ChaserMeasurement, used: NDArray[np.int64], prior: Array, mean: Array) -> bool:
         """Write ``prior``, corrected by the rows ``used``, to ``mean``; return False if their covariance is not positive."""
         return bool(
             function("correct", c_int64)(
@@ -123,22 +130,31 @@ class Innovation:
             )
         )  # fmt: skip
 
-    def reduce(self, z: Measurement, rows: int, covariance: Array) -> None:
+    def reduce(self, z: ChaserMeasurement, rows: int, covariance: Array) -> None:
         """Reduce the covariance by the last correction, of so many rows."""
-        function("reduce")(self._n, c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
+        function("reduce")(c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
 
-def _work_size(name: str, n: int) -> int:
-    return function(name, c_int64)(c_int64(n))
+def check_size(mean: Array, covariance: Array) -> int:
+    """Return the number of chasers of a state. Raises ValueError if its covariance has another size, with or without a shape."""
+    n, rest = divmod(mean.size - TARGET_MEAN, CHASER_MEAN)
+    size = 12 + 43 * n
+    if rest or covariance.shape not in ((size, size), (size + SHAPE, size + SHAPE)):
+        raise ValueError(f"a state of {n} chasers with a covariance of shape {covariance.shape}")
+    return n
 
 
-def complete(n: int, covariance: Array) -> None:
+def _work_size(name: str, *sizes: int) -> int:
+    return function(name, c_int64)(*map(c_int64, sizes))
+
+
+def complete(covariance: Array) -> None:
     """Make a covariance (D, D) symmetric by its lower triangle."""
-    function("complete")(c_int64(n), address(covariance))
+    function("complete")(c_int64(len(covariance)), address(covariance))
 
 
 def predict(
-    motion: Motion,
+    motion: MotionParameters,
     target: Array,
     target_noise: Array,
     impulses: Array,
@@ -150,13 +166,18 @@ def predict(
     mean: Array,
     covariance: Array,
 ) -> Array:
-    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of native/covariance.c."""
-    n, out = len(fade_view), np.empty_like(covariance)
-    work = scratch(_work_size("predict_workspace", n))
+    """Predict the chasers of ``mean`` in place and return the covariance (D, D); see ``predict`` of native/covariance.c.
+
+    Raises ValueError if sizes contradict each other, as in a state from a checkpoint."""
+    n = check_size(mean, covariance)
+    if any(len(a) != n for a in (impulses, orbital, fade_view, alive, latched)):
+        raise ValueError(f"a state of {n} chasers with other numbers of chasers in its fields")
+    out = np.empty_like(covariance)
+    work = scratch(_work_size("predict_workspace", n, len(covariance)))
     arrays: tuple[NDArray[Any], ...] = (
         target, target_noise, impulses, orbital, fade_view, prior, alive, latched, mean, covariance, out, work,
     )  # fmt: skip
-    function("predict")(ctypes.byref(motion), c_int64(n), *map(address, arrays))
+    function("predict")(ctypes.byref(motion), c_int64(n), c_int64(len(covariance)), *map(address, arrays))
     return out
 
 
@@ -172,7 +193,7 @@ def wrench_at_origin(
     return out
 
 
-def linearize(z: Measurement, mean: Array) -> tuple[Array, Array, Array]:
+def linearize(z: ChaserMeasurement, mean: Array) -> tuple[Array, Array, Array]:
     """Return residual (k,), Jacobian (k, 55) by the errors of target and chaser, and noise (k, k)."""
     k = z.rows
     out = np.empty(k), np.empty((k, _SEEN)), np.empty((k, k))

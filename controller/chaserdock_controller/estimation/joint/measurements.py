@@ -55,7 +55,7 @@ def measurement(
     markers: int,
     mounting: CameraMounting,
     p: JointParameters,
-) -> kernels.Measurement:
+) -> kernels.ChaserMeasurement:
     """Return what chaser ``i`` of ``chasers`` measures in a tick, for the kernels: odometry, a solution from ``markers``
     markers, or both."""
     measured = sighted = None
@@ -67,10 +67,10 @@ def measurement(
         noise = p.sighting_noise(markers)
         pose = np.array([*solution.position_m, *solution.q_wxyz])
         sighted = pose, sighting_covariance(solution, p), noise.white_ratio, noise.view_ratio
-    return kernels.Measurement(chasers, i, mounting, measured, sighted)
+    return kernels.ChaserMeasurement(chasers, i, mounting, measured, sighted)
 
 
-def linearize(state: JointState, z: kernels.Measurement) -> LinearizedMeasurement:
+def linearize(state: JointState, z: kernels.ChaserMeasurement) -> LinearizedMeasurement:
     """Return the residual of a measurement, first the sighting: position in IRF, m, rotation in TRF, rad; then odometry: position,
     velocity, attitude, rate."""
     residual, jacobian, noise = kernels.linearize(z, packed(state))

@@ -18,7 +18,7 @@ from chaserdock_controller.estimation.parameters import GATE_CHI_SQUARE, MekfPar
 GATE_CHI_SQUARE_3 = 21.107513466160444
 """0.9999 quantile of the chi-square distribution with 3 degrees of freedom (tests compare with SciPy)."""
 
-TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-4, 1e-4)}
+TARGET_NOISE = {"constant_rates": (5e-6, 5e-6), "torque_free": (1e-5, 1e-5)}
 
 
 class SightingNoise(NamedTuple):
@@ -57,7 +57,8 @@ class JointParameters:
     contact_*: sigma of the change of a chaser's rates by a contact.
     floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
     target_noise: square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular acceleration
-        (rad/s²/√Hz), by motion model. Torque-free motion depends on inertia ratios, which may be wrong by some 15 %.
+        (rad/s²/√Hz), by motion model. Of a torque-free target the inertia is estimated.
+    ratio_memory: exponent by which measurements of the inertia of a torque-free target lose weight with time.
     single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
         more on the pixel grid. shape: errors of a sighting of the target's shape, without markers.
     unexpected_velocity_m_s, unexpected_omega_rad_s: sigma of a change of a chaser's rates within a tick that no command explains,
@@ -97,6 +98,7 @@ class JointParameters:
     floor_sighting_m: float = 2e-5
     floor_sighting_rad: float = math.radians(0.002)
     target_noise: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TARGET_NOISE)
+    ratio_memory: float = 1.0
     single_marker: SightingNoise = SINGLE_MARKER
     several_markers: SightingNoise = SEVERAL_MARKERS
     shape: SightingNoise = SHAPE

@@ -19,7 +19,8 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_wrench
 
-from chaserdock_controller.estimation.motion_models import process_noise, propagate_target
+from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
+from chaserdock_controller.estimation.motion_models import free_shape, process_noise, propagate_target
 
 from . import kernels
 from .kernels import CHASER_MEAN, TARGET_MEAN
@@ -41,6 +42,9 @@ from .state import (
     mean_fields,
     packed,
 )
+
+_YOUNG_S = 1.0
+"""Least age of a shape in the rate at which measurements of it fade, s."""
 
 
 def predict(
@@ -69,7 +73,7 @@ def predict(
             orbital[i] = cw_wrench(p.mean_motion_rad_s, row, p.body.mass_kg, p.inertia)
     covariance = kernels.predict(
         _motion(dt, p, max(0.0, dt - nominal_s)),
-        target_transition,
+        np.ascontiguousarray(target_transition[:, :TARGET]),
         _target_noise(dt, p) if state.target_known else np.zeros((TARGET, TARGET)),
         np.array(impulses, dtype=float),
         orbital,
@@ -80,13 +84,17 @@ def predict(
         mean,
         state.covariance,
     )
+    if state.ratio_information is not None:
+        _couple_shape(covariance, target_transition[:, TARGET:])
+        ratios = covariance[-SHAPE:, -SHAPE:][RATIOS, RATIOS]
+        _fade_ratios(ratios, state.ratio_information, dt, state, p)
     return replace(moved, time_ns=time_ns, covariance=covariance, **mean_fields(mean))
 
 
-def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.Motion:
+def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.MotionParameters:
     """Return the parameters of a prediction over ``dt``, of which the command is unknown for ``unknown_s``."""
     n = p.navigation
-    return kernels.Motion(
+    return kernels.MotionParameters(
         dt,
         p.body.mass_kg,
         (c_double * 3)(*p.inertia),
@@ -109,24 +117,55 @@ def _motion(dt: float, p: JointParameters, unknown_s: float) -> kernels.Motion:
 def predict_target(state: JointState, time_ns: int, p: JointParameters) -> tuple[JointState, Array]:
     """Return the state with the target's mean at ``time_ns``, and the target's covariance (12, 12) then."""
     dt = (time_ns - state.time_ns) * 1e-9
-    covariance = state.covariance[:TARGET, :TARGET]
     if dt == 0.0:
-        return state, covariance.copy()
+        return state, state.covariance[:TARGET, :TARGET].copy()
     moved, f = _predict_target(state, dt, p)
-    return moved, f @ covariance @ f.T + _target_noise(dt, p)
+    return moved, f @ target_covariance(state) @ f.T + _target_noise(dt, p)
+
+
+def target_covariance(state: JointState) -> Array:
+    """Return the covariance (12, 12) of the target's motion, or (20, 20) of its motion and shape."""
+    if state.shape is None:
+        return state.covariance[:TARGET, :TARGET]
+    size = len(state.covariance)
+    part = np.concatenate([np.arange(TARGET), np.arange(size - SHAPE, size)])
+    return state.covariance[np.ix_(part, part)]
 
 
 def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[JointState, Array]:
+    """Return the state with the target after ``dt``, and the transition (12, 12), or (12, 20) if its shape is estimated."""
     if not state.target_known:
-        return state, np.eye(TARGET)
+        return state, np.eye(TARGET, TARGET if state.shape is None else TARGET + SHAPE)
     motion = (state.position_m, state.velocity_m_s, state.q_wxyz, state.omega_rad_s)
-    (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
+    if state.shape is None:
+        (position, velocity, q, omega), f = propagate_target(*motion, dt, p.target)
+    else:
+        (position, velocity, q, omega), f = free_shape(motion, dt, state.shape, p.mean_motion_rad_s)
     return replace(state, position_m=position, velocity_m_s=velocity, q_wxyz=q, omega_rad_s=omega), f
 
 
 def _target_noise(dt: float, p: JointParameters) -> Array:
     linear, angular = p.target_noise[p.target.motion_model]
     return process_noise(dt, linear**2, angular**2)
+
+
+def _couple_shape(covariance: Array, by_shape: Array) -> None:
+    """Add to a predicted covariance, in place, that the target moves by its shape; ``by_shape`` (12, 8): the transition."""
+    covariance[:TARGET] += by_shape @ covariance[-SHAPE:]
+    covariance[:, :TARGET] += covariance[:, -SHAPE:] @ by_shape.T
+
+
+def _fade_ratios(
+    covariance: Array, information: Array, dt: float, state: JointState, p: JointParameters
+) -> None:
+    """Let the filter forget, in place, a part of what measurements told of the ratios of the inertia since the shape started.
+
+    They were linearized at an earlier estimate, which was far from the truth at first: after the time t, what was measured at the
+    time s weighs (s / t)^``ratio_memory``. The ``information`` (5, 5) from before the measurements is kept.
+    """
+    age = max((state.time_ns - state.shape_ns) * 1e-9, _YOUNG_S)
+    share = p.ratio_memory * dt / (age + dt)
+    covariance += share * (covariance - covariance @ information @ covariance)
 
 
 def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) -> Array:

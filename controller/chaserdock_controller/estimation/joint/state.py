@@ -2,7 +2,8 @@
 """State of the joint filter, and the layout of its error vector.
 
 The error vector has 12 components for the target, then ``CHASER`` for each chaser. Both begin with position and velocity
-(WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body axes). A chaser's additive states follow.
+(WRF), rotation (body axes, q_true = q (x) exp(dtheta)) and angular rate (body axes). A chaser's additive states follow. The last
+``SHAPE`` components, of a torque-free target only, are those of its ``BodyShape``.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
 
+from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE, BodyShape, shape_covariance, shape_of
+from chaserdock_controller.estimation.parameters import BodyPrior, MekfParameters
 from chaserdock_controller.estimation.target_hypotheses import TargetHypothesis
 
 from . import kernels
@@ -47,7 +50,9 @@ class JointState(TargetHypothesis):
     """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``) and of N chasers.
 
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their
-    additive states. covariance (12 + CHASER N, 12 + CHASER N). alive (N,): chasers whose state is known.
+    additive states. covariance (12 + CHASER N, 12 + CHASER N), or with ``shape`` ``SHAPE`` more. alive (N,): chasers whose state
+    is known. shape: of a torque-free target. prior: knowledge that it started from at ``shape_ns``, with ``ratio_information``
+    (5, 5), the (pseudo-)inverse of the covariance of its ratios.
     odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
     markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
@@ -66,6 +71,10 @@ class JointState(TargetHypothesis):
     markers: NDArray[np.int64]
     target_known: bool = False
     updates: int = 0
+    shape: BodyShape | None = None
+    prior: BodyPrior | None = None
+    ratio_information: Array | None = None
+    shape_ns: int = 0
 
     @property
     def chasers(self) -> int:
@@ -97,6 +106,31 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         rejections=np.zeros((n, len(CHANNELS)), dtype=np.int64),
         nis=np.full((n, len(CHANNELS) - 1), 3.0),
         markers=np.ones(n, dtype=np.int64),
+    )
+
+
+def with_body(state: JointState, p: MekfParameters) -> JointState:
+    """Return the state of a target that is the body of ``p`` from now on: the same, unless it was another body until now."""
+    if p.motion_model != "torque_free" or state.prior == p.body_prior:
+        return state
+    return start_shape(state, p)
+
+
+def start_shape(state: JointState, p: MekfParameters) -> JointState:
+    """Return the state in which no more is known of the target's body than ``p`` tells."""
+    inertia = np.array(p.inertia_ratios, dtype=float)
+    own = TARGET + CHASER * state.chasers
+    covariance = np.zeros((own + SHAPE, own + SHAPE))
+    covariance[:own, :own] = state.covariance[:own, :own]
+    if p.body_covariance:
+        covariance[own:, own:] = shape_covariance(inertia, np.array(p.body_covariance))
+    return replace(
+        state,
+        shape=shape_of(inertia, np.array(p.centre_of_mass_trf_m)),
+        prior=p.body_prior,
+        ratio_information=np.linalg.pinv(covariance[own:, own:][RATIOS, RATIOS], rcond=1e-12, hermitian=True),
+        shape_ns=state.time_ns,
+        covariance=covariance,
     )
 
 
@@ -135,9 +169,14 @@ def mean_fields(mean: Array) -> dict[str, Array]:
 
 def inject(state: JointState, error: Array) -> JointState:
     """Return the state corrected by an error vector; the covariance stays."""
-    return replace(state, **mean_fields(kernels.inject(packed(state), np.array(error))))
+    end = TARGET + CHASER * state.chasers
+    shape = None if state.shape is None else state.shape.corrected(error[end:])
+    return replace(state, shape=shape, **mean_fields(kernels.inject(packed(state), np.array(error))))
 
 
 def difference(a: JointState, b: JointState) -> Array:
     """Return the error vector that takes the state ``a`` to ``b``."""
-    return kernels.difference(packed(a), packed(b))
+    error = kernels.difference(packed(a), packed(b))
+    if a.shape is None or b.shape is None:
+        return error
+    return np.concatenate([error, a.shape.error_of(b.shape)])

@@ -21,6 +21,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
 from numpy.typing import NDArray
 
+from chaserdock_controller.estimation.body_shape import SHAPE
 from chaserdock_controller.estimation.target_hypotheses import POSE, RATES, TargetRates
 from chaserdock_controller.estimation.types import PoseHypothesis
 
@@ -192,17 +193,19 @@ class RunningUpdate:
 
     def __init__(self, state: JointState) -> None:
         self.state, self.mean, self.covariance = state, packed(state), state.covariance.copy()
+        kernels.check_size(self.mean, self.covariance)
         self.rejections, self.nis = state.rejections.copy(), state.nis.copy()
         self.log_likelihood = state.log_likelihood
-        self.innovation = kernels.Innovation(state.chasers)
+        self.shape = state.shape
+        self.innovation = kernels.JointInnovation(state.chasers, len(self.covariance))
 
-    def values(self, z: kernels.Measurement) -> list[float]:
+    def values(self, z: kernels.ChaserMeasurement) -> list[float]:
         """Compute the innovation of a measurement; return the squared norm of each channel's residual by its innovation
         covariance, then the determinant of the sighting's."""
         self.innovation.innovate(z, self.mean, self.mean, self.covariance)
         return self.innovation.values.tolist()
 
-    def correct(self, z: kernels.Measurement, used: NDArray[np.int64], iterations: int) -> None:
+    def correct(self, z: kernels.ChaserMeasurement, used: NDArray[np.int64], iterations: int) -> None:
         """Update with the rows ``used`` of the last innovation, linearized ``iterations`` times.
 
         Raises numpy.linalg.LinAlgError for an innovation covariance that is not positive definite.
@@ -215,13 +218,16 @@ class RunningUpdate:
             if not innovation.correct(z, used, prior, self.mean):
                 raise np.linalg.LinAlgError("the innovation covariance is not positive definite")
         innovation.reduce(z, len(used), self.covariance)
+        if self.shape is not None:
+            self.shape = self.shape.corrected(innovation.correction[-SHAPE:])
 
     def finished(self, updates: int, markers: NDArray[np.int64]) -> JointState:
         """Return the state after the updates, with these fields."""
-        kernels.complete(self.state.chasers, self.covariance)
+        kernels.complete(self.covariance)
         return replace(
             self.state,
             covariance=self.covariance,
+            shape=self.shape,
             rejections=self.rejections,
             nis=self.nis,
             log_likelihood=self.log_likelihood,
@@ -286,7 +292,7 @@ def _update_chaser(
 def _follow_unexpected_motion(
     running: RunningUpdate,
     i: int,
-    z: kernels.Measurement,
+    z: kernels.ChaserMeasurement,
     channels: Sequence[_Channel],
     gates: _Gates,
     p: JointParameters,
@@ -337,7 +343,7 @@ def _gate(
             # Bound the penalty: a gross outlier counts as much as one at the gate.
             likelihood -= 0.5 * (min(value, gate) + math.log(values[-1]))
         else:
-            nis[number - 1] += (min(value, 10.0 * gate) - nis[number - 1]) / p.overconfident_ticks
+            nis[number - 1] += (min(10.0 * gate, value) - nis[number - 1]) / p.overconfident_ticks
     return _Gates(fits, rejections, nis, likelihood)
 
 

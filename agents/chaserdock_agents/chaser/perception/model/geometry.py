@@ -23,7 +23,7 @@ class GeometryCorrection:
     @cached_property
     def factor(self) -> Array:
         """Lower Cholesky factor (k, k) of the covariance: its columns are the modes of the corrected mesh."""
-        return np.linalg.cholesky(self.covariance)
+        return np.asarray(np.linalg.cholesky(self.covariance), dtype=float)
 
     def is_of(self, mean: Array) -> bool:
         """Return whether this is the correction by ``mean`` (k,)."""

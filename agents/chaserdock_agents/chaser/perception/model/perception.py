@@ -21,10 +21,9 @@ from .geometry import GeometryCorrection
 from .lighting import light_at
 from .mesh import TrackerMesh
 from .rendering import Lighting
-from .steps import Steps
+from .steps import LIGHT_MS, Steps
 from .tracking import (
     is_valid,
-    key_view_ms,
     levels_of,
     prior_steps,
     refine_pose,
@@ -32,6 +31,7 @@ from .tracking import (
     starts_around,
     track_points,
     turn_between,
+    view_ms,
 )
 
 _KEY_EVERY = 8
@@ -184,16 +184,20 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
     prior, modes = track.predicted(), track.last.modes
     missed = replace(track, missed=track.missed + 1)
     fresh = track.age + 1 < _KEY_EVERY and turn_between(prior, track.last.points.pose) < _KEY_TURN_RAD
+    # The light of a new view is estimated in the image before, which leaves more time for the view.
+    view_is_next = track.age + 2 == _KEY_EVERY
     if fresh and not track.missed:
-        yield _POINTS_MS
+        yield _POINTS_MS + view_is_next * LIGHT_MS
         found = track_points(pyramid, track.last.points, prior, modes)
         if is_valid(found):
-            return PoseTrack(found, track.light, track.last.pose, track.age + 1)
+            light = _light_near(pyramid, mesh, found.pose, track.light) if view_is_next else None
+            return PoseTrack(found, light or track.light, track.last.pose, track.age + 1)
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
         return missed
-    yield key_view_ms(pyramid, mesh, prior, levels[-1])
-    light = light_at(pyramid, mesh, prior, levels[0], track.light)
+    yield view_ms(pyramid, mesh, prior, levels[-1])
+    known = track.age + 1 == _KEY_EVERY and not track.missed
+    light = track.light if known else _light_near(pyramid, mesh, prior, track.light)
     if light is None:
         return missed
     found = refine_pose(pyramid, mesh, prior, light, levels[-1:], modes=modes)
@@ -206,6 +210,11 @@ def advance(pyramid: Pyramid, mesh: TrackerMesh, track: PoseTrack) -> Steps[Pose
         return missed
     found = yield from start_steps(pyramid, mesh, starts_around(prior), refined[1] if refined else light)
     return PoseTrack(found, light) if is_valid(found) else missed
+
+
+def _light_near(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting) -> Lighting | None:
+    levels = levels_of(pyramid, mesh, pose)
+    return light_at(pyramid, mesh, pose, levels[0], light) if levels else None
 
 
 def _distinct(tracks: list[PoseTrack]) -> tuple[PoseTrack, ...]:

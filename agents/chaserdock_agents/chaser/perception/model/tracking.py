@@ -85,7 +85,7 @@ def pose_steps(
     """Do what `refine_pose` does, one level in each step."""
     pose, alignment = prior, None
     for number, k in enumerate(levels):
-        yield level_ms(_area_px(pyramid, mesh, pose, k))
+        yield view_ms(pyramid, mesh, pose, k)
         points = control_points(pyramid, k, mesh, pose, light)
         alignment = (
             None
@@ -173,14 +173,10 @@ def start_steps(
     return best
 
 
-def key_view_ms(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
-    """Return the expected CPU time to estimate the light near a previous one and to align a view of one level."""
-    return LIGHT_MS + level_ms(_area_px(pyramid, mesh, pose, level))
-
-
-def _area_px(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
+def view_ms(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, level: int) -> float:
+    """Return the expected CPU time to align a view of one level."""
     found = window_of(pyramid, level, mesh, pose)
-    return float(found[0].height * found[0].width) if found else 0.0
+    return level_ms(float(found[0].height * found[0].width) if found else 0.0)
 
 
 def turn_between(a: PoseInCamera, b: PoseInCamera) -> float:

@@ -39,10 +39,10 @@ static void transform_row(const double *f, int k, const double *x, double *out) 
 
 /* Lower triangle of `out` becomes that of F P F', for P = `p` (d, d): F is block diagonal, with the transposed `target` (12,
  * 12), and for each chaser rows as `motion_transition` gives them, in `motion` (n, MOTION, COUPLED), and factors `fade`
- * (n, CHASER) of the components from MOTION on. `g`: working memory (d, d). */
-static void propagate(int64_t n, const double *target, const double *motion, const double *fade, const double *p,
+ * (n, CHASER) of the components from MOTION on; what follows the chasers is constant. `g`: working memory (d, d). */
+static void propagate(int64_t n, int64_t d, const double *target, const double *motion, const double *fade, const double *p,
                       double *g, double *out) {
-    const int64_t d = size_of(n);
+    const int64_t end = size_of(n);
     transform_rows(target, TARGET, p, d, TARGET, g);
     for (int64_t i = 0; i < n; i++) {
         const int64_t first = first_of(i), columns = first + CHASER;
@@ -53,9 +53,11 @@ static void propagate(int64_t n, const double *target, const double *motion, con
         for (int64_t r = MOTION; r < CHASER; r++)
             for (int64_t c = 0; c < columns; c++) rows[d * r + c] = fade[CHASER * i + r] * own[d * r + c];
     }
+    copy(p + d * end, g + d * end, d * (d - end));
     for (int64_t r = 0; r < d; r++) {
         const double *row = g + d * r;
         double *to = out + d * r;
+        for (int64_t c = end; c <= r; c++) to[c] = row[c];
         transform_row(target, TARGET, row, to);
         for (int64_t j = 0; j < n && first_of(j) <= r; j++) {
             const double *x = row + first_of(j), *f = fade + CHASER * j;
@@ -100,17 +102,16 @@ static void add_noise(double *p, int64_t d, int64_t first, const double *impulse
     for (int k = CENTRE; k < CHASER; k++) add_element(p, d, first, k, k, (1.0 - fade[k] * fade[k]) * prior[k - 12]);
 }
 
-EXPORT int64_t NAME(predict_workspace)(int64_t n) {
-    return size_of(n) * size_of(n) + n * (MOTION * COUPLED + CHASER) + 144 + 4 * 8;
+EXPORT int64_t NAME(predict_workspace)(int64_t n, int64_t d) {
+    return d * d + n * (MOTION * COUPLED + CHASER) + 144 + 4 * 8;
 }
 
 /* Predict the chasers' `mean` in place, and `covariance` (D, D) to `out`. target, target_noise (12, 12): of the target.
  * impulses (n, 6): N s, N m s; orbital (n, 6): wrench of the orbit. fade_view (n,): decay of the view's error. alive, latched
  * (n,): 0 or 1. prior (31): variances of the additive states. */
-EXPORT void NAME(predict)(const Motion *m, int64_t n, const double *target, const double *target_noise, const double *impulses,
+EXPORT void NAME(predict)(const Motion *m, int64_t n, int64_t d, const double *target, const double *target_noise, const double *impulses,
                           const double *orbital, const double *fade_view, const double *prior, const int64_t *alive,
                           const int64_t *latched, double *mean, const double *covariance, double *out, double *work) {
-    const int64_t d = size_of(n);
     double *g = allocate(&work, d * d), *motion = allocate(&work, n * MOTION * COUPLED), *fade = allocate(&work, n * CHASER);
     double *transposed = allocate(&work, 144);
     for (int i = 0; i < 12; i++)
@@ -130,7 +131,7 @@ EXPORT void NAME(predict)(const Motion *m, int64_t n, const double *target, cons
         move(x, total, m);
         for (int k = FORCE; k < CHASER; k++) additive[k] *= own[k];
     }
-    propagate(n, transposed, motion, fade, covariance, g, out);
+    propagate(n, d, transposed, motion, fade, covariance, g, out);
     for (int i = 0; i < TARGET; i++)
         for (int j = 0; j <= i; j++) out[d * i + j] += target_noise[12 * i + j];
     for (int64_t i = 0; i < n; i++)

@@ -1,7 +1,8 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Layout of the error vector and of the mean, as in state.py.
  *
- * Error vector (D = TARGET + CHASER n): the target's components, then those of each chaser. Mean (TARGET_MEAN +
+ * Error vector (D = TARGET + CHASER n, or more): the target's components, then those of each chaser. Further ones are constant, no
+ * measurement depends on them, and the mean does not contain them: the shape of a torque-free target. Mean (TARGET_MEAN +
  * CHASER_MEAN n): position, velocity, attitude, rate of the target; the same of each chaser, and its additive states, which
  * are its error's components from FORCE on.
  */

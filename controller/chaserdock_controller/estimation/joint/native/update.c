@@ -4,10 +4,10 @@
 
 /* Memory of an update: residual (18), jacobian (18, SEEN), noise, innovation covariance s (18, 18), cross (18, stride) = H P,
  * white (18, stride), correction (D). values: squared norm of each channel's residual by its innovation covariance, then
- * the determinant of the sighting's; NaN where that is not positive definite. stride: D, rounded up to a multiple of 8. */
+ * the determinant of the sighting's; NaN where that is not positive definite. stride: D, rounded up to a multiple of 8. size: D. */
 typedef struct {
     double *residual, *jacobian, *noise, *s, *cross, *white, *correction, *values;
-    int64_t stride;
+    int64_t stride, size;
 } Innovation;
 
 static void body_difference(const double *a, const double *b, double *error) {
@@ -87,13 +87,13 @@ static double normalized_square(const double *s, int rows, const double *residua
     return square;
 }
 
-EXPORT int64_t NAME(innovate_workspace)(int64_t n) { return SEEN * size_of(n) + TARGET + CHASER + 2 * 8; }
+EXPORT int64_t NAME(innovate_workspace)(int64_t d) { return SEEN * d + TARGET + CHASER + 2 * 8; }
 
 /* Linearize the measurements at `mean` and compute the innovation by the lower triangle of `covariance` (D, D). The residual
  * is that of the prior mean `prior`, to first order, for an iterated update; equal to `mean` in the first iteration. */
 EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const double *prior, const double *covariance,
                            Innovation *out, double *work) {
-    const int64_t d = size_of(z->n), first = first_of(z->i), stride = out->stride;
+    const int64_t d = out->size, first = first_of(z->i), stride = out->stride;
     const int k = rows_of(z);
     double *seen = allocate(&work, SEEN * d), *error = allocate(&work, SEEN), *s = out->s;
     NAME(linearize)(z, mean, out->residual, out->jacobian, out->noise);
@@ -139,7 +139,7 @@ EXPORT void NAME(innovate)(const Measurement *z, const double *mean, const doubl
 EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t m, Innovation *z, const double *prior,
                              double *mean) {
     double factor[MOST_ROWS * MOST_ROWS], y[MOST_ROWS];
-    const int64_t d = size_of(n), stride = z->stride;
+    const int64_t d = z->size, stride = z->stride;
     for (int64_t i = 0; i < m; i++) {
         y[i] = z->residual[used[i]];
         for (int64_t j = 0; j < m; j++) factor[m * i + j] = z->s[k * used[i] + used[j]];
@@ -164,12 +164,12 @@ EXPORT int64_t NAME(correct)(int64_t n, int64_t k, const int64_t *used, int64_t 
 
 /* Subtract the information of the m rows of white from the lower triangle of `covariance`, and make the rotation errors of
  * target and chaser i relative to their corrected attitudes. */
-EXPORT void NAME(reduce)(int64_t n, int64_t i, int64_t m, const Innovation *z, double *covariance) {
-    const int64_t d = size_of(n), own = first_of(i) + ATTITUDE;
+EXPORT void NAME(reduce)(int64_t i, int64_t m, const Innovation *z, double *covariance) {
+    const int64_t d = z->size, own = first_of(i) + ATTITUDE;
     subtract_square(z->white, (int)m, z->stride, covariance, d);
     turn_error(covariance, d, ATTITUDE, z->correction + ATTITUDE);
     turn_error(covariance, d, own, z->correction + own);
 }
 
 /* Make a covariance (D, D) symmetric by its lower triangle. */
-EXPORT void NAME(complete)(int64_t n, double *covariance) { mirror(covariance, size_of(n)); }
+EXPORT void NAME(complete)(int64_t d, double *covariance) { mirror(covariance, d); }

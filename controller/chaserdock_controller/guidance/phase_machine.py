@@ -52,6 +52,8 @@ _REST_S = 0.5
 """Time for which a stack must be below its limits to count as stopped."""
 _MOVING_S = 0.2
 """Time for which a stopped stack must be above half of them to be stopped again; it drifts meanwhile."""
+_SETTLING_S = 1.0
+"""Time after the last thrust in which the estimate of the stack's motion is still late."""
 _SIGHT_LOSS_S = 3.0
 """An approach stops when no chaser has seen the target for this long."""
 _HELD_MARGIN_M = 0.03
@@ -407,7 +409,8 @@ class PhaseMachine:
         for i in sorted(self.detumbling()):
             c = self.chasers[i]
             holds = c.phase is Phase.STACK_HOLD
-            since = self._inside_since(i, moving if holds else stopped, now_s)
+            settled = now_s - c.since_s >= _SETTLING_S
+            since = self._inside_since(i, moving and settled if holds else stopped, now_s)
             self.chasers[i] = replace(c, inside_since_s=since)
             if since is not None and now_s - since >= (_MOVING_S if holds else _REST_S):
                 trigger = Trigger.STACK_MOVED if holds else Trigger.STACK_STOPPED

@@ -71,7 +71,7 @@ LEAST_GREY = 5.0
 MOST_UNSEEN = 120
 RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0])))
 
-Row = dict[str, float]
+ViewRow = dict[str, float]
 """Figures of one view."""
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
@@ -113,7 +113,9 @@ class Cells:
 
     path: Path | None
 
-    def rows(self, cell: str, views: int, view: Callable[[np.random.Generator, int], Row]) -> list[Row]:
+    def rows(
+        self, cell: str, views: int, view: Callable[[np.random.Generator, int], ViewRow]
+    ) -> list[ViewRow]:
         """Return the rows of a cell; ``view`` makes that of a number with a generator of its own."""
         known = {line["number"]: line["row"] for line in read_lines(self.path) if line["cell"] == cell}
         for number in range(views):
@@ -173,7 +175,9 @@ def inspect(views: int) -> Figures:
     }
 
 
-def tracked_view(image: NDArray[np.uint8], mesh: TrackerMesh, pose: PoseInCamera, prior: PoseInCamera) -> Row:
+def tracked_view(
+    image: NDArray[np.uint8], mesh: TrackerMesh, pose: PoseInCamera, prior: PoseInCamera
+) -> ViewRow:
     """Return the result of tracking one image."""
     _ = mesh.suns  # made once in a flight
     begin_s = time.process_time()
@@ -194,7 +198,7 @@ def tracked_view(image: NDArray[np.uint8], mesh: TrackerMesh, pose: PoseInCamera
     }
 
 
-def tracking_figures(key: str, rows: list[Row]) -> Figures:
+def tracking_figures(key: str, rows: list[ViewRow]) -> Figures:
     """Return the figures of views that were tracked."""
     valid = [row for row in rows if row["valid"]]
     figures: Figures = {f"{key}_views": len(rows), f"{key}_rejected": len(rows) - len(valid)}
@@ -211,7 +215,7 @@ def track_cell(cells: Cells, name: str, range_m: float, views: int) -> Figures:
     """Track single images at one range."""
     scene = SatelliteImages()
 
-    def view(rng: np.random.Generator, number: int) -> Row:
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
         mesh = _drawn_mesh(rng) if name == "knowledge" else EXACT
         pose, light = random_view(rng, range_m, CAMERA)
         image = scene.image(pose, light, number)
@@ -229,7 +233,7 @@ def independent(cells: Cells, views: int) -> Figures:
     mesh = plain(satellite(TARGET))
     tracker = TrackerMesh.of_mesh(mesh, 0.0, 0.0)
 
-    def view(rng: np.random.Generator, number: int) -> Row:
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, light = random_view(rng, 3.0, CAMERA)
         exact = trace(mesh, CAMERA, pose.position, rotations.from_matrix(pose.rotation), light, 3).level
         spread = cv2.GaussianBlur(exact, (0, 0), Effects().point_spread_px)
@@ -242,7 +246,7 @@ def independent(cells: Cells, views: int) -> Figures:
 def behind(cells: Cells, views: int) -> Figures:
     """Track single images in front of the Earth."""
 
-    def view(rng: np.random.Generator, number: int) -> Row:
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, light = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
         image = SatelliteImages(earth_behind(rng)).image(pose, light, number)
         return tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
@@ -254,7 +258,7 @@ def backlit(cells: Cells, views: int) -> Figures:
     """Track single images with the sun behind the target."""
     scene = SatelliteImages()
 
-    def view(rng: np.random.Generator, number: int) -> Row:
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, _ = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
         sun = (rng.normal(0.0, 0.6), rng.normal(0.0, 0.6), 1.0)
         ambient = float(rng.uniform(0.01, 0.2))
@@ -278,7 +282,7 @@ def gate(cells: Cells, views: int) -> Figures:
     """Track from priors that are mostly too far off."""
     scene = SatelliteImages()
 
-    def view(rng: np.random.Generator, number: int) -> Row:
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, light = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
         prior = perturbed(pose, rng, rng.uniform(0.0, 0.05), np.deg2rad(rng.uniform(0.0, 12.0)))
         return tracked_view(scene.image(pose, light, number), EXACT, pose, prior)
@@ -297,7 +301,7 @@ def acquire(cells: Cells, key: str, views: int) -> Figures:
     acquisition = Acquisition(CAMERA, TrackerMesh.of_mesh(KNOWN, 0.0, 0.0))
     acquisition.prepare()
 
-    def view(rng: np.random.Generator, number: int) -> Row:
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
         range_m = rng.uniform(1.0, 3.0)
         pose, light = random_view(rng, range_m, CAMERA)
         scene = SatelliteImages(earth_behind(rng) if key == "earth" else None)

@@ -44,7 +44,7 @@ PROGRESS_S = 5.0
 STEADY_RAD = math.radians(0.3)
 
 
-class MissionOutcome(msgspec.Struct, frozen=True):
+class MarkerlessOutcome(msgspec.Struct, frozen=True):
     """How one flight ended.
 
     ``steady_position_m``, ``steady_orientation_rad``: RMS tracking errors of the worst chaser in the steady interval.
@@ -136,7 +136,7 @@ def pose_covariance(covariance: Array) -> Array:
     return covariance[np.ix_(pose, pose)]
 
 
-def fly(seed: int, scenario: Scenario) -> MissionOutcome:
+def fly(seed: int, scenario: Scenario) -> MarkerlessOutcome:
     """Fly one mission."""
     images = TimedImages(scenario)
     capture, wanted = scenario.docking.kind == "capture", scenario.success.latched
@@ -193,7 +193,7 @@ def outcome(
     errors: list[list[tuple[float, float]]],
     rows: list[tuple[float, float, float] | None],
     total_s: float,
-) -> MissionOutcome:
+) -> MarkerlessOutcome:
     scenario, capture = flight.scenario, flight.scenario.docking.kind == "capture"
     done = "verified" if capture else "docked"
     wanted = scenario.success.latched if capture else scenario.success.docked
@@ -214,7 +214,7 @@ def outcome(
         cause = done + (f" after {len(retreats)} retreats" if retreats else "")
     ticks, per_image = len(errors), 1e3 * np.array(images.perception_s)
     image_s = 1.0 / scenario.timing.rate_hz * scenario.timing.ticks_per_image
-    return MissionOutcome(
+    return MarkerlessOutcome(
         seed=seed,
         cause=cause,
         success=not missing and not flight.contacts,
@@ -243,7 +243,7 @@ def outcome(
     )
 
 
-def line_of(o: MissionOutcome) -> str:
+def line_of(o: MarkerlessOutcome) -> str:
     """Return one line for people."""
     text = (
         f"{o.seed}: {o.cause} at {o.time_s:.1f} s; steady {1e3 * o.steady_position_m:.2f} mm "
@@ -260,7 +260,7 @@ def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | 
     outcomes = []
     key = {"part": part, "changes": list(changes)}
     known = {
-        line["outcome"]["seed"]: msgspec.convert(line["outcome"], MissionOutcome)
+        line["outcome"]["seed"]: msgspec.convert(line["outcome"], MarkerlessOutcome)
         for line in read_lines(results)
         if {k: line[k] for k in key} == key
     }
@@ -272,7 +272,7 @@ def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | 
         outcomes.append(known[seed])
         print(f"  {line_of(known[seed])}", flush=True)
 
-    def worst(of: Callable[[MissionOutcome], float]) -> float:
+    def worst(of: Callable[[MarkerlessOutcome], float]) -> float:
         return max(map(of, outcomes))
 
     steady = [o.steady_position_m <= 0.003 and o.steady_orientation_rad <= STEADY_RAD for o in outcomes]

@@ -48,7 +48,7 @@ def test_kernels_stand_any_floating_point_input(folder: str, tmp_path: Path) -> 
     [
         (1, "draw_stars", "scene.c", "if (!(x > -1.0 && y > -1.0", "if ((x < -1.0 && y > -1.0", "outside the range"),
         (2, "refine_corners", "corners.c", "if (row > p->height - 2)", "if (row > p->height)", "heap-buffer-overflow"),
-        (3, "plan_violation", "planes.c", "max_or_nan(worst[i], zones", "max_of(worst[i], zones", "violated: worst"),
+        (3, "plan_violation", "planes.c", "or_nan(worst[i], zones->to_target", "of(worst[i], zones->to_target", "violated: worst"),
     ],
 )  # fmt: skip
 def test_planted_faults_are_found(

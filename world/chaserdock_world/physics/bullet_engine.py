@@ -18,10 +18,10 @@ from chaserdock_models.rigid_body import BodyState
 from .bullet import connect, pybullet
 from .engine import (
     BodyContact,
+    BodyMotion,
+    CollisionSolid,
     EngineSetup,
-    Motion,
     RigidBodyDefinition,
-    Solid,
     SolidBox,
     SolidCapsule,
     SolidHull,
@@ -66,7 +66,7 @@ class BulletEngine:
         omega_world = rotations.rotate(state.q_wxyz, state.omega_rad_s)
         pybullet.resetBaseVelocity(identity, state.velocity_m_s.tolist(), omega_world.tolist(), self._client)
 
-    def _shape(self, solids: Sequence[Solid]) -> int:
+    def _shape(self, solids: Sequence[CollisionSolid]) -> int:
         hulls = [s for s in solids if isinstance(s, SolidHull)]
         if hulls:
             return self._hull_shape(hulls)
@@ -95,7 +95,7 @@ class BulletEngine:
             path.write_text("\n".join(lines) + "\n")
             return self._bullet.createCollisionShape(pybullet.GEOM_MESH, fileName=str(path))
 
-    def motion(self, body: int) -> Motion:
+    def motion(self, body: int) -> BodyMotion:
         """See ``RigidBodyEngine.motion``."""
         identity, client = self._ids[body], self._client
         position, (x, y, z, w) = pybullet.getBasePositionAndOrientation(identity, client)

@@ -21,7 +21,7 @@ from chaserdock_models.orbit import Scalars3
 from chaserdock_models.rigid_body import BodyState
 
 Scalars4 = tuple[float, float, float, float]
-Motion = tuple[Scalars3, Scalars4, Scalars3, Scalars3]
+BodyMotion = tuple[Scalars3, Scalars4, Scalars3, Scalars3]
 """Position (3,), m, attitude (4,), velocity (3,), m/s, and rate (3,), rad/s, of a body in WRF."""
 
 
@@ -52,7 +52,7 @@ class SolidHull:
     triangles: IntArray
 
 
-Solid = SolidBox | SolidCapsule | SolidHull
+CollisionSolid = SolidBox | SolidCapsule | SolidHull
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +64,7 @@ class RigidBodyDefinition:
 
     mass_kg: float
     moments_kg_m2: Sequence[float]
-    solids: Sequence[Solid]
+    solids: Sequence[CollisionSolid]
     state: BodyState
 
 
@@ -106,7 +106,7 @@ class BodyContact(NamedTuple):
 class RigidBodyEngine(Protocol):
     """Rigid bodies, their contacts and joints. Loads are cleared after each step."""
 
-    def motion(self, body: int) -> Motion:
+    def motion(self, body: int) -> BodyMotion:
         """Return the present motion of a body."""
         ...
 

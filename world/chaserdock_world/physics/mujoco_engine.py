@@ -25,11 +25,11 @@ from chaserdock_models.scalar_rotations import cross_components, rotated_compone
 
 from .engine import (
     BodyContact,
+    BodyMotion,
+    CollisionSolid,
     ContactSpring,
     EngineSetup,
-    Motion,
     RigidBodyDefinition,
-    Solid,
     SolidBox,
     SolidCapsule,
     SolidHull,
@@ -71,18 +71,18 @@ class MujocoEngine:
         # Numbers of the closed joints in ascending order, now and in the last step.
         self._closed: tuple[int, ...] = ()
         self._solved: tuple[int, ...] = ()
-        self._motions: dict[int, Motion] = {}
+        self._motions: dict[int, BodyMotion] = {}
         for number, body in enumerate(setup.bodies):
             self.place(number, body.state)
 
-    def motion(self, body: int) -> Motion:
+    def motion(self, body: int) -> BodyMotion:
         """See ``RigidBodyEngine.motion``."""
         found = self._motions.get(body)
         if found is None:
             found = self._motions[body] = self._read_motion(body)
         return found
 
-    def _read_motion(self, body: int) -> Motion:
+    def _read_motion(self, body: int) -> BodyMotion:
         data, index = self._data, self._index[body]
         if not self._free[body]:
             x, y, z = data.mocap_pos[index].tolist()
@@ -256,7 +256,7 @@ def _add_body(spec: Any, number: int, body: RigidBodyDefinition, reference: list
         )
 
 
-def _geometry(spec: Any, name: str, solid: Solid) -> dict[str, object]:
+def _geometry(spec: Any, name: str, solid: CollisionSolid) -> dict[str, object]:
     """Return type, size and pose of a solid; a hull is added to ``spec`` as a mesh of this name."""
     kinds = mujoco.mjtGeom
     if isinstance(solid, SolidBox):

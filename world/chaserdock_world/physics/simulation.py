@@ -26,11 +26,11 @@ from .collision_hulls import collision_hulls, triangles_of
 from .compliant_latch import ENGAGED_M, CompliantLatch, Grip
 from .engine import (
     BodyContact,
+    BodyMotion,
+    CollisionSolid,
     ContactSpring,
     EngineSetup,
-    Motion,
     RigidBodyDefinition,
-    Solid,
     SolidBox,
     SolidCapsule,
     SolidHull,
@@ -95,7 +95,7 @@ class Physics:
         self._openings: list[tuple[int, str]] = []
         self._closing = False  # a latch closed in the last step: its joint acts first in the next one
         # Motion of every free body at the beginning of the last step.
-        self._before: dict[int, Motion] = {}
+        self._before: dict[int, BodyMotion] = {}
 
     @property
     def bodies(self) -> tuple[str, ...]:
@@ -128,7 +128,7 @@ class Physics:
     def _chaser_definition(self, i: int) -> RigidBodyDefinition:
         scenario, body, plant = self._scenario, self._scenario.chaser, self.plants[f"chaser/{i}"]
         half = [s / 2 for s in body.size_m]
-        solids: list[Solid] = [SolidBox(half, *_place(plant, np.zeros(3), rotations.IDENTITY))]
+        solids: list[CollisionSolid] = [SolidBox(half, *_place(plant, np.zeros(3), rotations.IDENTITY))]
         if scenario.docking.kind == "capture":
             # The probe: a massless capsule from the body's front to the tip.
             length = body.probe_reach_m - half[0] - PROBE_RADIUS_M
@@ -145,7 +145,7 @@ class Physics:
             return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
         return self._body_state(name, self._engine.motion(self._bodies[name]))
 
-    def _body_state(self, name: str, motion: Motion) -> BodyState:
+    def _body_state(self, name: str, motion: BodyMotion) -> BodyState:
         """Return the state of a body's frame from the engine's motion of it."""
         state, frame = _state_of(motion), self.plants[name].frame
         return state if frame is None else frame.to_body(state)
@@ -233,7 +233,7 @@ class Physics:
         attached = (*self._joints, *self._compliant)
         return {self._bodies[name] for name in (*attached, TARGET)} if attached else set()
 
-    def _apply_orbital(self, orbital: OrbitalForces, body: int, motion: Motion) -> None:
+    def _apply_orbital(self, orbital: OrbitalForces, body: int, motion: BodyMotion) -> None:
         """Apply the loads of the orbit to a body for one step."""
         name, (position, q_wxyz, velocity, omega_world) = self._names[body], motion
         plant = self.plants[name]
@@ -431,7 +431,7 @@ def _hull_solids(hulls: Sequence[Array], plant: Plant) -> list[SolidHull]:
     return [SolidHull(_place(plant, hull, rotations.IDENTITY)[0], triangles_of(hull)) for hull in hulls]
 
 
-def _state_of(motion: Motion) -> BodyState:
+def _state_of(motion: BodyMotion) -> BodyState:
     """Return the state of the engine's frame of a body."""
     position, q_wxyz, velocity, omega_world = motion
     q = rotations.normalize(q_wxyz)

@@ -31,7 +31,7 @@ def mass_estimate(values: tuple[float, ...], share: float) -> m.MassEstimate:
     sigmas = share * np.array([1.5, *[0.002] * 3, *[0.1] * 6])
     return m.MassEstimate(
         mass_kg=values[0],
-        centre_of_mass_m=values[1:4],
+        centre_of_mass_m=(values[1], values[2], values[3]),
         inertia_kg_m2=values[4:],
         covariance=tuple(np.diag(sigmas**2).reshape(-1).tolist()),
     )

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from subprocess import PIPE, STDOUT
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -102,7 +103,7 @@ def test_images_are_of_one_moment() -> None:
     state = MissionState.empty(3)
 
     def image(chaser: int, time_s: float, seen: bool = True) -> None:
-        at = {"chaser": chaser, "sim_time_ns": round(time_s * 1e9)}
+        at: dict[str, Any] = {"chaser": chaser, "sim_time_ns": round(time_s * 1e9)}
         state.update(topics.IMAGE, Image(width_px=1, height_px=1, encoding="mono8", data=b"0", **at))
         if seen:
             state.update(

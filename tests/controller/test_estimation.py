@@ -57,6 +57,7 @@ def test_no_clock_and_no_global_randomness() -> None:
         "chaserdock_models",
         "chaserdock_protocol",
         "collections",
+        "ctypes",
         "dataclasses",
         "functools",
     }

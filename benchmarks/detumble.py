@@ -35,7 +35,9 @@ from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -53,6 +55,9 @@ from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_c
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
+
+
+_Outcome = TypeVar("_Outcome")
 
 
 class DetumbleRow(msgspec.Struct, frozen=True):
@@ -106,6 +111,34 @@ def figures_of(name: str, outcomes: list[DetumbleOutcome]) -> Figures:
     return out | {f"{name}_held_N_s_per_minute": 60.0 * sum(o.held_N_s for o in stopped) / held_s}
 
 
+def fly_sets(
+    o: argparse.Namespace,
+    seeds: range,
+    known: Mapping[tuple[str, int], _Outcome],
+    fly: Callable[[str, int], _Outcome],
+    row: Callable[[str, int, _Outcome], msgspec.Struct],
+    line: Callable[[str, int, _Outcome], str],
+    figures_of_set: Callable[[str, list[_Outcome]], Figures],
+) -> Figures:
+    """Fly every set of chasers with every seed that is not ``known``; return the figures.
+
+    ``row``: of a flight for the results file; ``line``: for the terminal.
+    """
+    figures: Figures = {}
+    for chasers in o.sets:
+        outcomes = []
+        for seed in seeds:
+            outcome = known.get((chasers, seed))
+            if outcome is None:
+                outcome = fly(chasers, seed)
+                append_line(o.results, msgspec.to_builtins(row(chasers, seed, outcome)))
+                print(line(chasers, seed, outcome), file=sys.stderr, flush=True)
+            outcomes.append(outcome)
+        figures |= (part := figures_of_set(chasers, outcomes))
+        print_figures(part)
+    return figures
+
+
 class SilentRow(msgspec.Struct, frozen=True):
     """One flight without controller in the results file."""
 
@@ -139,20 +172,15 @@ def fly_sets_silent(o: argparse.Namespace, seeds: range) -> Figures:
         for row in read_lines(o.results)
         if row["settings"] == settings
     }
-    figures: Figures = {}
-    for chasers in o.sets:
-        outcomes = []
-        for seed in seeds:
-            outcome = known.get((chasers, seed))
-            if outcome is None:
-                scenario = stack_scenario(seed, [int(c) for c in chasers], o.set)
-                outcome = fly_silent(scenario, rest_s=10.0)
-                append_line(o.results, msgspec.to_builtins(SilentRow(chasers, settings, seed, outcome)))
-                print(f"{chasers} seed {seed}: {outcome}", file=sys.stderr, flush=True)
-            outcomes.append(outcome)
-        figures |= (part := silent_figures(f"silent_{chasers}", outcomes))
-        print_figures(part)
-    return figures
+    return fly_sets(
+        o,
+        seeds,
+        known,
+        lambda chasers, seed: fly_silent(stack_scenario(seed, numbers_of(chasers), o.set), rest_s=10.0),
+        lambda chasers, seed, outcome: SilentRow(chasers, settings, seed, outcome),
+        lambda chasers, seed, outcome: f"{chasers} seed {seed}: {outcome}",
+        lambda chasers, outcomes: silent_figures(f"silent_{chasers}", outcomes),
+    )
 
 
 class RigidRow(msgspec.Struct, frozen=True):
@@ -165,7 +193,7 @@ class RigidRow(msgspec.Struct, frozen=True):
 
 def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> StackFlight:
     """Fly one case."""
-    numbers, one = [int(c) for c in chasers], len(chasers) == 1
+    numbers, one = numbers_of(chasers), len(chasers) == 1
     settings, events = [*wrong_knowledge(seed), *o.set], FlightEvents()
     if case not in ("fast", "silent"):
         settings.append(f"detumble.plan_s={75.0 if one else 14.0}")
@@ -245,23 +273,21 @@ def rigid_figures(name: str, flights: list[StackFlight]) -> Figures:
 def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
     """Fly a case with every set of chasers; return the figures."""
     limits = f" limits={o.limits}" if o.limits else ""
-    case, figures = f"{o.rigid} set={sorted(o.set)}{limits}", {}
+    case = f"{o.rigid} set={sorted(o.set)}{limits}"
     known = {
-        (row["chasers"], row["case"], row["flight"]["seed"]): msgspec.convert(row, RigidRow).flight
+        (row["chasers"], row["flight"]["seed"]): msgspec.convert(row, RigidRow).flight
         for row in read_lines(o.results)
+        if row["case"] == case
     }
-    for chasers in o.sets:
-        flights = []
-        for seed in seeds:
-            flight = known.get((chasers, case, seed))
-            if flight is None:
-                flight = fly_rigid(o.rigid, chasers, seed, o)
-                append_line(o.results, msgspec.to_builtins(RigidRow(chasers, case, flight)))
-                print(f"{o.rigid} {chasers}: {flight}", file=sys.stderr, flush=True)
-            flights.append(flight)
-        figures |= (part := rigid_figures(f"{o.rigid}_{chasers}", flights))
-        print_figures(part)
-    return figures
+    return fly_sets(
+        o,
+        seeds,
+        known,
+        lambda chasers, seed: fly_rigid(o.rigid, chasers, seed, o),
+        lambda chasers, _, flight: RigidRow(chasers, case, flight),
+        lambda chasers, _, flight: f"{o.rigid} {chasers}: {flight}",
+        lambda chasers, flights: rigid_figures(f"{o.rigid}_{chasers}", flights),
+    )
 
 
 class VisionRow(msgspec.Struct, frozen=True):
@@ -290,26 +316,51 @@ def vision_figures(name: str, tumbles: list[TumbleOutcome]) -> Figures:
 
 def fly_sets_vision(o: argparse.Namespace, seeds: range) -> Figures:
     """Watch free tumbles with every set of chasers; return the figures."""
-    settings, figures = f"vision set={sorted(o.set)}", {}
+    settings = f"vision set={sorted(o.set)}"
     known = {
         (row["chasers"], row["outcome"]["seed"]): msgspec.convert(row, VisionRow).outcome
         for row in read_lines(o.results)
         if row.get("settings") == settings
     }
-    for chasers in o.sets:
-        tumbles = []
-        for seed in seeds:
-            outcome = known.get((chasers, seed))
-            if outcome is None:
-                outcome = watch_tumble(
-                    tumble_scenario(seed, [int(c) for c in chasers], VISION_DEG_S, o.set), VISION_S
-                )
-                append_line(o.results, msgspec.to_builtins(VisionRow(chasers, settings, outcome)))
-                print(f"{chasers}: {outcome}", file=sys.stderr, flush=True)
-            tumbles.append(outcome)
-        figures |= (part := vision_figures(f"vision_{chasers}", tumbles))
-        print_figures(part)
-    return figures
+    return fly_sets(
+        o,
+        seeds,
+        known,
+        lambda chasers, seed: watch_tumble(
+            tumble_scenario(seed, numbers_of(chasers), VISION_DEG_S, o.set), VISION_S
+        ),
+        lambda chasers, _, outcome: VisionRow(chasers, settings, outcome),
+        lambda chasers, _, outcome: f"{chasers}: {outcome}",
+        lambda chasers, outcomes: vision_figures(f"vision_{chasers}", outcomes),
+    )
+
+
+def fly_sets_whole(o: argparse.Namespace, seeds: range) -> Figures:
+    """Fly every set of chasers with rendered images; return the figures."""
+    settings = f"duration={o.duration:g} set={sorted(o.set)}"
+    settings += f" limits={o.limits}" if o.limits else ""
+    rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results) if row["settings"] == settings]
+
+    def fly(chasers: str, seed: int) -> DetumbleOutcome:
+        scenario = stack_scenario(seed, numbers_of(chasers), o.set)
+        if o.limits:
+            scenario = with_load_limits(scenario, *o.limits)
+        return fly_stack(scenario, RenderedImages, o.duration)
+
+    return fly_sets(
+        o,
+        seeds,
+        {(r.chasers, r.outcome.seed): r.outcome for r in rows},
+        fly,
+        lambda chasers, _, outcome: DetumbleRow(chasers, settings, outcome),
+        lambda chasers, _, outcome: f"{chasers} {line_of(outcome)}",
+        lambda chasers, outcomes: figures_of(f"chasers_{chasers}", outcomes),
+    )
+
+
+def numbers_of(chasers: str) -> list[int]:
+    """Return the numbers of a set of chasers."""
+    return [int(c) for c in chasers]
 
 
 def main() -> None:
@@ -328,36 +379,14 @@ def main() -> None:
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="scenario override")
     parser.add_argument("--results", type=Path, metavar="FILE")
     o = parser.parse_args()
-    number = 2 if o.quick else o.tumbles
+    fly = fly_sets_whole
     if o.silent:
-        write_json(o.json, fly_sets_silent(o, range(o.first, o.first + number)))
-        return
-    if o.vision:
-        write_json(o.json, fly_sets_vision(o, range(o.first, o.first + number)))
-        return
-    if o.rigid:
-        write_json(o.json, fly_sets_rigid(o, range(o.first, o.first + number)))
-        return
-    settings = f"duration={o.duration:g} set={sorted(o.set)}"
-    settings += f" limits={o.limits}" if o.limits else ""
-    rows = [msgspec.convert(row, DetumbleRow) for row in read_lines(o.results) if row["settings"] == settings]
-    known = {(r.chasers, r.outcome.seed): r.outcome for r in rows}
-    figures: Figures = {}
-    for chasers in o.sets:
-        outcomes = []
-        for seed in range(o.first, o.first + number):
-            outcome = known.get((chasers, seed))
-            if outcome is None:
-                scenario = stack_scenario(seed, [int(c) for c in chasers], o.set)
-                if o.limits:
-                    scenario = with_load_limits(scenario, *o.limits)
-                outcome = fly_stack(scenario, RenderedImages, o.duration)
-                append_line(o.results, msgspec.to_builtins(DetumbleRow(chasers, settings, outcome)))
-                print(f"{chasers} {line_of(outcome)}", file=sys.stderr, flush=True)
-            outcomes.append(outcome)
-        figures |= (part := figures_of(f"chasers_{chasers}", outcomes))
-        print_figures(part)
-    write_json(o.json, figures)
+        fly = fly_sets_silent
+    elif o.vision:
+        fly = fly_sets_vision
+    elif o.rigid:
+        fly = fly_sets_rigid
+    write_json(o.json, fly(o, range(o.first, o.first + (2 if o.quick else o.tumbles))))
 
 
 if __name__ == "__main__":

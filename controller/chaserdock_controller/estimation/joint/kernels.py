@@ -135,10 +135,15 @@ class JointInnovation:
         function("reduce")(c_int64(z.chaser), c_int64(rows), self._address, address(covariance))
 
 
+def _error_size(n: int) -> int:
+    """Return the number of errors of a target without shape and ``n`` chasers."""
+    return 12 + 43 * n
+
+
 def check_size(mean: Array, covariance: Array) -> int:
     """Return the number of chasers of a state. Raises ValueError if its covariance has another size, with or without a shape."""
     n, rest = divmod(mean.size - TARGET_MEAN, CHASER_MEAN)
-    size = 12 + 43 * n
+    size = _error_size(n)
     if rest or covariance.shape not in ((size, size), (size + SHAPE, size + SHAPE)):
         raise ValueError(f"a state of {n} chasers with a covariance of shape {covariance.shape}")
     return n
@@ -213,7 +218,7 @@ def predict_sighting(mean: Array, i: int, mounting: tuple[Array, Array, Array]) 
 def difference(a: Array, b: Array) -> Array:
     """Return the error (D,) that takes the mean ``a`` to ``b``."""
     n = (len(a) - TARGET_MEAN) // CHASER_MEAN
-    error = np.empty(12 + 43 * n)
+    error = np.empty(_error_size(n))
     function("difference")(c_int64(n), address(a), address(b), address(error))
     return error
 

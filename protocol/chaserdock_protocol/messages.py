@@ -96,7 +96,7 @@ SquareOfParameters = Annotated[tuple[float, ...], Meta(max_length=64 * 64)]
 
 
 class GeometryMeasurement(Struct, frozen=True, kw_only=True):
-    """What one image tells about the k errors of the target's known geometry, whatever its pose.
+    """Information of one image on the k errors of the target's known geometry, for any pose of it.
 
     ``information``: row-major (k, k); ``vector``: it times the estimate (k,). In units of the errors' prior standard deviations, in
     the order of ``GeometryEstimate.names``.
@@ -355,7 +355,7 @@ class Sighting(Message, frozen=True, kw_only=True):
 
     The best solution comes first; a second one follows if a single small marker is ambiguous.
     ``corners_px``: u, v of the four corners of each used marker, in the distorted image. ``geometry``: by shape only, in images
-    whose view was rendered anew.
+    for which a view was rendered.
     """
 
     chaser: ChaserId
@@ -528,7 +528,7 @@ class ActuatorCommand(Message, frozen=True, kw_only=True):
 
 
 class Lease(Message, frozen=True, kw_only=True):
-    """Command authority over chaser ``chaser``, granted by it to the controller ``holder``; empty: to nobody.
+    """Command authority over chaser ``chaser``, granted by it to the controller ``holder``; empty: to none.
 
     Its ticks are those from ``from_tick`` (in revision ``from_revision`` on) to ``until_tick``. The chaser executes commands
     of that controller's ``instance`` only, and of no term before ``term``. ``tick`` and ``revision`` are those of the newest

@@ -138,7 +138,7 @@ NEVER_DROPPED = (END, FAREWELL)
 """Published once, at the end, and never dropped, not even in real time."""
 
 JOIN_KEY = "world/join"
-"""Query: JoinRequest -> JoinReply, with the flight scenario, whoever asks: the name in a request is only a claim."""
+"""Query: JoinRequest -> JoinReply, with the flight scenario, for any client: the name in a request is only a claim."""
 SCENARIO_KEY = "truth/scenario"
 """Query: ScenarioRequest -> ScenarioReply, with the full scenario."""
 OPERATE_KEY = "controller/operate"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of the known geometry: what an image tells about them, correction of the tracker mesh, and the messages that carry both."""
+"""Errors of the known geometry: information of an image on them, correction of the tracker mesh, and the messages that carry both."""
 
 from __future__ import annotations
 
@@ -60,9 +60,9 @@ def test_information_of_a_corrected_mesh_is_about_the_errors_before() -> None:
     # Rows measure errors before: of the corrected mesh they measure x with e = mean + C x.
     seen = rows @ correction.factor
     x = np.linalg.solve(correction.factor, error - correction.mean)
-    told = correction.of_uncorrected(GeometryInformation(seen.T @ seen, seen.T @ (seen @ x)))
-    np.testing.assert_allclose(told.matrix, rows.T @ rows, atol=1e-9)
-    np.testing.assert_allclose(told.vector, rows.T @ (rows @ error), atol=1e-9)
+    measured = correction.of_uncorrected(GeometryInformation(seen.T @ seen, seen.T @ (seen @ x)))
+    np.testing.assert_allclose(measured.matrix, rows.T @ rows, atol=1e-9)
+    np.testing.assert_allclose(measured.vector, rows.T @ (rows @ error), atol=1e-9)
 
 
 def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_accurate() -> None:
@@ -80,8 +80,8 @@ def test_views_from_all_around_find_the_errors_and_their_correction_makes_poses_
         return tracking.pose_error(found[0].pose, pose), found[0].geometry
 
     for number in range(6):
-        _, told = seen(mesh, number)
-        information, vector = information + told.matrix, vector + told.vector
+        _, measured = seen(mesh, number)
+        information, vector = information + measured.matrix, vector + measured.vector
     covariance = np.asarray(np.linalg.inv(information), dtype=float)
     mean = covariance @ vector
     # The scale is hardly observable without its effect on the range; the panels are.
@@ -105,14 +105,14 @@ def test_perception_publishes_what_new_views_tell_and_tracks_on_after_a_correcti
     found = tracking.refine_from_prior(Pyramid(scene.image(pose, light, 0), CAMERA), mesh, pose)
     assert found is not None
     perception._tracks = (PoseTrack(*found, age=7),)  # in place of an acquisition; the next view is a new one
-    told = []
+    measured = []
     for number in range(1, 4):
         sighting = look(perception, image_of(scene.image(pose, light, number), number), None)
         assert sighting.solutions
-        told.append(sighting.geometry)
-    assert told[0] is not None
-    assert len(told[0].vector) == 3
-    assert told[1:] == [None] * 2  # control points reused: no new information
+        measured.append(sighting.geometry)
+    assert measured[0] is not None
+    assert len(measured[0].vector) == 3
+    assert measured[1:] == [None] * 2  # control points reused: no new information
     estimate = GeometryEstimate(
         names=("a", "b", "scale"),
         sigmas=(PANEL_RAD, PANEL_RAD, SCALE),

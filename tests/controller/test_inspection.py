@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inspection: the flight around the target, and the fusion of what its images tell about the geometry."""
+"""Inspection: the flight around the target, and the fusion of the information of its images on the geometry."""
 
 from __future__ import annotations
 
@@ -96,14 +96,14 @@ def test_inspection_is_refused_with_the_reason() -> None:
 
 
 def views(true: Array, count: int, seed: int) -> list[tuple[Array, Array, Array]]:
-    """Return directions, information and vectors of views that each tell about three combinations of the parameters."""
+    """Return directions, information and vectors of views that each measure three combinations of the parameters."""
     rng = np.random.default_rng(seed)
     made = []
     for _ in range(count):
         rows = 4.0 * rng.normal(size=(3, len(true)))
         direction = rng.normal(size=3)
-        told = rows @ true + rng.normal(size=3)
-        made.append((direction / np.linalg.norm(direction), rows.T @ rows, rows.T @ told))
+        measured = rows @ true + rng.normal(size=3)
+        made.append((direction / np.linalg.norm(direction), rows.T @ rows, rows.T @ measured))
     return made
 
 

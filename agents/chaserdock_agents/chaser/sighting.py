@@ -95,10 +95,10 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
     )
 
 
-def _geometry(told: GeometryInformation | None) -> GeometryMeasurement | None:
-    if told is None:
+def _geometry(found: GeometryInformation | None) -> GeometryMeasurement | None:
+    if found is None:
         return None
-    return GeometryMeasurement(information=vector(told.matrix), vector=vector(told.vector))
+    return GeometryMeasurement(information=vector(found.matrix), vector=vector(found.vector))
 
 
 def apply_geometry(perception: PerceptionMethod, estimate: GeometryEstimate | None) -> str | None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Errors of the target's known geometry, fused over views from all around by an information filter.
 
-A view tells about the geometry whatever its pose (the Schur complement of the tracker's least squares). Views from one direction
+A view has information on the geometry for any pose (the Schur complement of the tracker's least squares). Views from one direction
 err alike, by texture and shading that the known mesh does not have, and count once. The parameters are in their standard deviations;
 prior: 0 with covariance 1.
 """
@@ -22,19 +22,26 @@ from msgspec import Struct
 from chaserdock_controller.interfaces import EstimatedShape, Observation
 
 VIEW_CELLS = 80
-"""Number of directions of view that are told apart, about 25 degrees from each other."""
+"""Number of directions of view that are distinguished, about 25 degrees from each other."""
 FLOOR_SIGMAS = 0.15
 """Standard deviation, as a share of the prior one, of what the views of a target have in common."""
 _GATE_SIGMAS = 4.0
-_GOLDEN_RAD = math.pi * (3.0 - math.sqrt(5.0))
+
+
+def _spiral() -> Array:
+    k = np.arange(VIEW_CELLS)
+    z, turn = 1.0 - (2.0 * k + 1.0) / VIEW_CELLS, math.pi * (3.0 - math.sqrt(5.0)) * k
+    r = np.sqrt(1.0 - z * z)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+
+
+_CELLS = _spiral()
+"""Directions (VIEW_CELLS, 3) on a Fibonacci spiral."""
 
 
 def view_cell(direction_trf: Array) -> int:
-    """Return the number of the cell of a direction (3,), a unit vector from the target in TRF: of a Fibonacci spiral."""
-    k = np.arange(VIEW_CELLS)
-    z, turn = 1.0 - (2.0 * k + 1.0) / VIEW_CELLS, _GOLDEN_RAD * k
-    r = np.sqrt(1.0 - z * z)
-    return int(np.argmax(np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1) @ direction_trf))
+    """Return the number of the cell of a direction (3,), a unit vector from the target in TRF."""
+    return int(np.argmax(_CELLS @ direction_trf))
 
 
 class ShapeFilter(Struct, frozen=True, eq=False):
@@ -77,10 +84,10 @@ class ShapeFilter(Struct, frozen=True, eq=False):
     def _contradicts(self, matrix: Array, vector: Array) -> bool:
         """Return whether a view's estimate is farther from this one than their covariances explain."""
         values, vectors = np.linalg.eigh(matrix)
-        told = values > 0.05 * max(float(values[-1]), 1e-12)
-        basis = vectors[:, told]
-        estimate = (basis.T @ vector) / values[told]
-        spread = basis.T @ self.covariance() @ basis + np.diag(1.0 / values[told])
+        informed = values > 0.05 * max(float(values[-1]), 1e-12)
+        basis = vectors[:, informed]
+        estimate = (basis.T @ vector) / values[informed]
+        spread = basis.T @ self.covariance() @ basis + np.diag(1.0 / values[informed])
         off = estimate - basis.T @ self.mean()
         return float(off @ np.linalg.solve(spread, off)) > _GATE_SIGMAS**2 * len(off)
 
@@ -118,13 +125,17 @@ class ShapeEstimation:
         )
 
     def _with(self, sighting: Sighting) -> ShapeFilter:
-        """Return the filter with a sighting; without it where it tells nothing about a geometry of these parameters."""
-        told, k = sighting.geometry, len(self.parameters)
-        if told is None or not sighting.solutions or (len(told.vector), len(told.information)) != (k, k * k):
+        """Return the filter with a sighting; without it where it has no information on these parameters."""
+        measured, k = sighting.geometry, len(self.parameters)
+        if (
+            measured is None
+            or not sighting.solutions
+            or (len(measured.vector), len(measured.information)) != (k, k * k)
+        ):
             return self.filter
         pose = sighting.solutions[0]
         direction = -rotations.rotate_inverse(np.array(pose.q_wxyz), np.array(pose.position_m))
-        matrix, vector = np.array(told.information).reshape(k, k), np.array(told.vector)
+        matrix, vector = np.array(measured.information).reshape(k, k), np.array(measured.vector)
         if not (np.isfinite(matrix).all() and np.isfinite(vector).all() and np.isfinite(direction).all()):
             return self.filter
         return self.filter.with_view(direction / np.linalg.norm(direction), matrix, vector)

@@ -6,6 +6,7 @@ Each runs in a new folder, from which ``../tests`` is that of the clone. Needs t
 
 from __future__ import annotations
 
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -26,7 +27,9 @@ def executed(path: Path, folder: Path) -> Any:
     """Return the notebook with the outputs of an execution in ``folder``. Raises CellExecutionError."""
     notebook = nbformat.read(path, as_version=4)
     client = NotebookClient(notebook, timeout=TIMEOUT_S, resources={"metadata": {"path": str(folder)}})
-    client.execute()
+    # Cells call ``!chaserdock``: the command of this environment, also where it is not activated.
+    path_variable = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    client.execute(env=os.environ | {"PATH": path_variable})
     return without_traces(notebook, folder)
 
 

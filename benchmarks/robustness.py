@@ -35,6 +35,7 @@ from chaserdock_protocol.scenario.navigation import GRADES
 from chaserdock_world.rendering.cameras import States
 from common import ROOT, Figures, make_parser, print_figures, run_parts
 
+from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages, measurement_model
 
@@ -81,23 +82,15 @@ def relative_error(tick: TickRecord, chaser: int) -> tuple[Array, float]:
     a covariance."""
     assert tick.outputs is not None
     estimate, true, own = tick.outputs.target, tick.states["target"], tick.states[f"chaser/{chaser}"]
-    place = rotations.rotate_inverse(true.q_wxyz, own.position_m - true.position_m)
-    attitude = rotations.multiply(rotations.conjugate(true.q_wxyz), own.q_wxyz)
+    truth = relative_pose(own.position_m, own.q_wxyz, true.position_m, true.q_wxyz)
     found = next((r for r in estimate.relative if r.chaser == chaser), None)
-    if found is not None:
-        position, q = np.array(found.position_m), np.array(found.q_wxyz)
-    else:
-        odometry = tick.odometry[chaser]
-        position = rotations.rotate_inverse(
-            estimate.q_wxyz, np.array(odometry.position_m) - estimate.position_m
-        )
-        q = rotations.multiply(rotations.conjugate(estimate.q_wxyz), odometry.q_wxyz)
-    error = np.concatenate(
-        [place - position, rotations.log(rotations.multiply(rotations.conjugate(q), attitude))]
-    )
     if found is None:
-        return error, math.nan
-    return error, float(error @ np.linalg.solve(np.reshape(found.covariance, (6, 6)), error))
+        odometry = tick.odometry[chaser]
+        own_pose = np.array(odometry.position_m), np.array(odometry.q_wxyz)
+        target_pose = np.array(estimate.position_m), np.array(estimate.q_wxyz)
+        return pose_error(*truth, *relative_pose(*own_pose, *target_pose)), math.nan
+    error = pose_error(*truth, np.array(found.position_m), np.array(found.q_wxyz))
+    return error, float(normalized_square(error, np.reshape(found.covariance, (6, 6))))
 
 
 def fly(flight: Flight) -> Array:

@@ -55,6 +55,16 @@ class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
     safe_share: float
 
 
+class PoseEstimateErrors(Struct, frozen=True, kw_only=True):
+    """Errors of an estimated pose after the settling time, and the mean NEES (6 expected); None without an estimate there."""
+
+    position_rms_m: float | None
+    orientation_rms_rad: float | None
+    max_position_error_m: float | None
+    max_orientation_error_rad: float | None
+    nees_mean: float | None
+
+
 class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     """Results of one chaser, measured on ground truth."""
 
@@ -68,20 +78,16 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     impulse_N_s: float
     thruster_impulse_N_s: float
     propellant_kg: float
+    relative_estimate: PoseEstimateErrors | None = None
     capture: Capture | None = None
     passive_safety: PassiveSafetySummary | None = None
 
 
-class TargetEstimateErrors(Struct, frozen=True, kw_only=True):
+class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):
     """Errors of the target estimate after the settling time; None without an estimate there."""
 
-    position_rms_m: float | None
-    orientation_rms_rad: float | None
     velocity_rms_m_s: float | None
     omega_rms_rad_s: float | None
-    max_position_error_m: float | None
-    max_orientation_error_rad: float | None
-    nees_mean: float | None
 
 
 class StackRest(Struct, frozen=True, kw_only=True):

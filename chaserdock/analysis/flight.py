@@ -55,6 +55,7 @@ LOAD_QUANTITIES = (
 _POSE = (0, 1, 2, 6, 7, 8)
 _UPPER = np.triu_indices(6)
 _KEPT = np.array([12 * _POSE[i] + _POSE[j] for i, j in zip(*_UPPER, strict=True)])
+_UPPER_FLAT = np.ravel_multi_index(_UPPER, (6, 6))
 _RATES = np.array([13 * k for k in (3, 4, 5, 9, 10, 11)])
 
 
@@ -186,6 +187,21 @@ class SafetyHistory:
 
 
 @dataclass
+class RelativeHistory:
+    """Estimated poses of a chaser relative to the target: times (K,) s, CRF's origin (K, 3) m in TRF, attitudes (K, 4), and
+    covariances (K, 21), upper triangles over position (TRF axes) and attitude (CRF axes)."""
+
+    time_s: Array
+    position_m: Array
+    q_wxyz: Array
+    upper: Array
+
+    def covariance(self, rows: NDArray[np.intp]) -> Array:
+        """Return the covariances (L, 6, 6) at these rows (L,)."""
+        return _symmetric(self.upper[rows])
+
+
+@dataclass
 class PlumeTotals:
     """What plumes gave a body: sums of the magnitudes of the impulses per tick, N s and N m s, and the largest force, N."""
 
@@ -204,8 +220,8 @@ class RecordedFlight:
     """Content of a log without the images. Mappings by body name or chaser.
 
     ``estimates`` holds the fused estimate as ``target``; ``estimate_known`` (K,): whether the target was tracked or
-    predicted. ``identified``: None without identification. ``expected_commands``: number of actuator commands that all ticks
-    expected.
+    predicted. ``relative``: of the chasers whose pose the estimator publishes, while the target is known. ``identified``:
+    None without identification. ``expected_commands``: number of actuator commands that all ticks expected.
     """
 
     scenario: Scenario
@@ -217,6 +233,7 @@ class RecordedFlight:
     estimates: Tracks
     estimate_known: NDArray[np.bool_]
     covariances: Columns
+    relative: dict[int, RelativeHistory]
     references: dict[int, ReferenceHistory]
     sightings: dict[int, SightingHistory]
     loads: dict[int, LoadHistory]
@@ -302,6 +319,7 @@ class _Collector:
     target: Columns = field(default_factory=_motion_table)
     known: bytearray = field(default_factory=bytearray)
     covariance: Columns = field(default_factory=lambda: Columns(27))
+    relative: dict[int, Columns] = field(default_factory=lambda: defaultdict(lambda: Columns(29)))
     references: dict[int, _ReferenceCollector] = field(
         default_factory=lambda: defaultdict(_ReferenceCollector)
     )
@@ -415,9 +433,13 @@ class _Collector:
 
     def _add_estimate(self, message: TargetEstimate) -> None:
         _add_motion(self.target, message)
-        self.known.append(message.status in ("tracking", "predicting"))
+        known = message.status in ("tracking", "predicting")
+        self.known.append(known)
         covariance = np.asarray(message.covariance)
         self.covariance.add(covariance[_KEPT].tolist(), covariance[_RATES].tolist())
+        for r in message.relative if known else ():
+            upper = np.asarray(r.covariance)[_UPPER_FLAT].tolist()
+            self.relative[r.chaser].add((message.sim_time_ns / 1e9,), r.position_m, r.q_wxyz, upper)
 
     def _add_solve(self, message: SolverStatus) -> None:
         self.solver = self.solver or message.solver
@@ -440,6 +462,11 @@ def _sighting_history(columns: Columns) -> SightingHistory:
 def _load_history(columns: Columns) -> LoadHistory:
     t = columns.table()
     return LoadHistory(t[:, 0].copy(), t[:, 1:])
+
+
+def _relative_history(columns: Columns) -> RelativeHistory:
+    t = columns.table()
+    return RelativeHistory(t[:, 0].copy(), t[:, 1:4], t[:, 4:8], t[:, 8:])
 
 
 def _safety_history(columns: Columns) -> SafetyHistory:
@@ -477,6 +504,7 @@ def load_flight(log: LogSource) -> RecordedFlight:
         estimates=Tracks({"target": c.target}),
         estimate_known=np.frombuffer(c.known, dtype=np.bool_),
         covariances=c.covariance,
+        relative={i: _relative_history(columns) for i, columns in c.relative.items()},
         references={i: collector.finish() for i, collector in c.references.items()},
         sightings={i: _sighting_history(columns) for i, columns in c.sightings.items()},
         loads={i: _load_history(columns) for i, columns in c.loads.items()},

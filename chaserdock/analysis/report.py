@@ -140,6 +140,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         return "<h2>Chasers</h2><p>The log holds no motion of a chaser.</p>"
     degree = math.degrees(1.0)
     at_distance = any("capture" not in c for c in result["chasers"].values())
+    relative = any("relative_estimate" in c for c in result["chasers"].values())
     fuel = any(c["propellant_kg"] > 0.0 for c in result["chasers"].values())
     rows = [
         (
@@ -148,6 +149,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
             _rms(c["steady"]["orientation_mse_rad2"], "°", degree),
             _quantity(c["position_mse_m2"], "m²"),
             _quantity(c["orientation_mse_rad2"], "rad²"),
+            *([_relative(c)] if relative else []),
             *([_docked(c)] if at_distance else []),
             _quantity(c["min_distance_target_m"], "m"),
             _quantity(c["impulse_N_s"], "N s"),
@@ -162,6 +164,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         "steady orientation RMS",
         "position MSE, whole run",
         "orientation MSE, whole run",
+        *(["estimated pose relative to the target, RMS"] if relative else []),
         *(["docked since"] if at_distance else []),
         "minimum distance to target",
         "impulse",
@@ -175,6 +178,15 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         + f"Steady state: {s.settling_s:g} s to {until:g} s.</p>"
         + _captures(result)
     )
+
+
+def _relative(c: dict[str, Any]) -> str:
+    """Return the errors of the estimated pose of a chaser relative to the target."""
+    e = c.get("relative_estimate")
+    if e is None:
+        return _DASH
+    position, angle = e["position_rms_m"], e["orientation_rms_rad"]
+    return f"{_quantity(position, 'mm', 1e3)}, {_quantity(angle, '°', math.degrees(1.0))}"
 
 
 def _docked(c: dict[str, Any]) -> str:

@@ -33,6 +33,7 @@ from .criteria import (
     stack_rest,
 )
 from .flight import RecordedFlight, SafetyHistory, Track, load_flight
+from .pose_errors import normalized_square, pose_error, relative_pose
 
 _BLOCK = 1 << 14  # rows processed at a time
 
@@ -120,16 +121,49 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
     }
     for rows in blocks(len(a)):
         i, j = a[rows], b[rows]
-        position = truth.position_m[j] - e.position_m[i]
-        angle = rotations.log(rotations.multiply(rotations.conjugate(e.q_wxyz[i]), truth.q_wxyz[j]))
-        pose = np.concatenate([position, angle], axis=1)
-        weighted = np.linalg.solve(flight.pose_covariance(i), pose[:, :, None])[:, :, 0]
-        errors["position_m"][rows] = np.linalg.norm(position, axis=1)
-        errors["orientation_rad"][rows] = np.linalg.norm(angle, axis=1)
+        pose = pose_error(truth.position_m[j], truth.q_wxyz[j], e.position_m[i], e.q_wxyz[i])
+        errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
+        errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
         errors["velocity_m_s"][rows] = np.linalg.norm(truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1)
         errors["omega_rad_s"][rows] = np.linalg.norm(truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1)
-        errors["nees"][rows] = np.einsum("ki,ki->k", pose, weighted)
+        errors["nees"][rows] = normalized_square(pose, flight.pose_covariance(i))
     return {"time_s": e.time_s[a], **errors}
+
+
+def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
+    """Return errors of a chaser's estimated pose relative to the target: ``time_s``, ``position_m``, ``orientation_rad``,
+    ``nees``, each (K,); no rows without truth, or if the estimator does not publish that pose."""
+    names = ("time_s", "position_m", "orientation_rad", "nees")
+    own, target = flight.truth.get(f"chaser/{chaser}"), flight.truth.get("target")
+    history = flight.relative.get(chaser)
+    if own is None or target is None or history is None:
+        return {name: np.zeros(0) for name in names}
+    n = min(len(own.time_s), len(target.time_s))
+    at_ns, true_ns = nanoseconds(history.time_s), nanoseconds(target.time_s[:n])
+    true_row = rows_since(true_ns, at_ns)
+    a = np.flatnonzero((true_row >= 0) & (true_ns[true_row] == at_ns))
+    errors = {name: np.empty(len(a)) for name in names} | {"time_s": history.time_s[a]}
+    for rows in blocks(len(a)):
+        i, j = a[rows], true_row[a[rows]]
+        true = relative_pose(own.position_m[j], own.q_wxyz[j], target.position_m[j], target.q_wxyz[j])
+        pose = pose_error(*true, history.position_m[i], history.q_wxyz[i])
+        errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
+        errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
+        errors["nees"][rows] = normalized_square(pose, history.covariance(i))
+    return errors
+
+
+def _pose_figures(errors: dict[str, Array], from_s: float) -> dict[str, float | None]:
+    """Return RMS, largest value and mean NEES of pose errors from a time on; None without any."""
+    late = errors["time_s"] >= from_s
+    position, angle, nees = (errors[name][late] for name in ("position_m", "orientation_rad", "nees"))
+    return {
+        "position_rms_m": _rms(position),
+        "orientation_rms_rad": _rms(angle),
+        "max_position_error_m": _greatest(position),
+        "max_orientation_error_rad": _greatest(angle),
+        "nees_mean": float(np.mean(nees)) if len(nees) else None,
+    }
 
 
 def _rms(x: Array) -> float | None:
@@ -202,6 +236,9 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             "thruster_impulse_N_s": flight.thruster_impulse_N_s[name],
             "propellant_kg": flight.propellant_kg[name],
         }
+        relative = _pose_figures(relative_errors(flight, i), s.settling_s)
+        if relative["nees_mean"] is not None:
+            chasers[str(i)]["relative_estimate"] = relative
         if (capture := capture_of(flight, i)) is not None:
             chasers[str(i)]["capture"] = capture
         if i in flight.safety:
@@ -228,13 +265,9 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
         "min_distance_chasers_m": min(between) if between else None,
         "collisions": flight.world.contacts,
         "target_estimate": {
-            "position_rms_m": _rms(errors["position_m"][late]),
-            "orientation_rms_rad": _rms(errors["orientation_rad"][late]),
+            **_pose_figures(errors, s.settling_s),
             "velocity_rms_m_s": _rms(errors["velocity_m_s"][late]),
             "omega_rms_rad_s": _rms(errors["omega_rad_s"][late]),
-            "max_position_error_m": _greatest(errors["position_m"][late]),
-            "max_orientation_error_rad": _greatest(errors["orientation_rad"][late]),
-            "nees_mean": float(np.mean(errors["nees"][late])) if np.any(late) else None,
         },
         "latency_s": _percentiles(flight.latency_s, {"p50": 50, "p99": 99}),
         "late_commands": flight.world.late_commands,
@@ -314,12 +347,25 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
     out += capture_failures(result, s)
     out += overloads(result, s)
     out += rest_failures(result, s)
-    estimate = result["target_estimate"]
-    position, angle = estimate["max_position_error_m"], _degrees(estimate["max_orientation_error_rad"])
-    what = "error of the estimate"
-    out += _exceeded(f"largest position {what}", position, s.success.max_estimate_position_m, "m")
-    out += _exceeded(f"largest orientation {what}", angle, s.success.max_estimate_orientation_deg, "deg")
-    return out
+    return out + list(_estimate_failures(result, s))
+
+
+def _estimate_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
+    """Yield a message for each estimated pose relative to the target that exceeds its limits.
+
+    An estimator that publishes none takes the odometry of the chasers as exact, and is judged by the target's pose.
+    """
+    relative = {
+        f"chaser {i}: largest {{}} error of its estimated pose relative to the target": c["relative_estimate"]
+        for i, c in result["chasers"].items()
+        if "relative_estimate" in c
+    }
+    for what, estimate in (
+        relative or {"largest {} error of the estimate": result["target_estimate"]}
+    ).items():
+        position, angle = estimate["max_position_error_m"], _degrees(estimate["max_orientation_error_rad"])
+        yield from _exceeded(what.format("position"), position, s.success.max_estimate_position_m, "m")
+        yield from _exceeded(what.format("orientation"), angle, s.success.max_estimate_orientation_deg, "deg")
 
 
 def _root(mean_square: float | None) -> float | None:
@@ -357,6 +403,11 @@ def text_of(result: dict[str, Any]) -> str:
             line += f"; propellant {c['propellant_kg'] * 1e3:.1f} g"
         if c["docked"]:
             line += f"; docked since {c['dock_time_s']:.1f} s"
+        if (relative := c.get("relative_estimate")) is not None:
+            line += (
+                f"; estimated relative to it within {relative['position_rms_m'] * 1e3:.2f} mm, "
+                f"{math.degrees(relative['orientation_rms_rad']):.3f} deg RMS"
+            )
         if "capture" in c:
             line += capture_text(c["capture"])
         lines.append(line)

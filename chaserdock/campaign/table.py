@@ -46,6 +46,8 @@ def row_of(run: Run, result: FinishedRun) -> RunRow:
         ("steady_orientation_mse_rad2", ("steady", "orientation_mse_rad2"), max),
         ("position_mse_m2", ("position_mse_m2",), max),
         ("orientation_mse_rad2", ("orientation_mse_rad2",), max),
+        ("relative_estimate_position_rms_m", ("relative_estimate", "position_rms_m"), max),
+        ("relative_estimate_orientation_rms_rad", ("relative_estimate", "orientation_rms_rad"), max),
         ("min_distance_target_m", ("min_distance_target_m",), min),
         ("impulse_N_s", ("impulse_N_s",), sum),
     ):

@@ -43,6 +43,7 @@ from chaserdock_protocol.transport import RawSample
 from chaserdock_world.orbit import TargetOrbit
 
 from chaserdock.analysis.criteria import nearest_allowed_m
+from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
 
 from .message_checks import defects_of
 from .network import decode_once
@@ -537,11 +538,8 @@ class Invariants:
         if estimate.tick % self.scenario.time.rate_hz:
             return
         covariance = np.array(estimate.covariance).reshape(12, 12)[np.ix_(_POSE, _POSE)]
-        turn = rotations.log(
-            rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), np.array(truth.q_wxyz))
-        )
-        error = np.concatenate([np.array(truth.position_m) - np.array(estimate.position_m), turn])
-        self.nees.append(float(error @ np.linalg.solve(covariance, error)))
+        true, known = ((np.array(x.position_m), np.array(x.q_wxyz)) for x in (truth, estimate))
+        self.nees.append(float(normalized_square(pose_error(*true, *known), covariance)))
         for relative in estimate.relative:
             own = self._states.get(f"chaser/{relative.chaser}")
             if own is not None and own.body not in self._touching and own.sim_time_ns == estimate.sim_time_ns:
@@ -655,12 +653,10 @@ def _concerns(fault: Fault, name: str) -> bool:
 
 def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:
     """Return the normalized squared error (6 on average if consistent) of the pose of a chaser relative to the target."""
-    q_target = np.array(target.q_wxyz)
-    place = rotations.rotate_inverse(q_target, np.subtract(own.position_m, target.position_m))
-    q = rotations.multiply(rotations.conjugate(q_target), np.array(own.q_wxyz))
-    turn = rotations.log(rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), q))
-    error = np.concatenate([place - np.array(estimate.position_m), turn])
-    return float(error @ np.linalg.solve(np.reshape(estimate.covariance, (6, 6)), error))
+    own_pose, target_pose = ((np.array(b.position_m), np.array(b.q_wxyz)) for b in (own, target))
+    true = relative_pose(*own_pose, *target_pose)
+    error = pose_error(*true, np.array(estimate.position_m), np.array(estimate.q_wxyz))
+    return float(normalized_square(error, np.reshape(estimate.covariance, (6, 6))))
 
 
 def _angular_momentum(bodies: Sequence[tuple[BodyTruth, DrawnBody]]) -> Array:

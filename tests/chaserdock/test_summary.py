@@ -4,11 +4,14 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from harness import ROOT
 
-from chaserdock.analysis.summary import summarize
+from chaserdock.analysis.flight import load_flight
+from chaserdock.analysis.summary import summarize, summary_of
 from chaserdock.summary import Summary
 
 GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
@@ -38,3 +41,35 @@ def test_documented_fields_equal_the_produced_fields() -> None:
     expected = (set(produced) - {"chasers"}) | set(chaser) | IN_SOME_FLIGHTS
     expected |= RUN_ONLY | DETUMBLING_ONLY | PLUMES_ONLY
     assert names == expected
+
+
+def test_estimate_is_judged_relative_to_each_chaser() -> None:
+    """A shift of one chaser's estimated pose by 5 mm is its error, and violates the criterion; a common drift does not."""
+    flight = load_flight(GOLDEN)
+    limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 0.003})
+    scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
+    before = summary_of(replace(flight, scenario=scenario))
+    assert before["chasers"]["0"]["relative_estimate"]["max_position_error_m"] < 0.002
+    assert not [f for f in before["failures"] if "estimated pose" in f]
+
+    history = flight.relative[0]
+    shifted = replace(history, position_m=history.position_m + np.array([0.003, 0.0, 0.004]))
+    after = summary_of(replace(flight, scenario=scenario, relative={**flight.relative, 0: shifted}))
+    error = after["chasers"]["0"]["relative_estimate"]
+    assert abs(error["position_rms_m"] - 0.005) < 0.002
+    assert error["nees_mean"] > 5.0 * before["chasers"]["0"]["relative_estimate"]["nees_mean"]
+    (failure,) = [f for f in after["failures"] if "estimated pose" in f]
+    assert failure.startswith("chaser 0: largest position error of its estimated pose relative to the target")
+
+    drifted = {"target": replace(flight.estimate, position_m=flight.estimate.position_m + 0.02)}
+    common = summary_of(replace(flight, scenario=scenario, estimates=drifted))  # type: ignore[arg-type]
+    assert common["target_estimate"]["position_rms_m"] > 0.03
+    assert not [f for f in common["failures"] if "error" in f]
+
+
+def test_estimate_without_relative_poses_is_judged_by_the_target() -> None:
+    flight = load_flight(GOLDEN)
+    limits = flight.scenario.success.model_copy(update={"max_estimate_position_m": 1e-9})
+    scenario = flight.scenario.model_copy(update={"success": limits, "settling_s": 1.0})
+    failures = summary_of(replace(flight, scenario=scenario, relative={}))["failures"]
+    assert any(f.startswith("largest position error of the estimate") for f in failures)

@@ -66,11 +66,14 @@ class Success(Section):
         description="Largest RMS of each chaser's attitude error in the steady interval, degrees.",
     )
     max_estimate_position_m: Positive | None = Field(
-        default=None, description="Largest error of the target's estimated position after `settling_s`, m."
+        default=None,
+        description="Largest error of the estimated position of a chaser relative to the target after `settling_s`, m (with "
+        "`mekf` and `paper`: of the target's position).",
     )
     max_estimate_orientation_deg: Positive | None = Field(
         default=None,
-        description="Largest error of the target's estimated attitude after `settling_s`, degrees.",
+        description="Largest error of the estimated attitude of a chaser relative to the target after `settling_s`, degrees "
+        "(with `mekf` and `paper`: of the target's attitude).",
     )
 
 

@@ -10,7 +10,7 @@ use std::error::Error;
 use zenoh::{Config, Wait};
 
 /// Any domain, any chaser; the last part is the hash of the type.
-const KEY: &str = "*/*/odometry/nav_msgs::msg::dds_::Odometry_/*";
+const KEY: &str = "*/chaser_$*/odometry/nav_msgs::msg::dds_::Odometry_/*";
 
 fn main() -> Result<(), Box<dyn Error + Send + Sync>> {
     let mut arguments = std::env::args().skip(1);

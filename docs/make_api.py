@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import inspect
 import re
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -108,7 +107,6 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    if "--print" in sys.argv:
-        print(page(), end="")
-    else:
-        PAGE.write_text(page(), encoding="utf-8")
+    from page_command import run
+
+    run(__doc__, PAGE, page)

@@ -6,7 +6,7 @@ One image for each effect and target: the view of chaser 0 of ``harsh-light`` at
 
 from __future__ import annotations
 
-import sys
+import argparse
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,9 @@ IMAGES: dict[str, tuple[str, ...]] = {
 
 
 def main() -> None:
-    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "docs" / "images"
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("folder", nargs="?", type=Path, default=ROOT / "docs" / "images", metavar="FOLDER")
+    folder: Path = parser.parse_args().folder
     for name, changes in IMAGES.items():
         base = () if name == "camera-harsh-light" else WITHOUT_EFFECTS
         scenario = load_scenario(ROOT / "scenarios" / "harsh-light.toml", (*base, *changes))

@@ -167,7 +167,6 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--print"]:
-        print(page(), end="")
-    else:
-        PAGE.write_text(page(), encoding="utf-8")
+    from page_command import run
+
+    run(__doc__, PAGE, page)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 from chaserdock_controller.guidance.phases import TRANSITIONS, Phase, Transition
@@ -83,7 +82,6 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    if "--print" in sys.argv:
-        print(page(), end="")
-    else:
-        PAGE.write_text(page(), encoding="utf-8")
+    from page_command import run
+
+    run(__doc__, PAGE, page)

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from pathlib import Path
 
 from chaserdock_protocol.scenario import Scenario
@@ -160,10 +159,6 @@ def page() -> str:
 
 
 if __name__ == "__main__":
-    if sys.argv[1:] == ["--print"]:
-        print(page(), end="")
-    elif sys.argv[1:] == ["--print-schema"]:
-        print(editor_schema_text(Scenario), end="")
-    else:
-        PAGE.write_text(page(), encoding="utf-8")
-        SCHEMA.write_text(editor_schema_text(Scenario), encoding="utf-8")
+    from page_command import run
+
+    run(__doc__, PAGE, page, schema=lambda: editor_schema_text(Scenario))

@@ -10,6 +10,7 @@ its own make_site.py, and the page ``versions.html``, to which the first page li
 
 from __future__ import annotations
 
+import argparse
 import base64
 import json
 import posixpath
@@ -233,14 +234,19 @@ def build(out: Path) -> None:
 
 
 def main() -> int:
-    places = [argument for argument in sys.argv[1:] if argument != "--releases"]
-    out = Path(places[0]) if places else ROOT / "site"
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("out", nargs="?", type=Path, default=ROOT / "site", metavar="OUT")
+    parser.add_argument("--releases", action="store_true", help="add the documentation of each tag")
+    options = parser.parse_args()
+    out: Path = options.out
     if out.exists() and not (out / "sitemap.xml").is_file():
         print(f"make_site: {out} exists and is not a site; it would be replaced", file=sys.stderr)
         return 2
     try:
         build(out)
-        if "--releases" in sys.argv:
+        if options.releases:
             build_releases(out.resolve())
     except SiteError as error:
         print(f"make_site: {error}", file=sys.stderr)

@@ -6,6 +6,7 @@ Each runs in a new folder, from which ``../tests`` is that of the clone. Needs t
 
 from __future__ import annotations
 
+import argparse
 import os
 import sys
 import tempfile
@@ -49,7 +50,14 @@ def without_traces(notebook: Any, folder: Path) -> Any:
 
 
 def main() -> int:
-    names = sys.argv[1:] or sorted(path.stem for path in EXAMPLES.glob("*.ipynb"))
+    known = sorted(path.stem for path in EXAMPLES.glob("*.ipynb"))
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("names", nargs="*", metavar="NAME", help=", ".join(known))
+    names = parser.parse_args().names or known
+    if unknown := sorted(set(names) - set(known)):
+        parser.error(f"no notebook {unknown[0]}; there are {', '.join(known)}")
     for name in names:
         path = EXAMPLES / f"{name}.ipynb"
         with tempfile.TemporaryDirectory(prefix="chaserdock-notebook-") as top:

@@ -148,7 +148,7 @@ def view(
         ),
     ] = None,
     host: Annotated[
-        str, typer.Option(help="address to serve the page on; whoever has its URL can command the mission")
+        str, typer.Option(help="address to serve the page on; anyone who has its URL can command the mission")
     ] = "127.0.0.1",
     port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="port; the first free one from 8080 by default")

@@ -123,7 +123,7 @@ def events(lines: list[Line], most: int = 99) -> str:
     """Return at most so many event lines, newest first; lines that differ in numbers only are one, with their count."""
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
-        # A chaser's or thruster's number tells apart; measured values do not.
+        # Events differ by the number of a chaser or thruster, not by measured values.
         pattern = re.sub(r"(?<!chaser )(?<!chaser/)(?<!thruster )\b\d+(\.\d+)?", "#", line.text)
         groups.setdefault((line.level, pattern), []).append(line)
     out = []

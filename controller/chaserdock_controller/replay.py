@@ -45,7 +45,7 @@ def _core_of(scenario: FlightScenario) -> ControllerCore:
 def _with_leader(
     recorded: Iterable[ReceivedMessage],
 ) -> Iterator[tuple[Commander | None, list[ReceivedMessage]]]:
-    """Return the messages of each tick with the last controller that commanded it, None if nobody did."""
+    """Return the messages of each tick with the last controller that commanded it, None if none did."""
     for _, group in groupby(recorded, key=lambda r: r.message.tick):
         received = list(group)
         commands = [r.message for r in received if r.topic is topics.WRENCH]

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Validation of odometry: states that no rigid body can have, and jumps that a chaser cannot have made. No I/O.
 
-A chaser that suddenly believes to be somewhere else would fly there, through the target if that lies between. A jump is
+A chaser whose odometry jumps would fly to the wrong place, through the target if that lies between. A jump is
 therefore removed and the state before it continued; a jump back removes the correction.
 """
 

@@ -73,7 +73,7 @@ class LeaseHolder:
         return granted
 
     def commander_of(self, tick: Tick) -> Commander | None:
-        """Return who commands a tick by the leases known, None if nobody does."""
+        """Return who commands a tick by the leases known, None if no controller does."""
         for name, instance in tick.controllers.items():
             granted = self._granted(name, tick)
             if is_majority({lease.chaser for lease in granted}, tick.chasers):

@@ -26,7 +26,7 @@ _MOST_HELD = 100_000
 class HotStandby:
     """Role of this process. ``leads``: it commands the newest tick; ``since``: from which tick on.
 
-    ``leader``: who commands the newest tick, None if nobody does. ``replayed``: in a replay, in which this process commands
+    ``leader``: who commands the newest tick, None if no controller does. ``replayed``: in a replay, in which this process commands
     every tick, the commander in the log.
     """
 

@@ -117,7 +117,7 @@ def with_body(state: JointState, p: MekfParameters) -> JointState:
 
 
 def start_shape(state: JointState, p: MekfParameters) -> JointState:
-    """Return the state in which no more is known of the target's body than ``p`` tells."""
+    """Return the state in which no more is known of the target's body than ``p`` states."""
     inertia = np.array(p.inertia_ratios, dtype=float)
     own = TARGET + CHASER * state.chasers
     covariance = np.zeros((own + SHAPE, own + SHAPE))

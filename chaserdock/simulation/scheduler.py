@@ -68,13 +68,13 @@ class Scheduler:
         self.now_s = 0.0
         self.tasks: list[Task] = []
         self._draw = random.Random(f"scheduler {seed}").random
-        self._events: list[tuple[float, float, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._events: list[tuple[float, float, int, Callable[..., object], tuple[Any, ...]]] = []
         self._count = self._alive = 0
         self._hub: greenlet = getcurrent()
         self._running: Task | None = None
 
     def call_at(
-        self, time_s: float, call: Callable[..., None], after: Due = NEVER, args: tuple[Any, ...] = ()
+        self, time_s: float, call: Callable[..., object], after: Due = NEVER, args: tuple[Any, ...] = ()
     ) -> Due:
         """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``; return when.
 

@@ -50,7 +50,7 @@ def test_queue_wakes_its_reader_and_times_out() -> None:
 
     def reader(scheduler: Scheduler) -> None:
         items = VirtualQueue(scheduler, lambda: None)
-        scheduler.call_at(2.0, lambda: items.put("late", 4))
+        scheduler.call_at(2.0, items.put, args=("late", 4))
         with pytest.raises(queue.Empty):
             items.get(0.5)
         got.append((scheduler.now_s, None))

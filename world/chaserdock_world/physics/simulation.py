@@ -85,6 +85,8 @@ class Physics:
         # Principal moments, force and torque of the free bodies.
         self._loads = np.zeros((len(self._free), 9))
         self._loads[:, :3] = [plant.moments_kg_m2 for plant in self._free.values()]
+        self._prescribed_start = _prescribed_start(scenario)
+        self._disturbed = {name for name, plant in self.plants.items() if plant.disturbance.any()}
         self._moves_target = self._prescribed and scenario.target.motion != "static"
         self._orbital: OrbitalForces | None = None
         if scenario.orbit is not None:
@@ -148,7 +150,7 @@ class Physics:
     def state(self, name: str) -> BodyState:
         """Return the current state of a body; that of a prescribed target is exact."""
         if name == TARGET and self._prescribed:
-            return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
+            return _moved(self._prescribed_start, self.step_count / self._scenario.time.physics_hz)
         return self._body_state(name, self._engine.motion(self._bodies[name]))
 
     def _body_state(self, name: str, motion: BodyMotion) -> BodyState:
@@ -173,7 +175,7 @@ class Physics:
     def _wrench_on(self, name: str, wrench: Array) -> Array:
         """Return force and torque (6,), in the engine's frame of a body, of its actuators and its present disturbances."""
         plant = self.plants[name]
-        if plant.disturbance.any():
+        if name in self._disturbed:
             wrench = wrench + plant.disturbance
         if name in self._noise:
             noise, sigma = self._noise[name]
@@ -471,10 +473,19 @@ def _state_of(motion: BodyMotion) -> BodyState:
 
 def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:
     """Return the target's exact state at a simulated time under constant velocity and body rate."""
+    return _moved(_prescribed_start(scenario), time_s)
+
+
+def _prescribed_start(scenario: Scenario) -> BodyState:
     target = scenario.target
     still = target.motion == "static"
     velocity = np.zeros(3) if still else np.asarray(target.velocity_m_s)
     omega = np.zeros(3) if still else np.asarray(target.omega_rad_s)
-    position = np.asarray(target.position_m) + velocity * time_s
-    attitude = rotations.integrate(target.q_wxyz, omega, time_s)
-    return BodyState(position, velocity, attitude, omega)
+    return BodyState(np.asarray(target.position_m), velocity, np.asarray(target.q_wxyz), omega)
+
+
+def _moved(start: BodyState, time_s: float) -> BodyState:
+    """Return a state after a time at constant velocity and body rate."""
+    velocity, omega = start.velocity_m_s, start.omega_rad_s
+    position = start.position_m + velocity * time_s
+    return BodyState(position, velocity, rotations.integrate(start.q_wxyz, omega, time_s), omega)

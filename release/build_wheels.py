@@ -32,6 +32,7 @@ KERNELS = {
     "chaserdock_agents/chaser/perception/native/kernels.so",
     "chaserdock_controller/nmpc/native/kernels.so",
     "chaserdock_controller/estimation/joint/native/kernels.so",
+    "chaserdock_world/physics/native/kernels.so",
 }
 # Files that a mission needs beside modules.
 DATA = ("chaserdock/shipped/single.toml", "chaserdock/py.typed", "chaserdock_models/native/kernels.c")

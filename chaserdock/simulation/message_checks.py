@@ -39,15 +39,32 @@ def defects_of(message: Any, scenario: Scenario) -> list[str]:
 def covariance_defect(values: Sequence[float]) -> str:
     """Return why a row-major matrix is no covariance, or an empty string."""
     size = math.isqrt(len(values))
+    if size == 3 and _is_covariance_3(*values):
+        return ""
     matrix = np.reshape(np.asarray(values), (size, size))
     scale = float(np.abs(matrix).max())
     asymmetry = float(np.abs(matrix - matrix.T).max())
     if asymmetry > _SYMMETRY * scale:
         return f"covariance is not symmetric: {asymmetry:.2e} of {scale:.2e}"
-    least = float(np.linalg.eigvalsh(matrix)[0])
+    try:
+        # Exists unless an eigenvalue is below -_SYMMETRY * scale, and is faster than the eigenvalues.
+        np.linalg.cholesky(matrix + _SYMMETRY * scale * np.eye(size))
+        return ""
+    except np.linalg.LinAlgError:
+        least = float(np.linalg.eigvalsh(matrix)[0])
     if least < -_SYMMETRY * scale:
         return f"covariance is not positive semidefinite: eigenvalue {least:.2e}"
     return ""
+
+
+def _is_covariance_3(
+    a: float, b: float, c: float, d: float, e: float, f: float, g: float, h: float, i: float
+) -> bool:
+    """Return whether a row-major matrix (3, 3) is exactly symmetric and has only positive pivots."""
+    if not (b == d and c == g and f == h and a > 0.0):
+        return False
+    e, f, i = e - b * b / a, f - b * c / a, i - c * c / a
+    return e > 0.0 and i - f * f / e > 0.0
 
 
 def _quaternions(values: Iterable[Sequence[float]], tolerance: float = _UNIT) -> Iterator[str]:

@@ -72,6 +72,7 @@ class _Subscription:
     expression: str
     arrived: Callable[[RawSample], None]
     known_to: set[str] = field(default_factory=set)
+    links: dict[str, _LinkState] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self.records_all = self.owner.name == "recorder" and self.expression == "**"
@@ -94,6 +95,7 @@ class SimulatedNetwork:
         self.scheduler, self.conditions, self.lockstep, self.tap = scheduler, conditions, lockstep, tap
         self.traffic = Traffic()
         self.first_tick_s: float | None = None
+        self._latency_s, self._jitter_s = conditions.latency_s, conditions.jitter_s
         self._seed = seed
         self._random = random.Random(f"network {seed}")
         self._connections: dict[str, SimulatedConnection] = {}
@@ -145,15 +147,19 @@ class SimulatedNetwork:
     def _send(
         self, sender: SimulatedConnection, to: _Subscription, raw: RawSample, qos: str, blocking: bool
     ) -> None:
-        link, size = self._link(sender.name, to.owner.name), len(raw.payload)
+        name, size = sender.name, len(raw.payload)
+        link = to.links.get(name)
+        if link is None:
+            link = to.links[name] = self._link(name, to.owner.name)
         copies, late_s = 1, 0.0
         if not self.lockstep:
-            copies, late_s = self._draw_faults(link, sender.name, to.owner.name, size, not blocking)
+            copies, late_s = self._draw_faults(link, name, to.owner.name, size, not blocking)
         for _ in range(copies):
             link.bytes += size
             if link.bytes > self.traffic.most_bytes:
                 self.traffic.most_bytes = link.bytes
-            self.deliver(sender.name, to.owner.name, self._arrive, qos, late_s, (link, to, raw))
+            due_s = self._due_s(name, to.owner.name, late_s)
+            self._call_in_order(link, due_s, self._arrive, qos, late_s, (link, to, raw))
 
     def _arrive(self, link: _LinkState, to: _Subscription, raw: RawSample) -> None:
         """Hand a sample that has crossed a link to the subscriber."""
@@ -195,21 +201,36 @@ class SimulatedNetwork:
 
         It arrives after all earlier ones of its priority, unless ``late_s`` < 0, and after all declarations.
         """
-        c = self.conditions
-        delay_s = c.latency_s + max(0.0, late_s)
-        if c.jitter_s:
-            delay_s += self._random.expovariate(1.0 / c.jitter_s)
+        link, due_s = self._link(sender, receiver), self._due_s(sender, receiver, late_s)
+        self._call_in_order(link, due_s, call, qos, late_s, args)
+
+    def _due_s(self, sender: str, receiver: str, late_s: float) -> float:
+        """Return when a message arrives that is sent now, but for those before it."""
+        delay_s = self._latency_s
+        if late_s > 0.0:
+            delay_s += late_s
+        if self._jitter_s:
+            delay_s += self._random.expovariate(1.0 / self._jitter_s)
         if late_s < 0.0:
-            delay_s += 4.0 * (c.latency_s + c.jitter_s)
+            delay_s += 4.0 * (self._latency_s + self._jitter_s)
         due_s = self.scheduler.now_s + delay_s
-        if c.partition:
-            due_s = max(due_s, self._cut_until_s(sender, receiver))
+        return max(due_s, self._cut_until_s(sender, receiver)) if self.conditions.partition else due_s
+
+    def _call_in_order(
+        self,
+        link: _LinkState,
+        due_s: float,
+        call: Callable[..., None],
+        qos: str,
+        late_s: float,
+        args: tuple[Any, ...],
+    ) -> None:
         if late_s < 0.0:
             self.scheduler.call_at(due_s, call, args=args)
             return
-        last = self._link(sender, receiver).last
-        after = max(last.get(qos, NEVER), last.get("control", NEVER))
-        last[qos] = self.scheduler.call_at(due_s, call, after, args)
+        last = link.last
+        after, declared = last.get(qos, NEVER), last.get("control", NEVER)
+        last[qos] = self.scheduler.call_at(due_s, call, after if after > declared else declared, args)
 
     def _link(self, sender: str, receiver: str) -> _LinkState:
         link = self._links.get((sender, receiver))
@@ -452,10 +473,10 @@ class SimulatedHost:
     def sleep(self, duration_s: float) -> None:
         self.pause(duration_s)
 
-    def new_queue(self) -> BoundedQueue:
-        items = VirtualQueue(self._scheduler, self._read_slowly, self._rate)
-        self._network.traffic.queues[f"{self.name} {len(self._network.traffic.queues)}"] = items
-        return BoundedQueue(items=items)
+    def new_queue(self) -> BoundedQueue[Any]:
+        queue = VirtualQueue(self._scheduler, self._read_slowly, self._rate)
+        self._network.traffic.queues[f"{self.name} {len(self._network.traffic.queues)}"] = queue
+        return queue
 
     def _read_slowly(self) -> None:
         """Take as long as a slow reader does before it reads a message."""

@@ -9,6 +9,7 @@ repeats a run exactly and seeds differ in their interleavings.
 from __future__ import annotations
 
 import heapq
+import math
 import queue
 import random
 import traceback
@@ -16,6 +17,7 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from chaserdock_protocol.transport.bounded_queue import BoundedQueue
 from greenlet import GreenletExit, getcurrent, greenlet
 
 
@@ -26,10 +28,15 @@ class Killed(BaseException):
 Due = tuple[float, float]
 """Virtual time (s) of an event, and its place among those of the same time."""
 NEVER: Due = (0.0, 0.0)
+WAKE_SPREAD = 4.0
+"""Range of the place of a task that is woken, among events of its time; that of others is 1."""
 
 
 class Task:
-    """One task. ``result`` is its return value; ``error`` the traceback of the exception that ended it, empty if none did."""
+    """One task. ``result`` is its return value; ``error`` the traceback of the exception that ended it, empty if none did.
+
+    ``until_s``: virtual time (s) at which a pause ends, None without a limit. ``timer_s``: time of its pending timer.
+    """
 
     def __init__(self, name: str, work: Callable[[], Any]) -> None:
         self.name = name
@@ -38,6 +45,8 @@ class Task:
         self.result: Any = None
         self.error = ""
         self.waits = 0
+        self.until_s: float | None = None
+        self.timer_s = math.inf
         self._work = work
         self.fiber = greenlet(self._run)
 
@@ -59,13 +68,13 @@ class Scheduler:
         self.now_s = 0.0
         self.tasks: list[Task] = []
         self._draw = random.Random(f"scheduler {seed}").random
-        self._events: list[tuple[float, float, int, Callable[..., None], tuple[Any, ...]]] = []
+        self._events: list[tuple[float, float, int, Callable[..., object], tuple[Any, ...]]] = []
         self._count = self._alive = 0
         self._hub: greenlet = getcurrent()
         self._running: Task | None = None
 
     def call_at(
-        self, time_s: float, call: Callable[..., None], after: Due = NEVER, args: tuple[Any, ...] = ()
+        self, time_s: float, call: Callable[..., object], after: Due = NEVER, args: tuple[Any, ...] = ()
     ) -> Due:
         """Call ``call(*args)``, which must not wait, at a time and after the call of ``after``; return when.
 
@@ -112,14 +121,39 @@ class Scheduler:
         """Let others run until the time has passed or ``wake`` is called for the running task."""
         task = self._task()
         task.waits += 1
-        stamp = task.waits
-        if timeout_s is not None:
-            self.call_at(self.now_s + timeout_s, self._continue, args=(task, stamp))
+        if timeout_s is None:
+            task.until_s = None
+        else:
+            # One timer per task: a pause that outlasts the pending one sets no other.
+            task.until_s = until_s = self.now_s + timeout_s
+            if until_s < task.timer_s:
+                self._set_timer(task, until_s)
         self._hub.switch()
 
+    def _set_timer(self, task: Task, time_s: float) -> None:
+        task.timer_s = time_s
+        self.call_at(time_s, self._on_timer, args=(task,))
+
+    def _on_timer(self, task: Task) -> None:
+        """Continue a task whose pause has ended, or wait for the end of its present pause."""
+        if task.timer_s <= self.now_s:
+            task.timer_s = math.inf
+        until_s = task.until_s
+        if until_s is None:
+            return
+        if until_s <= self.now_s:
+            self._continue(task, task.waits)
+        elif until_s < task.timer_s:
+            self._set_timer(task, until_s)
+
     def wake(self, task: Task) -> None:
-        """Continue a task that pauses, at the present time."""
-        self.call_at(self.now_s, self._continue, args=(task, task.waits))
+        """Continue a task that pauses, at the present time.
+
+        Other events of this time are likelier to come first, so that a reader often finds several messages.
+        """
+        self._count += 1
+        event = (self.now_s, WAKE_SPREAD * self._draw(), self._count, self._continue, (task, task.waits))
+        heapq.heappush(self._events, event)
 
     def _task(self) -> Task:
         if self._running is None:
@@ -135,6 +169,7 @@ class Scheduler:
         if task.done or task.waits != stamp:
             return  # it was continued before
         task.waits += 1
+        task.until_s = None
         self._running = task
         try:
             task.fiber.switch()
@@ -143,45 +178,49 @@ class Scheduler:
             self._alive -= task.done
 
 
-class VirtualQueue:
-    """An ``ItemQueue`` whose reader waits in virtual time, by a clock of this rate.
+class VirtualQueue(BoundedQueue[Any]):
+    """A ``BoundedQueue`` whose reader waits in virtual time, by a clock of this rate.
 
     ``before_take`` runs in the reader's task before it takes an item. ``most``: most items that have been in it.
     """
 
     def __init__(self, scheduler: Scheduler, before_take: Callable[[], None], rate: float = 1.0) -> None:
+        super().__init__()
         self.most = 0
         self._scheduler = scheduler
         self._before_take, self._rate = before_take, rate
-        self._items: deque[Any] = deque()
-        self._waiting: Task | None = None
+        self._waiting_items: deque[tuple[Any, int]] = deque()
+        self._reader: Task | None = None
 
-    def put(self, item: Any) -> None:
-        self._items.append(item)
-        if len(self._items) > self.most:
-            self.most = len(self._items)
-        if self._waiting is not None:
-            self._scheduler.wake(self._waiting)
-            self._waiting = None
+    def put(self, item: Any, size: int) -> bool:
+        """See ``BoundedQueue.put``."""
+        items = self._waiting_items
+        if self._bytes + size > self._max_bytes or len(items) >= self._max_items:
+            self.dropped += 1
+            return False
+        self._bytes += size
+        items.append((item, size))
+        if len(items) > self.most:
+            self.most = len(items)
+        if self._reader is not None:
+            self._scheduler.wake(self._reader)
+            self._reader = None
+        return True
 
-    def get(self, *, timeout: float | None) -> Any:
-        """Remove and return the oldest item. Raises queue.Empty on timeout."""
-        self._before_take()
-        if not self._items:
-            self._waiting = self._scheduler.running
-            self._scheduler.pause(None if timeout is None else timeout / self._rate)
-            self._waiting = None
-            if not self._items:
-                raise queue.Empty
-        return self._items.popleft()
-
-    def get_nowait(self) -> Any:
-        if not self._items:
+    def get(self, timeout_s: float | None) -> Any:
+        """See ``BoundedQueue.get``."""
+        items = self._waiting_items
+        if timeout_s != 0:
+            self._before_take()
+            if not items:
+                self._reader = self._scheduler.running
+                self._scheduler.pause(None if timeout_s is None else timeout_s / self._rate)
+                self._reader = None
+        if not items:
             raise queue.Empty
-        return self._items.popleft()
-
-    def qsize(self) -> int:
-        return len(self._items)
+        item, size = items.popleft()
+        self._bytes -= size
+        return item
 
     def empty(self) -> bool:
-        return not self._items
+        return not self._waiting_items

@@ -50,11 +50,11 @@ def test_queue_wakes_its_reader_and_times_out() -> None:
 
     def reader(scheduler: Scheduler) -> None:
         items = VirtualQueue(scheduler, lambda: None)
-        scheduler.call_at(2.0, lambda: items.put("late"))
+        scheduler.call_at(2.0, items.put, args=("late", 4))
         with pytest.raises(queue.Empty):
-            items.get(timeout=0.5)
+            items.get(0.5)
         got.append((scheduler.now_s, None))
-        got.append((scheduler.now_s, items.get(timeout=5.0)))
+        got.append((scheduler.now_s, items.get(5.0)))
         got.append((scheduler.now_s, items.empty()))
 
     assert flown(reader).now_s == 2.0

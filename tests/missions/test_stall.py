@@ -62,19 +62,20 @@ def test_message_lost_in_lockstep_ends_the_mission_with_who_owes_what(
     lost_tick = 15
     key = topics.SIGHTING.key_of(2)
 
-    class Overflowing(BoundedQueue[Any]):
-        def put(self, item: Any, size: int) -> bool:
-            if isinstance(item, tuple) and item[2].key == key:
-                sighting: Any = codec.decode(topics.SIGHTING.kind, item[2].payload)
-                if sighting.tick == lost_tick:
-                    return False
-            return super().put(item, size)
+    def is_lost(item: Any) -> bool:
+        if not isinstance(item, tuple) or item[2].key != key:
+            return False
+        sighting: Any = codec.decode(topics.SIGHTING.kind, item[2].payload)
+        return sighting.tick == lost_tick
 
     new_queue = SimulatedHost.new_queue
 
     def overflowing_queue(self: SimulatedHost) -> BoundedQueue[Any]:
         made = new_queue(self)
-        return made if self.name != "controller" else Overflowing(items=made._items)
+        if self.name == "controller":
+            put = made.put
+            monkeypatch.setattr(made, "put", lambda item, size: not is_lost(item) and put(item, size))
+        return made
 
     monkeypatch.setattr(SimulatedHost, "new_queue", overflowing_queue)
     flight = simulated(tmp_path)

@@ -206,6 +206,24 @@ static void align_points(void) {
     if (inside) CHECK(all_finite(pose, 12));
 }
 
+static void measure_pose(void) {
+    const int64_t m = whole(0, 6);
+    PinholeCamera *lens = block(sizeof *lens);
+    MarkerLimits *limits = block(sizeof *limits);
+    *lens = (PinholeCamera){value(200.0, 400.0), value(200.0, 400.0), value(200.0, 280.0), value(100.0, 160.0), 480.0, 270.0};
+    *limits = (MarkerLimits){value(0.01, 0.1), value(10.0, 30.0), value(1.0, 10.0), value(0.0, 0.4), value(0.0, 0.8), value(0.0, 3.0)};
+    double *pose = doubles(12, -0.1, 0.1), *covariance = outputs(36), *error = outputs(6);
+    for (int i = 0; i < 3; i++) pose[3 + 4 * i] = value(0.9, 1.0);
+    pose[2] = value(0.3, 2.0);
+    int64_t *seen = block((size_t)m * 8);
+    double *corners = doubles(12 * m, -0.2, 0.2), *origins = doubles(3 * m, -0.2, 0.2), *normals = doubles(3 * m, -1.0, 1.0);
+    int64_t count = NAME(measure_pose)(lens, limits, corners, origins, normals, m, pose, doubles(6, -3.0, 3.0), seen,
+                                       outputs(8 * m), covariance, error);
+    CHECK(count >= -1 && count <= m);
+    if (count > 0) CHECK(all_finite(covariance, 36));
+    for (int i = 0; i < 6 && count > 0; i++) CHECK(covariance[7 * i] >= 0.0);
+}
+
 static const Target TARGETS[] = {
     {"refine_corners", refine_corners},
     {"refine_pose", refine_pose},
@@ -217,5 +235,6 @@ static const Target TARGETS[] = {
     {"rate_suns", rate_suns},
     {"control_points", control_points},
     {"align_points", align_points},
+    {"measure_pose", measure_pose},
 };
 FUZZ_MAIN(TARGETS)

@@ -132,6 +132,31 @@ def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
     assert rotations.angle_between(s.q_wxyz, physics._scenario.start_pose(0)[1]) < 1e-7
 
 
+def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> None:
+    """A chaser that turns flies against another until they touch; a third is thrust alone."""
+    chasers = [
+        {
+            "position_m": [-5.0, 0.0, 0.0],
+            "q_wxyz": [1.0, 0.0, 0.0, 0.0],
+            "start_velocity_m_s": [0.05, 0.01, 0.0],
+        },
+        {"position_m": [-4.5, 0.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
+        {"position_m": [5.0, 1.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
+    ]
+    wrench = np.array([0.1, -0.05, 0.02, 1e-3, 2e-3, -1e-3])
+    flown: list[tuple[list[Any], list[set[tuple[str, str]]]]] = []
+    for in_c in (True, False):
+        physics = worlds(chasers=chasers, limits=NONE)
+        engine = physics._engine
+        assert engine._stepper is not None, "this build of PyBullet offers no plugin with its C interface"
+        if not in_c:
+            engine._stepper = None
+        touched = [physics.advance(HZ, {"chaser/0": wrench, "chaser/2": -wrench}) for _ in range(6)]
+        flown.append(([engine.motion(body) for body in range(4)], touched))
+    assert flown[0] == flown[1]
+    assert any(flown[0][1])
+
+
 # -- forces -----------------------------------------------------------------------------------------------
 
 

@@ -39,6 +39,8 @@ from .rotation import Recording
 
 _DRAIN_S = 10.0
 _HEALTH_TICKS = 15
+_BATCH = 64
+"""Most messages that are written before the recorder looks for a signal and for the world."""
 # glibc's malloc.h
 _M_MMAP_THRESHOLD, _M_ARENA_MAX = -3, -8
 _MAPPED_FROM_BYTES = 1 << 18
@@ -46,7 +48,8 @@ _MAPPED_FROM_BYTES = 1 << 18
 
 def main(options: ProcessOptions) -> int:
     """Record to ``options.out``; return 0 if complete, 1 if stopped early or messages are missing, 2 on an error."""
-    _limit_heap()
+    if options.link.network is None:  # a simulated process shares its heap with others
+        _limit_heap()
     return run_member("recorder", "recorder", options, lambda *member: record(options, *member))
 
 
@@ -83,7 +86,7 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
             # Flight processes have priority; received messages wait in the queue.
             node.host.lower_priority()
         while not recorder.finished() and not (stop() and recorder.idle()):
-            recorder.write_next(0.1)
+            recorder.write_waiting(0.1)
             if recorder.ended_s is None and recorder.heartbeat.world_is_gone():
                 break
     finally:
@@ -130,16 +133,22 @@ class Recorder:
         if not self._queue.put(raw, len(raw.payload)):
             self.node.counts.rejected["queue full"] += 1
 
-    def write_next(self, timeout_s: float) -> None:
-        """Write one message, if one arrives in time."""
+    def write_waiting(self, timeout_s: float) -> None:
+        """Write the messages that wait, at most ``_BATCH``; if there are none, the next one that arrives in time."""
         while self.node.receive(0) is not None:
             pass  # the raw subscription receives presence as well; the typed one only serves the join barrier
         try:
-            raw = self._queue.get(timeout_s)
+            self._write(self._queue.get(timeout_s))
         except queue.Empty:
             self.recording.flush_if_due()
             self.heartbeat.waiting_for = self._missing_keys()
             return
+        for _ in range(_BATCH - 1):
+            if self._queue.empty():
+                return
+            self._write(self._queue.get(timeout_s))
+
+    def _write(self, raw: RawSample) -> None:
         found, message = topics.topic_of_key(raw.key), None
         if found is not None and found[0] in _DECODED:
             with suppress(Rejected):

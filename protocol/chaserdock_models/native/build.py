@@ -26,6 +26,7 @@ NATIVE_FOLDERS = (
     "agents/chaserdock_agents/chaser/perception/native",
     "controller/chaserdock_controller/nmpc/native",
     "controller/chaserdock_controller/estimation/joint/native",
+    "world/chaserdock_world/physics/native",
 )
 # Sources that every library contains in addition to those of its own folder.
 _SHARED = ("base.h", "elementary.h", "dispatch.c", "build.py")

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import queue
 import threading
-from typing import Any, Generic, Protocol, TypeVar
+from typing import Generic, TypeVar
 
 T = TypeVar("T")
 
@@ -13,28 +13,13 @@ MAX_BYTES = 256_000_000
 MAX_ITEMS = 200_000
 
 
-class ItemQueue(Protocol):
-    """First-in-first-out queue without bounds, as ``queue.SimpleQueue``."""
-
-    def put(self, item: Any) -> None: ...
-    def get(self, *, timeout: float | None) -> Any: ...
-    def get_nowait(self) -> Any: ...
-    def qsize(self) -> int: ...
-    def empty(self) -> bool: ...
-
-
 class BoundedQueue(Generic[T]):
-    """FIFO queue that drops items when it is full, and counts them in ``dropped``.
+    """FIFO queue between threads that drops items when it is full, and counts them in ``dropped``."""
 
-    ``items`` holds the items and does the waiting; by default between threads.
-    """
-
-    def __init__(
-        self, max_bytes: int = MAX_BYTES, max_items: int = MAX_ITEMS, items: ItemQueue | None = None
-    ) -> None:
+    def __init__(self, max_bytes: int = MAX_BYTES, max_items: int = MAX_ITEMS) -> None:
         self.dropped = 0
         self._max_bytes, self._max_items = max_bytes, max_items
-        self._items: ItemQueue = queue.SimpleQueue() if items is None else items
+        self._items: queue.SimpleQueue[tuple[T, int]] = queue.SimpleQueue()
         self._bytes = 0
         self._lock = threading.Lock()
 

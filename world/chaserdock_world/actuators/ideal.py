@@ -77,13 +77,15 @@ class IdealActuators:
     errors: ActuationErrors | None = None
     physics_hz: int = 960
     wrench: Array = field(default_factory=lambda: np.zeros(6))
-    impulse: Array = field(default_factory=lambda: np.zeros(6))
+    impulse: list[float] = field(default_factory=lambda: [0.0] * 6)
     absolute_impulse_N_s: float = 0.0
     saturated: bool = False
     late: int = 0
     _queue: list[tuple[int, int, int, Array]] = field(default_factory=list)
     _received: int = 0
     _last_step: int = 0
+    _values: list[float] = field(default_factory=lambda: [0.0] * 6)
+    _absolute_N: float = 0.0
 
     def command(self, command: ActuatorCommand, effective_step: int, now_step: int) -> None:
         """See ``Actuators.command``."""
@@ -103,15 +105,22 @@ class IdealActuators:
 
     def next_change(self, step: int) -> int | None:
         """See ``Actuators.next_change``."""
+        if not self._queue:
+            return None
         return min((entry[0] for entry in self._queue if entry[0] > step), default=None)
 
     def act(self, step: int, steps: int, step_s: float) -> Array:
         """See ``Actuators.act``."""
         while self._queue and self._queue[0][0] <= step:
-            self.wrench = heapq.heappop(self._queue)[3]
-        self.impulse = self.impulse + self.wrench * (steps * step_s)
-        self.absolute_impulse_N_s += float(np.abs(self.wrench[:3]).sum()) * steps * step_s
+            self._set_wrench(heapq.heappop(self._queue)[3])
+        duration_s = steps * step_s
+        self.impulse = [a + b * duration_s for a, b in zip(self.impulse, self._values, strict=True)]
+        self.absolute_impulse_N_s += self._absolute_N * steps * step_s
         return self.wrench
+
+    def _set_wrench(self, wrench: Array) -> None:
+        self.wrench, self._values = wrench, wrench.tolist()
+        self._absolute_N = float(np.abs(wrench[:3]).sum())
 
     def thrusts(self, step: int) -> Array:
         """See ``Actuators.thrusts``: there are no thrusters."""
@@ -120,12 +129,12 @@ class IdealActuators:
     def stop(self, step: int) -> None:
         """See ``Actuators.stop``."""
         self._queue.clear()
-        self.wrench = np.zeros(6)
+        self._set_wrench(np.zeros(6))
 
     def take_output(self, step: int) -> ActuatorOutput:
         """See ``Actuators.take_output``."""
-        output = ActuatorOutput(self.impulse, self.absolute_impulse_N_s, self.saturated, self.late)
-        self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = np.zeros(6), 0.0, False, 0
+        output = ActuatorOutput(np.array(self.impulse), self.absolute_impulse_N_s, self.saturated, self.late)
+        self.impulse, self.absolute_impulse_N_s, self.saturated, self.late = [0.0] * 6, 0.0, False, 0
         return output
 
 

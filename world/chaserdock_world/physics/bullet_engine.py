@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.rigid_body import BodyState
 
 from .bullet import connect, pybullet
+from .bullet_stepping import make_stepper
 from .engine import (
     BodyContact,
     BodyMotion,
@@ -26,6 +27,7 @@ from .engine import (
     SolidCapsule,
     SolidHull,
 )
+from .gyroscopic import advance_free
 
 _NO_LOAD = (0.0, 0.0, 0.0)
 
@@ -44,6 +46,8 @@ class BulletEngine:
             # Else the solver stops early, and joint reactions lag behind changes of thrust by a few steps.
             self._bullet.setPhysicsEngineParameter(solverResidualThreshold=0.0)
         self._joints: dict[tuple[int, int], int] = {}
+        self._step_s = setup.step_s
+        self._stepper = make_stepper(self._ids, self._client, setup.step_s)
 
     def _add(self, body: RigidBodyDefinition, setup: EngineSetup) -> int:
         identity = self._bullet.createMultiBody(
@@ -127,6 +131,12 @@ class BulletEngine:
     def step(self) -> None:
         """See ``RigidBodyEngine.step``. Bullet clears external loads after it."""
         pybullet.stepSimulation(self._client)
+
+    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+        """See ``RigidBodyEngine.advance``."""
+        if self._stepper is None:
+            return advance_free(self, bodies, loads, steps, self._step_s)
+        return self._stepper.advance(bodies, loads, steps)
 
     def touching(self) -> bool:
         """See ``RigidBodyEngine.touching``."""

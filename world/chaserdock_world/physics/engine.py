@@ -128,6 +128,14 @@ class RigidBodyEngine(Protocol):
         """Make one step."""
         ...
 
+    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+        """Make at most ``steps`` steps of free ``bodies`` (n,) under constant loads, and stop after one with contacts.
+
+        ``loads`` (n, 9): principal moments, force and torque in body axes; gyroscopic.py corrects the torque. Return the
+        number of steps made, and whether ``contacts`` may return any.
+        """
+        ...
+
     def touching(self) -> bool:
         """Return quickly whether ``contacts`` may return any."""
         ...

@@ -10,6 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from chaserdock_models.arrays import Array, IntArray
+
+from .engine import RigidBodyEngine
+
 
 def _gyroscopic_torque(inertia: Sequence[float], a: float, b: float, c: float) -> tuple[float, float, float]:
     """Return omega x I omega for principal moments ``inertia`` and rates (a, b, c)."""
@@ -63,3 +67,22 @@ def midpoint_torque_of_rates(
     gx, gy, gz = _gyroscopic_torque(inertia, *_rotate_to_body(q_wxyz, omega_world))
     nx, ny, nz = _gyroscopic_torque(inertia, *_rotate_to_body(q_wxyz, middle))
     return (gx - nx, gy - ny, gz - nz)
+
+
+def advance_free(
+    engine: RigidBodyEngine, bodies: IntArray, loads: Array, steps: int, step_s: float
+) -> tuple[int, bool]:
+    """Make the steps of ``RigidBodyEngine.advance`` one by one, of ``step_s`` each."""
+    rows = [
+        (body, load[:3], load[3:6], load[6:])
+        for body, load in zip(bodies.tolist(), loads.tolist(), strict=True)
+    ]
+    for made in range(1, steps + 1):
+        for body, inertia, force, torque in rows:
+            _, q_wxyz, _, omega_world = engine.motion(body)
+            x, y, z = midpoint_torque(inertia, q_wxyz, omega_world, torque, step_s)
+            engine.push(body, force, (torque[0] + x, torque[1] + y, torque[2] + z))
+        engine.step()
+        if engine.touching():
+            return made, True
+    return steps, False

@@ -18,7 +18,7 @@ from typing import Any
 import mujoco as untyped_mujoco
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.orbit import Scalars3
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.scalar_rotations import cross_components, rotated_components
@@ -34,6 +34,7 @@ from .engine import (
     SolidCapsule,
     SolidHull,
 )
+from .gyroscopic import advance_free
 
 mujoco: Any = untyped_mujoco  # has no type stubs
 
@@ -55,6 +56,7 @@ class MujocoEngine:
             _add_body(spec, number, body, _contact_reference(setup.spring, setup.step_s))
         for a, b in setup.joints:
             _add_joint(spec, a, b, setup.step_s)
+        self._step_s = setup.step_s
         self._model = spec.compile()
         self._data = mujoco.MjData(self._model)
         self._free = [body.mass_kg > 0.0 for body in setup.bodies]
@@ -142,6 +144,10 @@ class MujocoEngine:
         mujoco.mj_step(self._model, self._data)
         self._load = [0.0] * len(self._load)
         self._motions.clear()
+
+    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+        """See ``RigidBodyEngine.advance``."""
+        return advance_free(self, bodies, loads, steps, self._step_s)
 
     def touching(self) -> bool:
         """See ``RigidBodyEngine.touching``."""

@@ -48,6 +48,7 @@ _Z_TO_X_WXYZ = np.array([0.5**0.5, 0.0, 0.5**0.5, 0.0])
 # A compliant contact: restitution 0.35 and 0.3 mm penetration at 1 cm/s (docs/docking.md).
 _STIFFNESS_N_M, _DAMPING_N_S_M = 1e4, 100.0
 _ZERO = (0.0, 0.0, 0.0)
+_NO_WRENCH = np.zeros(6)
 
 
 class Physics:
@@ -80,6 +81,13 @@ class Physics:
         self._free = {name: self.plants[name] for name in chasers}
         if not self._prescribed:
             self._free[TARGET] = self.plants[TARGET]
+        self._free_bodies = np.array([self._bodies[name] for name in self._free], dtype=np.int64)
+        # Principal moments, force and torque of the free bodies.
+        self._loads = np.zeros((len(self._free), 9))
+        self._loads[:, :3] = [plant.moments_kg_m2 for plant in self._free.values()]
+        self._prescribed_start = _prescribed_start(scenario)
+        self._disturbed = {name for name, plant in self.plants.items() if plant.disturbance.any()}
+        self._moves_target = self._prescribed and scenario.target.motion != "static"
         self._orbital: OrbitalForces | None = None
         if scenario.orbit is not None:
             self._orbital = OrbitalForces(
@@ -142,7 +150,7 @@ class Physics:
     def state(self, name: str) -> BodyState:
         """Return the current state of a body; that of a prescribed target is exact."""
         if name == TARGET and self._prescribed:
-            return prescribed_state(self._scenario, self.step_count / self._scenario.time.physics_hz)
+            return _moved(self._prescribed_start, self.step_count / self._scenario.time.physics_hz)
         return self._body_state(name, self._engine.motion(self._bodies[name]))
 
     def _body_state(self, name: str, motion: BodyMotion) -> BodyState:
@@ -167,7 +175,7 @@ class Physics:
     def _wrench_on(self, name: str, wrench: Array) -> Array:
         """Return force and torque (6,), in the engine's frame of a body, of its actuators and its present disturbances."""
         plant = self.plants[name]
-        if plant.disturbance.any():
+        if name in self._disturbed:
             wrench = wrench + plant.disturbance
         if name in self._noise:
             noise, sigma = self._noise[name]
@@ -180,13 +188,39 @@ class Physics:
         ``wrenches`` maps a chaser's name to force and torque (6,) at its origin in its body axes, N and N m. Disturbances
         must not change in between (see ``next_change``).
         """
-        zero = np.zeros(6)
-        loads = []
-        for name, plant in self._free.items():
-            wrench = self._wrench_on(name, wrenches.get(name, zero))
-            loads.append((self._bodies[name], plant.moments_kg_m2, wrench[:3].tolist(), wrench[3:].tolist()))
+        loads = self._loads
+        for k, name in enumerate(self._free):
+            loads[k, 3:] = self._wrench_on(name, wrenches.get(name, _NO_WRENCH))
+        if self.latches or self._orbital is not None:
+            return self._advance_by_step(steps, loads)
+        touched: set[tuple[str, str]] = set()
+        end = self.step_count + steps
+        while self.step_count < end:
+            until = end
+            if self._moves_target:
+                until = min(end, self.step_count + self._steps_to_target_update())
+            made, touching = self._engine.advance(self._free_bodies, loads, until - self.step_count)
+            self.step_count += made
+            if touching:
+                touched.update(self._process_contacts())
+            self._move_target()
+        return touched
+
+    def _steps_to_target_update(self) -> int:
+        return self._steps_per_target_update - self.step_count % self._steps_per_target_update
+
+    def _move_target(self) -> None:
+        """Move the engine's copy of a prescribed target, if it is due."""
+        if self._moves_target and self.step_count % self._steps_per_target_update == 0:
+            self.place(TARGET, self.state(TARGET))
+
+    def _advance_by_step(self, steps: int, wrenches: Array) -> set[tuple[str, str]]:
+        """Make steps in which loads depend on the motion: with latches, or in an orbit. ``wrenches``: as ``_loads``."""
         step_s = 1.0 / self._scenario.time.physics_hz
-        moves = self._prescribed and self._scenario.target.motion != "static"
+        loads = [
+            (body, load[:3], load[3:6], load[6:])
+            for body, load in zip(self._free_bodies.tolist(), wrenches.tolist(), strict=True)
+        ]
         touched: set[tuple[str, str]] = set()
         engine, before, jointed = self._engine, self._before, set[int]()
         motion_of, push = engine.motion, engine.push
@@ -213,8 +247,7 @@ class Physics:
             # A bounce may last a single step, so contacts are checked after each.
             if engine.touching():
                 touched.update(self._process_contacts())
-            if moves and self.step_count % self._steps_per_target_update == 0:
-                self.place(TARGET, self.state(TARGET))
+            self._move_target()
         return touched
 
     def _process_contacts(self) -> tuple[tuple[str, str], ...]:
@@ -440,10 +473,19 @@ def _state_of(motion: BodyMotion) -> BodyState:
 
 def prescribed_state(scenario: Scenario, time_s: float) -> BodyState:
     """Return the target's exact state at a simulated time under constant velocity and body rate."""
+    return _moved(_prescribed_start(scenario), time_s)
+
+
+def _prescribed_start(scenario: Scenario) -> BodyState:
     target = scenario.target
     still = target.motion == "static"
     velocity = np.zeros(3) if still else np.asarray(target.velocity_m_s)
     omega = np.zeros(3) if still else np.asarray(target.omega_rad_s)
-    position = np.asarray(target.position_m) + velocity * time_s
-    attitude = rotations.integrate(target.q_wxyz, omega, time_s)
-    return BodyState(position, velocity, attitude, omega)
+    return BodyState(np.asarray(target.position_m), velocity, np.asarray(target.q_wxyz), omega)
+
+
+def _moved(start: BodyState, time_s: float) -> BodyState:
+    """Return a state after a time at constant velocity and body rate."""
+    velocity, omega = start.velocity_m_s, start.omega_rad_s
+    position = start.position_m + velocity * time_s
+    return BodyState(position, velocity, rotations.integrate(start.q_wxyz, omega, time_s), omega)

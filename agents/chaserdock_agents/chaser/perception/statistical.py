@@ -9,18 +9,21 @@ compares both with rendered images. Where no marker is seen, ``[ranging]`` gives
 from __future__ import annotations
 
 import math
+from ctypes import c_double, c_int64
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.native import address
 from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.pose_image import decode_pose
 from chaserdock_protocol.scenario.ranging import Ranging
 from numpy.typing import ArrayLike, NDArray
 
+from .native import function
 from .pipeline import PerceptionResult
-from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose, pose_covariance
+from .pnp import MIN_SINGLE_COSINE, MarkerTable, TargetPose
 
 SIGMA_PX = 0.042
 """Standard deviation of the coordinates of a corner of a large marker, pixels."""
@@ -30,6 +33,8 @@ MIN_SIDE_PX = 14.0
 """Shortest side of a marker that is detected, pixels."""
 MIN_COSINE = 0.3
 _MARGIN_PX = 2.0
+_LIMITS = (c_double * 6)(SIGMA_PX, SMALL_SIDE_PX, MIN_SIDE_PX, MIN_COSINE, MIN_SINGLE_COSINE, _MARGIN_PX)
+"""``MarkerLimits`` of native/statistical.c."""
 _NOTHING = PerceptionResult((), np.zeros(0, dtype=np.int64), np.zeros((0, 4, 2)), ())
 
 
@@ -39,42 +44,44 @@ class StatisticalPerception:
     def __init__(self, camera: Camera, model: TargetModel, ranging: Ranging | None = None) -> None:
         self._camera, self._ranging = camera, ranging
         self._table = MarkerTable.of(model)
+        self._lens = (c_double * 6)(
+            camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
+        )
 
     def estimate(
         self, image: NDArray[np.uint8], predicted: tuple[ArrayLike, ArrayLike] | None = None
     ) -> PerceptionResult:
         """Return one solution, or none if too little of the target is in view. Raises ValueError for a rendered image."""
         position, q, seed = decode_pose(image)
-        rotation = rotations.to_matrix(q)
-        corners = self._table.corners.reshape(-1, 3) @ rotation.T + position
-        if corners[:, 2].min() <= 0.0:
-            return _NOTHING
-        seen_near = self._by_markers(position, q, rotation, corners, seed)
-        return seen_near or self._by_range(position, q, seed) or _NOTHING
-
-    def _by_markers(
-        self, position: Array, q: Array, rotation: Array, corners: Array, seed: tuple[int, int]
-    ) -> PerceptionResult | None:
+        white = np.random.default_rng(seed).standard_normal(6)
         table = self._table
-        px = self._camera.project_ideal(corners).reshape(-1, 4, 2)
-        sides = px - px[:, (1, 2, 3, 0)]
-        side_px = np.sqrt(np.einsum("ijk,ijk->ij", sides, sides).min(axis=1))
-        seen = self._visible(px, side_px, rotation, position)
-        if not seen.any():
-            return None
-        points, pixels = table.corners[seen].reshape(-1, 3), np.ascontiguousarray(px[seen].reshape(-1, 2))
-        relative = np.repeat(np.maximum(1.0, SMALL_SIDE_PX / side_px[seen]), 4)
-        found = pose_covariance(self._camera, points, pixels, position, rotation, SIGMA_PX, relative)
-        if found is None:
-            return None
-        covariance, _ = found
-        error = np.linalg.cholesky(covariance) @ np.random.default_rng(seed).standard_normal(6)
-        pose = TargetPose(
+        m = len(table.ids)
+        pose = np.concatenate([position, rotations.to_matrix(q).ravel()])
+        seen, px, covariance, error = (
+            np.empty(m, np.int64),
+            np.empty((m, 4, 2)),
+            np.empty((6, 6)),
+            np.empty(6),
+        )
+        surface, outputs = (table.corners, table.origins, table.normals), (seen, px, covariance, error)
+        count = function("measure_pose", c_int64)(
+            self._lens,
+            _LIMITS,
+            *map(address, surface),
+            c_int64(m),
+            *map(address, (pose, white, *outputs)),
+        )
+        if count < 0:
+            return _NOTHING
+        if count == 0:
+            return self._by_range(position, q, white) or _NOTHING
+        found = TargetPose(
             position + error[:3], rotations.multiply(q, rotations.exp(error[3:])), covariance, SIGMA_PX
         )
-        return PerceptionResult((pose,), table.ids[seen], self._camera.distort(px[seen]), ())
+        used = seen != 0
+        return PerceptionResult((found,), table.ids[used], self._camera.distort(px[used]), ())
 
-    def _by_range(self, position: Array, q: Array, seed: tuple[int, int]) -> PerceptionResult | None:
+    def _by_range(self, position: Array, q: Array, white: Array) -> PerceptionResult | None:
         """Return the pose from bearing, range and the attitude that the target sends; None out of the image or of reach."""
         ranging, camera = self._ranging, self._camera
         distance = float(np.linalg.norm(position))
@@ -90,23 +97,9 @@ class StatisticalPerception:
         line = np.outer(along, along)
         covariance[:3, :3] = range_m**2 * line + across_m**2 * (np.eye(3) - line)
         covariance[3:, 3:] = math.radians(ranging.attitude_noise_deg) ** 2 * np.eye(3)
-        error = np.linalg.cholesky(covariance) @ np.random.default_rng(seed).standard_normal(6)
+        error = np.linalg.cholesky(covariance) @ white
         sigma_px = math.radians(ranging.bearing_noise_deg) * camera.fx_px
         pose = TargetPose(
             position + error[:3], rotations.multiply(q, rotations.exp(error[3:])), covariance, sigma_px
         )
         return PerceptionResult((pose,), _NOTHING.marker_ids, _NOTHING.corners_px, ())
-
-    def _visible(self, px: Array, side_px: Array, rotation: Array, position: Array) -> NDArray[np.bool_]:
-        """Return which markers (m,) are detected, from their corners' ideal pixels (m, 4, 2), shortest sides and the pose."""
-        table, camera = self._table, self._camera
-        centres = table.origins @ rotation.T + position
-        towards = -np.einsum("ij,ij->i", table.normals @ rotation.T, centres)
-        cosine = towards / np.sqrt(np.einsum("ij,ij->i", centres, centres))
-        low, high = px.min(axis=(1, 2)), px.max(axis=1)
-        right, bottom = camera.width_px - 1.0 - _MARGIN_PX, camera.height_px - 1.0 - _MARGIN_PX
-        inside = (low >= _MARGIN_PX) & (high[:, 0] <= right) & (high[:, 1] <= bottom)
-        seen = inside & (cosine > MIN_COSINE) & (side_px >= MIN_SIDE_PX)
-        if seen.sum() == 1 and cosine[seen][0] < MIN_SINGLE_COSINE:
-            seen[:] = False
-        return seen

@@ -8,3 +8,4 @@
 #include "mesh.c"
 #include "light.c"
 #include "align.c"
+#include "statistical.c"

@@ -1,0 +1,68 @@
+/* SPDX-License-Identifier: Apache-2.0 */
+/* Fuzz targets of world/chaserdock_world/physics/native, with an imitation of Bullet's C interface. */
+#include "fuzz.h"
+#include "kernels.c"
+
+typedef struct {
+    int64_t count, steps, contact_step;
+    double *q, *u, *loads;
+    int64_t *applied;
+} World; /* the client; a command or status is the index of a body, plus one */
+
+static World world;
+static int body_now;
+
+static void *submit(void *client, void *command) {
+    CHECK(client == &world);
+    return command;
+}
+static void *begin_state(void *client, int body) {
+    CHECK(client == &world && body >= 0 && body < world.count);
+    body_now = body;
+    return &world.q[7 * body];
+}
+static int read_state(void *status, int *body, int *q_count, int *u_count, const double **frame, const double **q, const double **u,
+                      const double **reactions) {
+    CHECK(!body && !q_count && !u_count && !frame && !reactions);
+    *q = status;
+    *u = world.u + 6 * body_now;
+    return 0;
+}
+static void *begin(void *client) { return client; }
+static void add_force(void *command, int body, int link, const double *force, const double *point, int axes) {
+    CHECK(command == &world && body == body_now && link == -1 && axes == 1 && point[0] == 0.0);
+    CHECK(same_bits(force, world.loads + 9 * body + 3, 3));
+}
+static void add_torque(void *command, int body, int link, const double *torque, int axes) {
+    CHECK(command == &world && body == body_now && link == -1 && axes == 1);
+    if (!special_drawn) CHECK(all_finite(torque, 3));
+    world.applied[body]++;
+}
+static void *begin_step(void *client) {
+    world.steps++;
+    return client;
+}
+static void read_contacts(void *client, Contacts *found) {
+    CHECK(client == &world);
+    found->count = world.steps == world.contact_step;
+}
+
+static void advance(void) {
+    const Bullet bullet = {submit, begin_state, read_state, begin, add_force, add_torque, begin_step, begin, read_contacts};
+    const int64_t count = whole(0, 4), steps = whole(0, 5), contact_step = whole(1, 8);
+    world = (World){count, 0, contact_step, outputs(7 * count), doubles(6 * count, -1.0, 1.0), doubles(9 * count, 0.1, 1.0),
+                    block((size_t)count * 8)};
+    int64_t *bodies = block((size_t)count * 8), *touching = block(8);
+    for (int64_t i = 0; i < count; i++) {
+        bodies[i] = i, world.applied[i] = 0;
+        fill(world.q + 7 * i, 3, -1.0, 1.0);
+        fill_quaternion(world.q + 7 * i + 3);
+    }
+    const int64_t made = NAME(advance)(&bullet, &world, count, bodies, world.loads, steps, value(0.001, 0.01), touching);
+    CHECK(made == (contact_step < steps ? contact_step : steps) && made == world.steps);
+    CHECK(*touching == (made == contact_step));
+    for (int64_t i = 0; i < count; i++) CHECK(world.applied[i] == made);
+}
+
+static const Target TARGETS[] = {{"advance", advance}};
+FUZZ_MAIN(TARGETS)

@@ -73,4 +73,4 @@ class BodyRenderer:
         levels = np.array([255.0 * (v / 255.0) ** _GAMMA for v in range(256)]).astype(np.uint8)
         bgr: BgrImage = np.asarray(cv2.LUT(np.clip(colours, 0.0, 255.0).astype(np.uint8), levels), np.uint8)
         space: BgrImage = np.asarray(cv2.LUT(np.repeat(behind[:, :, None], 3, axis=2), levels), np.uint8)
-        return RenderedBodies(space, bgr, whole != behind)
+        return RenderedBodies(space, bgr, np.any(bgr != space, axis=2))

@@ -484,7 +484,7 @@ def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
 _OUTCOME_COLOURS: dict[ImageOutcome, str] = {
     "used": SERIES[2],
     "rejected": SERIES[1],
-    "no marker": "#d9dce1",
+    "not seen": "#d9dce1",
     "bad image": LIMIT,
     "not processed": SERIES[3],
 }

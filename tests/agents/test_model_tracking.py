@@ -118,6 +118,19 @@ def test_synthetic_view_matches_the_ray_tracer():
         assert np.abs(WHITE_LEVEL * view.grey - exact)[inside].mean() < 4.0
 
 
+def test_target_that_is_wider_than_the_image_is_aligned_at_a_coarser_level():
+    """Whole images of it would take the most time, and show texture that the mesh does not have."""
+    camera, mesh = Camera.from_hfov(960, 540, np.deg2rad(60.0)), mesh_of()
+    pyramid = Pyramid(np.zeros((540, 960), np.uint8), camera)
+    widest_at_m = 2.0 * mesh.radius_m * camera.fx_px / 1300.0
+    pose, _ = random_view(np.random.default_rng(3), 1.0, camera)
+    finest = []
+    for range_m in (1.02 * widest_at_m, 0.98 * widest_at_m, 0.49 * widest_at_m):
+        at = type(pose)(np.array([0.0, 0.0, range_m]), pose.rotation)
+        finest.append(tracking.levels_of(pyramid, mesh, at)[-1])
+    assert finest == [0, 1, 2]
+
+
 def test_target_behind_the_camera_or_out_of_the_image_has_no_levels():
     pyramid = Pyramid(np.zeros((270, 480), np.uint8), CAMERA)
     pose, _ = random_view(np.random.default_rng(1), 3.0, CAMERA)

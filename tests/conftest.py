@@ -5,6 +5,8 @@ from __future__ import annotations
 
 import fcntl
 import os
+import sys
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,8 +16,18 @@ from harness import DRILL, SHORT, run
 
 Fly = Callable[..., Path]
 
-# The hundreds of processes that tests start would each compile every module again.
+# The hundreds of processes that tests start would each compile every module again, and every run of the tests these.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the files with the longest missions first: at the end, workers share short tests, and none waits for another."""
+    minutes: Counter[Path] = Counter()
+    for item in items:
+        if slow := item.get_closest_marker("slow"):
+            minutes[item.path] += slow.kwargs.get("minutes", 0.25)
+    items.sort(key=lambda item: -minutes[item.path])
 
 
 @pytest.fixture(scope="session")

@@ -57,17 +57,20 @@ class _Rows(Structure):
         ("n_rows", c_void_p),
         ("a", c_void_p),
         ("c", c_void_p),
+        ("b", c_void_p),
     ]
 
 
 @dataclass(frozen=True)
 class HalfSpaceRows:
-    """Half-spaces a' dp_k >= c of each chaser: stage (N, M), a (N, M, 3), c (N, M); the first n_rows (N,) are used."""
+    """Half-spaces a' dp_k + b' dv_k >= c of each chaser: stage (N, M), a and b (N, M, 3), c (N, M); the first n_rows (N,) are
+    used."""
 
     stage: IntArray
     a: Array
     c: Array
     n_rows: IntArray
+    b: Array
 
 
 def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> HalfSpaceRows:
@@ -76,12 +79,14 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
     reach_m (N, D+1): how far admissible inputs can move a chaser from its rollout.
     """
     n, nodes, _ = x.shape
-    width = (nodes - 1) * (n + 2 + (0 if problem.boxes is None else problem.boxes.shape[1]))
+    extra = sum(0 if a is None else a.shape[k] for a, k in ((problem.boxes, 1), (problem.coasts, 2)))
+    width = (nodes - 1) * (n + 2 + extra)
     rows = HalfSpaceRows(
-        np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64)
+        np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64),
+        np.zeros((n, width, 3)),
     )  # fmt: skip
     zones, reach = zones_of(problem, outer_m), np.ascontiguousarray(reach_m)
-    native = _Rows(width, nodes, *(address(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c)))
+    native = _Rows(width, nodes, *(address(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b)))
     function("build_rows")(ctypes.byref(zones), address(x), ctypes.byref(native))
     return rows
 
@@ -96,7 +101,7 @@ class _Qp(Structure):
         ("w2", c_double),
         *(
             (name, c_void_p)
-            for name in ("mats", "q_pos", "q_att", "qx", "r_diag", "r", "w_bar", "stage", "a", "c")
+            for name in ("mats", "q_pos", "q_att", "qx", "r_diag", "r", "w_bar", "stage", "a", "c", "b")
         ),
     ]
 
@@ -126,13 +131,13 @@ class QpAnswer:
 
 def solve_qp(
     mats: Array, h: float, model: tuple[Array, ...], stage: IntArray, a: Array, c: Array, w1: float, w2: float,
-    max_iterations: int = MAX_ITERATIONS,
+    max_iterations: int = MAX_ITERATIONS, b: Array | None = None,
 ) -> QpAnswer:  # fmt: skip
     """Solve the QP of one chaser: mats (D, 12, 12), ``model`` as `quadratic_model` returns it, rows (R,), (R, 3),
-    (R,)."""
+    (R,), and with velocities (R, 3)."""
     d, rows = len(mats), len(stage)
     dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
-    qp = _Qp(d, rows, max_iterations, h, w1, w2, *(address(v) for v in (mats, *model, stage, a, c)))
+    qp = _Qp(d, rows, max_iterations, h, w1, w2, *(address(v) for v in (mats, *model, stage, a, c)), None if b is None else address(b))
     answer = _Answer(address(dx), address(dw), address(mul))
     work = scratch(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))
     code = function("solve_qp", c_int)(ctypes.byref(qp), ctypes.byref(answer), address(work))

@@ -95,4 +95,4 @@ def seen_text(sighting: Sighting | None) -> str:
     count = len(sighting.marker_ids) if sighting else 0
     if count:
         return f"{count} marker{'s' if count > 1 else ''}"
-    return "seen by its shape" if sighting is not None and sighting.solutions else "no marker"
+    return "seen by its shape" if sighting is not None and sighting.solutions else "not seen"

@@ -72,16 +72,21 @@ def too_many_chasers(scenario: str, overrides: str, services: int) -> str | None
 
 def run(arguments: list[str], host: str, port: int) -> int:
     """Run the program to its end, forward signals; return its status, or 0 when the router has gone for good."""
-    process = subprocess.Popen([sys.executable, "-m", "chaserdock", *arguments])
-    stopping = False
+    process: subprocess.Popen[bytes] | None = None
+    stopping: int | None = None
 
     def forward(number: int, frame: object) -> None:
         nonlocal stopping
-        stopping = True
-        process.send_signal(number)
+        stopping = number
+        if process is not None:
+            process.send_signal(number)
 
+    # Before the start, so that no signal is lost: it would leave the program behind.
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, forward)
+    process = subprocess.Popen([sys.executable, "-m", "chaserdock", *arguments])
+    if stopping is not None:
+        process.send_signal(stopping)
     linked_s = math.inf  # until the first connection: starting can take long on a busy machine
     while True:
         try:
@@ -95,8 +100,8 @@ def run(arguments: list[str], host: str, port: int) -> int:
                 process.terminate()
                 process.wait()
                 return 0
-    if status == 0 and not stopping and arguments[0] not in ("router", "judge"):
-        wait_for_router_exit(host, port, lambda: stopping)
+    if status == 0 and stopping is None and arguments[0] not in ("router", "judge"):
+        wait_for_router_exit(host, port, lambda: stopping is not None)
     return status
 
 

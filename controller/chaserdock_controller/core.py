@@ -21,7 +21,8 @@ from .parameters import estimator_of, nmpc_parameters
 
 
 class ControllerCore:
-    """The controller's stages, which keep its state from tick to tick.
+    """The controller's stages, which keep its state from tick to tick. ``inspecting``: the chasers that guidance let inspect the
+    target in the last tick.
 
     ``now_s`` is a wall clock that only measures solve times; in ``realtime`` the scenario's solve budget follows from them.
     ``estimator`` replaces the scenario's. Raises PluginError for an installed solver that cannot be held to a budget.
@@ -40,12 +41,14 @@ class ControllerCore:
         self.guidance = GuidanceStage(scenario)
         self.planning = PlanningStage(scenario, nmpc_parameters(scenario), now_s, realtime)
         self.output = OutputStage(scenario)
+        self.inspecting: frozenset[int] = frozenset()
 
     def step(self, inputs: TickInputs) -> TickOutputs:
         """Process one tick. A chaser with invalid odometry is excluded from planning and coasts."""
         observation = self.ingest.run(inputs, self.output.history)
-        estimation = self.estimation.run(observation, self.guidance.machine.inspecting())
+        estimation = self.estimation.run(observation, self.inspecting)
         guidance = self.guidance.run(observation, estimation, self.planning.history)
+        self.inspecting = guidance.inspecting
         plan = self.planning.run(observation, estimation, guidance)
         return self.output.run(observation, estimation, guidance, plan)
 

@@ -242,6 +242,11 @@ class GuidanceResult:
     events: tuple[LogEntry, ...]
     abort_margins: Mapping[int, float] = field(default_factory=dict)
 
+    @property
+    def inspecting(self) -> frozenset[int]:
+        """Return the chasers that fly around the target to view it."""
+        return frozenset(i for i, d in self.directives.items() if d.phase is Phase.INSPECT)
+
 
 @dataclass(frozen=True)
 class PlanCertificate:

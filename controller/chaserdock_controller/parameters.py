@@ -18,6 +18,7 @@ from .estimation.composite_body import rows_of, stated_properties
 from .estimation.joint import JointEstimator, JointParameters
 from .estimation.joint.parameters import RANGING, SHAPE, TARGET_NOISE
 from .nmpc import NmpcParameters
+from .nmpc.coast_rows import COASTS
 
 
 def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
@@ -30,6 +31,7 @@ def nmpc_parameters(scenario: FlightScenario) -> NmpcParameters:
         force_max_N=body.force_max_N,
         torque_max_N_m=body.torque_max_N_m,
         boxes=len(scenario.target_model().boxes) if scenario.limits.min_distance_shape_m else 0,
+        coasts=COASTS if scenario.limits.passive_safety == "enforce" else 0,
         **nmpc_settings(scenario.controller, scenario.limits),
     )
 

@@ -76,6 +76,55 @@ class CoastModel:
         """Return the approach with the smallest margin of the coast from each of the states (M, 6); arguments as in ``certify``."""
         return self._closest_in(np.arange(len(self._times_s) - 1), states, covariance, keep_out_m)
 
+    def tangent_planes(
+        self, states: Array, covariance: Array, keep_out_m: float, sigmas: float, count: int
+    ) -> Array:
+        """Return half-spaces (M, count, 7) at the closest approaches of the coast from each of M states; arguments as in ``certify``.
+
+        [c (6), d]: at its moment, c' x >= d suffices for a state x (6,) to keep ``sigmas`` standard deviations from the keep-out;
+        c is zero where a coast has fewer approaches. Those with the smallest margins are returned.
+        """
+        rows = self._by_axis[:3]
+        coasts = (rows @ states.T).transpose(2, 1, 0)
+        distances = np.sqrt(np.square(coasts).sum(axis=2))
+        lines = coasts / np.maximum(distances, 1e-9)[..., None]
+        spread = self._transitions[:, :3] @ covariance @ self._transitions[:, :3].transpose(0, 2, 1)
+        sigmas_m = np.sqrt(np.maximum(_variance_along(lines, spread), 1e-18))
+        margins = (distances - keep_out_m) / sigmas_m
+        beside = np.pad(margins, ((0, 0), (1, 1)), constant_values=np.inf)
+        lowest = np.where((margins <= beside[:, :-2]) & (margins < beside[:, 2:]), margins, np.inf)
+        samples = np.argsort(lowest, axis=1, kind="stable")[:, :count]
+        # The closest approach is in the step before or after the sample.
+        before, after = (
+            self._planes_in(np.clip(steps, 0, len(self._times_s) - 2), states, covariance, keep_out_m, sigmas)
+            for steps in (samples - 1, samples)
+        )
+        planes = np.where((before[1] < after[1])[..., None], before[0], after[0])
+        planes[np.isinf(np.take_along_axis(lowest, samples, axis=1))] = 0.0
+        return planes
+
+    def _planes_in(
+        self, steps: IntArray, states: Array, covariance: Array, keep_out_m: float, sigmas: float
+    ) -> tuple[Array, Array]:
+        """Return half-spaces (M, C, 7) of the closest approach within ``steps`` (M, C) of the coasts, and its margins (M, C)."""
+        parts = self._transitions[steps], self._transitions[steps + 1]
+        begin, end = (np.einsum("mcij,mj->mci", part, states) for part in parts)
+        here, step = begin[..., :3], end[..., :3] - begin[..., :3]
+        length2 = np.maximum(np.einsum("mci,mci->mc", step, step), 1e-30)
+        share = np.clip(-np.einsum("mci,mci->mc", here, step) / length2, 0.0, 1.0)[..., None]
+        nearest = here + share * step
+        chord_m = np.linalg.norm(nearest, axis=2)
+        line = np.where((chord_m > 1e-6)[..., None], nearest, _across(step))
+        line /= np.linalg.norm(line, axis=2)[..., None]
+        bulge_m = self._sagitta_share * self._step_s * np.linalg.norm(end[..., 3:] - begin[..., 3:], axis=2)
+        slopes = [np.einsum("mci,mcij->mcj", line, part[..., :3, :]) for part in parts]
+        variances = [np.einsum("mci,ij,mcj->mc", slope, covariance, slope) for slope in slopes]
+        sigma_m = np.sqrt(np.maximum(np.maximum(*variances), 1e-18))
+        normal = (1.0 - share) * slopes[0] + share * slopes[1]
+        bound = keep_out_m + sigmas * sigma_m + bulge_m
+        margin = (chord_m - bulge_m - keep_out_m) / sigma_m
+        return np.concatenate([normal, bound[..., None]], axis=2), margin
+
     def _candidates(self, states: Array, covariance: Array, keep_out_m: float) -> IntArray:
         """Return the steps of the coasts that can contain the smallest margin of all states; arguments as in ``certify``.
 
@@ -126,6 +175,13 @@ class CoastModel:
         every, k = np.arange(len(states)), np.argmin(margins, axis=1)
         times_s = self._times_s[columns[k]] + share[every, k] * self._step_s
         return ClosestApproaches(margins[every, k], away[every, k], times_s)
+
+
+def _across(step: Array) -> Array:
+    """Return vectors (..., 3) across the given ones, for coasts through the target's centre, which have no line from it."""
+    least = np.eye(3)[np.argmin(np.abs(step), axis=-1)]
+    side = np.cross(step, least)
+    return np.where(np.linalg.norm(side, axis=-1, keepdims=True) > 0.0, side, least)
 
 
 def _variance_along(line: Array, covariance: Array) -> Array:

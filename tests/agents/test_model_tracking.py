@@ -8,6 +8,7 @@ from chaserdock_agents.chaser.perception.model import tracking
 from chaserdock_agents.chaser.perception.model.alignment import Pyramid
 from chaserdock_agents.chaser.perception.model.mesh import MeshError, TrackerMesh
 from chaserdock_agents.chaser.perception.model.rendering import PixelWindow, render
+from chaserdock_agents.chaser.perception.model.steps import result_of
 from chaserdock_models.camera import Camera
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
 from markerless_cases import Scene, lighting_of, mesh_of, perturbed, random_view, wrong_boxes
@@ -100,7 +101,7 @@ def test_several_starts_recover_a_prior_outside_of_the_basin():
         prior = perturbed(pose, rng, 0.03, np.deg2rad(5.0))
         pyramid = Pyramid(scene.image(pose, light, number), CAMERA)
         starts = [prior, *tracking.starts_around(prior)]
-        found = tracking.refine_from_starts(pyramid, mesh_of(), starts, lighting_of(light))
+        found = result_of(tracking.start_steps(pyramid, mesh_of(), starts, lighting_of(light)))
         recovered += found is not None and np.linalg.norm(tracking.pose_error(found.pose, pose)[:3]) < 5e-3
     assert recovered == 5
 

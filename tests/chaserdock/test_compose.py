@@ -56,7 +56,7 @@ def clone(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.slow
+@pytest.mark.slow(minutes=60)  # its building and flying is not this worker's: it starts first
 @pytest.mark.timeout(2400)
 def test_short_mission_by_compose(clone: Path) -> None:
     """Mission succeeds with access control; exit status, file owners, absence of keys in the image and its size."""

@@ -258,10 +258,37 @@ def test_container_forwards_signals_and_leaves_no_process(tmp_path: Path) -> Non
     """A recorder without a world, stopped as Docker stops a container."""
     arguments = ["record", "--out", str(tmp_path / "run"), "-e", f"tcp/127.0.0.1:{free_port()}"]
     process = subprocess.Popen([sys.executable, "-m", "chaserdock.launch.container", *arguments])
-    recorder = find_child(process, "record")
+    recorder = find_child(process, "chaserdock", "record", timeout_s=60.0)
     process.send_signal(signal.SIGTERM)
-    assert process.wait(timeout=15) != 0
-    assert all_gone([recorder])
+    assert process.wait(timeout=60) != 0
+    assert all_gone([recorder], timeout_s=60.0)
+
+
+def test_container_forwards_a_signal_that_arrives_while_it_starts_its_process(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    forwarded: list[int] = []
+
+    class Started:
+        def __init__(self, command: list[str]) -> None:
+            os.kill(os.getpid(), signal.SIGTERM)
+
+        def send_signal(self, number: int) -> None:
+            forwarded.append(number)
+
+        def wait(self, timeout: float) -> int:
+            return -forwarded[0]
+
+    before = [(number, signal.getsignal(number)) for number in (signal.SIGTERM, signal.SIGINT)]
+    monkeypatch.setattr(container.subprocess, "Popen", Started)
+    # Without its handler the signal would end the tests.
+    signal.signal(signal.SIGTERM, lambda number, frame: pytest.fail("the container has no handler yet"))
+    try:
+        assert container.run(["record"], "router", 7447) == -signal.SIGTERM
+    finally:
+        for number, handler in before:
+            signal.signal(number, handler)
+    assert forwarded == [signal.SIGTERM]
 
 
 # -- status -----------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,10 @@ import pytest
 from chaserdock_controller.core import ControllerCore
 from chaserdock_controller.estimation.target_shape import FLOOR_SIGMAS, ShapeFilter, view_cell
 from chaserdock_controller.guidance.phase_machine import PhaseMachine
+from chaserdock_controller.guidance.phases import Phase
 from chaserdock_controller.guidance.trajectories import circuit
 from chaserdock_controller.ingest.odometry_validation import OdometryValidation
+from chaserdock_controller.interfaces import TickInputs
 from chaserdock_controller.redundancy.checkpoint import Checkpoint
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
@@ -57,7 +60,7 @@ def test_circuit_is_smooth_slow_and_returns_to_its_direction() -> None:
 def test_chasers_inspect_together_keep_their_distance_face_the_target_and_hold_afterwards() -> None:
     guidance = machine()
     assert all(r.accepted for r in command(guidance, 10.0, 0, 1))
-    assert guidance.inspecting() == {0, 1}
+    assert [c.phase for c in guidance.chasers] == ["inspect", "inspect"]
     assert all(c.faces for c in guidance.chasers)
     end = max(c.move.start_s + c.move.duration_s for c in guidance.chasers)
     for t in np.linspace(10.0, end, 200):
@@ -156,6 +159,29 @@ def test_standby_takes_over_the_estimate(markerless: ControllerCore) -> None:
     checkpoint.restore(saved)
     np.testing.assert_array_equal(shape.filter.vector, np.ones(k))
     assert shape.filter.cells
+
+
+def test_images_count_once_guidance_has_let_their_chaser_inspect(
+    markerless: ControllerCore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Estimation of a tick uses the phases after the tick before; a standby takes them over."""
+    flight = ControllerCore(markerless.scenario, now_s=lambda: 0.0)
+    shape = flight.estimation.shape
+    assert shape is not None
+    used: list[frozenset[int]] = []
+    monkeypatch.setattr(shape, "update", lambda _, inspecting: used.append(inspecting))
+    for tick in range(4):
+        if tick == 1:
+            flight.guidance.chasers[1] = replace(flight.guidance.chasers[1], phase=Phase.INSPECT)
+        if tick == 3:
+            flight.guidance.chasers[1] = replace(flight.guidance.chasers[1], phase=Phase.HOLD)
+        now_ns = flight.scenario.timing.tick_time_ns(tick)
+        flight.step(TickInputs(tick, now_ns, {}, ()))
+    assert used == [frozenset(), frozenset(), {1}, {1}]
+    flight.inspecting = frozenset({0})
+    saved = Checkpoint(flight, OdometryValidation(flight.scenario)).save()
+    Checkpoint(markerless, OdometryValidation(markerless.scenario)).restore(saved)
+    assert markerless.inspecting == {0}
 
 
 def test_targets_with_markers_have_no_geometry_to_estimate() -> None:

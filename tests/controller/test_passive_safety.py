@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
 from chaserdock_controller.interfaces import TargetEstimation
+from chaserdock_controller.nmpc.coast_rows import COASTS
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
+from chaserdock_controller.nmpc.types import CoastSafety
+from chaserdock_models.passive_safety import CoastModel
 from chaserdock_protocol.scenario import FlightScenario, ScenarioError, flight_scenario, parse_scenario
+from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
 
 
 def mission(limits: dict[str, Any], **changes: Any) -> FlightScenario:
@@ -90,3 +95,78 @@ def test_chaser_that_never_was_safe_has_to_abort_after_a_minute() -> None:
     for time_s in (0, 30, 59, 61):
         monitor.update((0,), plan(0.05), estimation(), time_s * 1_000_000_000)
         assert bool(monitor.unsafe(time_s * 1_000_000_000)) == (time_s > 60)
+
+
+SIGMAS = 3.0
+ORBIT_RAD_S, TWO_ORBITS_S = 1.13e-3, 11120.0
+WITH_COASTS = replace(PARAMS, coasts=COASTS, max_reference_distance_m=300.0)
+
+
+def fly(
+    coast: CoastModel, start: np.ndarray, goal: np.ndarray, covariance: np.ndarray, ticks: int, enforced: bool
+) -> tuple[np.ndarray, list[float]]:
+    """Return the last position (3,) of a chaser that is sent to ``goal``, and the margin of its plan at each tick."""
+    solver, state, margins = fresh("rti", 1, WITH_COASTS), at_rest(start), []
+    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance})
+    for tick in range(ticks):
+        problem = replace(
+            fixed_problem(state[None], goal[None], d_target=0.0), coast_safety=safety if enforced else None
+        )
+        found = solver.solve(problem, PARAMS.dt_s if tick else 0.0)
+        margins.append(coast.certify(found.states[0, :, :6], covariance, 0.75).margin_sigmas)
+        state = found.states[0, 1]
+    return state[:3], margins
+
+
+def test_plan_to_a_place_on_v_bar_is_bent_so_that_its_coasts_stay_outside() -> None:
+    """The transient at the end of the move leaves a drift towards the target; the enforced plan leaves none."""
+    coast, goal = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S), np.array([0.0, -119.0, 0.0])
+    covariance = np.diag([4e-3] * 3 + [1e-7] * 3)
+    start = np.array([0.0, -120.0, 0.0])
+    end, free = fly(coast, start, goal, covariance, 140, enforced=False)
+    bent_end, bent = fly(coast, start, goal, covariance, 140, enforced=True)
+    assert min(free) < 0.0
+    assert min(bent) > SIGMAS
+    np.testing.assert_allclose(end, goal, atol=0.15)
+    np.testing.assert_allclose(bent_end, goal, atol=0.15)
+
+
+def test_plan_that_heads_for_the_target_in_free_space_is_bent_aside_or_slowed() -> None:
+    coast = CoastModel(0.0, 600.0)
+    covariance = np.diag([1e-6] * 3 + [1e-8] * 3)
+    start, goal = np.array([-5.0, 0.02, 0.0]), np.array([-2.0, 0.0, 0.0])
+    _, free = fly(coast, start, goal, covariance, 60, enforced=False)
+    _, bent = fly(coast, start, goal, covariance, 60, enforced=True)
+    assert max(free[1:]) < 0.0
+    assert min(bent[10:]) > SIGMAS
+
+
+def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:
+    """The distance of a state from a plane, over the deviation that the plane keeps, is the certified margin."""
+    rng = np.random.default_rng(3)
+    coast = CoastModel(ORBIT_RAD_S, TWO_ORBITS_S)
+    covariance = np.diag([1e-2] * 3 + [1e-8] * 3)
+    states = np.concatenate([rng.normal(0.0, 60.0, (40, 3)), rng.normal(0.0, 0.05, (40, 3))], axis=1)
+    planes, wider = (coast.tangent_planes(states, covariance, 0.75, k, COASTS) for k in (0.0, 1.0))
+    used = np.abs(planes[..., :6]).max(axis=2) > 0.0
+    assert used[:, 0].all()
+    room = np.einsum("mcj,mj->mc", planes[..., :6], states) - planes[..., 6]
+    margins = np.where(used, room / np.where(used, wider[..., 6] - planes[..., 6], 1.0), np.inf).min(axis=1)
+    np.testing.assert_allclose(margins, coast.closest(states, covariance, 0.75).margin_sigmas, rtol=1e-3)
+
+
+def test_chasers_are_restricted_where_safety_is_enforced_once_they_count() -> None:
+    monitor = PassiveSafetyMonitor(mission({"passive_safety": "enforce"}))
+    assert monitor.restriction((0,), (0,), estimation()) is None
+    for k in range(12):
+        monitor.update((0,), plan(0.0), estimation(), k * 1_000_000_000)
+    found = monitor.restriction((3, 0), (0,), estimation())
+    assert found is not None
+    assert set(found.covariances) == {1}
+    np.testing.assert_array_equal(found.target_velocity_m_s, [0.1, 0.0, 0.0])
+    assert monitor.restriction((0,), (), estimation()) is None
+
+
+def test_enforcing_needs_the_solver_that_keeps_it() -> None:
+    with pytest.raises(ScenarioError, match=r"limits\.passive_safety: .*needs controller\.solver"):
+        mission({"passive_safety": "enforce"}, controller={"solver": "ipopt"})

@@ -41,7 +41,7 @@ static double *references(int64_t count) {
     return refs;
 }
 
-static Zones *zones(int64_t n, int64_t d, int64_t boxes) {
+static Zones *zones(int64_t n, int64_t d, int64_t boxes, int64_t coasts) {
     Zones *z = block(sizeof *z);
     double *corridors = doubles(5 * n * (d + 1), 0.0, 0.5), *between = doubles(n * n, 0.0, 0.8);
     for (int64_t i = 0; i < n * (d + 1); i++) {
@@ -52,7 +52,8 @@ static Zones *zones(int64_t n, int64_t d, int64_t boxes) {
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < i; j++) between[i * n + j] = between[j * n + i];
     *z = (Zones){n, d, references(n * (d + 1)), doubles(3 * (d + 1), -0.2, 0.2), doubles(n * (d + 1), -0.2, 1.0), between, corridors,
-                 value(0.5, 30.0), boxes, doubles(15 * boxes * (d + 1), -0.5, 0.5), doubles(n, -0.2, 0.6)};
+                 value(0.5, 30.0), boxes, doubles(15 * boxes * (d + 1), -0.5, 0.5), doubles(n, -0.2, 0.6),
+                 coasts, doubles(7 * n * (d + 1) * coasts, -1.0, 1.0), value(0.01, 0.3)};
     return z;
 }
 
@@ -141,7 +142,7 @@ static void plan_cost(void) {
 static void plan_violation(void) {
     const int64_t n = whole(1, 3), d = whole(1, 4);
     double *x = states(n * (d + 1)), *worst = outputs(n);
-    NAME(plan_violation)(zones(n, d, whole(0, 2)), x, worst);
+    NAME(plan_violation)(zones(n, d, whole(0, 2), 0), x, worst);
     for (int64_t i = 0; i < n; i++) {
         CHECK(worst[i] >= 0.0 || worst[i] != worst[i]);
         for (int64_t k = 0; k <= d; k++)
@@ -150,11 +151,11 @@ static void plan_violation(void) {
 }
 
 static void build_rows(void) {
-    const int64_t n = whole(1, 3), d = whole(1, 4), boxes = whole(0, 2), width = d * (n + 2 + boxes);
+    const int64_t n = whole(1, 3), d = whole(1, 4), boxes = whole(0, 2), coasts = whole(0, 2), width = d * (n + 2 + boxes + coasts);
     double *x = states(n * (d + 1));
     Rows rows = {width, d + 1, doubles(n * (d + 1), 0.0, 5.0), block((size_t)(n * width) * 8), block((size_t)n * 8), outputs(3 * n * width),
-                 outputs(n * width)};
-    NAME(build_rows)(zones(n, d, boxes), x, &rows);
+                 outputs(n * width), coasts ? outputs(3 * n * width) : 0};
+    NAME(build_rows)(zones(n, d, boxes, coasts), x, &rows);
     for (int64_t i = 0; i < n; i++) {
         CHECK(0 <= rows.n_rows[i] && rows.n_rows[i] <= width);
         for (int64_t m = width * i; m < width * i + rows.n_rows[i]; m++)
@@ -176,7 +177,7 @@ static void solve_qp(void) {
     for (int64_t j = 0; j < rows; j++) stage[j] = whole(1, d);
     Qp qp = {d, rows, most, value(0.01, 0.3), value(1.0, 1e4), value(0.0, 1e4), doubles(144 * d, -0.3, 0.3), q_pos, q_att,
              doubles(12 * (d + 1), -5.0, 5.0), doubles(6 * d, 0.01, 5.0), doubles(6 * d, -5.0, 5.0), doubles(6 * d, -1.0, 1.0),
-             stage, a, doubles(rows, -1.0, 0.3)};
+             stage, a, doubles(rows, -1.0, 0.3), chance(0.5) ? doubles(3 * rows, -1.0, 1.0) : 0};
     Answer answer = {outputs(12 * (d + 1)), outputs(6 * d), outputs(n_mul), 0.0, 0.0, 0};
     int code = NAME(solve_qp)(&qp, &answer, outputs(NAME(qp_workspace)(d, rows)));
     check_answer(code, answer.iterations, most);
@@ -185,15 +186,15 @@ static void solve_qp(void) {
 }
 
 static void solve_tick(void) {
-    const int64_t n = whole(1, 2), d = whole(1, 3), budget = whole(0, 20), boxes = whole(0, 2);
+    const int64_t n = whole(1, 2), d = whole(1, 3), budget = whole(0, 20), boxes = whole(0, 2), coasts = whole(0, 2);
     double *limits = doubles(6 * n, 0.0, 3.0), *inputs = doubles(6 * n * d, -1.0, 1.0), *given;
     for (int64_t i = 0; i < 6 * n; i++) limits[i] = abs_of(limits[i]);
     for (int64_t i = 0; i < 6 * n * d; i++) inputs[i] *= limits[6 * (i / (6 * d)) + i % 6];
     given = copy_of(inputs, 6 * n * d);
     int64_t *code = block((size_t)n * 8), *iterations = block((size_t)n * 8), left = budget;
-    Tick tick = {model(), weights(d), zones(n, d, boxes), states(n), doubles(6 * n * d, -1.0, 1.0), limits, doubles(d + 1, 0.0, 1.0),
+    Tick tick = {model(), weights(d), zones(n, d, boxes, coasts), states(n), doubles(6 * n * d, -1.0, 1.0), limits, doubles(d + 1, 0.0, 1.0),
                  doubles(n, 1.0, 1e4), inputs, value(0.0, 1e4), budget, code, iterations};
-    NAME(solve_tick)(&tick, outputs(NAME(tick_workspace)(n, d, boxes)));
+    NAME(solve_tick)(&tick, outputs(NAME(tick_workspace)(n, d, boxes + coasts)));
     for (int64_t i = 0; i < n; i++, left -= iterations[i - 1]) {
         check_answer(code[i], iterations[i], left);
         if (code[i] == BROKEN) CHECK(same_bits(inputs + 6 * d * i, given + 6 * d * i, 6 * d));

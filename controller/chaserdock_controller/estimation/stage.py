@@ -55,8 +55,8 @@ class EstimationStage:
 
     def run(self, observation: Observation, inspecting: Collection[int] = ()) -> TargetEstimation:
         """Update the estimator with a tick's inputs, and with contacts and impulses from before them; then the geometry by the
-        images of ``inspecting`` chasers, and the identification of the stack, whose result the estimator takes from the next tick
-        on."""
+        images of the chasers that were ``inspecting`` after the tick before, and the identification of the stack, whose result the
+        estimator takes from the next tick on."""
         estimation = self._estimate(observation)
         if self.shape is not None:
             estimation = replace(estimation, shape=self.shape.update(observation, inspecting))

@@ -346,10 +346,6 @@ class PhaseMachine:
 
     # -- inspection ------------------------------------------------------------------------------------------------
 
-    def inspecting(self) -> frozenset[int]:
-        """Return the chasers that fly around the target."""
-        return frozenset(i for i, c in enumerate(self.chasers) if c.phase is Phase.INSPECT)
-
     def _circuit(self, i: int, now_s: float) -> Circuit:
         section = self._scenario.inspection
         start = self._in_trf(i, now_s).at(np.array([now_s]))[0][0]

@@ -95,6 +95,7 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         corridors=corridors,
         boxes=boxes,
         box_clearance_m=clearance,
+        coast_safety=problem.coast_safety,
     )
 
 

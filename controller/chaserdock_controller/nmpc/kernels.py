@@ -116,10 +116,13 @@ class _Zones(Structure):
         ("n_boxes", c_int64),
         ("boxes", c_void_p),
         ("clearance", c_void_p),
+        ("n_coasts", c_int64),
+        ("coasts", c_void_p),
+        ("step_s", c_double),
     ]
 
 
-def zones_of(problem: NmpcInput, outer: float) -> _Zones:
+def zones_of(problem: NmpcInput, outer: float, step_s: float = 1.0) -> _Zones:
     n, nodes, _ = problem.references.shape
     between, corridors = problem.min_distance_chasers_m, problem.corridors
     assert isinstance(between, np.ndarray)
@@ -127,10 +130,12 @@ def zones_of(problem: NmpcInput, outer: float) -> _Zones:
     assert corridors is not None
     assert boxes is not None
     assert clearance is not None
+    coasts = problem.coasts
     return _Zones(
         n, nodes - 1, address(problem.references), address(problem.target_positions),
         address(problem.min_distance_target_m), address(between), address(corridors), outer,
         boxes.shape[1], address(boxes), address(clearance),
+        *((0, None) if coasts is None else (coasts.shape[2], address(coasts))), step_s,
     )  # fmt: skip
 
 
@@ -155,10 +160,10 @@ class _Tick(Structure):
     ]
 
 
-def tick_workspace(n: int, d: int, boxes: int) -> Array:
-    """Allocate working memory of `solve_tick` for up to ``n`` chasers, ``d`` stages and ``boxes`` cuboids; for one thread at a
-    time."""
-    return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d), c_int64(boxes)))
+def tick_workspace(n: int, d: int, extra: int) -> Array:
+    """Allocate working memory of `solve_tick` for up to ``n`` chasers, ``d`` stages and ``extra`` cuboids and coasts;
+    for one thread at a time."""
+    return scratch(function("tick_workspace", c_int64)(c_int64(n), c_int64(d), c_int64(extra)))
 
 
 def solve_tick(
@@ -172,7 +177,7 @@ def solve_tick(
     iterations, each (N,); the inputs of a chaser with code BROKEN are unchanged.
     """
     n = len(inputs)
-    zones = zones_of(problem, outer_m)
+    zones = zones_of(problem, outer_m, model.step_s)
     code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     tick = _Tick(
         ctypes.addressof(model), ctypes.addressof(weights.native), ctypes.addressof(zones), address(problem.states),

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -11,6 +11,8 @@ from chaserdock_models.passive_safety import CoastCertificate, CoastModel
 from chaserdock_protocol.scenario import FlightScenario
 
 from chaserdock_controller.interfaces import LogEntry, PlanCertificate, TargetEstimation
+
+from .types import CoastSafety
 
 ORBITS = 2.0
 FREE_SPACE_S = 600.0
@@ -71,6 +73,19 @@ class PassiveSafetyMonitor:
                 self._safe[i] = safe
                 events.append(("info" if safe else "warning", self._text(i, found, safe)))
         return tuple(events)
+
+    def restriction(
+        self, chasers: Sequence[int], enforced: Collection[int], estimation: TargetEstimation
+    ) -> CoastSafety | None:
+        """Return the passive safety that the plans of ``chasers``, the rows of a problem, have to keep; None for none.
+
+        It applies to those of ``enforced`` that count (see ``unsafe``).
+        """
+        target, known = estimation.at_effect, estimation.motion_covariances
+        kept = {row: known[i] for row, i in enumerate(chasers) if i in enforced and i in self._armed and i in known}
+        if target is None or not kept:
+            return None
+        return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)
 
     def unsafe(self, time_ns: int) -> dict[int, str]:
         """Return why chasers have to abort at ``time_ns``: their plans are not safe for `PERSISTENT_S`.

@@ -14,6 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from .coast_rows import coast_rows
 from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick, tick_workspace
 from .slack import SLACK_L2, slack_l1_weight
 from .types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
@@ -38,7 +39,7 @@ class RtiSolver:
         if max_iterations is not None and max_iterations < 0:
             raise ValueError(f"max_iterations must not be negative, not {max_iterations}")
         self.max_iterations = max_iterations
-        self._workspace = tick_workspace(n_chasers, params.stages, params.boxes)
+        self._workspace = tick_workspace(n_chasers, params.stages, params.boxes + params.coasts)
         # Largest displacement of a chaser by stage k for a change of the inputs by 1 N.
         times = params.dt_s * np.arange(params.stages + 1)
         self._reach = REACH_SAFETY * np.sqrt(3.0) / params.mass_kg * times**2
@@ -56,6 +57,9 @@ class RtiSolver:
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
         p, u = task.problem, task.start.copy()
+        if p.coast_safety is not None:
+            rolled = frame.rolled(task, u)
+            p = replace(p, coasts=coast_rows(p.coast_safety, rolled, p.target_positions, frame.params))
         away = p.states[:, :3] - p.references[:, -1, :3]
         away_m = np.sqrt((away * away).sum(axis=1))
         w1 = slack_l1_weight(frame.params, away_m)

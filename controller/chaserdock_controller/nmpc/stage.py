@@ -96,6 +96,9 @@ class PlanningStage:
         problem = with_lost_chasers(
             problem, observation.lost, observation.effective_ns, self._parameters.dt_s
         )
+        if self._passive_safety is not None and guidance.abort_margins:
+            safety = self._passive_safety.restriction(horizon.chasers, guidance.abort_margins, estimation)
+            problem = replace(problem, coast_safety=safety)
         since_ns = 0 if self._last_solve_ns is None else observation.time_ns - self._last_solve_ns
         if self._budget is not None:
             cast(Bounded, self.solver).max_iterations = self._budget.iterations()

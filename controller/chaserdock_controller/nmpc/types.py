@@ -4,12 +4,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray, Matrix3
+from chaserdock_models.passive_safety import CoastModel
 
 INTEGRATORS = ("rk4", "euler")
 
@@ -38,7 +39,7 @@ class NmpcParameters:
     The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2, ``weight_orientation``
     on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
     (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
-    body axes. ``boxes``: most cuboids of the target's shape in a problem. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
+    body axes. ``boxes``, ``coasts``: most cuboids of the target's shape, and most approaches of a coast, in a problem. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
     Raises ValueError, naming the field, for an invalid value.
     """
 
@@ -58,6 +59,7 @@ class NmpcParameters:
     max_reference_distance_m: float
     integrator: str
     boxes: int = 0
+    coasts: int = 0
 
     def __post_init__(self) -> None:
         for name in _POSITIVE:
@@ -103,6 +105,21 @@ class NmpcParameters:
 
 
 @dataclass(frozen=True)
+class CoastSafety:
+    """Passive safety to keep: the coasts from all stages stay outside of a sphere about the target.
+
+    ``covariances``: of a chaser's position and velocity relative to the target (6, 6), by row of the problem; other rows are free.
+    ``sigmas``: the margin, in standard deviations along the line from the target. ``target_velocity_m_s`` (3,): WRF.
+    """
+
+    coast: CoastModel
+    keep_out_m: float
+    sigmas: float
+    target_velocity_m_s: Array
+    covariances: Mapping[int, Array]
+
+
+@dataclass(frozen=True)
 class NmpcInput:
     """The problem of one tick for N chasers over D stages.
 
@@ -119,6 +136,9 @@ class NmpcInput:
     boxes (D+1, C, 15) or None: cuboids of the target's shape at each stage: centre (3; WRF, m), rotation cuboid to WRF (9,
     row-major), half edges (3; m). box_clearance_m (N,) or None: distance that each chaser's centre keeps from them; 0 switches it
     off. Only the back end `rti` keeps it.
+    coast_safety: passive safety to keep, or None. The back end `rti` linearizes it about its start into coasts (N, D+1, C, 7):
+    half-spaces a' p + b' v >= d of position and velocity at a stage, [a (3), b (3), d]; a and b zero for none (`coast_rows`).
+    Other back ends do not keep it.
     """
 
     states: Array
@@ -131,6 +151,8 @@ class NmpcInput:
     corridors: Array | None = None
     boxes: Array | None = None
     box_clearance_m: Array | None = None
+    coast_safety: CoastSafety | None = None
+    coasts: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -47,6 +47,10 @@ class CheckpointError(ValueError):
 # The fields of each part are the attributes of the object that it is taken from.
 
 
+class CoreState(Struct, forbid_unknown_fields=True):
+    inspecting: frozenset[int]
+
+
 class SightingState(Struct, forbid_unknown_fields=True):
     _odometry: dict[tuple[int, int], Odometry]
 
@@ -183,6 +187,7 @@ class ControllerCheckpoint(Struct, forbid_unknown_fields=True):
     """State of a controller after a tick. ``timeline_left``: commands of the scenario's timeline that are not yet due.
     ``identification``: None without it. ``plans``: warm starts of the NMPC solver, inputs by chaser."""
 
+    core: CoreState
     sightings: SightingState
     planning: PlanningState
     plan_monitor: PlanMonitorState
@@ -217,6 +222,7 @@ class Checkpoint:
         """Return the objects whose attributes are copied, and what is copied of them, by field of the checkpoint."""
         core = self._core
         parts: dict[str, tuple[Any, type[Struct]]] = {
+            "core": (core, CoreState),
             "sightings": (vars(core.estimation)["_converter"], SightingState),
             "planning": (core.planning, PlanningState),
             "plan_monitor": (core.planning.monitor, PlanMonitorState),

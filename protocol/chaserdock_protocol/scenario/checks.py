@@ -51,6 +51,11 @@ def check_flight(scenario: FlightScenario) -> None:
             'limits.passive_safety: needs the covariance of estimator.name = "joint", '
             f"not {scenario.estimator.name!r}"
         )
+    if scenario.limits.passive_safety == "enforce" and scenario.controller.solver != "rti":
+        raise ValueError(
+            'limits.passive_safety: "enforce" needs controller.solver = "rti", '
+            f"not {scenario.controller.solver!r}"
+        )
 
 
 def check_consistent(scenario: Scenario) -> None:

@@ -26,6 +26,10 @@ _PRIORITY = {
     "event": zenoh.Priority.DATA_LOW,
 }
 
+_LOG_FILTER = "error,zenoh::api::session=off"
+"""Level of Zenoh's own log without ``RUST_LOG``. A session that joins a flight receives data before the declarations of their
+keys, which Zenoh discards and reports as errors."""
+
 _FIRST_ATTEMPT_S, _LONGEST_ATTEMPT_S = 1.0, 5.0
 """Wall time of the attempts of a client to connect."""
 
@@ -101,7 +105,7 @@ class ZenohNetwork:
 
     def open(self, name: str) -> tuple[Connection, Host]:
         """Open a session. Raises TransportError."""
-        zenoh.init_log_from_env_or("error")
+        zenoh.init_log_from_env_or(_LOG_FILTER)
         config = zenoh_config(self._link)
         try:
             if config.get_json("mode") == '"client"' and config.get_json("connect/timeout_ms") == "-1":
@@ -215,7 +219,7 @@ class PlainSession:
     def __init__(
         self, connect: tuple[str, ...], listen: tuple[str, ...], mode: Literal["peer", "router"]
     ) -> None:
-        zenoh.init_log_from_env_or("error")
+        zenoh.init_log_from_env_or(_LOG_FILTER)
         config = zenoh.Config()
         values = {
             "mode": mode,

@@ -9,14 +9,15 @@ ring becomes arcs and a dish facets, so that what is inside a ring or in front o
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.decimation import decimated
 from chaserdock_models.meshes import MeshPart, TriangleMesh
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import ConvexHull, QhullError
+
+if TYPE_CHECKING:  # as slow to import as the whole world, and needed for targets with hulls only
+    from scipy.spatial import ConvexHull
 
 MOST_PIECES = 16
 _WITHIN = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]]) / np.array([[3], [6], [6], [6]])
@@ -46,6 +47,9 @@ def _coarse(part: MeshPart) -> MeshPart:
 
 def connected_surfaces(part: MeshPart) -> list[MeshPart]:
     """Return the connected surfaces of a part."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     n = len(part.vertices_m)
     rows, columns = part.triangles[:, [0, 1, 2]].ravel(), part.triangles[:, [1, 2, 0]].ravel()
     graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n))
@@ -85,6 +89,8 @@ def _pieces(part: MeshPart, tolerance_m: float) -> list[Array]:
 
 def _hull(points: Array) -> ConvexHull | None:
     """Return the convex hull, or None for points in a plane."""
+    from scipy.spatial import ConvexHull, QhullError
+
     try:
         return ConvexHull(points)
     except QhullError:

@@ -1,10 +1,10 @@
 /* SPDX-License-Identifier: Apache-2.0 */
 /* Mehrotra's predictor-corrector interior point for one chaser's QP, on top of the Riccati sweeps.
  *
- * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dp_k >= c (a unit normal, dp_k the change of position
- * at stage k) is soft: with a slack s >= 0, priced w1 s + w2/2 s^2, and z = a' dp - c + s >= 0, multipliers lam (of z)
- * and pi (of s). Slack and multipliers are eliminated row by row, so a row only adds a rank-one term to the position
- * block of Q_k and the sparsity of the Riccati sweep stays.
+ * The box on the scaled inputs, -1 <= w <= 1, is hard. A row a' dp_k + b' dv_k >= c (dp_k, dv_k the changes of position
+ * and velocity at stage k; b is absent where no coast is restricted) is soft: with a slack s >= 0, priced w1 s + w2/2 s^2,
+ * and z = a' dp + b' dv - c + s >= 0, multipliers lam (of z) and pi (of s). Slack and multipliers are eliminated row by row,
+ * so a row only adds a rank-one term to the blocks of position and velocity of Q_k and the sparsity of the Riccati sweep stays.
  * Method: S. Mehrotra, SIAM J. Optim. 2 (1992); Nocedal and Wright, "Numerical Optimization", sec. 16.6.
  *
  * All positive quantities are stored in one vector, val: z (R rows), s (R), 1 + w (6 D), 1 - w (6 D); its
@@ -33,13 +33,13 @@
 enum { FREE, CONVERGED, LIMIT, BROKEN };
 
 /* One chaser's problem. mats (D, 12, 12) = [C B]; q_pos, q_att (D+1, 3, 3); qx (D+1, 12); r_diag, r, w_bar (D, 6);
- * rows: stage (R,), a (R, 3), c (R,). */
+ * rows: stage (R,), a (R, 3), c (R,), b (R, 3) or NULL if no row has a velocity. */
 typedef struct {
     int64_t stages, n_rows, max_iterations;
     double h, w1, w2;
     const double *mats, *q_pos, *q_att, *qx, *r_diag, *r, *w_bar;
     const int64_t *stage;
-    const double *a, *c;
+    const double *a, *c, *b;
 } Qp;
 
 /* dx (D+1, 12), dw (D, 6), multipliers mul (2 R + 12 D), scaled stationarity, complementarity. */
@@ -51,9 +51,9 @@ typedef struct {
 /* The active rows, and the working vectors of an iteration. */
 typedef struct {
     int64_t count, n, *stage, *index;
-    double *a, *c;
+    double *a, *c, *b;
     double *val, *mul, *d_val, *d_mul, *res, *inverse, *w;
-    double *gx, *gw, *grad_x, *grad_w, *step_x, *step_w, *r_eff, *q_eff;
+    double *gx, *gw, *grad_x, *grad_w, *step_x, *step_w, *r_eff, *q_eff, *q_vel;
     Factor *factors;
 } Iterate;
 
@@ -61,7 +61,7 @@ static int64_t padded(int64_t count) { return (count + 3) / 4 * 4; }
 
 static int64_t ipm_workspace(int64_t d, int64_t rows) {
     int64_t count = padded(2 * rows + 12 * d), x = 12 * (d + 1), w = 6 * d;
-    return 20 * 8 + 6 * count + 6 * rows + 3 * x + 5 * w + 9 * (d + 1) + d * (int64_t)(sizeof(Factor) / 8);
+    return 22 * 8 + 6 * count + 9 * rows + 3 * x + 5 * w + 27 * (d + 1) + d * (int64_t)(sizeof(Factor) / 8);
 }
 
 static Iterate lay_out(int64_t d, int64_t rows, double *work) {
@@ -75,7 +75,9 @@ static Iterate lay_out(int64_t d, int64_t rows, double *work) {
     double **states[] = {&it.gx, &it.grad_x, &it.step_x};
     for (int i = 0; i < 3; i++) *states[i] = allocate(&work, x);
     it.q_eff = allocate(&work, 9 * (d + 1));
+    it.q_vel = allocate(&work, 18 * (d + 1));
     it.a = allocate(&work, 3 * rows);
+    it.b = allocate(&work, 3 * rows);
     it.c = allocate(&work, rows);
     it.stage = (int64_t *)allocate(&work, rows);
     it.index = (int64_t *)allocate(&work, rows);
@@ -93,21 +95,33 @@ static void gradients(const Qp *qp, const double *dx, const double *dw, double *
     for (int64_t i = 0; i < 6 * qp->stages; i++) gw[i] = madd(qp->r_diag[i], dw[i], qp->r[i]);
 }
 
-/* Margin of a row: a' dp - c. */
-static inline double row_margin(const double *dx, int64_t stage, const double *a, double c) {
-    return dot3(a, dx + 12 * stage) - c;
+/* Change of row j: a' dp + b' dv. */
+static inline double row_change(const double *dx, int64_t stage, const double *a, const double *b, int64_t j) {
+    double change = dot3(a + 3 * j, dx + 12 * stage);
+    return b ? change + dot3(b + 3 * j, dx + 12 * stage + 3) : change;
 }
 
-/* Add force along a row's normal to the gradient gx. */
-static inline void add_row_force(double *gx, int64_t stage, const double *a, double force) {
-    for (int i = 0; i < 3; i++) gx[12 * stage + i] = madd(force, a[i], gx[12 * stage + i]);
+static inline double margin_of(const Qp *qp, const double *dx, int64_t j) {
+    return row_change(dx, qp->stage[j], qp->a, qp->b, j) - qp->c[j];
+}
+
+/* Margin of the active row j. */
+static inline double active_margin(const Iterate *it, const double *dx, int64_t j) {
+    return row_change(dx, it->stage[j], it->a, it->b, j) - it->c[j];
+}
+
+/* Add force along the normal of the active row j to the gradient gx. */
+static inline void add_row_force(const Iterate *it, double *gx, int64_t j, double force) {
+    double *g = gx + 12 * it->stage[j];
+    for (int i = 0; i < 3; i++) g[i] = madd(force, it->a[3 * j + i], g[i]);
+    for (int i = 0; i < 3 && it->b; i++) g[3 + i] = madd(force, it->b[3 * j + i], g[3 + i]);
 }
 
 static int is_free(const Qp *qp, const double *dx, const double *w) {
     for (int64_t i = 0; i < 6 * qp->stages; i++)
         if (!(abs_of(w[i]) <= 1.0 + FREE_TOLERANCE)) return 0;
     for (int64_t j = 0; j < qp->n_rows; j++)
-        if (!(row_margin(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= -FREE_TOLERANCE)) return 0;
+        if (!(margin_of(qp, dx, j) >= -FREE_TOLERANCE)) return 0;
     return 1;
 }
 
@@ -115,9 +129,10 @@ static int is_free(const Qp *qp, const double *dx, const double *w) {
 static void activate_rows(const Qp *qp, const double *dx, double *active, Iterate *it) {
     it->n = 0;
     for (int64_t j = 0; j < qp->n_rows; j++) {
-        if (!(row_margin(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= NEAR_M)) active[j] = 1.0;
+        if (!(margin_of(qp, dx, j) >= NEAR_M)) active[j] = 1.0;
         if (active[j] == 0.0) continue;
         copy(qp->a + 3 * j, it->a + 3 * it->n, 3);
+        if (qp->b) copy(qp->b + 3 * j, it->b + 3 * it->n, 3);
         it->c[it->n] = qp->c[j];
         it->stage[it->n] = qp->stage[j];
         it->index[it->n++] = j;
@@ -128,7 +143,7 @@ static void activate_rows(const Qp *qp, const double *dx, double *active, Iterat
 /* Test whether dx violates an inactive row. */
 static int violates_inactive(const Qp *qp, const double *dx, const double *active) {
     for (int64_t j = 0; j < qp->n_rows; j++)
-        if (active[j] == 0.0 && !(row_margin(dx, qp->stage[j], qp->a + 3 * j, qp->c[j]) >= 0.0)) return 1;
+        if (active[j] == 0.0 && !(margin_of(qp, dx, j) >= 0.0)) return 1;
     return 0;
 }
 
@@ -154,11 +169,11 @@ static double set_start(const Qp *qp, Answer *answer, Iterate *it) {
     /* Rows violated at the start contribute their full slack weight; a much smaller initial complementarity would start
      * close to the boundary, where steps are short (27 to 40 iterations instead of 12). */
     for (int64_t j = 0; j < it->n; j++)
-        if (row_margin(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]) < 0.0) add_row_force(it->gx, it->stage[j], it->a + 3 * j, -qp->w1);
+        if (active_margin(it, answer->dx, j) < 0.0) add_row_force(it, it->gx, j, -qp->w1);
     double slope = max_of(scale, reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w));
     double mu = min_of(max_of(MU_START * slope, MU_START), MU_START_MAX);
     for (int64_t j = 0; j < it->n; j++) {
-        double g = row_margin(answer->dx, it->stage[j], it->a + 3 * j, it->c[j]);
+        double g = active_margin(it, answer->dx, j);
         double price = qp->w1 + qp->w2 * max_of(-g, 0.0), t = price * g;
         double s = (2.0 * mu + (sqrt_of(t * t + 4.0 * mu * mu) - t)) / (2.0 * price);
         it->val[j] = g + s;
@@ -187,10 +202,20 @@ static double complementarity(const Iterate *it) {
     return sum4(sum) / (double)it->count;
 }
 
+/* Add f [a; b] [a; b]' to the blocks of velocity, q (2, 3, 3). */
+static inline void add_velocity_blocks(double *q, double f, const double *a, const double *b) {
+    for (int m = 0; m < 3; m++)
+        for (int n = 0; n < 3; n++) {
+            q[3 * m + n] = madd(f * b[m], a[n], q[3 * m + n]);
+            q[9 + 3 * m + n] = madd(f * b[m], b[n], q[9 + 3 * m + n]);
+        }
+}
+
 /* Factor the Newton system: curvatures of rows and box added to those of the cost. */
 static int factor_newton(const Qp *qp, Iterate *it) {
     const int64_t inputs = 6 * qp->stages, bottom = 2 * it->n, top = bottom + inputs;
     copy(qp->q_pos, it->q_eff, 9 * (qp->stages + 1));
+    if (it->b) zero(it->q_vel, 18 * (qp->stages + 1));
     for (int64_t j = 0; j < it->n; j++) {
         double d, e, *q = it->q_eff + 9 * it->stage[j];
         const double *a = it->a + 3 * j;
@@ -198,10 +223,11 @@ static int factor_newton(const Qp *qp, Iterate *it) {
         double f = d * e / (d + e);
         for (int m = 0; m < 3; m++)
             for (int n = 0; n < 3; n++) q[3 * m + n] = madd(f * a[m], a[n], q[3 * m + n]);
+        if (it->b) add_velocity_blocks(it->q_vel + 18 * it->stage[j], f, a, it->b + 3 * j);
     }
     for (int64_t i = 0; i < inputs; i++)
         it->r_eff[i] = qp->r_diag[i] + (it->mul[bottom + i] * it->inverse[bottom + i] + it->mul[top + i] * it->inverse[top + i]);
-    return factor(qp->stages, qp->mats, qp->h, it->q_eff, qp->q_att, it->r_eff, it->factors);
+    return factor(qp->stages, qp->mats, qp->h, it->q_eff, qp->q_att, it->b ? it->q_vel : 0, it->r_eff, it->factors);
 }
 
 /* Compute the step that reduces the products val mul by res; return the largest fraction that keeps all positive. */
@@ -211,7 +237,7 @@ static double newton_step(const Qp *qp, Iterate *it) {
     for (int64_t j = 0; j < it->n; j++) {
         double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
         curvature(it, j, qp->w2, &d, &e);
-        add_row_force(it->grad_x, it->stage[j], it->a + 3 * j, rz - d * (rs + rz) / (d + e));
+        add_row_force(it, it->grad_x, j, rz - d * (rs + rz) / (d + e));
     }
     for (int64_t i = 0; i < inputs; i++)
         it->grad_w[i] = it->gw[i] + (it->res[bottom + i] * it->inverse[bottom + i] - it->res[top + i] * it->inverse[top + i]);
@@ -219,7 +245,7 @@ static double newton_step(const Qp *qp, Iterate *it) {
     for (int64_t j = 0; j < it->n; j++) {
         double d, e, rz = it->res[j] * it->inverse[j], rs = it->res[it->n + j] * it->inverse[it->n + j];
         curvature(it, j, qp->w2, &d, &e);
-        double dg = dot3(it->a + 3 * j, it->step_x + 12 * it->stage[j]);
+        double dg = row_change(it->step_x, it->stage[j], it->a, it->b, j);
         it->d_val[it->n + j] = -(rs + rz + d * dg) / (d + e);
         it->d_val[j] = dg + it->d_val[it->n + j];
     }
@@ -255,7 +281,7 @@ static int iterate(const Qp *qp, Answer *answer, Iterate *it) {
         /* complementarity and stationarity of the current point */
         double mu = complementarity(it);
         gradients(qp, answer->dx, answer->dw, it->gx, it->gw);
-        for (int64_t j = 0; j < it->n; j++) add_row_force(it->gx, it->stage[j], it->a + 3 * j, -it->mul[j]);
+        for (int64_t j = 0; j < it->n; j++) add_row_force(it, it->gx, j, -it->mul[j]);
         for (int64_t i = 0; i < inputs; i++) it->gw[i] += it->mul[top + i] - it->mul[bottom + i];
         answer->mu = mu;
         answer->residual = reduced_gradient(qp->stages, qp->mats, qp->h, it->gx, it->gw, it->grad_w) / scale;
@@ -301,9 +327,10 @@ static int solve_one(const Qp *qp, Answer *answer, double *work) {
     const int64_t inputs = 6 * qp->stages;
     double *active = allocate(&work, qp->n_rows);
     Iterate it = lay_out(qp->stages, qp->n_rows, work);
+    if (!qp->b) it.b = 0;
     answer->iterations = 0;
     answer->residual = answer->mu = 0.0;
-    if (!factor(qp->stages, qp->mats, qp->h, qp->q_pos, qp->q_att, qp->r_diag, it.factors)) return BROKEN;
+    if (!factor(qp->stages, qp->mats, qp->h, qp->q_pos, qp->q_att, 0, qp->r_diag, it.factors)) return BROKEN;
     minimize(qp->stages, qp->mats, qp->h, it.factors, qp->qx, qp->r, answer->dx, answer->dw);
     for (int64_t i = 0; i < inputs; i++) it.w[i] = qp->w_bar[i] + answer->dw[i];
     if (is_free(qp, answer->dx, it.w)) {

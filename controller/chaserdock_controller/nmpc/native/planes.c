@@ -4,8 +4,9 @@
  * A chaser-target constraint becomes the plane tangent to the keep-out ball; a chaser-chaser constraint a separating
  * plane at the midpoint, half the distance to each side; the outer bound a plane tangent to the ball about the
  * reference; an approach corridor the plane tangent to its cone where the chaser is nearest; a cuboid of the target's shape the
- * plane that separates it from the chaser, normal to the line from its nearest point. A row of stage k reads
- * a' dp_k >= c with dp_k the change of the rolled position.
+ * plane that separates it from the chaser, normal to the line from its nearest point; the coast after a loss of thrust a
+ * half-space of position and velocity (nmpc/coast_rows.py). A row of stage k reads a' dp_k + b' dv_k >= c with dp_k and dv_k
+ * the changes of the rolled position and velocity.
  */
 #include "base.h"
 
@@ -26,6 +27,9 @@ typedef struct {
     double outer;
     int64_t n_boxes;
     const double *boxes, *clearance; /* (D+1, n_boxes, 15): centre, rotation to WRF, half edges; (N,) */
+    int64_t n_coasts;
+    const double *coasts; /* (N, D+1, n_coasts, 7): a (3), b (3), d of a' p + b' v >= d; a and b zero for none */
+    double step_s;
 } Zones;
 
 /* The rows of all chasers, capacity `width` each; reach (N, D+1): how far admissible inputs can move a chaser from its
@@ -34,7 +38,7 @@ typedef struct {
     int64_t width, nodes;
     const double *reach;
     int64_t *stage, *n_rows;
-    double *a, *c;
+    double *a, *c, *b; /* b: NULL if no coast is restricted */
 } Rows;
 
 /* Tilt the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane. The side is n x e,
@@ -58,6 +62,7 @@ static inline void push(const Rows *rows, int64_t i, int64_t k, const double *n,
     if (!(room <= rows->reach[i * rows->nodes + k])) return;
     int64_t m = i * rows->width + rows->n_rows[i]++;
     for (int c = 0; c < 3; c++) rows->a[3 * m + c] = sign * n[c];
+    if (rows->b) zero(rows->b + 3 * m, 3);
     rows->c[m] = -room;
     rows->stage[m] = k;
 }
@@ -186,6 +191,23 @@ static void box_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t bo
     }
 }
 
+/* Rows of the coasts of one chaser, unless no admissible input can reach them. */
+static void coast_rows(const Zones *zones, const Rows *rows, int64_t i, const double *x) {
+    for (int64_t k = 1; k < rows->nodes; k++)
+        for (int64_t j = 0; j < zones->n_coasts; j++) {
+            const double *row = zones->coasts + 7 * (zones->n_coasts * (rows->nodes * i + k) + j);
+            double a = sqrt_of(dot3(row, row)), b = sqrt_of(dot3(row + 3, row + 3));
+            double room = dot3(row, x + 13 * k) + dot3(row + 3, x + 13 * k + 3) - row[6];
+            double reach = rows->reach[i * rows->nodes + k] * (a + b / (zones->step_s * (double)k));
+            if ((a == 0.0 && b == 0.0) || !(room <= reach)) continue;
+            int64_t m = i * rows->width + rows->n_rows[i]++;
+            copy(row, rows->a + 3 * m, 3);
+            copy(row + 3, rows->b + 3 * m, 3);
+            rows->c[m] = -room;
+            rows->stage[m] = k;
+        }
+}
+
 static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const double *x) {
     const int64_t nodes = rows->nodes;
     const double *reference = zones->references + 7 * nodes * i, *corridor = zones->corridors + 5 * nodes * i;
@@ -218,13 +240,14 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
 }
 
 /* Write the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
- * at least D (N + 2 + n_boxes). None at stage 0, and none whose distance is NaN. */
+ * at least D (N + 2 + n_boxes + n_coasts); b (N, M, 3) if there are coasts. None at stage 0, and none whose distance is NaN. */
 EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *rows) {
     for (int64_t i = 0; i < zones->n; i++) rows->n_rows[i] = 0;
     for (int64_t i = 0; i < zones->n; i++) {
         own_rows(zones, rows, i, x + 13 * rows->nodes * i);
         if (zones->clearance[i] > 0.0)
             for (int64_t b = 0; b < zones->n_boxes; b++) box_rows(zones, rows, i, b, x + 13 * rows->nodes * i);
+        if (zones->n_coasts) coast_rows(zones, rows, i, x + 13 * rows->nodes * i);
         for (int64_t j = i + 1; j < zones->n; j++)
             if (zones->between[i * zones->n + j] > 0.0)
                 pair_rows(zones, rows, i, j, x + 13 * rows->nodes * i, x + 13 * rows->nodes * j);

@@ -5,7 +5,7 @@
  *     subject to dx_{k+1} = A_k dx_k + B_k dw_k, dx_0 = 0,  k = 0..D-1
  *
  * A_k = [[I, hI], [0, I], [0, 0], [0, 0] | C_k]; M_k = [C_k B_k] (12, 12) is what is stored. Q_k holds a 3 x 3 block
- * for position and one for attitude; R_k is diagonal. Standard discrete-time recursion, e.g. Rawlings, Mayne and
+ * for position and one for attitude, and blocks of velocity where rows restrict it; R_k is diagonal. Standard discrete-time recursion, e.g. Rawlings, Mayne and
  * Diehl, "Model Predictive Control", 2nd ed., section 8.8.3.
  */
 #include "base.h"
@@ -61,16 +61,20 @@ static inline int decompose(const row12 *gram, const double *r, double *low, dou
     return 1;
 }
 
-/* Backward sweep over the matrices. q_pos, q_att (D+1, 3, 3), r_diag (D, 6). Return 0 if Rt is not positive
- * definite. */
+/* Backward sweep over the matrices. q_pos, q_att (D+1, 3, 3), r_diag (D, 6); q_vel (D+1, 2, 3, 3): blocks
+ * (velocity, position) and (velocity, velocity) of Q, or NULL if they are zero. Return 0 if Rt is not positive definite. */
 static int factor(int64_t stages, const double *mats, double h, const double *q_pos, const double *q_att,
-                  const double *r_diag, Factor *factors) {
+                  const double *q_vel, const double *r_diag, Factor *factors) {
     row12 p[12], t[12], gram[12], y[6], scaled[6]; /* t = M'P, gram = M'PM, y = L^-1 B'PA */
     zero(p[0], 144);
     for (int i = 0; i < 3; i++)
         for (int j = 0; j < 3; j++) {
             p[i][j] = q_pos[9 * stages + 3 * i + j];
             p[6 + i][6 + j] = q_att[9 * stages + 3 * i + j];
+            if (q_vel) {
+                p[3 + i][j] = p[j][3 + i] = q_vel[18 * stages + 3 * i + j];
+                p[3 + i][3 + j] = q_vel[18 * stages + 9 + 3 * i + j];
+            }
         }
     for (int64_t k = stages - 1; k >= 0; k--) {
         const row12 *m_mat = (const row12 *)(mats + 144 * k);
@@ -125,6 +129,10 @@ static int factor(int64_t stages, const double *mats, double h, const double *q_
             for (int j = 0; j < 3; j++) {
                 p[i][j] += q_pos[9 * k + 3 * i + j];
                 p[6 + i][6 + j] += q_att[9 * k + 3 * i + j];
+                if (q_vel) {
+                    p[3 + i][j] += q_vel[18 * k + 3 * i + j];
+                    p[3 + i][3 + j] += q_vel[18 * k + 9 + 3 * i + j];
+                }
             }
         for (int i = 0; i < 12; i++)
             for (int j = 0; j < i; j++) p[j][i] = p[i][j];

@@ -18,23 +18,25 @@ typedef struct {
     int64_t budget, *code, *iterations;
 } Tick;
 
-static int64_t tick_width(int64_t n, int64_t d, int64_t boxes) { return d * (n + 2 + boxes); }
+/* Rows of a chaser; `extra`: cuboids and coasts. */
+static int64_t tick_width(int64_t n, int64_t d, int64_t extra) { return d * (n + 2 + extra); }
 
-EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d, int64_t boxes) {
-    int64_t width = tick_width(n, d, boxes);
-    return n * (14 * (d + 1) + 5 * width + 1) + 144 * n * d + (9 + 9 + 12 + 12) * (d + 1) + 4 * 6 * d + 2 * width +
+EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d, int64_t extra) {
+    int64_t width = tick_width(n, d, extra);
+    return n * (14 * (d + 1) + 8 * width + 1) + 144 * n * d + (9 + 9 + 12 + 12) * (d + 1) + 4 * 6 * d + 2 * width +
            12 * d + ipm_workspace(d, width) + width + 40 * 8;
 }
 
 EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
-    const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d, tick->zones->n_boxes);
+    const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d, tick->zones->n_boxes + tick->zones->n_coasts);
     double *x = allocate(&work, 13 * n * (d + 1)), *mats = allocate(&work, 144 * n * d);
     double *reach = allocate(&work, n * (d + 1));
-    Rows rows = {width, d + 1, reach, 0, 0, 0, 0};
+    Rows rows = {width, d + 1, reach, 0, 0, 0, 0, 0};
     rows.stage = (int64_t *)allocate(&work, n * width);
     rows.n_rows = (int64_t *)allocate(&work, n);
     rows.a = allocate(&work, 3 * n * width);
     rows.c = allocate(&work, n * width);
+    if (tick->zones->n_coasts) rows.b = allocate(&work, 3 * n * width);
     double *q_pos = allocate(&work, 9 * (d + 1)), *q_att = allocate(&work, 9 * (d + 1)), *qx = allocate(&work, 12 * (d + 1));
     double *r_diag = allocate(&work, 6 * d), *r = allocate(&work, 6 * d), *w_bar = allocate(&work, 6 * d);
     Answer answer = {allocate(&work, 12 * (d + 1)), allocate(&work, 6 * d), allocate(&work, 2 * width + 12 * d), 0.0, 0.0, 0};
@@ -55,7 +57,7 @@ EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
                                 tick->u_ref + 6 * d * i, limits, q_pos, q_att, qx, r_diag, r, w_bar);
         Qp qp = {d, rows.n_rows[i], share < MAX_ITERATIONS ? share : MAX_ITERATIONS, tick->model->step_s, tick->w1[i],
                  tick->w2, mats + 144 * d * i, q_pos, q_att, qx, r_diag, r, w_bar, rows.stage + width * i,
-                 rows.a + 3 * width * i, rows.c + width * i};
+                 rows.a + 3 * width * i, rows.c + width * i, rows.b ? rows.b + 3 * width * i : 0};
         tick->code[i] = solve_one(&qp, &answer, work);
         tick->iterations[i] = answer.iterations;
         left -= answer.iterations;

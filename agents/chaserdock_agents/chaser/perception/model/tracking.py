@@ -146,17 +146,10 @@ def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
     return starts
 
 
-def refine_from_starts(
-    pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
-) -> Alignment | None:
-    """Return the best alignment from several starts: all at the coarsest level, the best three at all levels."""
-    return result_of(start_steps(pyramid, mesh, starts, light))
-
-
 def start_steps(
     pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
 ) -> Steps[Alignment | None]:
-    """Do what `refine_from_starts` does, in steps."""
+    """Return the best alignment from several starts, in steps: all at the coarsest level, the best three at all levels."""
     coarse: list[Alignment] = []
     for start in starts:
         levels = levels_of(pyramid, mesh, start)

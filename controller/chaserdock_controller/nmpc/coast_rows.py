@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Passive safety as rows of the QP: half-spaces of position and velocity that keep a plan's coasts outside the keep-out.
+
+The coast from a stage is linear in the state there (chaserdock_models/passive_safety.py). At the moments of its closest approaches
+the keep-out sphere, enlarged by the covariance, is replaced by its tangent plane across the line from the target: a condition that
+is linear in the state, and sufficient at that moment.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from chaserdock_models.arrays import Array
+
+from .types import CoastSafety, NmpcParameters
+
+COASTS = 3
+"""Number of approaches of a coast that are restricted."""
+SPARE_SHARE = 0.05
+"""Share of the required margin that plans keep in addition: the approaches, and with them the planes, move as a plan is bent."""
+
+
+def coast_rows(safety: CoastSafety, states: Array, targets: Array, params: NmpcParameters) -> Array:
+    """Return half-spaces (N, D+1, C, 7) as in `NmpcInput` about plans ``states`` (N, D+1, 13).
+
+    ``targets`` (D+1, 3): positions of the target. Rows are scaled so that a displacement by 1 m, or the change of velocity that
+    makes it within the horizon, changes a row by at most about 1: they are priced as the distances are.
+    """
+    n, nodes, _ = states.shape
+    rows = np.zeros((n, nodes, params.coasts, 7))
+    velocities = np.tile(safety.target_velocity_m_s, (nodes - 1, 1))
+    origin = np.concatenate([targets[1:], velocities], axis=1)
+    sigmas = (1.0 + SPARE_SHARE) * safety.sigmas
+    for i, covariance in safety.covariances.items():
+        relative = states[i, 1:, :6] - origin
+        planes = safety.coast.tangent_planes(relative, covariance, safety.keep_out_m, sigmas, params.coasts)
+        planes[..., 6] += np.einsum("kcj,kj->kc", planes[..., :6], origin)
+        by_velocity = np.linalg.norm(planes[..., 3:6], axis=2) / (params.stages * params.dt_s)
+        scale = np.maximum(np.linalg.norm(planes[..., :3], axis=2), by_velocity)
+        rows[i, 1:] = planes / np.where(scale > 0.0, scale, 1.0)[..., None]
+    return rows

@@ -86,7 +86,9 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
         np.zeros((n, width, 3)),
     )  # fmt: skip
     zones, reach = zones_of(problem, outer_m), np.ascontiguousarray(reach_m)
-    native = _Rows(width, nodes, *(address(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b)))
+    native = _Rows(
+        width, nodes, *(address(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b))
+    )
     function("build_rows")(ctypes.byref(zones), address(x), ctypes.byref(native))
     return rows
 
@@ -137,7 +139,16 @@ def solve_qp(
     (R,), and with velocities (R, 3)."""
     d, rows = len(mats), len(stage)
     dx, dw, mul = np.empty((d + 1, 12)), np.empty((d, 6)), np.empty(2 * rows + 12 * d)
-    qp = _Qp(d, rows, max_iterations, h, w1, w2, *(address(v) for v in (mats, *model, stage, a, c)), None if b is None else address(b))
+    qp = _Qp(
+        d,
+        rows,
+        max_iterations,
+        h,
+        w1,
+        w2,
+        *(address(v) for v in (mats, *model, stage, a, c)),
+        None if b is None else address(b),
+    )
     answer = _Answer(address(dx), address(dw), address(mul))
     work = scratch(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))
     code = function("solve_qp", c_int)(ctypes.byref(qp), ctypes.byref(answer), address(work))

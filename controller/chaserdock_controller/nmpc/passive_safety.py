@@ -82,7 +82,11 @@ class PassiveSafetyMonitor:
         It applies to those of ``enforced`` that count (see ``unsafe``).
         """
         target, known = estimation.at_effect, estimation.motion_covariances
-        kept = {row: known[i] for row, i in enumerate(chasers) if i in enforced and i in self._armed and i in known}
+        kept = {
+            row: known[i]
+            for row, i in enumerate(chasers)
+            if i in enforced and i in self._armed and i in known
+        }
         if target is None or not kept:
             return None
         return CoastSafety(self._coast, self._keep_out_m, self._sigmas, target.velocity_m_s, kept)

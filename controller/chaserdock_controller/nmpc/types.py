@@ -39,7 +39,8 @@ class NmpcParameters:
     The weights are those of the paper's cost (eq. 6): ``weight_position`` per m^2, ``weight_orientation``
     on the squared vector part of q_err (dimensionless), ``weight_force`` per N^2, ``weight_torque`` per
     (N m)^2. ``falloff`` is alpha, 0 to 1. ``inertia_kg_m2`` is the full matrix about the centre of mass in
-    body axes. ``boxes``, ``coasts``: most cuboids of the target's shape, and most approaches of a coast, in a problem. ``force_max_N`` and ``torque_max_N_m`` are per body axis.
+    body axes. ``boxes``, ``coasts``: most cuboids of the target's shape, and most approaches of a coast, in a problem.
+    ``force_max_N`` and ``torque_max_N_m`` are per body axis.
     Raises ValueError, naming the field, for an invalid value.
     """
 

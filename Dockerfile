@@ -15,7 +15,7 @@ COPY controller /src/controller
 ARG CHASERDOCK_VERSION
 RUN pip wheel --no-deps --no-build-isolation --wheel-dir /wheels /src
 
-FROM python:3.11-slim
+FROM python:3.11-slim AS image
 ENV PYTHONUNBUFFERED=1 HOME=/tmp \
     OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 MKL_NUM_THREADS=1
 # What changes rarely comes first. Volumes take over the owner and mode of the folder that they are mounted on.
@@ -32,13 +32,15 @@ COPY --from=wheel /wheels /opt/chaserdock/wheels
 RUN pip install --no-cache-dir --no-index --no-deps /opt/chaserdock/wheels/*.whl
 COPY docker/as-owner docker/healthy /usr/local/bin/
 USER chaserdock
-# Shows that the image flies, on MuJoCo where PyBullet has no wheel.
+WORKDIR /tmp
+ENTRYPOINT ["python", "-m", "chaserdock.launch.container"]
+HEALTHCHECK --interval=5s --timeout=60s --start-period=60s --retries=3 CMD ["healthy"]
+
+# The same image, once it has flown a mission: on MuJoCo where PyBullet has no wheel. Compose builds the stage before, whose mission follows.
+FROM image
 RUN engine=$([ "$(uname -m)" = x86_64 ] && echo pybullet || echo mujoco) \
     && chaserdock run two-chaser-tracking --quiet --out /tmp/warm --set duration_s=6.0 --set settling_s=4.0 \
       --set world.engine=$engine \
       --set camera.width_px=640 --set camera.height_px=480 \
       --set success.steady_position_rms_m=0.2 --set success.steady_orientation_rms_deg=10.0 \
     && rm -rf /tmp/warm
-WORKDIR /tmp
-ENTRYPOINT ["python", "-m", "chaserdock.launch.container"]
-HEALTHCHECK --interval=5s --timeout=60s --start-period=60s --retries=3 CMD ["healthy"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import sys
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -15,8 +16,9 @@ from harness import DRILL, SHORT, run
 
 Fly = Callable[..., Path]
 
-# The hundreds of processes that tests start would each compile every module again.
+# The hundreds of processes that tests start would each compile every module again, and every run of the tests these.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

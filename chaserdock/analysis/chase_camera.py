@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""External view of a mission, drawn with OpenCV: flat faces in order of depth (painter's algorithm)."""
+"""External view of a mission, drawn with OpenCV: rendered bodies, or flat faces in order of depth (painter's algorithm)."""
 
 from __future__ import annotations
 
@@ -77,6 +77,15 @@ class Viewpoint:
         return px, depth
 
 
+@dataclass(frozen=True)
+class RenderedBodies:
+    """Bodies as rendered (`body_renderer`): ``behind`` and ``bgr`` (h, w, 3), space without and with them; ``covered`` (h, w)."""
+
+    behind: BgrImage
+    bgr: BgrImage
+    covered: NDArray[np.bool_]
+
+
 def _fixed(px: Array) -> NDArray[np.int32]:
     # Clip points far outside the image: OpenCV's fixed-point coordinates overflow.
     return np.round(np.clip(px, -20_000, 20_000) * (1 << _SHIFT)).astype(np.int32)
@@ -104,18 +113,38 @@ def draw(
     seeing: frozenset[int],
     plumes: dict[int, Array] | None = None,
     background: BgrImage | None = None,
+    rendered: RenderedBodies | None = None,
 ) -> BgrImage:
     """Draw target and chasers into an image (height, width, 3), BGR.
 
     ``sun`` (3,): direction to it in WRF, unit length. ``paths``: points (N, 3) WRF behind each chaser, and the target's
     under None. ``seeing``: chasers whose image was used; their camera frustums are brighter. ``plumes``: nozzles and ends of
-    thruster plumes (K, 2, 3) of each chaser, CRF. ``background``: stars and Earth; plain space without.
+    thruster plumes (K, 2, 3) of each chaser, CRF. ``background``: stars and Earth; plain space without. ``rendered``: takes the
+    place of the background and of the faces of the scene.
     """
     space = np.full((view.height_px, view.width_px, 3), _SPACE, dtype=np.uint8)
+    if rendered is not None:
+        background = rendered.behind
     image = space if background is None else background.copy()
     for body, points in paths.items():
         shade = _TARGET_PATH if body is None else (0.75 * tint(body)).tolist()
         _lines(image, view, points, shade)
+    if rendered is None:
+        _draw_faces(image, scene, view, sun, target, chasers)
+    else:
+        image[rendered.covered] = rendered.bgr[rendered.covered]
+    for i, lines in (plumes or {}).items():
+        position, attitude = chasers[i]
+        for nozzle, end in rotations.rotate(attitude, lines) + position:
+            _draw_plume(image, view, nozzle, end)
+    _draw_cameras(image, view, scene, chasers, seeing)
+    return image
+
+
+def _draw_faces(
+    image: BgrImage, scene: Scene, view: Viewpoint, sun: Array, target: BodyPose, chasers: dict[int, BodyPose]
+) -> None:
+    """Draw the faces of the bodies that are turned towards the view, the farthest first."""
     bodies: list[tuple[BodyPose, tuple[Face, ...], Array | None]] = [(target, scene.target, None)]
     bodies += [(pose, scene.chaser, tint(i)) for i, pose in chasers.items()]
     eye = view.centre_m + view.axes()[2] * view.distance_m
@@ -140,12 +169,6 @@ def draw(
         for quad, grey in face.decals:
             px, _ = view.project(rotations.rotate(attitude, quad) + position)
             _fill(image, px, np.full(3, grey * light))
-    for i, lines in (plumes or {}).items():
-        position, attitude = chasers[i]
-        for nozzle, end in rotations.rotate(attitude, lines) + position:
-            _draw_plume(image, view, nozzle, end)
-    _draw_cameras(image, view, scene, chasers, seeing)
-    return image
 
 
 def _draw_cameras(

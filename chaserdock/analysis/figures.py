@@ -484,7 +484,7 @@ def thrusters(_: RecordedFlight, traces: Traces) -> Figure:
 _OUTCOME_COLOURS: dict[ImageOutcome, str] = {
     "used": SERIES[2],
     "rejected": SERIES[1],
-    "no marker": "#d9dce1",
+    "not seen": "#d9dce1",
     "bad image": LIMIT,
     "not processed": SERIES[3],
 }
@@ -571,11 +571,11 @@ def consistency_text(nees: Array, low: float, high: float) -> str:
     "below it a conservative one.",
 )
 def consistency(flight: RecordedFlight, _: Traces) -> Figure:
-    from scipy.stats import chi2
+    from scipy.special import gammaincinv  # scipy.stats takes a second to import
 
     component_errors(flight)  # raises MissingData without estimates
     errors = estimate_errors(flight)
-    low, high = chi2.ppf((0.025, 0.975), df=6)
+    low, high = 2.0 * gammaincinv(6 / 2, (0.025, 0.975))  # quantiles of the chi-square distribution
     figure, (axes,) = new_figure(1)
     d = decimated(len(errors["nees"]))
     axes.semilogy(errors["time_s"][d], np.maximum(errors["nees"][d], 1e-3), color=SERIES[0], linewidth=0.8)

@@ -91,8 +91,8 @@ def _draw_axes(canvas: NDArray[np.uint8], scenario: FlightScenario, sighting: Si
 
 
 def seen_text(sighting: Sighting | None) -> str:
-    """Return by what a sighting found the target: a number of markers, or its shape."""
+    """Return by what a sighting found the target, a number of markers or its shape, or that it did not."""
     count = len(sighting.marker_ids) if sighting else 0
     if count:
         return f"{count} marker{'s' if count > 1 else ''}"
-    return "seen by its shape" if sighting is not None and sighting.solutions else "no marker"
+    return "seen by its shape" if sighting is not None and sighting.solutions else "not seen"

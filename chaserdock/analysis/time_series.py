@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 
 from .columns import Columns
 
-ImageOutcome = Literal["used", "rejected", "no marker", "bad image", "not processed"]
-"""Outcome of an image: its sighting was used or rejected by the filter; no marker was detected; the image was unreadable;
+ImageOutcome = Literal["used", "rejected", "not seen", "bad image", "not processed"]
+"""Outcome of an image: its sighting was used or rejected by the filter; the target was not detected; the image was unreadable;
 or the log holds no sighting of it."""
 OUTCOMES: tuple[ImageOutcome, ...] = get_args(ImageOutcome)
-_OUTCOME_OF_STATUS: dict[str, ImageOutcome] = {"seen": "used", "nothing": "no marker"}
+_OUTCOME_OF_STATUS: dict[str, ImageOutcome] = {"seen": "used", "nothing": "not seen"}
 
 
 @dataclass

@@ -19,7 +19,8 @@ from chaserdock_protocol.recording.log import LogError
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import Background, Earth, Light
 
-from .chase_camera import BgrImage, BodyPose, Viewpoint, draw, tint
+from .body_renderer import BodyRenderer
+from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint, draw, tint
 from .columns import nanoseconds
 from .flight import RecordedFlight, Track, load_flight
 from .images import Pair, columns_for, shots
@@ -165,6 +166,8 @@ class _ExternalView:
         self._begin_s, self._end_s = part_s[0], min(float(target.time_s[-1]), part_s[1])
         self._span_s = max(self._end_s - self._begin_s, 1e-3)
         self._sky: BgrImage | None = None
+        self._mesh = flight.scenario.target.nominal_mesh()
+        self._renderers: dict[tuple[int, int], BodyRenderer] = {}
         self.chasers = {i: flight.truth[f"chaser/{i}"] for i in self.numbers}
         reach, distances, speeds = 0.3, {}, {}
         for i, own in self.chasers.items():
@@ -196,7 +199,9 @@ class _ExternalView:
         time_ns = round(_time_of(self.target, time_s) * 1e9)
         seeing = frozenset(i for i in self.numbers if time_ns in self.seen.get(i, ()))
         plumes = {i: self._plumes_at(i, time_s) for i in chasers if i in self._plumes}
-        image = draw(self.scene, look, self.sun, at, chasers, paths, seeing, plumes, self._background(look))
+        rendered = self._rendered(look, at, chasers)
+        background = self._background(look) if rendered is None else None
+        image = draw(self.scene, look, self.sun, at, chasers, paths, seeing, plumes, background, rendered)
         self._close_up(image, at, chasers, plumes, seeing, time_s)
         self._draw_graph(image, time_s)
         self._write(image, time_s)
@@ -211,6 +216,15 @@ class _ExternalView:
             grey = space.draw(look.attitude(), Light((x, y, z)))
             self._sky = np.repeat(grey[:, :, None], 3, axis=2)
         return self._sky
+
+    def _rendered(self, look: Viewpoint, at: BodyPose, chasers: dict[int, BodyPose]) -> RenderedBodies | None:
+        """Return the bodies as rendered; None for a target without a mesh, whose faces are drawn."""
+        if self._mesh is None:
+            return None
+        size = (look.width_px, look.height_px)
+        if size not in self._renderers:
+            self._renderers[size] = BodyRenderer(self.flight.scenario, self._mesh, look)
+        return self._renderers[size].render(look, at, chasers, tint)
 
     def _plumes_at(self, chaser: int, time_s: float) -> Array:
         """Return nozzles and plume ends (K, 2, 3), CRF, of the thrusters that are open in the tick at a time."""
@@ -245,11 +259,12 @@ class _ExternalView:
         away = close[nearest]
         # From the side: the gap between the bodies is visible.
         across_rad = math.atan2(away[1], away[0]) - math.pi / 2.0
-        distance_m = 2.0 * float(np.linalg.norm(away))
+        distance_m = 2.6 * float(np.linalg.norm(away))
         look = Viewpoint(
             at[0] + away / 2.0, distance_m, across_rad, _ELEVATION_RAD, width, round(0.75 * width)
         )
-        view = draw(self.scene, look, self.sun, at, chasers, {}, seeing, plumes)
+        rendered = self._rendered(look, at, chasers)
+        view = draw(self.scene, look, self.sun, at, chasers, {}, seeing, plumes, rendered=rendered)
         h, w = view.shape[:2]
         x = self.size[0] - w - _MARGIN_PX
         image[_MARGIN_PX : _MARGIN_PX + h, x : x + w] = view

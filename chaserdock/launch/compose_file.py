@@ -25,7 +25,7 @@ _HEAD = """\
 
 x-member: &member
   image: ${{CHASERDOCK_IMAGE:-chaserdock}}
-  build: .
+  build: {{context: ., target: image}}
   restart: "on-failure:5"
   depends_on: &after-router
     router: {{condition: service_healthy}}

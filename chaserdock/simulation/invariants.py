@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -46,7 +47,7 @@ from chaserdock.analysis.criteria import nearest_allowed_m
 from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
 
 from .message_checks import defects_of
-from .network import decode_once
+from .network import EPOCH_NS, decode_once
 
 SAFE_PHASES = frozenset(
     {"hold", "retreat", "abort", "wait", "searching", "acquire", "goto", "calibrate", "inspect"}
@@ -57,8 +58,9 @@ RETREAT_SLACK_M = 0.15
 """A reference that moves inwards at up to 8 cm/s turns within this distance."""
 TURNING_S, HOMING_SLACK_M = 5.0, 0.03
 """Time (s) after which a retreat leads to the nominal place, and the noise of its reference."""
-SETTLING_S = 15.0
-"""Longest time (s) after the last warning or command until a chaser has docked or is safe."""
+SETTLING_S, STOPPING_S = 15.0, 3.0
+"""Time (s) after the last warning or command until a chaser has docked or is safe, at least the time that an approach takes;
+and until a chaser that is in motion has stopped."""
 _NAMED_IN = ("hold", "retreat", "abort", "goto", "calibrate", "inspect")
 ATTACHED = frozenset({"latched", "verified", "identify", "detumble", "stack_hold"})
 DOCKED = ATTACHED | {"docked"}
@@ -73,6 +75,10 @@ _SPUN_SHARE = 1e-5
 """Largest unexplained change of angular momentum in a tick in an orbit, as a share of it; the turning frame gives 7e-5."""
 _DISPLACEMENT_FLOOR_M = 2e-5
 _ROUNDING = 1e-6
+LATE_JITTERS = 6.0
+"""Sum of the delays of three messages in mean jitters, which one in 16 exceeds."""
+KNOWN_AFTER_S = 0.1
+"""Time (s), in addition to the latency, after which a tick is known to a chaser that is not frozen."""
 FOLLOWING_S = 3.0
 """Longest time (s) in which a chaser flies none of the commands that are published for it, unless a fault lasts."""
 _GAP_S = 1.1
@@ -117,6 +123,7 @@ class Invariants:
     dead: set[str] = field(default_factory=set)
     _seen: set[tuple[str, str]] = field(default_factory=set)
     _tick: int = -1
+    _opened: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=200))
     _state_tick: int = -1
     _bodies: list[BodyTruth] = field(default_factory=list)
     _states: dict[str, BodyTruth] = field(default_factory=dict)
@@ -143,6 +150,7 @@ class Invariants:
             self.scenario.controller.command_lifetime_s * self.scenario.time.rate_hz
         )
         self._orbit = None if self.scenario.orbit is None else TargetOrbit(self.scenario.orbit)
+        self._now_s = 0.0
         self._nearest_m = {
             f"chaser/{i}": nearest_allowed_m(self.scenario, i) for i in range(len(self.scenario.chasers))
         }
@@ -192,6 +200,7 @@ class Invariants:
             return
         for text in defects_of(message, self.scenario):
             self.violate("valid messages", raw.key, text)
+        self._now_s = self._clock_s(sender, raw.sent_ns)
         handle = self._handlers.get(type(message))
         if handle is not None:
             handle(message)
@@ -202,6 +211,7 @@ class Invariants:
         if tick.revision:
             self._repeated.add(tick.tick)
         if tick.tick > self._tick:
+            self._opened.append((self._now_s, tick.tick))
             self._tick = tick.tick
             self._check_distances()
 
@@ -460,7 +470,7 @@ class Invariants:
         self._following[command.chaser] = self._tick
         name, before = f"chaser/{command.chaser}", self._flown.get(command.chaser)
         self._flown[command.chaser] = command
-        age = self._tick - command.tick
+        age = self._known_tick() - command.tick
         if age > self._lifetime_ticks:
             self.violate("no stale command", name, f"flies a command of {age} ticks ago")
         if before is not None and command.tick < before.tick:
@@ -473,6 +483,20 @@ class Invariants:
         if other != sender and command.tick not in self._repeated:
             text = f"flies a command of {sender} for tick {command.tick}, in which {other} commands"
             self.violate("one commander", name, text)
+
+    def _clock_s(self, process: str, sent_ns: int) -> float:
+        """Return the virtual time (s) at which a process has stamped a message with its own clock."""
+        clock = next((c for c in self.scenario.simulation.clock if c.process == process), None)
+        wall_s = (sent_ns - EPOCH_NS) * 1e-9
+        return wall_s if clock is None else (wall_s - clock.offset_s) / (1.0 + clock.drift)
+
+    def _known_tick(self) -> int:
+        """Return the newest tick that has reached the chasers by now: a world that was frozen opens many at once."""
+        network = self.scenario.simulation
+        if network.mode == "lockstep":
+            return self._tick
+        sent_s = self._now_s - network.latency_s - KNOWN_AFTER_S
+        return next((tick for opened_s, tick in reversed(self._opened) if opened_s <= sent_s), -1)
 
     # -- the rest ------------------------------------------------------------------------------------------------
 
@@ -571,7 +595,9 @@ class Invariants:
             self.violate("retreat leads away", f"chaser/{i}", text)
 
     def _on_event(self, event: Event) -> None:
-        if event.level != "info" and not event.what.startswith("fault "):
+        # A phase that guidance chose names its reason: "chaser 0: hold (from approach: REASON)".
+        chosen = "(from " in event.what and ": " in event.what.partition("(from ")[2]
+        if (event.level != "info" and not event.what.startswith("fault ")) or chosen:
             self.reasons.append(f"{event.process}: {event.what} {event.detail}".strip())
             self.reason_s = self.time_s
         if event.process == "world" and event.what in ("process lost", "actuators stopped"):
@@ -590,21 +616,29 @@ class Invariants:
         """Return whether a fault or the network explains that a process is lost."""
         s = self.scenario.simulation
         lossy = s.mode == "realtime" and (s.loss or s.reorder)
-        return bool(lossy or s.slow or s.partition) or any(f.at_s <= self.time_s for f in self.scenario.fault)
+        # A tick's messages cross the network three times; if that takes longer than half a tick, leases may run out.
+        late_s = 3.0 * s.latency_s + LATE_JITTERS * s.jitter_s
+        slow = s.mode == "realtime" and late_s > 0.5 / self.scenario.time.rate_hz
+        return bool(lossy or slow or s.slow or s.partition) or any(
+            f.at_s <= self.time_s for f in self.scenario.fault
+        )
 
     def _on_end(self, end: MissionEnd) -> None:
         self.end = end
 
-    def _attempt_s(self, chaser: int) -> float:
-        """Return how long a chaser with a port takes to back out and to try again; 0 without a port."""
-        d = self.scenario.docking
+    def _settling_s(self, chaser: int) -> float:
+        """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
+        d, approach = self.scenario.docking, self.scenario.approach
         if d.port_of(chaser) is None:
-            return 0.0
-        out_s = d.entry_m / self.scenario.approach.max_speed_m_s
+            # The peak speed of a move of least jerk is 1.875 of its mean.
+            way_m = math.hypot(*self.scenario.chasers[chaser].position_m) - approach.dock_distance_m
+            moving_s = 1.875 * max(0.0, way_m) / approach.max_speed_m_s
+            return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
+        out_s = d.entry_m / approach.max_speed_m_s
         in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (
             d.final_m + d.overdrive_m
         ) / d.contact_speed_m_s
-        return out_s + in_s + d.settle_s + 2.0 * d.pull_s
+        return SETTLING_S + out_s + in_s + d.settle_s + 2.0 * d.pull_s
 
     def check_end(self, crashes: dict[str, str], stalled: tuple[str, ...]) -> None:
         """Check what must hold when a flight is over: it ended, all processes did, and each mission is docked or safe."""
@@ -631,7 +665,7 @@ class Invariants:
                     "liveness", name, f"ends in phase {phase or 'none'}, although nothing disturbed it"
                 )
             commands_s = [e.at_s for e in self.scenario.timeline if chaser in e.chasers]
-            allowed_s = SETTLING_S + self._attempt_s(chaser)
+            allowed_s = self._settling_s(chaser)
             disturbed = self.time_s - max(self.reason_s, *commands_s, 0.0) < allowed_s
             if phase in DOCKED or name in self.dead or (named and (phase in SAFE_PHASES or disturbed)):
                 continue

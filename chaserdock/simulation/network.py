@@ -30,7 +30,7 @@ LEASE_S = 2.0
 """Time after which a silent process counts as lost in real time, as under ``chaserdock run``."""
 _RETRY_S = 0.2
 """Time after which a lost message that must not be lost is sent again."""
-_EPOCH_NS = 1_800_000_000 * 10**9
+EPOCH_NS = 1_800_000_000 * 10**9
 """Wall-clock time at the begin of a simulation."""
 
 
@@ -462,7 +462,7 @@ class SimulatedHost:
 
     def wall_ns(self) -> int:
         """Return the wall clock (ns), which message time stamps use."""
-        return _EPOCH_NS + round(self.now_s() * 1e9)
+        return EPOCH_NS + round(self.now_s() * 1e9)
 
     def pause(self, timeout_s: float | None, over: Callable[[], bool] = lambda: False) -> None:
         """Wait until ``over``, after which the task is woken, or for a time of this host's clock."""

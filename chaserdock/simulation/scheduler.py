@@ -28,8 +28,8 @@ class Killed(BaseException):
 Due = tuple[float, float]
 """Virtual time (s) of an event, and its place among those of the same time."""
 NEVER: Due = (0.0, 0.0)
-WAKE_SPREAD = 4.0
-"""Range of the place of a task that is woken, among events of its time; that of others is 1."""
+SPREAD, WAKE_SPREAD = 32.0, 128.0
+"""How many later events of the same time may come before an event, and before a task that is woken continues."""
 
 
 class Task:
@@ -82,7 +82,7 @@ class Scheduler:
         """
         self._count += 1
         now_s = self.now_s
-        due = (time_s if time_s > now_s else now_s, self._draw())
+        due = (time_s if time_s > now_s else now_s, self._count + SPREAD * self._draw())
         if after > due:
             due = after
         heapq.heappush(self._events, (due[0], due[1], self._count, call, args))
@@ -152,7 +152,8 @@ class Scheduler:
         Other events of this time are likelier to come first, so that a reader often finds several messages.
         """
         self._count += 1
-        event = (self.now_s, WAKE_SPREAD * self._draw(), self._count, self._continue, (task, task.waits))
+        place = self._count + WAKE_SPREAD * self._draw()
+        event = (self.now_s, place, self._count, self._continue, (task, task.waits))
         heapq.heappush(self._events, event)
 
     def _task(self) -> Task:

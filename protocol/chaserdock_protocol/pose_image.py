@@ -7,9 +7,13 @@ them as ``mono8`` images, so that everything but rendering and detection stays a
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from chaserdock_models.arrays import Array
 from numpy.typing import NDArray
+
+from .codec import UNIT_QUATERNION_TOLERANCE
 
 NAME = "statistical"
 """Value of ``perception.name``."""
@@ -27,6 +31,8 @@ def decode_pose(image: NDArray[np.uint8]) -> tuple[Array, Array, tuple[int, int]
     if image.shape != (1, WIDTH_PX):
         raise ValueError(f"an image of {image.shape} is none of perception {NAME!r}")
     numbers = np.frombuffer(image.tobytes(), dtype="<f8")
-    if not np.isfinite(numbers).all() or not 0.0 <= numbers[7:].min() <= numbers[7:].max() < 2.0**32:
+    seeds_valid = 0.0 <= numbers[7:].min() <= numbers[7:].max() < 2.0**32
+    length = math.hypot(*numbers[3:7].tolist())
+    if not np.isfinite(numbers).all() or not seeds_valid or abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
         raise ValueError("damaged image")
     return numbers[:3], numbers[3:7], (int(numbers[7]), int(numbers[8]))

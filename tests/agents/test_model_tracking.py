@@ -8,6 +8,7 @@ from chaserdock_agents.chaser.perception.model import tracking
 from chaserdock_agents.chaser.perception.model.alignment import Pyramid
 from chaserdock_agents.chaser.perception.model.mesh import MeshError, TrackerMesh
 from chaserdock_agents.chaser.perception.model.rendering import PixelWindow, render
+from chaserdock_agents.chaser.perception.model.steps import result_of
 from chaserdock_models.camera import Camera
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
 from markerless_cases import Scene, lighting_of, mesh_of, perturbed, random_view, wrong_boxes
@@ -100,7 +101,7 @@ def test_several_starts_recover_a_prior_outside_of_the_basin():
         prior = perturbed(pose, rng, 0.03, np.deg2rad(5.0))
         pyramid = Pyramid(scene.image(pose, light, number), CAMERA)
         starts = [prior, *tracking.starts_around(prior)]
-        found = tracking.refine_from_starts(pyramid, mesh_of(), starts, lighting_of(light))
+        found = result_of(tracking.start_steps(pyramid, mesh_of(), starts, lighting_of(light)))
         recovered += found is not None and np.linalg.norm(tracking.pose_error(found.pose, pose)[:3]) < 5e-3
     assert recovered == 5
 
@@ -115,6 +116,19 @@ def test_synthetic_view_matches_the_ray_tracer():
         inside = cv2.erode(view.coverage, np.ones((5, 5))) > 0.99
         # Noise of the image included.
         assert np.abs(WHITE_LEVEL * view.grey - exact)[inside].mean() < 4.0
+
+
+def test_target_that_is_wider_than_the_image_is_aligned_at_a_coarser_level():
+    """Whole images of it would take the most time, and show texture that the mesh does not have."""
+    camera, mesh = Camera.from_hfov(960, 540, np.deg2rad(60.0)), mesh_of()
+    pyramid = Pyramid(np.zeros((540, 960), np.uint8), camera)
+    widest_at_m = 2.0 * mesh.radius_m * camera.fx_px / 1300.0
+    pose, _ = random_view(np.random.default_rng(3), 1.0, camera)
+    finest = []
+    for range_m in (1.02 * widest_at_m, 0.98 * widest_at_m, 0.49 * widest_at_m):
+        at = type(pose)(np.array([0.0, 0.0, range_m]), pose.rotation)
+        finest.append(tracking.levels_of(pyramid, mesh, at)[-1])
+    assert finest == [0, 1, 2]
 
 
 def test_target_behind_the_camera_or_out_of_the_image_has_no_levels():

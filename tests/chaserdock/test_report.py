@@ -252,7 +252,7 @@ def test_forces_are_impulses_divided_by_tick_durations(tmp_path: Path) -> None:
 
 def test_every_image_has_an_outcome(tmp_path: Path) -> None:
     nothing = load_traces(made_log(tmp_path / "a.mcap", 4), [0]).image_outcomes[0]
-    assert {OUTCOMES[code] for code in nothing.code} == {"no marker"}
+    assert {OUTCOMES[code] for code in nothing.code} == {"not seen"}
     seen = load_traces(made_log(tmp_path / "b.mcap", 4, seen=True), [0]).image_outcomes[0]
     assert list(seen.intervals()) == [(0.0, 3 * TICK_NS / 1e9, "used")]
     np.testing.assert_array_equal(seen.time_s, [k * TICK_NS / 1e9 for k in range(4)])
@@ -260,11 +260,11 @@ def test_every_image_has_an_outcome(tmp_path: Path) -> None:
 
 def test_intervals_end_at_changes_and_gaps() -> None:
     outcomes = ImageOutcomes(np.array([0.0, 1.0, 2.0, 3.0, 7.0]), np.array([0, 0, 2, 2, 2]))
-    assert list(outcomes.intervals()) == [(0.0, 1.0, "used"), (2.0, 7.0, "no marker")]
+    assert list(outcomes.intervals()) == [(0.0, 1.0, "used"), (2.0, 7.0, "not seen")]
     assert list(outcomes.intervals(1.5)) == [
         (0.0, 1.0, "used"),
-        (2.0, 3.0, "no marker"),
-        (7.0, 7.0, "no marker"),
+        (2.0, 3.0, "not seen"),
+        (7.0, 7.0, "not seen"),
     ]
     assert list(ImageOutcomes(np.zeros(0), np.zeros(0, dtype=np.intp)).intervals()) == []
 

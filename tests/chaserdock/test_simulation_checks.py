@@ -44,6 +44,7 @@ from pydantic import ValidationError
 from chaserdock.simulation.campaign import NEES_LIMITS, inconsistency
 from chaserdock.simulation.invariants import Invariants, Violation
 from chaserdock.simulation.message_checks import covariance_defect, defects_of
+from chaserdock.simulation.network import EPOCH_NS
 from chaserdock.simulation.shrinking import shrink
 from chaserdock.simulation.swarm import (
     KINDS,
@@ -185,11 +186,17 @@ class Log:
 
     def __init__(self, scenario: Scenario) -> None:
         self.checks = Invariants(scenario)
+        self.now_s = 0.0
 
     def publish(
         self, topic: Topic, message: Any, place: int | str | None = None, sender: str = "world"
     ) -> None:
-        raw = RawSample(topic.key_of(place), encoding_of(topic.kind), codec.encode(message), 0)
+        raw = RawSample(
+            topic.key_of(place),
+            encoding_of(topic.kind),
+            codec.encode(message),
+            EPOCH_NS + round(self.now_s * 1e9),
+        )
         self.checks.observe(sender, raw)
 
     def tick(self, tick: int, revision: int = 0) -> None:
@@ -309,6 +316,16 @@ def test_a_chaser_is_lost_for_a_cause_only(killed: Scenario, scenario: Scenario)
         log.event("actuators stopped", "chaser/1: no command for 0.5 s")
     assert with_cause.found == []
     assert without.found == ["no loss without a cause"]
+
+
+@pytest.mark.parametrize(("jitter_s", "found"), [(0.002, ["no loss without a cause"]), (0.01, [])])
+def test_leases_may_run_out_in_a_network_that_is_slow_against_a_tick(
+    jitter_s: float, found: list[str], tmp_path: Path
+) -> None:
+    log = Log(variant(tmp_path, simulation={"mode": "realtime", "jitter_s": jitter_s}))
+    log.tick(2)
+    log.event("actuators stopped", "chaser/1: no command for 0.5 s")
+    assert log.found == found
 
 
 def test_published_commands_are_flown_unless_a_fault_lasts(tmp_path: Path) -> None:
@@ -478,6 +495,21 @@ def test_flown_commands_are_neither_old_nor_superseded(log: Log) -> None:
     assert log.found[1:] == ["no superseded command"]
 
 
+def test_commands_may_be_older_than_the_ticks_that_a_frozen_world_opens_at_once(tmp_path: Path) -> None:
+    log = Log(variant(tmp_path, simulation={"mode": "realtime", "latency_s": 0.01}))
+    log.now_s = 1.0
+    log.tick(20)
+    log.now_s = 4.0
+    for tick in range(21, 51):
+        log.tick(tick)
+    log.now_s = 4.1
+    log.flies(0, 20)
+    assert log.found == []
+    log.now_s = 4.12
+    log.flies(1, 20)
+    assert log.found == ["no stale command"]
+
+
 def test_chasers_fly_different_commanders_only_in_a_tick_that_is_repeated(log: Log) -> None:
     log.tick(20)
     log.flies(1, 20, term=1)
@@ -577,6 +609,21 @@ def test_a_mission_is_docked_or_safe_with_a_reason(log: Log, killed: Scenario) -
     with_reason.event("no command", "for 2 s", "chaser/0")
     ended(with_reason).checks.check_end({}, ())
     assert with_reason.found == []
+
+
+@pytest.mark.parametrize(
+    ("what", "violations"),
+    [
+        ("chaser 0: hold (from approach: no chaser has seen the target for 3 s)", 0),
+        ("chaser 0: hold (from wait)", 2),
+    ],
+)
+def test_guidance_names_the_reason_of_a_phase(what: str, violations: int, killed: Scenario) -> None:
+    log = Log(killed)
+    at_end(log, "hold")
+    log.event(what, "", "controller", "info")
+    ended(log).checks.check_end({}, ())
+    assert log.found == ["liveness"] * violations
 
 
 def test_an_undisturbed_mission_docks(log: Log) -> None:

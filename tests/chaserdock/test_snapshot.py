@@ -20,7 +20,7 @@ POSE = PoseSolution(
 
 @pytest.mark.parametrize(
     ("markers", "solutions", "text"),
-    [((), (), "no marker"), ((4,), (POSE,), "1 marker"), ((4, 5), (), "2 markers"), ((), (POSE,), "seen by its shape")],
+    [((), (), "not seen"), ((4,), (POSE,), "1 marker"), ((4, 5), (), "2 markers"), ((), (POSE,), "seen by its shape")],
 )  # fmt: skip
 def test_text_states_by_what_the_target_was_found(
     markers: tuple[int, ...], solutions: tuple[PoseSolution, ...], text: str
@@ -36,4 +36,4 @@ def test_text_states_by_what_the_target_was_found(
         rejected_ids=(),
     )
     assert seen_text(sighting) == text
-    assert seen_text(None) == "no marker"
+    assert seen_text(None) == "not seen"

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -62,6 +63,28 @@ def test_a_plan_stops_the_stack_cheaply_also_where_feedback_cannot(
     assert body.mass_kg > 0.0
     if least is not None:
         assert plan.impulse_N_s < 0.85 * least.impulse_N_s
+
+
+def test_a_first_plan_leaves_a_local_minimum() -> None:
+    """From no thrust this tumble's programme ends in a minimum that is 1.6 times as expensive."""
+    p = problem(0, (0, 3))
+    from_no_thrust = plan_stop(p, np.zeros((28, 24)), 0.5, 60)
+    plan = StackPlanner(14.0).trial(p)
+    assert plan.cost_N_s < 0.75 * from_no_thrust.cost_N_s
+    assert np.linalg.norm(plan.remaining) < 0.02 * np.linalg.norm(p.momentum)
+
+
+def test_a_plan_in_flight_leaves_a_local_minimum() -> None:
+    p = problem(0, (0, 3))
+    planner = StackPlanner(14.0)
+    planner.thrusts(p, 0, feedback_can=True)
+    assert planner.active is not None
+    dear = plan_stop(p, np.zeros((28, 24)), 0.5, 60)
+    planner.active = replace(planner.active, plan=dear)
+    # The stack has not moved: only another guess can be cheaper.
+    for tick in range(1, 9):
+        planner.thrusts(p, round(tick * 0.5e9), feedback_can=True)
+    assert planner.active.plan.cost_N_s < 0.85 * dear.cost_N_s
 
 
 def test_a_plan_turns_with_the_world() -> None:

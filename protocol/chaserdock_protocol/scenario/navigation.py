@@ -99,11 +99,6 @@ class NavigationErrors:
         return not any(getattr(self, name) for name in names if not name.endswith("_time_s"))
 
     @property
-    def exact_camera(self) -> bool:
-        """Whether cameras are as calibrated."""
-        return not any(getattr(self, f.name) for f in fields(self) if f.name.startswith("camera_"))
-
-    @property
     def uncertain_mounting(self) -> bool:
         """Whether mounting, lens position or focal length of the cameras are uncertain."""
         return any((self.camera_turn_rad, self.camera_shift_m, self.camera_focal_share))

@@ -44,11 +44,12 @@ class StackProblem:
 @dataclass(frozen=True, eq=False)
 class StackPlan:
     """``thrusts_N`` (K, n) for K steps of ``step_s``. ``remaining`` (6,): momentum at the end, WRF axes, by the plan's own model;
-    ``impulse_N_s`` of all thrusters."""
+    ``impulse_N_s`` of all thrusters; ``cost_N_s``: this impulse and the penalty on the remaining momentum."""
 
     thrusts_N: Array
     step_s: float
     remaining: Array
+    cost_N_s: float
 
     @property
     def impulse_N_s(self) -> float:
@@ -81,7 +82,7 @@ def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: 
         raise ValueError("momentum and wrenches must be finite")
     able = np.flatnonzero(problem.limits_N > 0.0)
     if not len(able):
-        return StackPlan(np.zeros_like(guess_N), step_s, problem.momentum.copy())
+        return StackPlan(np.zeros_like(guess_N), step_s, problem.momentum.copy(), math.inf)
     thrusts = np.clip(guess_N, 0.0, problem.limits_N)
     price = _price(problem, able)
     flight = fly(problem, thrusts, step_s)
@@ -101,7 +102,7 @@ def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: 
         radius = min(1.0, 2.0 * radius) if ratio > 0.75 else radius if ratio > 0.3 else radius / 3.0
         if radius < _LEAST_RADIUS:
             break
-    return StackPlan(thrusts, step_s, flight.end)
+    return StackPlan(thrusts, step_s, flight.end, merit)
 
 
 def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:

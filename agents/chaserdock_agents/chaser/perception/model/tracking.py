@@ -25,6 +25,9 @@ MIN_SCORE = 0.56
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
 """Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
 _FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
+_LARGEST_PX = 1300.0
+"""Largest diameter of the target at the finest level. Nearer targets are aligned at a coarser level: they show texture that the
+mesh does not have at the size of profiles, and a whole image of them takes the most time."""
 _FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
 _START_SHARE, _START_RAD = 0.02, math.radians(3.0)
 _EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
@@ -44,15 +47,16 @@ def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
 def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
     """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is out of view.
 
-    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time; small targets are
-    upsampled twice.
+    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time, and at most 1,300 pixels
+    wide, of which it may show a part; small targets are upsampled twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
     if found is None:
         return ()
     area = found[0].height * found[0].width
     finest = -1 if area < _UPSAMPLED_AREA_PX else 0
-    while area / 4**finest > _FINEST_AREA_PX:
+    diameter_px = 2.0 * mesh.radius_m * pyramid.camera.fx_px / float(np.linalg.norm(pose.position))
+    while area / 4**finest > _FINEST_AREA_PX or diameter_px / 2**finest > _LARGEST_PX:
         finest += 1
     coarsest = finest
     while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 4:
@@ -146,17 +150,10 @@ def starts_around(prior: PoseInCamera) -> list[PoseInCamera]:
     return starts
 
 
-def refine_from_starts(
-    pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
-) -> Alignment | None:
-    """Return the best alignment from several starts: all at the coarsest level, the best three at all levels."""
-    return result_of(start_steps(pyramid, mesh, starts, light))
-
-
 def start_steps(
     pyramid: Pyramid, mesh: TrackerMesh, starts: list[PoseInCamera], light: Lighting
 ) -> Steps[Alignment | None]:
-    """Do what `refine_from_starts` does, in steps."""
+    """Return the best alignment from several starts, in steps: all at the coarsest level, the best three at all levels."""
     coarse: list[Alignment] = []
     for start in starts:
         levels = levels_of(pyramid, mesh, start)

@@ -16,7 +16,7 @@ from common import Figures, make_parser, print_figures, write_json
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rendezvous import last_leg, leg, rendezvous
+from chaserdock.evaluation.rendezvous import IMAGES_FROM_M, last_leg, leg, rendezvous
 from chaserdock.evaluation.transfers import load_shipped
 
 
@@ -26,7 +26,7 @@ def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
     if options.leg is not None:
         scenario = leg(scenario, options.leg)
     elif options.quick or options.images:
-        scenario = last_leg(scenario, images=options.images)
+        scenario = last_leg(scenario, images=options.images, images_from_m=options.images_from)
     begin_s, shown = time.process_time(), [0]
 
     def report(record: TickRecord, flight: InProcessMission) -> None:
@@ -75,6 +75,9 @@ def main() -> None:
     parser.add_argument("--scenario", nargs="+", default=["v-bar", "r-bar"], help="shipped scenarios")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each, from 0")
     parser.add_argument("--images", action="store_true", help="last leg with rendered images")
+    parser.add_argument(
+        "--images-from", type=float, default=IMAGES_FROM_M, help="distance where it begins, m"
+    )
     parser.add_argument(
         "--leg",
         type=int,

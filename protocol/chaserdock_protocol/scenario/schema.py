@@ -181,8 +181,8 @@ class Limits(Section):
         default="off",
         description="`monitor`: at every tick, whether the coast after a loss of all thrust at any moment of the plan stays "
         "outside `min_distance_target_m`; the certificate is published and changes are logged. `enforce`: outside the final corridor, "
-        "moves are as slow as this needs, moves that cannot be safe are refused, and a chaser whose plans are not safe aborts onto a "
-        "safe coast. Needs the estimator `joint`.",
+        "plans are kept safe by constraints, moves are as slow as this needs, moves that cannot be safe are refused, and a chaser "
+        "whose plans are not safe aborts onto a safe coast. Needs the estimator `joint`, and `enforce` the solver `rti`.",
     )
     final_corridor_m: NotNegative = Field(
         default=0.0,

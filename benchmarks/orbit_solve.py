@@ -23,7 +23,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class TimedMission:
+class TimedFlight:
     """A mission whose controller is timed. ``solve_s``, ``tick_s``: processor time of each tick's solve and of its controller."""
 
     def __init__(self, scenario: Scenario) -> None:
@@ -57,10 +57,10 @@ def main() -> None:
     overrides = ("perception.name='statistical'", "timeline=[]", "duration_s=1000.0")
     in_orbit = load_shipped(options.scenario, *overrides, f"limits.passive_safety='{options.safety}'")
     free = load_shipped(options.scenario, *overrides, "limits.passive_safety='off'")
-    pair = [TimedMission(in_orbit), TimedMission(free.model_copy(update={"orbit": None}))]
+    pair = [TimedFlight(in_orbit), TimedFlight(free.model_copy(update={"orbit": None}))]
     for _ in range(60 if options.quick else options.ticks):
-        for timed_mission in pair:
-            timed_mission.mission.step()
+        for flight in pair:
+            flight.mission.step()
     figures: Figures = {"ticks": len(pair[0].tick_s)}
     for name, orbit_s, free_s in (
         ("solve", median(pair[0].solve_s), median(pair[1].solve_s)),

@@ -35,6 +35,7 @@ from chaserdock_world.physics.simulation import BodyState
 from chaserdock_world.sensors.errors import true_camera
 from common import Figures, append_line, make_parser, read_lines, run_parts
 
+from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import RenderedImages, States
 
@@ -103,19 +104,16 @@ class EstimatorErrors:
 
     def add(self, now_s: float, message: TargetEstimate, truth: BodyState) -> None:
         """Append one estimate."""
-        covariance = np.reshape(message.covariance, (12, 12))
-        dp = truth.position_m - message.position_m
-        dtheta = rotations.log(rotations.multiply(rotations.conjugate(message.q_wxyz), truth.q_wxyz))
-        pose = np.concatenate([dp, dtheta])
-        i = [0, 1, 2, 6, 7, 8]
-        pose_covariance = covariance[np.ix_(i, i)]
+        covariance = pose_covariance(message.covariance)
+        known = np.array(message.position_m), np.array(message.q_wxyz)
+        pose = pose_error(truth.position_m, truth.q_wxyz, *known)
         self.time_s.append(now_s)
-        self.position_m.append(float(np.linalg.norm(dp)))
-        self.angle_rad.append(float(np.linalg.norm(dtheta)))
+        self.position_m.append(float(np.linalg.norm(pose[:3])))
+        self.angle_rad.append(float(np.linalg.norm(pose[3:])))
         self.velocity_m_s.append(float(np.linalg.norm(truth.velocity_m_s - message.velocity_m_s)))
         self.omega_rad_s.append(float(np.linalg.norm(truth.omega_rad_s - message.omega_rad_s)))
-        self.nees.append(float(pose @ np.linalg.solve(pose_covariance, pose)))
-        self.inside.append(float(np.mean(np.abs(pose) <= 3.0 * np.sqrt(np.diag(pose_covariance)))))
+        self.nees.append(float(normalized_square(pose, covariance)))
+        self.inside.append(float(np.mean(np.abs(pose) <= 3.0 * np.sqrt(np.diag(covariance)))))
         self.status.append(message.status)
 
     def array(self, name: str, from_s: float = 0.0, to_s: float = np.inf) -> Array:

@@ -26,8 +26,6 @@ import numpy as np
 from chaserdock_agents.chaser.perception import make_perception
 from chaserdock_agents.chaser.sighting import look
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
-from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
@@ -35,6 +33,7 @@ from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
 from common import Figures, append_line, commit, make_parser, read_lines, run_parts
 
+from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.transfers import load_shipped
 
@@ -120,20 +119,12 @@ def estimate_error(record: TickRecord) -> tuple[float, float, float] | None:
     if estimate is None or estimate.status == "none":
         return None
     truth = record.states[TARGET]
-    position = truth.position_m - np.array(estimate.position_m)
-    turn = rotations.log(rotations.multiply(rotations.conjugate(np.array(estimate.q_wxyz)), truth.q_wxyz))
+    known = np.array(estimate.position_m), np.array(estimate.q_wxyz)
+    e = pose_error(truth.position_m, truth.q_wxyz, *known)
     nees = math.nan
     if len(estimate.covariance):
-        covariance = np.array(estimate.covariance).reshape(12, 12)
-        e = np.concatenate([position, turn])
-        nees = float(e @ np.linalg.solve(pose_covariance(covariance), e))
-    return float(np.linalg.norm(position)), float(np.linalg.norm(turn)), nees
-
-
-def pose_covariance(covariance: Array) -> Array:
-    """Return the covariance (6, 6) of position and rotation out of that (12, 12) of the state."""
-    pose = np.r_[0:3, 6:9]
-    return covariance[np.ix_(pose, pose)]
+        nees = float(normalized_square(e, pose_covariance(estimate.covariance)))
+    return float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:])), nees
 
 
 def fly(seed: int, scenario: Scenario) -> MarkerlessOutcome:

@@ -41,6 +41,7 @@ from numpy.typing import NDArray
 
 from .columns import Columns
 from .mass_properties import values_of
+from .pose_errors import POSE
 
 # Messages whose number or content depends on the wall clock.
 NOT_IN_DIGEST = (topics.PRESENCE, topics.HEALTH, topics.FAREWELL, topics.ACK, topics.STATE)
@@ -52,9 +53,8 @@ LOAD_QUANTITIES = (
     "peak_bending_N_m",
     "closing_impulse_N_s",
 )
-_POSE = (0, 1, 2, 6, 7, 8)
 _UPPER = np.triu_indices(6)
-_KEPT = np.array([12 * _POSE[i] + _POSE[j] for i, j in zip(*_UPPER, strict=True)])
+_KEPT = np.array([12 * POSE[i] + POSE[j] for i, j in zip(*_UPPER, strict=True)])
 _UPPER_FLAT = np.ravel_multi_index(_UPPER, (6, 6))
 _RATES = np.array([13 * k for k in (3, 4, 5, 9, 10, 11)])
 

@@ -6,6 +6,15 @@ from __future__ import annotations
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from numpy.typing import ArrayLike
+
+POSE = (0, 1, 2, 6, 7, 8)
+"""Position and attitude in the state (12) of ``TargetEstimate``."""
+
+
+def pose_covariance(covariance: ArrayLike) -> Array:
+    """Return the covariance (6, 6) of position and attitude in the row-major one (144,) or (12, 12) of ``TargetEstimate``."""
+    return np.reshape(covariance, (12, 12))[np.ix_(POSE, POSE)]
 
 
 def relative_pose(

@@ -35,6 +35,7 @@ from .criteria import (
 from .flight import RecordedFlight, SafetyHistory, Track, load_flight
 from .pose_errors import normalized_square, pose_error, relative_pose
 
+_POSE_ERRORS = ("position_m", "orientation_rad", "nees")
 _BLOCK = 1 << 14  # rows processed at a time
 
 
@@ -103,10 +104,16 @@ def known_estimates(flight: RecordedFlight) -> tuple[NDArray[np.intp], NDArray[n
     truth, known = flight.truth.get("target"), np.flatnonzero(flight.estimate_known)
     if truth is None or not len(known):
         return none, none
-    at_ns, truth_ns = nanoseconds(flight.estimate.time_s[known]), nanoseconds(truth.time_s)
-    row = rows_since(truth_ns, at_ns)
-    both = (row >= 0) & (truth_ns[row] == at_ns)
-    return known[both], row[both]
+    rows, true_rows = rows_at_equal_times(flight.estimate.time_s[known], truth.time_s)
+    return known[rows], true_rows
+
+
+def rows_at_equal_times(time_s: Array, other_s: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Return the rows (K,) of ascending times that occur in both, in the first and in the second (not empty)."""
+    at_ns, other_ns = nanoseconds(time_s), nanoseconds(other_s)
+    row = rows_since(other_ns, at_ns)
+    both = np.flatnonzero((row >= 0) & (other_ns[row] == at_ns))
+    return both, row[both]
 
 
 def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
@@ -115,48 +122,45 @@ def estimate_errors(flight: RecordedFlight) -> dict[str, Array]:
     a, b = known_estimates(flight)
     truth = flight.truth.get("target", flight.estimate)  # without truth there are no rows
     e = flight.estimate
-    errors = {
-        name: np.empty(len(a))
-        for name in ("position_m", "orientation_rad", "velocity_m_s", "omega_rad_s", "nees")
-    }
+    errors = {name: np.empty(len(a)) for name in (*_POSE_ERRORS, "velocity_m_s", "omega_rad_s")}
     for rows in blocks(len(a)):
         i, j = a[rows], b[rows]
         pose = pose_error(truth.position_m[j], truth.q_wxyz[j], e.position_m[i], e.q_wxyz[i])
-        errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
-        errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
+        _store_pose_errors(errors, rows, pose, flight.pose_covariance(i))
         errors["velocity_m_s"][rows] = np.linalg.norm(truth.velocity_m_s[j] - e.velocity_m_s[i], axis=1)
         errors["omega_rad_s"][rows] = np.linalg.norm(truth.omega_rad_s[j] - e.omega_rad_s[i], axis=1)
-        errors["nees"][rows] = normalized_square(pose, flight.pose_covariance(i))
     return {"time_s": e.time_s[a], **errors}
 
 
 def relative_errors(flight: RecordedFlight, chaser: int) -> dict[str, Array]:
     """Return errors of a chaser's estimated pose relative to the target: ``time_s``, ``position_m``, ``orientation_rad``,
     ``nees``, each (K,); no rows without truth, or if the estimator does not publish that pose."""
-    names = ("time_s", "position_m", "orientation_rad", "nees")
     own, target = flight.truth.get(f"chaser/{chaser}"), flight.truth.get("target")
     history = flight.relative.get(chaser)
     if own is None or target is None or history is None:
-        return {name: np.zeros(0) for name in names}
+        return {name: np.zeros(0) for name in ("time_s", *_POSE_ERRORS)}
     n = min(len(own.time_s), len(target.time_s))
-    at_ns, true_ns = nanoseconds(history.time_s), nanoseconds(target.time_s[:n])
-    true_row = rows_since(true_ns, at_ns)
-    a = np.flatnonzero((true_row >= 0) & (true_ns[true_row] == at_ns))
-    errors = {name: np.empty(len(a)) for name in names} | {"time_s": history.time_s[a]}
+    a, b = rows_at_equal_times(history.time_s, target.time_s[:n])
+    errors = {name: np.empty(len(a)) for name in _POSE_ERRORS}
     for rows in blocks(len(a)):
-        i, j = a[rows], true_row[a[rows]]
+        i, j = a[rows], b[rows]
         true = relative_pose(own.position_m[j], own.q_wxyz[j], target.position_m[j], target.q_wxyz[j])
         pose = pose_error(*true, history.position_m[i], history.q_wxyz[i])
-        errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
-        errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
-        errors["nees"][rows] = normalized_square(pose, history.covariance(i))
-    return errors
+        _store_pose_errors(errors, rows, pose, history.covariance(i))
+    return {"time_s": history.time_s[a], **errors}
+
+
+def _store_pose_errors(errors: dict[str, Array], rows: slice, pose: Array, covariance: Array) -> None:
+    """Store what ``_POSE_ERRORS`` names, of pose errors (K, 6) with covariances (K, 6, 6), in these rows."""
+    errors["position_m"][rows] = np.linalg.norm(pose[:, :3], axis=1)
+    errors["orientation_rad"][rows] = np.linalg.norm(pose[:, 3:], axis=1)
+    errors["nees"][rows] = normalized_square(pose, covariance)
 
 
 def _pose_figures(errors: dict[str, Array], from_s: float) -> dict[str, float | None]:
     """Return RMS, largest value and mean NEES of pose errors from a time on; None without any."""
     late = errors["time_s"] >= from_s
-    position, angle, nees = (errors[name][late] for name in ("position_m", "orientation_rad", "nees"))
+    position, angle, nees = (errors[name][late] for name in _POSE_ERRORS)
     return {
         "position_rms_m": _rms(position),
         "orientation_rms_rad": _rms(angle),

@@ -30,6 +30,8 @@ from chaserdock_world.plant import target_plant
 from chaserdock_world.sensors.errors import OdometrySensor
 from chaserdock_world.sensors.publish import odometry_of
 
+from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
+
 from .detumble_flights import moving_with, stack_scenario
 from .latched_stack import body_of_plant
 from .perception import RenderedImages
@@ -170,8 +172,5 @@ def _impulse(scenario: Scenario, before: BodyState, after: BodyState) -> Array:
 
 def _nees(position_m: Array, q_wxyz: Array, covariance: Array, target: BodyState, own: BodyState) -> float:
     """Return the normalized squared error of a chaser's estimated pose relative to the target."""
-    place = rotations.rotate_inverse(target.q_wxyz, own.position_m - target.position_m)
-    q = rotations.multiply(rotations.conjugate(target.q_wxyz), own.q_wxyz)
-    turn = rotations.log(rotations.multiply(rotations.conjugate(q_wxyz), q))
-    e = np.concatenate([place - position_m, turn])
-    return float(e @ np.linalg.solve(covariance, e))
+    true = relative_pose(own.position_m, own.q_wxyz, target.position_m, target.q_wxyz)
+    return float(normalized_square(pose_error(*true, position_m, q_wxyz), covariance))

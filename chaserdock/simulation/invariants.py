@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from chaserdock_controller.guidance.trajectories import PEAK_SPEED
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import relative_acceleration, relative_torque
@@ -44,7 +45,7 @@ from chaserdock_protocol.transport import RawSample
 from chaserdock_world.orbit import TargetOrbit
 
 from chaserdock.analysis.criteria import nearest_allowed_m
-from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
+from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, pose_error, relative_pose
 
 from .message_checks import defects_of
 from .network import EPOCH_NS, decode_once
@@ -67,7 +68,6 @@ DOCKED = ATTACHED | {"docked"}
 DETUMBLING = frozenset({"identify", "detumble", "stack_hold"})
 _TUMBLE_SHARE, _TUMBLE_FLOOR_N_M_S = 0.05, 0.02
 """By how much the angular momentum of a stack may rise above its least while it is stopped: share of its first value, floor."""
-_POSE = (0, 1, 2, 6, 7, 8)
 _IMPULSE_SHARE, _IMPULSE_FLOOR_N_S = 0.02, 2e-5
 _ANGULAR_FLOOR_N_M_S, _ARM_M = 2e-5, 0.1
 _CONSERVED_SHARE = 2e-3
@@ -561,9 +561,10 @@ class Invariants:
         self._check_accuracy(estimate, truth)
         if estimate.tick % self.scenario.time.rate_hz:
             return
-        covariance = np.array(estimate.covariance).reshape(12, 12)[np.ix_(_POSE, _POSE)]
         true, known = ((np.array(x.position_m), np.array(x.q_wxyz)) for x in (truth, estimate))
-        self.nees.append(float(normalized_square(pose_error(*true, *known), covariance)))
+        self.nees.append(
+            float(normalized_square(pose_error(*true, *known), pose_covariance(estimate.covariance)))
+        )
         for relative in estimate.relative:
             own = self._states.get(f"chaser/{relative.chaser}")
             if own is not None and own.body not in self._touching and own.sim_time_ns == estimate.sim_time_ns:
@@ -630,9 +631,8 @@ class Invariants:
         """Return how long a chaser may take after the last disturbance: for an approach from rest, or another attempt."""
         d, approach = self.scenario.docking, self.scenario.approach
         if d.port_of(chaser) is None:
-            # The peak speed of a move of least jerk is 1.875 of its mean.
             way_m = math.hypot(*self.scenario.chasers[chaser].position_m) - approach.dock_distance_m
-            moving_s = 1.875 * max(0.0, way_m) / approach.max_speed_m_s
+            moving_s = PEAK_SPEED * max(0.0, way_m) / approach.max_speed_m_s
             return max(SETTLING_S, STOPPING_S + moving_s + approach.docked_time_s)
         out_s = d.entry_m / approach.max_speed_m_s
         in_s = (d.entry_m - d.final_m) / d.approach_speed_m_s + (

@@ -351,7 +351,7 @@ class ChaserProcess:
             self.node.publish(topics.LEASE, self.leases.stated(self.tick), self.number)
 
     def _now_ns(self) -> int:
-        """Return the simulated time: in real time it goes on while this process does not run or hears nothing."""
+        """Return the simulated time: in real time it continues while this process does not run or receives nothing."""
         if self.odometry is None:
             return 0
         silent_s = self.node.host.now_s() - self._odometry_arrived_s if self.realtime else 0.0

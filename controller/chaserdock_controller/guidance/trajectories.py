@@ -18,6 +18,8 @@ from chaserdock_models.relative_motion import cw_acceleration, cw_transition
 from msgspec import Struct
 from numpy.typing import ArrayLike
 
+PEAK_SPEED = 1.875
+"""Peak speed of a move of least jerk over its mean."""
 _RAMP_S = 2.0
 _SHORTEST_S = 2.0
 _STOP_S = 3.0
@@ -247,7 +249,7 @@ def circuit(from_m: ArrayLike, axis: ArrayLike, distance_m: float, now_s: float,
     if not (speed_m_s > 0.0 and distance_m > 0.0):
         raise ValueError(f"speed and distance must be positive, not {speed_m_s} and {distance_m}")
     unit = np.asarray(axis, dtype=float)
-    duration_s = 1.875 * 2.0 * math.pi * distance_m / speed_m_s
+    duration_s = PEAK_SPEED * 2.0 * math.pi * distance_m / speed_m_s
     return Circuit(
         now_s, np.asarray(from_m, dtype=float), unit / np.linalg.norm(unit), distance_m, duration_s
     )
@@ -310,7 +312,7 @@ def move_to(current: Motion, goal_m: ArrayLike, now_s: float, max_speed_m_s: flo
     stopping = stop(current, now_s)
     displacement = np.asarray(goal_m, dtype=float) - stopping.goal_m
     limit = max(max_speed_m_s, stopping._fastest()) * 1.005  # more than what lies between two samples
-    duration_s = max(_SHORTEST_S, 1.875 * float(np.linalg.norm(displacement)) / max_speed_m_s)
+    duration_s = max(_SHORTEST_S, PEAK_SPEED * float(np.linalg.norm(displacement)) / max_speed_m_s)
     move = Move(now_s, (*stopping.parts, _straight(displacement, duration_s)))
     # Terminates: the longer the displacement takes, the less it adds to the speed of stopping.
     while move._fastest() > limit:

@@ -74,7 +74,7 @@ class HotStandby:
     def decide(self, processed: Tick | None = None) -> bool:
         """Determine who commands the newest tick; return whether this process begins to, without any state.
 
-        In real time leases of a tick may be on their way: a commander goes on until it processes a tick (``processed``) that
+        In real time leases of a tick may be on their way: a commander continues until it processes a tick (``processed``) that
         it does not command, or until another one commands.
         """
         tick = processed or self.newest
@@ -144,7 +144,7 @@ class HotStandby:
     def on_idle(self, open_tick: int) -> bool:
         """Return whether to process the open tick although no more messages arrive.
 
-        The world has published a later tick. A standby has lost track then, and waits for the leader's state instead.
+        The world has published a later tick. A standby has missed its messages then, and waits for the leader's state instead.
         """
         if self.newest is None or self.newest.tick <= open_tick:
             return False

@@ -5,7 +5,8 @@ The package keeps one object per chunk until the file is closed. With 60 channel
 per chunk, 330 MB in a flight of ten hours, and slows down garbage collection; as bytes it is 0.7 kB. The file is the
 same to the byte (``tests/protocol/test_log.py``).
 
-A message record and its index are written by one ``struct.pack`` each, as messages are most of a log.
+A message record and its index are written by one ``struct.pack`` each, as messages are most of a log (measured in
+docs/simulation.md).
 """
 
 from __future__ import annotations

@@ -69,14 +69,16 @@ def midpoint_torque_of_rates(
     return (gx - nx, gy - ny, gz - nz)
 
 
+def split_loads(bodies: IntArray, loads: Array) -> list[tuple[int, list[float], list[float], list[float]]]:
+    """Return body, principal moments, force and torque of each row of ``RigidBodyEngine.advance``."""
+    return [(b, row[:3], row[3:6], row[6:]) for b, row in zip(bodies.tolist(), loads.tolist(), strict=True)]
+
+
 def advance_free(
     engine: RigidBodyEngine, bodies: IntArray, loads: Array, steps: int, step_s: float
 ) -> tuple[int, bool]:
     """Make the steps of ``RigidBodyEngine.advance`` one by one, of ``step_s`` each."""
-    rows = [
-        (body, load[:3], load[3:6], load[6:])
-        for body, load in zip(bodies.tolist(), loads.tolist(), strict=True)
-    ]
+    rows = split_loads(bodies, loads)
     for made in range(1, steps + 1):
         for body, inertia, force, torque in rows:
             _, q_wxyz, _, omega_world = engine.motion(body)

@@ -36,7 +36,7 @@ from .engine import (
     SolidHull,
 )
 from .engine_factory import make_engine
-from .gyroscopic import midpoint_torque, midpoint_torque_of_rates
+from .gyroscopic import midpoint_torque, midpoint_torque_of_rates, split_loads
 from .latch import ProbeLatch, latch_faults
 from .orbital_forces import OrbitalForces
 from .plume_loads import PlumeLoads
@@ -217,10 +217,7 @@ class Physics:
     def _advance_by_step(self, steps: int, wrenches: Array) -> set[tuple[str, str]]:
         """Make steps in which loads depend on the motion: with latches, or in an orbit. ``wrenches``: as ``_loads``."""
         step_s = 1.0 / self._scenario.time.physics_hz
-        loads = [
-            (body, load[:3], load[3:6], load[6:])
-            for body, load in zip(self._free_bodies.tolist(), wrenches.tolist(), strict=True)
-        ]
+        loads = split_loads(self._free_bodies, wrenches)
         touched: set[tuple[str, str]] = set()
         engine, before, jointed = self._engine, self._before, set[int]()
         motion_of, push = engine.motion, engine.push

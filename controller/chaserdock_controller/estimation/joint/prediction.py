@@ -158,7 +158,7 @@ def _couple_shape(covariance: Array, by_shape: Array) -> None:
 def _fade_ratios(
     covariance: Array, information: Array, dt: float, state: JointState, p: JointParameters
 ) -> None:
-    """Let the filter forget, in place, a part of what measurements told of the ratios of the inertia since the shape started.
+    """Reduce, in place, the information of past measurements on the ratios of the inertia since the shape started.
 
     They were linearized at an earlier estimate, which was far from the truth at first: after the time t, what was measured at the
     time s weighs (s / t)^``ratio_memory``. The ``information`` (5, 5) from before the measurements is kept.

@@ -162,7 +162,7 @@ def test_invalid_messages_processes_and_commands_are_rejected_in_flight(tmp_path
 
 def test_killed_recorder_leaves_readable_log(tmp_path: Path) -> None:
     """SIGKILL of the recorder loses at most the last second; the flight completes."""
-    mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG, "duration_s=12.0"))
+    mission = chaserdock("run", TWO, "--out", str(tmp_path / "run"), "-q", *sets(*LONG, "duration_s=30.0"))
     log = tmp_path / "run" / "mission.mcap"
     try:
         wait_for_log(log, FLYING_BYTES)

@@ -36,6 +36,7 @@ from chaserdock_controller.estimation.types import Shock
 from chaserdock_models import rotations
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import Odometry
 from chaserdock_protocol.scenario.navigation import NavigationErrors
 from flight_cases import scenario
 from joint_cases import PERIOD_S, SyntheticFlight, navigation, parameters
@@ -256,6 +257,39 @@ def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) 
     assert flight.relative_error(estimator, 1)[0] < 2.0 * usual_m + 1e-3
     fly(estimator, flight, 2.0)
     assert f"chaser 1: odometry {channel} used again" in [e.text for e in estimator.drain_events()]
+
+
+def test_chaser_that_contradicts_all_measurements_is_started_again() -> None:
+    """After a motion that nothing explained, all odometry of a chaser that sees nothing is rejected: within two seconds its
+    estimate starts again from the odometry, and is consistent with it from then on."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
+    estimator = estimator_for(flight.errors, 2)
+    fly(estimator, flight, 5.0)
+    assert estimator.state is not None
+    start_ns = estimator.state.time_ns
+    stated: list[Odometry] = []
+
+    def moved(inputs: JointInputs) -> JointInputs:
+        o, since_s = inputs.odometry[1], (inputs.time_ns - start_ns) * 1e-9
+        turn = so3.exp(np.array([0.0, 0.0, 0.2 + 0.3 * since_s]))
+        elsewhere = msgspec.structs.replace(
+            o,
+            position_m=vector(np.add(o.position_m, [0.2 + 0.05 * since_s, 0.0, 0.0])),
+            velocity_m_s=vector(np.add(o.velocity_m_s, [0.05, 0.0, 0.0])),
+            q_wxyz=vector(so3.multiply(np.array(o.q_wxyz), turn)),
+            omega_rad_s=vector(so3.to_matrix(turn).T @ o.omega_rad_s + [0.0, 0.0, 0.3]),
+        )
+        stated.append(elsewhere)
+        sightings = tuple(s for s in inputs.sightings if s.chaser != 1)
+        return replace(inputs, odometry={**inputs.odometry, 1: elsewhere}, sightings=sightings)
+
+    estimator.drain_events()
+    fly(estimator, flight, 2.0, moved)
+    texts = [e.text for e in estimator.drain_events()]
+    restart = "chaser 1: no measurement fitted for 1 s; started again from its odometry"
+    assert texts.count(restart) == 1
+    np.testing.assert_allclose(estimator.state.positions_m[1], stated[-1].position_m, atol=0.01)
+    assert (estimator.state.rejections[1, 1:] < 5).all()
 
 
 @pytest.mark.parametrize(("ticks", "follows"), [(1, False), (2, True)])

@@ -221,6 +221,7 @@ def process_tick(
     old = before
     if old is None:
         old = JointFilterState(record.time_ns, (empty_state(record.time_ns, chasers),))
+    _report_restarts(old.hypotheses[0], record, p, events)
     hypotheses = [_propagate(h, record, p) for h in old.hypotheses]
     seen = {i: s for i, s in record.sightings.items() if s.solutions and hypotheses[0].alive[i]}
     results = [update(h, record.inputs.odometry, seen, mounting, p) for h in hypotheses]
@@ -239,20 +240,38 @@ def process_tick(
 
 
 def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -> JointState:
-    """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured for long."""
+    """Predict a hypothesis to a tick; start chasers whose state is not known, or was not measured for long.
+
+    A state that contradicts all of its measurements for long cannot recover by them, as none passes its gate.
+    """
     inputs = record.inputs
     state = with_body(state, p.target)
     state = predict(state, record.time_ns, inputs.impulses, p, inputs.latched, inputs.covered_s)
-    stale = record.time_ns - round(p.restart_after_s * 1e9)
     newest = state.odometry_ns.copy()
     for i, odometry in inputs.odometry.items():
-        if not state.alive[i] or newest[i] < stale:
+        if not state.alive[i] or min(newest[i], state.measured_ns[i]) < _stale_ns(record, p):
             state = start_chaser(state, i, odometry, p)
         newest[i] = record.time_ns
     variances = rate_variances(p.contact_velocity_m_s, p.contact_omega_rad_s)
     for i in inputs.contacts:
         state = replace(state, covariance=widened(state.covariance, variances, block(i).start))
     return replace(state, odometry_ns=newest)
+
+
+def _stale_ns(record: JointTickRecord, p: JointParameters) -> int:
+    """Return the time before which a measurement is too old for a chaser's state to rest on it."""
+    return record.time_ns - round(p.restart_after_s * 1e9)
+
+
+def _report_restarts(
+    state: JointState, record: JointTickRecord, p: JointParameters, events: list[EstimatorEvent]
+) -> None:
+    """Report chasers that are started again although their odometry has arrived."""
+    stale = _stale_ns(record, p)
+    for i in sorted(record.inputs.odometry):
+        if state.alive[i] and state.measured_ns[i] < stale <= state.odometry_ns[i]:
+            text = f"chaser {i}: no measurement fitted for {p.restart_after_s:g} s; started again from its odometry"
+            events.append(EstimatorEvent(record.time_ns, "warning", text))
 
 
 def _check_cameras(

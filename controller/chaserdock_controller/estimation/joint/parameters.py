@@ -66,6 +66,8 @@ class JointParameters:
         the torque of a stuck thruster exceeds that of commands. It is assumed only where velocity or rate does not fit otherwise.
     rejections_to_drop: a channel that is rejected this many times in a row is not used until it fits again as often.
     collective_rejections: rejections in a row by most cameras after which the target's rates are widened.
+    restart_after_s: a chaser whose odometry was missing, or of which no measurement was used, for so long is started again from its
+        odometry.
     iterated_updates, iterations: the first updates after a start of the target are iterated, as they are far from linear.
     mean_motion_rad_s: of the target's orbit; 0 in free space. Chasers move by Clohessy-Wiltshire; the target stays at the
         origin of the Hill frame, where these forces vanish.

@@ -53,7 +53,8 @@ class JointState(TargetHypothesis):
     additive states. covariance (12 + CHASER N, 12 + CHASER N), or with ``shape`` ``SHAPE`` more. alive (N,): chasers whose state
     is known. shape: of a torque-free target. prior: knowledge that it started from at ``shape_ns``, with ``ratio_information``
     (5, 5), the (pseudo-)inverse of the covariance of its ratios.
-    odometry_ns (N,): time of the newest odometry. rejections (N, len(CHANNELS)): counts that decide which channel is used.
+    odometry_ns (N,): time of the newest odometry. measured_ns (N,): time of the newest measurement that was used.
+    rejections (N, len(CHANNELS)): counts that decide which channel is used.
     markers (N,): number of markers in the newest sighting of each chaser; 1 before the first one.
     nis (N, 4): moving average of the normalized innovation squared of the odometry's channels.
     updates: ticks with sightings since the start of the target.
@@ -66,6 +67,7 @@ class JointState(TargetHypothesis):
     extra: Array
     alive: NDArray[np.bool_]
     odometry_ns: NDArray[np.int64]
+    measured_ns: NDArray[np.int64]
     rejections: NDArray[np.int64]
     nis: Array
     markers: NDArray[np.int64]
@@ -103,6 +105,7 @@ def empty_state(time_ns: int, chasers: int) -> JointState:
         covariance=np.zeros((TARGET + CHASER * n, TARGET + CHASER * n)),
         alive=np.zeros(n, dtype=bool),
         odometry_ns=np.zeros(n, dtype=np.int64),
+        measured_ns=np.zeros(n, dtype=np.int64),
         rejections=np.zeros((n, len(CHANNELS)), dtype=np.int64),
         nis=np.full((n, len(CHANNELS) - 1), 3.0),
         markers=np.ones(n, dtype=np.int64),

@@ -2,10 +2,12 @@
 """Updates of the joint filter by a tick's odometry and sightings, with a gate for each channel. Pure functions.
 
 A channel whose residual does not fit is not used in that tick. After ``rejections_to_drop`` rejections in a row it is dropped
-until it has fitted as often: a jump or a constant error then changes nothing. A velocity or rate that does not fit in two ticks in a
-row, by no more than the thrusters can cause within a tick, is followed. Noise that exceeds the gate in a single tick, which
-happens in about every flight, must not pass for a force. When most cameras are rejected together, the
-target has moved in an unexpected way: its rates are widened, and if that does not help its pose is reinitialized.
+until it has fitted as often: a jump or a constant error then changes nothing. A chaser of which no measurement was used for
+``restart_after_s`` is started again from its odometry: an estimate that contradicts all measurements cannot recover otherwise.
+A velocity or rate that does not fit in two ticks in a row, by no more than the thrusters can cause within a tick, is followed.
+Noise that exceeds the gate in a single tick, which happens in about every flight, must not pass for a force. When most cameras
+are rejected together, the target has moved in an unexpected way: its rates are widened, and if that does not help its pose is
+reinitialized.
 """
 
 from __future__ import annotations
@@ -96,6 +98,8 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
     extra[i], alive[i] = 0.0, True
     rejections, nis = state.rejections.copy(), state.nis.copy()
     rejections[i], nis[i] = 0, 3.0
+    measured = state.measured_ns.copy()
+    measured[i] = state.time_ns
     covariance = state.covariance.copy()
     covariance[block(i), :] = covariance[:, block(i)] = 0.0
     own = np.zeros((CHASER, CHASER))
@@ -116,6 +120,7 @@ def start_chaser(state: JointState, i: int, odometry: Odometry, p: JointParamete
         omegas_rad_s=omegas,
         extra=extra,
         alive=alive,
+        measured_ns=measured,
         rejections=rejections,
         nis=nis,
         covariance=covariance,
@@ -247,19 +252,22 @@ def update(
     """Update the state at its time with the odometry and the sightings of the chasers."""
     accepted: list[int] = []
     rejected: list[int] = []
-    running = RunningUpdate(state)
+    running, measured = RunningUpdate(state), state.measured_ns.copy()
     for i in sorted(odometry.keys() | sightings.keys()):
         if not state.alive[i]:
             continue
         sighting = sightings.get(i) if state.target_known else None
         fits = _update_chaser(running, i, odometry.get(i), sighting, mounting, p)
+        if any(fits.values()):
+            measured[i] = state.time_ns
         if sighting is not None and sighting.solutions:
             (accepted if fits[SIGHTING_CHANNEL] else rejected).append(i)
     markers = state.markers.copy()
     for i in accepted:
         markers[i] = len(sightings[i].marker_ids)
     report = UpdateReport(tuple(accepted), tuple(rejected))
-    return running.finished(state.updates + bool(accepted), markers), report
+    finished = running.finished(state.updates + bool(accepted), markers)
+    return replace(finished, measured_ns=measured), report
 
 
 def _update_chaser(

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tracking by shape from a prior: accuracy, consistency of the covariance, gate, background, distortion."""
 
+import zlib
+
 import cv2
 import numpy as np
 import pytest
@@ -9,8 +11,13 @@ from chaserdock_agents.chaser.perception.model.alignment import Pyramid
 from chaserdock_agents.chaser.perception.model.mesh import MeshError, TrackerMesh
 from chaserdock_agents.chaser.perception.model.rendering import PixelWindow, render
 from chaserdock_agents.chaser.perception.model.steps import result_of
+from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
+from chaserdock_models.satellites import satellite
+from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
+from chaserdock_world.rendering.effects import CameraEffects
+from chaserdock_world.rendering.mesh_renderer import MeshRenderer
 from markerless_cases import Scene, lighting_of, mesh_of, perturbed, random_view, wrong_boxes
 
 SIZE = (480, 270)
@@ -171,3 +178,22 @@ def test_backlit_target_without_an_observable_attitude_is_rejected():
             tracked += 1
             assert np.rad2deg(np.linalg.norm(tracking.pose_error(found.pose, pose)[3:])) < 2.0
     assert tracked >= 3
+
+
+def test_pose_is_refined_until_it_settles() -> None:
+    # The light of a coarse pose that is 4 degrees wrong left a pose that passed the gate between the start and the truth.
+    camera = Camera.from_hfov(960, 540, np.deg2rad(60.0))
+    rng = np.random.default_rng([zlib.crc32(b"gate"), 1934])
+    pose, light = random_view(rng, rng.uniform(1.0, 3.0), camera)
+    prior = perturbed(pose, rng, rng.uniform(0.0, 0.05), np.deg2rad(rng.uniform(0.0, 12.0)))
+    renderer = MeshRenderer(camera, satellite("geo_servicer"), None, Effects().point_spread_px)
+    q = rotations.from_matrix(pose.rotation)
+    exact = renderer.render(np.zeros(3), rotations.IDENTITY, pose.position, q, (), light)
+    image = CameraEffects(960, 540, Effects(), 11).apply(exact, 0, 1934)
+    mesh = TrackerMesh.of_mesh(satellite("geo_servicer"), 0.0, 0.0)
+    found = tracking.refine_from_prior(Pyramid(image, camera), mesh, prior)
+    assert found is not None
+    assert tracking.is_valid(found[0])
+    error = tracking.pose_error(found[0].pose, pose)
+    assert np.linalg.norm(error[:3]) < 2e-3
+    assert np.linalg.norm(error[3:]) < np.deg2rad(0.2)

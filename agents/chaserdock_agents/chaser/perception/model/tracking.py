@@ -30,6 +30,9 @@ _LARGEST_PX = 1300.0
 mesh does not have at the size of profiles, and a whole image of them takes the most time."""
 _FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
 _START_SHARE, _START_RAD = 0.02, math.radians(3.0)
+_SETTLED_SHARE, _SETTLED_RAD, _MOST_REPEATED = 0.85, math.radians(0.5), 3
+"""A pose from a rough prior is settled within this turn from the view that it comes from; light and view are repeated until it is,
+at most three times, and once for a smaller share of inliers. One that still turns is rejected."""
 _EVEN_LIGHT = Lighting(None, 0.0, 1.0, shadows=False)
 """Light from everywhere."""
 
@@ -111,10 +114,10 @@ def refine_from_prior(
 def prior_steps(
     pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> Steps[tuple[Alignment, Lighting] | None]:
-    """Do what `refine_from_prior` does, in steps.
+    """Do what `refine_from_prior` does, in steps; None also for a pose that does not settle.
 
     The outline and the borders of materials give a coarse pose by light from everywhere; from it follows the light, which improves
-    the coarse pose, which improves the light.
+    the coarse pose, which improves the light. Both are improved again until the fine pose settles.
     """
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
@@ -129,7 +132,20 @@ def prior_steps(
             return None
         light = found
     fine = yield from pose_steps(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
-    return (fine, light) if fine else None
+    for number in range(_MOST_REPEATED):
+        if fine is None or _is_settled(fine, 0.0 if number else _SETTLED_SHARE):
+            break
+        # The light of a coarse pose that is wrong by degrees is wrong as well, and leaves the fine one between the two.
+        yield LIGHT_MS + VIEWS_MS
+        light = light_at(pyramid, mesh, fine.pose, levels[0], by_view=True) or light
+        fine = yield from pose_steps(pyramid, mesh, fine.pose, light, levels[-2:], _NEXT_REACH_PX, fine.modes)
+    return (fine, light) if fine is not None and _is_settled(fine) else None
+
+
+def _is_settled(alignment: Alignment, least_share: float = 0.0) -> bool:
+    """Return whether a pose hardly turned from that of its view, and at least ``least_share`` of the points agree with it."""
+    turned_rad = turn_between(alignment.pose, alignment.points.pose)
+    return alignment.inlier_share >= least_share and turned_rad <= _SETTLED_RAD
 
 
 def track_points(

@@ -8,11 +8,13 @@ Rendezvous and Docking of Spacecraft, section 4.4 (passive trajectory protection
 from __future__ import annotations
 
 import math
+from ctypes import c_double, c_int64, c_void_p
 from dataclasses import dataclass
 
 import numpy as np
 
 from .arrays import Array, IntArray
+from .native import address, function, scratch
 from .relative_motion import cw_transition
 
 STEP_S = 10.0
@@ -56,7 +58,10 @@ class CoastModel:
         self._step_s = duration_s / max(1, math.ceil(duration_s / step_s))
         self._times_s = np.arange(round(duration_s / self._step_s) + 1) * self._step_s
         self._transitions = cw_transition(mean_motion_rad_s, self._times_s)
-        self._by_axis = np.ascontiguousarray(self._transitions.transpose(1, 0, 2))
+        rows = self._transitions[:, :3]
+        self._by_axis = np.ascontiguousarray(rows.transpose(1, 0, 2))
+        # With these the trace of a position's covariance is one product.
+        self._squares = (rows.transpose(0, 2, 1) @ rows).reshape(-1, 36)
         # The acceleration of a coast turns with the orbit: in a step it changes by less than n dt of itself.
         self._sagitta_share = max(_SAGITTA_SHARE, (1.0 + mean_motion_rad_s * self._step_s) / 8.0)
 
@@ -84,8 +89,7 @@ class CoastModel:
         [c (6), d]: at its moment, c' x >= d suffices for a state x (6,) to keep ``sigmas`` standard deviations from the keep-out;
         c is zero where a coast has fewer approaches. Those with the smallest margins are returned.
         """
-        rows = self._by_axis[:3]
-        coasts = (rows @ states.T).transpose(2, 1, 0)
+        coasts = (self._by_axis @ states.T).transpose(2, 1, 0)
         distances = np.sqrt(np.square(coasts).sum(axis=2))
         lines = coasts / np.maximum(distances, 1e-9)[..., None]
         spread = self._transitions[:, :3] @ covariance @ self._transitions[:, :3].transpose(0, 2, 1)
@@ -128,53 +132,47 @@ class CoastModel:
     def _candidates(self, states: Array, covariance: Array, keep_out_m: float) -> IntArray:
         """Return the steps of the coasts that can contain the smallest margin of all states; arguments as in ``certify``.
 
-        In a step the distance is at least that of the nearer end, less half of the step and the bulge; the standard deviation is
-        at most the root of the trace of the covariance.
+        The distance is bounded as in ``_room``, the standard deviation by the root of the trace of the covariance.
         """
-        coasts = self._by_axis @ states.T
-        step_m, change_m_s = (
-            np.sqrt(np.square(np.diff(part, axis=1)).sum(axis=0)) for part in (coasts[:3], coasts[3:])
-        )
-        distance_m = np.sqrt(np.square(coasts[:3]).sum(axis=0))
-        ends_m = np.minimum(distance_m[:-1], distance_m[1:])
-        bulge_m = self._sagitta_share * self._step_s * change_m_s
-        room_m = (ends_m - 0.5 * step_m - bulge_m).min(axis=1) - keep_out_m
-        rows = self._by_axis[:3]
-        trace = (rows @ covariance * rows).sum(axis=(0, 2))
+        room_m = self._room(states) - keep_out_m
+        trace = self._squares @ covariance.ravel()
         sigma_m = np.sqrt(np.maximum(np.maximum(trace[:-1], trace[1:]), 1e-18))
         bound = np.where(room_m > 0.0, room_m / sigma_m, -np.inf)
         first = np.array([np.argmin(bound)])
         least = self._closest_in(first, states, covariance, keep_out_m).margin_sigmas.min()
         return np.flatnonzero(bound <= least + 1e-9 * abs(least))
 
+    def _room(self, states: Array) -> Array:
+        """Return lower bounds (T,) on the distance of the coasts of all states (M, 6) in each step (native/coast.c)."""
+        columns, room = _columns(states), np.empty(len(self._times_s) - 1)
+        work = scratch(columns.size)
+        function("coast_room")(
+            c_int64(len(room)), address(self._transitions), c_int64(columns.shape[1]), address(columns),
+            c_double(self._sagitta_share * self._step_s), address(room), address(work),
+        )  # fmt: skip
+        return room
+
     def _closest_in(
         self, columns: IntArray, states: Array, covariance: Array, keep_out_m: float
     ) -> ClosestApproaches:
-        """Return ``closest`` within these steps (L,) of the coasts."""
-        # One product of matrices: (L 6, 6) by (6, M).
-        begin, end = (
-            (self._transitions[k].reshape(-1, 6) @ states.T).T.reshape(len(states), -1, 6)
-            for k in (columns, columns + 1)
-        )
-        here, step = begin[:, :, :3], end[:, :, :3] - begin[:, :, :3]
-        length2 = np.maximum(np.einsum("mki,mki->mk", step, step), 1e-30)
-        share = np.clip(-np.einsum("mki,mki->mk", here, step) / length2, 0.0, 1.0)
-        nearest = here + share[..., None] * step
-        change = end[:, :, 3:] - begin[:, :, 3:]
-        bulge = self._sagitta_share * self._step_s * np.linalg.norm(change, axis=2)
-        chord = np.linalg.norm(nearest, axis=2)
-        away = np.maximum(chord - bulge, 0.0)
-        line = nearest / np.maximum(chord, 1e-9)[..., None]
-        variance = np.zeros_like(chord)
-        for k in (columns, columns + 1):
-            rows = self._transitions[k, :3]
-            spread = rows @ covariance @ rows.transpose(0, 2, 1)
-            variance = np.maximum(variance, _variance_along(line, spread))
-        sigma = np.sqrt(np.maximum(variance, 1e-18))
-        margins = (away - keep_out_m) / sigma
-        every, k = np.arange(len(states)), np.argmin(margins, axis=1)
-        times_s = self._times_s[columns[k]] + share[every, k] * self._step_s
-        return ClosestApproaches(margins[every, k], away[every, k], times_s)
+        """Return ``closest`` within these steps (L,) of the coasts (native/coast.c)."""
+        padded, found = _columns(states), np.empty((3, -(-len(states) // 4) * 4))
+        steps, spread = np.ascontiguousarray(columns, dtype=np.int64), np.ascontiguousarray(covariance)
+        approaches = (c_void_p * 3)(*(address(row).value for row in found))
+        function("coast_closest")(
+            c_int64(len(steps)), address(steps), address(self._transitions), c_int64(padded.shape[1]), address(padded),
+            address(spread), c_double(keep_out_m), c_double(self._sagitta_share * self._step_s), approaches,
+        )  # fmt: skip
+        margins, away, moments = found[:, : len(states)]
+        return ClosestApproaches(margins, away, moments * self._step_s)
+
+
+def _columns(states: Array) -> Array:
+    """Return states (M, 6) as columns (6, P) for the kernels: P is the next multiple of four, and the last state is repeated."""
+    count = -(-len(states) // 4) * 4
+    columns = np.empty((6, count))
+    columns[:, : len(states)], columns[:, len(states) :] = states.T, states[-1][:, None]
+    return columns
 
 
 def _across(step: Array) -> Array:

@@ -21,7 +21,7 @@ from chaserdock_controller.estimation.joint import kernels as joint_kernels
 from chaserdock_controller.estimation.joint import native as joint_native
 from chaserdock_controller.nmpc import NmpcInput, kernels, make_solver
 from chaserdock_controller.nmpc import native as nmpc_native
-from chaserdock_models import native
+from chaserdock_models import native, passive_safety
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import KernelLibrary
 from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS, X86_64, source_digest
@@ -153,6 +153,19 @@ def test_every_instruction_set_estimates_the_same_bits(number: int, monkeypatch:
     monkeypatch.setattr(joint_kernels, "function", lambda name, result=None: own(name, result, number))
     for ours, theirs in zip(estimated(), expected, strict=True):
         np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("number", LEVELS)
+def test_every_instruction_set_certifies_the_same_bits(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    if not has(number):
+        pytest.skip(f"this processor has no copy {number}")
+    coast, rng = passive_safety.CoastModel(1.13e-3, 11000.0), np.random.default_rng(5)
+    states = np.concatenate([rng.normal(0.0, 50.0, (31, 3)), rng.normal(0.0, 0.05, (31, 3))], axis=1)
+    spread = rng.normal(size=(6, 6)) * np.array([0.05] * 3 + [1e-4] * 3)[:, None]
+    expected = coast.certify(states, spread @ spread.T, 0.75)
+    own = native.function
+    monkeypatch.setattr(passive_safety, "function", lambda name, result=None: own(name, result, number))
+    assert coast.certify(states, spread @ spread.T, 0.75) == expected
 
 
 @pytest.mark.parametrize("corner", [np.nan, np.inf, -np.inf, 1e300, -1e9])

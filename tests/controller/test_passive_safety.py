@@ -10,9 +10,10 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from chaserdock_controller.interfaces import TargetEstimation
+from chaserdock_controller.nmpc import coast_rows, rti
 from chaserdock_controller.nmpc.coast_rows import COASTS
 from chaserdock_controller.nmpc.passive_safety import PassiveSafetyMonitor
-from chaserdock_controller.nmpc.types import CoastSafety
+from chaserdock_controller.nmpc.types import CoastSafety, NmpcPlan
 from chaserdock_models.passive_safety import CoastModel
 from chaserdock_protocol.scenario import FlightScenario, ScenarioError, flight_scenario, parse_scenario
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
@@ -139,6 +140,39 @@ def test_plan_that_heads_for_the_target_in_free_space_is_bent_aside_or_slowed() 
     _, bent = fly(coast, start, goal, covariance, 60, enforced=True)
     assert max(free[1:]) < 0.0
     assert min(bent[10:]) > SIGMAS
+
+
+def test_only_plans_that_are_not_safe_without_them_have_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A safe plan is that of the unrestricted problem to the last bit, and its certificate need not be computed again."""
+    coast, covariance = CoastModel(0.0, 600.0), np.diag([1e-6] * 3 + [1e-8] * 3)
+    rows, restricted = coast_rows.coast_rows, []
+
+    def counted(safety: CoastSafety, *rest: Any) -> np.ndarray:
+        restricted.append(sorted(safety.covariances))
+        return rows(safety, *rest)
+
+    monkeypatch.setattr(rti, "coast_rows", counted)
+    safety = CoastSafety(coast, 0.75, SIGMAS, np.zeros(3), {0: covariance, 1: covariance})
+    starts, aside = (
+        np.array([[-5.0, 0.0, 0.0], [0.0, 9.0, 0.0]]),
+        np.array([[-5.0, 0.5, 0.0], [0.0, 9.5, 0.0]]),
+    )
+    states = np.array([at_rest(start) for start in starts])
+
+    def solved(goals: np.ndarray, kept: CoastSafety | None) -> NmpcPlan:
+        problem = replace(fixed_problem(states, goals, d_target=0.0), coast_safety=kept)
+        return fresh("rti", 2, WITH_COASTS).solve(problem, 0.0)
+
+    safe, free = solved(aside, safety), solved(aside, None)
+    assert restricted == []
+    np.testing.assert_array_equal(safe.inputs, free.inputs)
+    assert safe.coasts[1] == coast.certify(safe.states[1, :, :6], covariance, 0.75)
+    towards = np.array([[-2.0, 0.0, 0.0], [0.0, 9.5, 0.0]])
+    bent, free = solved(towards, safety), solved(towards, None)
+    assert restricted == [[0]]
+    unbent = coast.certify(free.states[0, :, :6], covariance, 0.75)
+    assert bent.coasts[0].margin_sigmas > unbent.margin_sigmas + SIGMAS
+    np.testing.assert_array_equal(bent.inputs[1], free.inputs[1])
 
 
 def test_planes_agree_with_the_certificate_at_the_closest_approach() -> None:

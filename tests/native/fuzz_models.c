@@ -19,5 +19,20 @@ static void free_rotation(void) {
     }
 }
 
-static const Target TARGETS[] = {{"free_rotation", free_rotation}};
+/* Coasts of up to eight states within up to six steps: no approach is nearer than the bound of its step. */
+static void coasts(void) {
+    const int64_t steps = whole(1, 6), m = 4 * whole(1, 2), count = whole(0, steps);
+    double *transitions = doubles(36 * (steps + 1), -3.0, 3.0), *states = doubles(6 * m, -3.0, 3.0);
+    double *covariance = doubles(36, -1.0, 1.0), *room = outputs(steps), *work = outputs(6 * m), bulge_s = value(0.0, 1.0);
+    NAME(coast_room)(steps, transitions, m, states, bulge_s, room, work);
+    int64_t *columns = block((size_t)count * sizeof *columns);
+    for (int64_t c = 0; c < count; c++) columns[c] = whole(0, steps - 1);
+    Approaches found = {outputs(m), outputs(m), outputs(m)};
+    NAME(coast_closest)(count, columns, transitions, m, states, covariance, value(0.0, 1.0), bulge_s, &found);
+    double least = 1e300;
+    for (int64_t c = 0; c < count; c++) least = min_of(least, room[columns[c]]);
+    for (int64_t n = 0; n < m && count && !special_drawn; n++) CHECK(found.away[n] >= least - 1e-9);
+}
+
+static const Target TARGETS[] = {{"free_rotation", free_rotation}, {"coasts", coasts}};
 FUZZ_MAIN(TARGETS)

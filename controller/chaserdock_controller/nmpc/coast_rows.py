@@ -3,13 +3,17 @@
 
 The coast from a stage is linear in the state there (chaserdock_models/passive_safety.py). At the moments of its closest approaches
 the keep-out sphere, enlarged by the covariance, is replaced by its tangent plane across the line from the target: a condition that
-is linear in the state, and sufficient at that moment.
+is linear in the state, and sufficient at that moment. Only chasers whose plans without these rows are not safe have them.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
+
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.passive_safety import CoastCertificate
 
 from .types import CoastSafety, NmpcParameters
 
@@ -17,6 +21,31 @@ COASTS = 3
 """Number of approaches of a coast that are restricted."""
 SPARE_SHARE = 0.05
 """Share of the required margin that plans keep in addition: the approaches, and with them the planes, move as a plan is bent."""
+
+
+def certify(safety: CoastSafety, states: Array, targets: Array) -> dict[int, CoastCertificate]:
+    """Return the certificates of the restricted rows of plans ``states`` (N, D+1, 13); ``targets`` as in ``coast_rows``."""
+    origin = _origin(safety, targets)
+    return {
+        i: safety.coast.certify(states[i, :, :6] - origin, covariance, safety.keep_out_m)
+        for i, covariance in safety.covariances.items()
+    }
+
+
+def unsafe_rows(safety: CoastSafety, found: Mapping[int, CoastCertificate]) -> CoastSafety | None:
+    """Return the restriction of those rows whose certificates ``found`` lack the margin; None if none does."""
+    least = _planned_sigmas(safety)
+    kept = {i: c for i, c in safety.covariances.items() if not found[i].margin_sigmas >= least}
+    return replace(safety, covariances=kept) if kept else None
+
+
+def _planned_sigmas(safety: CoastSafety) -> float:
+    return (1.0 + SPARE_SHARE) * safety.sigmas
+
+
+def _origin(safety: CoastSafety, targets: Array) -> Array:
+    """Return the target's positions and velocities (K, 6) at its positions (K, 3)."""
+    return np.concatenate([targets, np.tile(safety.target_velocity_m_s, (len(targets), 1))], axis=1)
 
 
 def coast_rows(safety: CoastSafety, states: Array, targets: Array, params: NmpcParameters) -> Array:
@@ -27,9 +56,7 @@ def coast_rows(safety: CoastSafety, states: Array, targets: Array, params: NmpcP
     """
     n, nodes, _ = states.shape
     rows = np.zeros((n, nodes, params.coasts, 7))
-    velocities = np.tile(safety.target_velocity_m_s, (nodes - 1, 1))
-    origin = np.concatenate([targets[1:], velocities], axis=1)
-    sigmas = (1.0 + SPARE_SHARE) * safety.sigmas
+    origin, sigmas = _origin(safety, targets[1:]), _planned_sigmas(safety)
     for i, covariance in safety.covariances.items():
         relative = states[i, 1:, :6] - origin
         planes = safety.coast.tangent_planes(relative, covariance, safety.keep_out_m, sigmas, params.coasts)

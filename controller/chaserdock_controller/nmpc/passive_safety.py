@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from types import MappingProxyType
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -46,11 +47,17 @@ class PassiveSafetyMonitor:
         self.certificates: dict[int, PlanCertificate] = {}
 
     def update(
-        self, chasers: Sequence[int], states: Array, estimation: TargetEstimation, time_ns: int = 0
+        self,
+        chasers: Sequence[int],
+        states: Array,
+        estimation: TargetEstimation,
+        time_ns: int = 0,
+        known: Mapping[int, CoastCertificate] = MappingProxyType({}),
     ) -> tuple[LogEntry, ...]:
         """Certify the plans ``states`` (N, D+1, 13) of these chasers; return what has changed since the last tick.
 
         A plan is safe if its margin is at least ``limits.estimate_margin_sigmas``. Chasers that hold the target are left out.
+        ``known``: certificates that the solver has found, by row.
         """
         target, events = estimation.at_effect, []
         if target is None:
@@ -65,7 +72,7 @@ class PassiveSafetyMonitor:
                 continue
             own = states[row]
             relative = np.concatenate([own[:, :3] - moving, own[:, 3:6] - target.velocity_m_s], axis=1)
-            found = self._coast.certify(relative, covariance, self._keep_out_m)
+            found = known.get(row) or self._coast.certify(relative, covariance, self._keep_out_m)
             safe = found.margin_sigmas >= self._sigmas
             self.certificates[i] = PlanCertificate(found, found.loss * self._step_s, safe)
             self._follow(i, safe, time_ns)

@@ -14,10 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .coast_rows import coast_rows
+from .coast_rows import certify, coast_rows, unsafe_rows
 from .kernels import BROKEN, LIMIT, MAX_ITERATIONS, solve_tick, tick_workspace
 from .slack import SLACK_L2, slack_l1_weight
-from .types import BUDGET, NmpcInput, NmpcParameters, NmpcPlan
+from .types import BUDGET, Array, IntArray, NmpcInput, NmpcParameters, NmpcPlan
 from .warm_start import Frame, status_of
 
 # Rows that no admissible input can reach are omitted; safety factor of that bound.
@@ -56,19 +56,39 @@ class RtiSolver:
         """
         frame = self._frame
         task = frame.begin(problem, shift_s, ids)
-        p, u = task.problem, task.start.copy()
-        if p.coast_safety is not None:
-            rolled = frame.rolled(task, u)
-            p = replace(p, coasts=coast_rows(p.coast_safety, rolled, p.target_positions, frame.params))
-        away = p.states[:, :3] - p.references[:, -1, :3]
-        away_m = np.sqrt((away * away).sum(axis=1))
-        w1 = slack_l1_weight(frame.params, away_m)
-        budget = self.max_iterations if self.max_iterations is not None else len(u) * MAX_ITERATIONS
-        outer_m = frame.params.max_reference_distance_m
-        code, iterations = solve_tick(
-            frame.model, frame.weights, p, u, outer_m, self._reach, w1, SLACK_L2, budget, self._workspace
-        )
+        budget = self.max_iterations if self.max_iterations is not None else len(task.start) * MAX_ITERATIONS
+        u, code, iterations = self._iterate(task.problem, task.start, budget)
+        safety, certificates = task.problem.coast_safety, {}
+        if safety is not None:
+            targets = task.problem.target_positions
+            certificates = certify(safety, frame.rolled(task, u), targets)
+            if (unsafe := unsafe_rows(safety, certificates)) is not None:
+                rows = coast_rows(unsafe, frame.rolled(task, task.start), targets, frame.params)
+                bent = replace(task.problem, coasts=rows)
+                u, code, more = self._iterate(bent, task.start, budget - int(iterations.sum()))
+                iterations = iterations + more
+                certificates |= certify(unsafe, frame.rolled(task, u), targets)
         plan = frame.finish(task, u, [status_of(c != BROKEN, c == LIMIT) for c in code], iterations)
         cut_short = (code == LIMIT) & (iterations < MAX_ITERATIONS)
         status = [BUDGET if cut else code for cut, code in zip(cut_short, plan.status, strict=True)]
-        return replace(plan, status=tuple(status))
+        return replace(plan, status=tuple(status), coasts=certificates)
+
+    def _iterate(self, p: NmpcInput, start: Array, budget: int) -> tuple[Array, IntArray, IntArray]:
+        """Return inputs (N, D, 6), codes and iterations (N,) of one iteration from ``start`` (N, D, 6)."""
+        params, u = self._frame.params, start.copy()
+        away = p.states[:, :3] - p.references[:, -1, :3]
+        w1 = slack_l1_weight(params, np.sqrt((away * away).sum(axis=1)))
+        outer_m = params.max_reference_distance_m
+        code, iterations = solve_tick(
+            self._frame.model,
+            self._frame.weights,
+            p,
+            u,
+            outer_m,
+            self._reach,
+            w1,
+            SLACK_L2,
+            budget,
+            self._workspace,
+        )
+        return u, code, iterations

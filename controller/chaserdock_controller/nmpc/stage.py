@@ -118,7 +118,7 @@ class PlanningStage:
         self.monitor.update(horizon.chasers, plan, observation.time_ns, observation.effective_ns)
         if self._passive_safety is not None and plan is not None:
             events += self._passive_safety.update(
-                horizon.chasers, plan.states, estimation, observation.time_ns
+                horizon.chasers, plan.states, estimation, observation.time_ns, plan.coasts
             )
         flyable = self.monitor.plans(observation.time_ns)
         return PlanResult(horizon.chasers, plan, wall_s, events, flyable, self._certificates())

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
 from chaserdock_models.arrays import Array, IntArray, Matrix3
-from chaserdock_models.passive_safety import CoastModel
+from chaserdock_models.passive_safety import CoastCertificate, CoastModel
 
 INTEGRATORS = ("rk4", "euler")
 
@@ -137,9 +137,9 @@ class NmpcInput:
     boxes (D+1, C, 15) or None: cuboids of the target's shape at each stage: centre (3; WRF, m), rotation cuboid to WRF (9,
     row-major), half edges (3; m). box_clearance_m (N,) or None: distance that each chaser's centre keeps from them; 0 switches it
     off. Only the back end `rti` keeps it.
-    coast_safety: passive safety to keep, or None. The back end `rti` linearizes it about its start into coasts (N, D+1, C, 7):
-    half-spaces a' p + b' v >= d of position and velocity at a stage, [a (3), b (3), d]; a and b zero for none (`coast_rows`).
-    Other back ends do not keep it.
+    coast_safety: passive safety to keep, or None. Where a plan without it is not safe, the back end `rti` linearizes it
+    about its start into coasts (N, D+1, C, 7): half-spaces a' p + b' v >= d of position and velocity at a stage,
+    [a (3), b (3), d]; a and b zero for none (`coast_rows`). Other back ends do not keep it.
     """
 
     states: Array
@@ -165,7 +165,8 @@ class NmpcPlan:
     "budget" (best point within the iteration budget, which may violate distances: see ``max_violation_m``);
     "infeasible_relaxed" (the plan enters a keep-out zone by ``max_violation_m``: no input avoids it, or the start lies
     inside); "failed" (numerical breakdown: the inputs are the shifted previous plan).
-    iterations (N,): interior-point iterations, 0 if none is needed. cost (N,): eq. 6 on ``states``.
+    iterations (N,): interior-point iterations, 0 if none is needed. cost (N,): eq. 6 on ``states``. coasts: certificates of the
+    plans of the rows in ``coast_safety``.
     """
 
     inputs: Array
@@ -174,6 +175,7 @@ class NmpcPlan:
     iterations: IntArray
     cost: Array
     max_violation_m: Array
+    coasts: Mapping[int, CoastCertificate] = field(default_factory=dict)
 
 
 class NmpcSolver(Protocol):

@@ -39,7 +39,19 @@ def failed(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     Raises RuntimeError if tests cannot be run, for example because their modules cannot be imported.
     """
     try:
-        arguments = ("-m", "pytest", "-x", "-q", "-rf", "--tb=no", "-p", "no:cacheprovider", "-m", "not slow")
+        arguments = (
+            "-m",
+            "pytest",
+            "-x",
+            "-q",
+            "-rf",
+            "--tb=no",
+            "--hypothesis-seed=0",
+            "-p",
+            "no:cacheprovider",
+            "-m",
+            "not slow",
+        )
         done = run_python(folder, *arguments, *tests, timeout_s=timeout_s)
     except subprocess.TimeoutExpired:
         return "timeout"

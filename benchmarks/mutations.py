@@ -58,7 +58,13 @@ def failed(folder: Path, tests: Sequence[str], timeout_s: float) -> str:
     if done.returncode not in (0, 1):
         raise RuntimeError(f"pytest {' '.join(tests)}: status {done.returncode}\n{done.stdout}{done.stderr}")
     lines = [line for line in done.stdout.splitlines() if line.startswith(("FAILED ", "ERROR "))]
-    return lines[0].split(" ")[1] if done.returncode and lines else "failed" if done.returncode else ""
+    return (
+        lines[0].split(" ", 1)[1].split(" - ")[0]
+        if done.returncode and lines
+        else "failed"
+        if done.returncode
+        else ""
+    )
 
 
 def killer(folder: Path, mutant: Mutant, timeout_s: float) -> str:

@@ -9,10 +9,7 @@ lines of a patch before its first ``---`` state the bug and, as ``Scenario: NAME
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-import subprocess
 import sys
 import tempfile
 from dataclasses import dataclass
@@ -20,8 +17,11 @@ from pathlib import Path
 
 from common import ROOT, Figures, make_parser, write_json
 
+sys.path.insert(0, str(ROOT / "tests"))
+
+from source_changes import SOURCES, Change, apply, copy_checkout, run_python
+
 PATCHES = sorted((ROOT / "tests" / "planted_bugs").glob("*.patch"))
-SOURCES = ("agents", "chaserdock", "controller", "protocol", "world")
 COPIED = (
     *SOURCES,
     "scenarios",
@@ -37,14 +37,14 @@ _FAILED = re.compile(r"(?:seed (\d+)|chaserdock): (covariance consistency|[a-z ,
 
 @dataclass(frozen=True)
 class PlantedBug:
-    """A planted bug: its number and name, what is wrong, the scenario to fly, a seed that finds it, and the hunks: file, old
-    text, new text."""
+    """A planted bug: its number and name, what is wrong, the scenario to fly, a seed that finds it, and the
+    hunks."""
 
     name: str
     text: str
     scenario: str
     known_seed: int
-    hunks: tuple[tuple[str, str, str], ...]
+    hunks: tuple[Change, ...]
 
 
 @dataclass(frozen=True)
@@ -77,44 +77,16 @@ def read_bug(path: Path) -> PlantedBug:
             head.append(line)
         else:
             raise ValueError(f"{path.name}: not a line of a unified diff: {line!r}")
-    texts = tuple((f, "\n".join(old) + "\n", "\n".join(new) + "\n") for f, old, new in hunks)
+    texts = tuple(Change(f, "\n".join(old) + "\n", "\n".join(new) + "\n") for f, old, new in hunks)
     return PlantedBug(path.stem, " ".join(head), stated["Scenario"], int(stated["Seed"]), texts)
-
-
-def apply(bug: PlantedBug, folder: Path, write: bool = True) -> None:
-    """Apply a bug to the sources in ``folder``. Raises ValueError for a hunk whose old text is not there exactly once."""
-    for file, old, new in bug.hunks:
-        path = folder / file
-        source = path.read_text(encoding="utf-8") if path.is_file() else ""
-        if source.count(old) != 1:
-            raise ValueError(
-                f"{bug.name}: {file} contains the text to replace {source.count(old)} times:\n{old}"
-            )
-        if write:
-            path.write_text(source.replace(old, new), encoding="utf-8")
-
-
-def copy_checkout(folder: Path) -> None:
-    """Copy all that a simulation needs to ``folder``."""
-    for name in COPIED:
-        if (ROOT / name).is_dir():
-            shutil.copytree(
-                ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__", "node_modules")
-            )
-        else:
-            shutil.copy(ROOT / name, folder / name)
-
-
-def _run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
-    paths = [str(folder), *(str(folder / name) for name in SOURCES if name != "chaserdock")]
-    env = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "PYTHONDONTWRITEBYTECODE": "1"}
-    return subprocess.run([sys.executable, *arguments], cwd=folder, env=env, capture_output=True, text=True)
 
 
 def simulate(folder: Path, scenario: str, first: int, last: int) -> FailedSeed | None:
     """Fly seeds with the sources in ``folder`` until one fails. Raises RuntimeError if the program fails otherwise."""
     seeds = f"{first}:{last}"
-    done = _run(folder, "-m", "chaserdock", "simulate", scenario, "--seeds", seeds, "--no-shrink", "--stop")
+    done = run_python(
+        folder, "-m", "chaserdock", "simulate", scenario, "--seeds", seeds, "--no-shrink", "--stop"
+    )
     found = _FAILED.search(done.stdout) or _FAILED.search(done.stderr)
     if done.returncode == 0:
         return None
@@ -127,10 +99,10 @@ def hunt(bug: PlantedBug, first: int, last: int) -> FailedSeed | None:
     """Return the first of the seeds that finds a bug. Raises RuntimeError if the patched sources cannot be flown."""
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
-        copy_checkout(folder)
-        apply(bug, folder)
-        if any(file.endswith((".c", ".h")) for file, _, _ in bug.hunks):
-            built = _run(folder, _BUILD)
+        copy_checkout(folder, COPIED)
+        apply(bug.hunks, folder)
+        if any(change.file.endswith((".c", ".h")) for change in bug.hunks):
+            built = run_python(folder, _BUILD)
             if built.returncode:
                 raise RuntimeError(f"{bug.name} does not compile:\n{built.stdout}{built.stderr}")
         return simulate(folder, bug.scenario, first, last)
@@ -154,7 +126,10 @@ def main() -> int:
             f"no bug is named {' or '.join(options.only)}; there are: {', '.join(p.stem for p in PATCHES)}"
         )
     for bug in bugs:
-        apply(bug, ROOT, write=False)
+        try:
+            apply(bug.hunks, ROOT, write=False)
+        except ValueError as error:
+            raise SystemExit(f"{bug.name}: {error}") from None
     if options.check:
         print(f"{len(bugs)} patches apply")
         return 0

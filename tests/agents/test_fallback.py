@@ -187,6 +187,15 @@ def test_plan_is_interpolated_and_ends_after_its_last_node() -> None:
     np.testing.assert_allclose(early.position_m, [-1.0, 0.0, 0.0])
 
 
+def test_each_step_of_a_plan_has_its_own_input() -> None:
+    inputs = np.arange(6.0 * STAGES)
+    plan = msgspec.structs.replace(straight(0.1), inputs=vector(inputs))
+    for k in (0, 2, STAGES - 1):
+        goal = interpolate_plan(plan, round((k + 0.5) * DT_S * 1e9))
+        assert goal is not None
+        np.testing.assert_array_equal(goal.wrench, inputs[6 * k : 6 * k + 6])
+
+
 @pytest.mark.parametrize("status", ["none", "lost"])
 def test_unknown_target_has_no_position(status: str) -> None:
     assert extrapolate_target(target(status=status), 10**9) is None

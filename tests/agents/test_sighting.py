@@ -151,6 +151,13 @@ def test_noise_holds_nothing(perception: Perception) -> None:
     assert look(perception, message(NOISE.tobytes(), "mono8"), None).status == "nothing"
 
 
+@pytest.mark.parametrize("excess", [-1, 1, 640])
+def test_mono8_image_has_one_byte_for_each_pixel(excess: int) -> None:
+    data = NOISE.tobytes() + bytes(max(excess, 0))
+    with pytest.raises(BadImage, match=rf"^{NOISE.size + excess} bytes; a mono8 image"):
+        decode_image(message(data[: NOISE.size + excess], "mono8"))
+
+
 def test_images_are_decoded_row_by_row() -> None:
     np.testing.assert_array_equal(decode_image(message(NOISE.tobytes(), "mono8")), NOISE)
     smooth = cv2.GaussianBlur(NOISE, (0, 0), 8.0)

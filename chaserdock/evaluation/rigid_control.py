@@ -95,6 +95,7 @@ class ControlledStack:
             commands=(),
             docking={},
             impulses={},
+            last_commands={},
             thruster_impulses={i: given for i, given in self._given.items() if i in odometry},
             ahead={i: ((1.0, self._coming[i]),) if i in self._coming and seconds else () for i in odometry},
             input_limits={},

@@ -87,7 +87,7 @@ class Observation:
     ``lost``: last odometry of chasers that are obstacles to the others. ``ahead``: what acts on a chaser until
     ``effective_ns``, as durations (s) and wrenches (6,). ``input_limits``: (6,). Wrenches are N and N m, body axes.
     ``isolated``: thrusters that chasers report as closed. ``thruster_impulses``: of the thrusters (n,) since the tick before, N s,
-    as chasers report them.
+    as chasers report them. ``last_commands``: to chasers without odometry in this tick, (6,); what they fly now is not known.
     """
 
     tick: int
@@ -100,6 +100,7 @@ class Observation:
     commands: tuple[OperatorCommand, ...]
     docking: Mapping[int, DockingStatus]
     impulses: Mapping[int, AppliedImpulse]
+    last_commands: Mapping[int, Array]
     thruster_impulses: Mapping[int, Array]
     ahead: Mapping[int, tuple[tuple[float, Array], ...]]
     input_limits: Mapping[int, Array]

@@ -141,7 +141,8 @@ def test_feedback_is_exact_in_direction_and_within_limits(
     )
     shortest = minimum_time(wrenches, momentum, limits)
     if shortest is None:
-        assert found.scale < 1e-6
+        # Of a small momentum, thrusts within the tolerance of the solver are a larger share.
+        assert found.scale < 1e-6 or found.thrusts_N.max() < 1e-8
     else:
         assert found.scale == pytest.approx(min(1.0, 0.5 / shortest.time_s), rel=1e-3)
 

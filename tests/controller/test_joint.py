@@ -259,6 +259,28 @@ def test_odometry_that_lies_is_dropped_and_reported(channel: str, shift: float) 
     assert f"chaser 1: odometry {channel} used again" in [e.text for e in estimator.drain_events()]
 
 
+def test_command_of_a_chaser_without_odometry_is_uncertain() -> None:
+    """A chaser whose odometry is missing flies by a plan that the controller does not know: its velocity is uncertain by as much
+    as its last command would change it."""
+    flight = SyntheticFlight(SCENARIO, navigation("lab"), 2, 7)
+    known, unknown = estimator_for(flight.errors, 2), estimator_for(flight.errors, 2)
+    for _ in range(30):
+        inputs = flight.inputs()
+        known.update(inputs)
+        unknown.update(inputs)
+        flight.step()
+    inputs = flight.inputs()
+    missing = replace(inputs, odometry={0: inputs.odometry[0]}, sightings=())
+    known.update(missing)
+    unknown.update(replace(missing, unconfirmed={1: np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])}))
+    assert known.state is not None
+    assert unknown.state is not None
+    velocity = block(1).start + 3 + np.arange(3)
+    added = np.diag(unknown.state.covariance)[velocity] - np.diag(known.state.covariance)[velocity]
+    expected = (0.3 * PERIOD_S / known.parameters.body.mass_kg) ** 2
+    np.testing.assert_allclose(added, expected, rtol=0.05)
+
+
 def test_chaser_that_contradicts_all_measurements_is_started_again() -> None:
     """After a motion that nothing explained, all odometry of a chaser that sees nothing is rejected: within two seconds its
     estimate starts again from the odometry, and is consistent with it from then on."""

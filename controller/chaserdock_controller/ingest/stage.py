@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -45,6 +45,7 @@ class IngestStage:
             commands=inputs.commands,
             docking=inputs.docking,
             impulses=self._impulses(odometry, inputs, history),
+            last_commands=self._last_commands(odometry, inputs.time_ns, history),
             thruster_impulses=self.thrusters.given_by_thruster(inputs.tick),
             ahead={i: self._ahead(i, inputs, effective_ns, history) for i in odometry},
             input_limits={i: self.thrusters.limits(i) for i in inputs.odometry},
@@ -61,6 +62,12 @@ class IngestStage:
             return history.ahead(i, inputs.time_ns, effective_ns)
         duration_s = (effective_ns - inputs.time_ns) / 1e9
         return ((duration_s, impulse / duration_s),) if duration_s > 0.0 else ()
+
+    def _last_commands(
+        self, heard: Container[int], time_ns: int, history: CommandHistory
+    ) -> dict[int, Array]:
+        silent = (i for i in range(len(self._scenario.chasers)) if i not in heard)
+        return {i: history.segments(i, time_ns, time_ns + 1)[-1][2] for i in silent}
 
     def _impulses(
         self, chasers: Iterable[int], inputs: TickInputs, history: CommandHistory

@@ -71,7 +71,8 @@ class JointInputs:
     """Inputs of a tick: odometry by chaser, and sightings, which may belong to earlier ticks.
 
     impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last ``covered_s``. latched: chasers
-    whose latch holds the target. contacts: chasers with a contact since the tick before.
+    whose latch holds the target. contacts: chasers with a contact since the tick before. unconfirmed: last
+    commands (6,), N and N m, of chasers without odometry in this tick, which fly by plans that the controller does not know.
     """
 
     time_ns: int
@@ -81,6 +82,7 @@ class JointInputs:
     covered_s: float
     latched: frozenset[int] = frozenset()
     contacts: frozenset[int] = frozenset()
+    unconfirmed: Mapping[int, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +257,21 @@ def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -
     variances = rate_variances(p.contact_velocity_m_s, p.contact_omega_rad_s)
     for i in inputs.contacts:
         state = replace(state, covariance=widened(state.covariance, variances, block(i).start))
+    for i, wrench in inputs.unconfirmed.items():
+        if state.alive[i] and i not in inputs.latched:
+            state = replace(
+                state, covariance=_with_unknown_command(state.covariance, i, wrench, inputs.covered_s, p)
+            )
     return replace(state, odometry_ns=newest)
+
+
+def _with_unknown_command(
+    covariance: Array, i: int, wrench: Array, period_s: float, p: JointParameters
+) -> Array:
+    """Return the covariance with the rates of a chaser uncertain by a command as large as ``wrench`` (6,) for a period."""
+    velocity = float(np.linalg.norm(wrench[:3])) * period_s / p.body.mass_kg
+    rate = float(np.linalg.norm(wrench[3:])) * period_s / min(p.inertia)
+    return widened(covariance, rate_variances(velocity, rate), block(i).start)
 
 
 def _stale_ns(record: JointTickRecord, p: JointParameters) -> int:

@@ -81,6 +81,13 @@ def test_invalid_fault_command_is_refused_without_effect(
     assert thrusters.next_change(0) is None or not thrusters.act(0, 1, 0.001).any()
 
 
+@pytest.mark.parametrize("factor", [0.0, 1.0])
+def test_the_ends_of_the_range_of_a_factor_are_valid(factor: float) -> None:
+    s = mission(**ALLOWED)
+    handler = ThrusterFaultHandler(s, {"chaser/0": make_actuators(s, 0)})
+    assert submit(handler, 0, s.timing, kind="weak", factor=factor).accepted
+
+
 @pytest.mark.slow
 def test_chaser_detects_a_commanded_thruster_fault_in_a_mission(tmp_path: Path) -> None:
     by_hand, log = ByHand.at_free_port("thrusterfault"), tmp_path / "mission.mcap"

@@ -272,7 +272,7 @@ def test_command_of_a_chaser_without_odometry_is_uncertain() -> None:
     inputs = flight.inputs()
     missing = replace(inputs, odometry={0: inputs.odometry[0]}, sightings=())
     known.update(missing)
-    unknown.update(replace(missing, unconfirmed={1: np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])}))
+    unknown.update(replace(missing, last_commands={1: np.array([0.3, 0.0, 0.0, 0.0, 0.0, 0.0])}))
     assert known.state is not None
     assert unknown.state is not None
     velocity = block(1).start + 3 + np.arange(3)

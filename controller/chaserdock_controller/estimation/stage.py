@@ -131,7 +131,7 @@ class EstimationStage:
             sightings=o.sightings,
             impulses=impulses,
             covered_s=self._period_s,
-            unconfirmed=o.last_commands,
+            last_commands=o.last_commands,
             latched=latched,
             contacts=frozenset(touched | (latched ^ latched_before)),
         )

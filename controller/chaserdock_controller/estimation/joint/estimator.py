@@ -71,7 +71,7 @@ class JointInputs:
     """Inputs of a tick: odometry by chaser, and sightings, which may belong to earlier ticks.
 
     impulses (N, 6): N s and N m s, body axes, that the chasers' actuators gave in the last ``covered_s``. latched: chasers
-    whose latch holds the target. contacts: chasers with a contact since the tick before. unconfirmed: last
+    whose latch holds the target. contacts: chasers with a contact since the tick before. last_commands: last
     commands (6,), N and N m, of chasers without odometry in this tick, which fly by plans that the controller does not know.
     """
 
@@ -82,7 +82,7 @@ class JointInputs:
     covered_s: float
     latched: frozenset[int] = frozenset()
     contacts: frozenset[int] = frozenset()
-    unconfirmed: Mapping[int, Array] = field(default_factory=dict)
+    last_commands: Mapping[int, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ def _propagate(state: JointState, record: JointTickRecord, p: JointParameters) -
     variances = rate_variances(p.contact_velocity_m_s, p.contact_omega_rad_s)
     for i in inputs.contacts:
         state = replace(state, covariance=widened(state.covariance, variances, block(i).start))
-    for i, wrench in inputs.unconfirmed.items():
+    for i, wrench in inputs.last_commands.items():
         if state.alive[i] and i not in inputs.latched:
             state = replace(
                 state, covariance=_with_unknown_command(state.covariance, i, wrench, inputs.covered_s, p)

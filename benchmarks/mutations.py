@@ -30,6 +30,7 @@ COPIED = (
     "tests",
     "pyproject.toml",
     "CITATION.cff",
+    "uv.lock",
 )
 
 

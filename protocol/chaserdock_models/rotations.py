@@ -160,8 +160,8 @@ def from_matrix(r: ArrayLike) -> Array:
     return -q if q[0] < 0.0 else q
 
 
-def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float) -> Array:
-    """Return the attitude (..., 4) after ``dt_s`` at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
+def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float | Array) -> Array:
+    """Return the attitude (..., 4) after ``dt_s`` (or (..., 1)) at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
     return multiply(q, exp(np.asarray(omega_body, dtype=float) * dt_s))
 
 

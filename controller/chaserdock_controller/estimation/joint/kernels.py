@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.native import address, scratch
+from chaserdock_models.native import address, location, scratch
 from numpy.typing import NDArray
 
 from chaserdock_controller.estimation.body_shape import SHAPE
@@ -87,11 +87,11 @@ class ChaserMeasurement:
         self.rows = (0 if odometry is None else 12) + (0 if sighting is None else 6)
         self.chaser, self.n = i, n
         self._kept = mounting, odometry, sighting  # the kernels use the addresses of these arrays
-        state, noise = (None, None) if odometry is None else map(address, odometry)
+        state, noise = (None, None) if odometry is None else map(location, odometry)
         pose, stated, *ratios = (
-            (None, None, 0.0, 0.0) if sighting is None else (*map(address, sighting[:2]), *sighting[2:])
+            (None, None, 0.0, 0.0) if sighting is None else (*map(location, sighting[:2]), *sighting[2:])
         )
-        self.native = _Measurement(n, i, *map(address, mounting), state, noise, pose, stated, *ratios)
+        self.native = _Measurement(n, i, *map(location, mounting), state, noise, pose, stated, *ratios)
 
 
 class JointInnovation:
@@ -106,7 +106,7 @@ class JointInnovation:
                 MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
             )
         ] + [self.values]  # fmt: skip
-        self._native = _Innovation(*map(address, self._arrays), stride, size)
+        self._native = _Innovation(*map(location, self._arrays), stride, size)
         self._work = scratch(_work_size("innovate_workspace", size))
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)

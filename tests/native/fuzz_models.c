@@ -44,6 +44,16 @@ static void coast_closest(void) {
     for (int64_t n = 0; n < m && count && !special_drawn; n++) CHECK(found.away[n] >= least - 1e-9);
 }
 
+static void rigid_step(void) {
+    double *y = doubles(13, -2.0, 2.0), *wrench = doubles(6, -1.0, 1.0), *inertia = doubles(3, 0.01, 1.0), *before = outputs(13);
+    copy(y, before, 13);
+    NAME(rigid_step)(y, wrench, value(0.1, 10.0), inertia, value(0.0, 0.1));
+    if (special_drawn) return;
+    CHECK(all_finite(y, 13));
+    NAME(rigid_step)(before, wrench, 1.0, inertia, 0.0);
+    CHECK(all_finite(before, 13));
+}
+
 typedef void (*Rows)(int64_t, const double *, int64_t, const double *, int64_t, double *);
 
 /* Up to six rows of the result, from operands of which one may have fewer: equal rows give equal results. */
@@ -73,6 +83,7 @@ static void unit_rows(void) {
 }
 
 static const Target TARGETS[] = {{"free_rotation", free_rotation}, {"coast_room", coast_room}, {"coast_closest", coast_closest},
+                                 {"rigid_step", rigid_step},
                                  {"multiply_rows", multiply_rows}, {"rotate_rows", rotate_rows},
                                  {"cross_rows", cross_rows}, {"unit_rows", unit_rows}};
 FUZZ_MAIN(TARGETS)

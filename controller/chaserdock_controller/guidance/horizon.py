@@ -95,7 +95,7 @@ class ReferenceBuilder:
                 middles.acceleration_m_s2,
             )
         known = {r.chaser: r.covariance for r in relative}
-        margins = np.array([self._margin_m(known.get(i, start.covariance)) for i in chasers])
+        margins = self._margins_m([known.get(i, start.covariance) for i in chasers])
         distances = np.array([self._machine.min_distance_target_m(i) for i in chasers]) + margins
         boxes = clearance = None
         if self._boxes is not None:
@@ -140,7 +140,7 @@ class ReferenceBuilder:
         turns = self._machine.body_rotations(i, times_s)
         return q if turns is None else rotations.multiply(q, turns)
 
-    def _margin_m(self, covariance: Array) -> float:
-        """Return the addition to the distance from the target for an uncertain position, the first block of ``covariance``."""
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        return min(self._scenario.limits.estimate_margin_sigmas * sigma_m, _GREATEST_MARGIN_M)
+    def _margins_m(self, covariances: Sequence[Array]) -> Array:
+        """Return the additions (N,) to the distance from the target for uncertain positions, the first blocks of ``covariances``."""
+        sigmas_m = np.sqrt(np.linalg.eigvalsh(np.array([c[:3, :3] for c in covariances]))[:, -1])
+        return np.minimum(self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M)

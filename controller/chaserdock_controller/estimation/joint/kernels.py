@@ -8,6 +8,7 @@ states (44). Of a covariance within an update only the lower triangle is valid; 
 from __future__ import annotations
 
 import ctypes
+import itertools
 from ctypes import Structure, c_double, c_int64, c_void_p
 from typing import Any
 
@@ -99,22 +100,20 @@ class JointInnovation:
 
     def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
-        self.values: Array = np.empty(_CHANNELS + 1)
-        self._arrays = [
-            np.empty(count)
-            for count in (
-                MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
-            )
-        ] + [self.values]  # fmt: skip
-        self._native = _Innovation(*map(location, self._arrays), stride, size)
+        sizes = (
+            MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
+            _CHANNELS + 1,
+        )  # fmt: skip
+        *starts, end = itertools.accumulate(sizes, initial=0)
+        memory = scratch(end)
+        self.correction: Array = memory[starts[-2] : starts[-1]]
+        """Last correction (D,)."""
+        self.values: Array = memory[starts[-1] :]
+        begin = location(memory)
+        self._native = _Innovation(*(begin + 8 * start for start in starts), stride, size)
         self._work = scratch(_work_size("innovate_workspace", size))
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
-
-    @property
-    def correction(self) -> Array:
-        """Return the last correction (D,)."""
-        return self._arrays[6]
 
     def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""

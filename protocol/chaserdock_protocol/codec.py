@@ -87,7 +87,7 @@ def _passes_fast_check(message: Struct) -> bool:
     getters = _field_getters(type(message))
     if getters is None:
         return False
-    numbers, rows, quaternions, covariances, parts, optional = getters
+    numbers, rows, quaternions, covariances, *_ = getters
     if numbers is not None and not hypot(*numbers(message)) <= MAX_MAGNITUDE:
         return False
     if rows is not None:
@@ -102,10 +102,13 @@ def _passes_fast_check(message: Struct) -> bool:
         for covariance in covariances(message):
             if not covariance or min(covariance[:: isqrt(len(covariance)) + 1]) < 0.0:
                 return False
-    if optional is not None:
-        for part in optional(message):
-            if part is not None and not _passes_fast_check(part):
-                return False
+    return _parts_pass_fast_check(message, getters)
+
+
+def _parts_pass_fast_check(message: Struct, getters: _FieldGetters) -> bool:
+    parts, optional = getters.parts, getters.optional
+    if optional is not None and not all(p is None or _passes_fast_check(p) for p in optional(message)):
+        return False
     return parts is None or all(_passes_fast_check(part) for several in parts(message) for part in several)
 
 

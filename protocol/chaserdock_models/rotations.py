@@ -32,8 +32,8 @@ def normalize(q: ArrayLike) -> Array:
         if not 0.0 < length < math.inf:
             raise ValueError(f"quaternion cannot be normalized: {q.tolist()}")
         return q / length
-    q, out = _writable(q), np.empty(q.shape)
-    if not function("unit_rows", c_int64)(c_int64(q.size // 4), address(q), address(out)):
+    out = np.empty(q.shape)
+    if not function("unit_rows", c_int64)(c_int64(q.size // 4), _operand(q), address(out)):
         raise ValueError(f"quaternion cannot be normalized: {q.tolist()}")
     return out
 
@@ -59,9 +59,9 @@ def _by_rows(kernel: str, a: Array, b: Array) -> Array:
     a, b = _repeatable(a, lead), _repeatable(b, lead)
     function(kernel)(
         c_int64(out.size // out.shape[-1]),
-        address(a),
+        _operand(a),
         c_int64(a.size // a.shape[-1]),
-        address(b),
+        _operand(b),
         c_int64(b.size // b.shape[-1]),
         address(out),
     )
@@ -73,13 +73,16 @@ def _repeatable(operand: Array, lead: tuple[int, ...]) -> Array:
     own = operand.shape[:-1]
     if own != lead[len(lead) - len(own) :]:
         operand = np.broadcast_to(operand, (*lead, operand.shape[-1]))
-    return _writable(operand)
+    return operand
 
 
-def _writable(array: Array) -> Array:
-    """Return an array as kernels take it."""
+def _operand(array: Array) -> Any:
+    """Return an array, which may be read-only, as an argument of a kernel."""
     array = np.ascontiguousarray(array)
-    return array if array.flags.writeable else array.copy()
+    try:
+        return address(array)
+    except TypeError:
+        return address(array.copy())
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:

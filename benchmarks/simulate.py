@@ -2,11 +2,16 @@
 """Speed of simulated missions: ``python benchmarks/simulate.py [--quick] [--json FILE] [--only nominal swarm]``.
 
 ``nominal``: ``fault-drill`` without faults, in lock-step and in real time, with statistical perception and with images;
-``swarm``: random seeds. All on one core; seconds are those of the processor.
+``swarm``: random seeds. All on one core; seconds are those of the processor. ``--only instructions``: instructions per tick of
+the first 4 s in lock-step with statistical perception, which do not depend on the load of the machine, by valgrind.
 """
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -53,11 +58,47 @@ def swarm(seeds: int) -> Figures:
     }
 
 
+_TICKS, _WARM_UP_TICKS = 40, 20
+_FLIGHTS = """
+import sys, tempfile
+from pathlib import Path
+from chaserdock_models.native import KernelLibrary
+from chaserdock_protocol.shipped_scenarios import find_scenario
+from chaserdock.simulation.mission import simulate
+KernelLibrary.level = property(lambda self: 2)  # valgrind does not know all instructions of the other one
+for duration in sys.argv[2:]:
+    short = ("timeline=[]", "settling_s=0.0", "steady_until_s=1.0", "success.docked=[]", f"duration_s={duration}")
+    with tempfile.TemporaryDirectory() as folder:
+        simulate(find_scenario(sys.argv[1]), Path(folder) / "run", ('perception.name="statistical"', *short))
+"""
+
+
+def instructions() -> Figures:
+    """Count the instructions of a flight after one that fills the caches."""
+    warm_up, flight = (str(ticks / 10.0) for ticks in (_WARM_UP_TICKS, _TICKS))
+    return {"instructions_per_tick": (_count(warm_up, flight) - _count(warm_up)) / _TICKS}
+
+
+def _count(*durations_s: str) -> int:
+    """Return the instructions of a process that flies for these durations."""
+    valgrind = ["valgrind", "--tool=cachegrind", "--cache-sim=no", "--cachegrind-out-file=/dev/null"]
+    command = [*valgrind, sys.executable, "-c", _FLIGHTS, SCENARIO, *durations_s]
+    environment = {**os.environ, "PYTHONHASHSEED": "0"}
+    output = subprocess.run(command, check=True, capture_output=True, text=True, env=environment).stderr
+    found = re.search(r"I\s+refs:\s+([0-9,]+)", output)
+    if found is None:
+        raise RuntimeError(f"valgrind counts no instructions:\n{output}")
+    return int(found[1].replace(",", ""))
+
+
 def main() -> None:
-    options = make_parser(__doc__, ("nominal", "swarm")).parse_args()
+    parser = make_parser(__doc__, ("nominal", "swarm", "instructions"))
+    parser.set_defaults(only=("nominal", "swarm"))
+    options = parser.parse_args()
     parts = {
         "nominal": lambda: nominal(1 if options.quick else 3),
         "swarm": lambda: swarm(3 if options.quick else 50),
+        "instructions": instructions,
     }
     run_parts(options, parts)
 

@@ -15,7 +15,7 @@ from chaserdock_controller.nmpc import NmpcInput
 from chaserdock_controller.nmpc.kernels import MAX_ITERATIONS, Model, Weights, zones_of
 from chaserdock_controller.nmpc.native import function
 from chaserdock_controller.nmpc.types import Array, IntArray
-from chaserdock_models.native import address, scratch
+from chaserdock_models.native import address, location, scratch
 
 # From native/ipm.c: return codes and final complementarity.
 FREE, CONVERGED = 0, 1
@@ -87,7 +87,7 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
     )  # fmt: skip
     zones, reach = zones_of(problem, outer_m), np.ascontiguousarray(reach_m)
     native = _Rows(
-        width, nodes, *(address(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b))
+        width, nodes, *(location(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b))
     )
     function("build_rows")(ctypes.byref(zones), address(x), ctypes.byref(native))
     return rows
@@ -146,10 +146,10 @@ def solve_qp(
         h,
         w1,
         w2,
-        *(address(v) for v in (mats, *model, stage, a, c)),
-        None if b is None else address(b),
+        *(location(v) for v in (mats, *model, stage, a, c)),
+        None if b is None else location(b),
     )
-    answer = _Answer(address(dx), address(dw), address(mul))
+    answer = _Answer(location(dx), location(dw), location(mul))
     work = scratch(function("qp_workspace", c_int64)(c_int64(d), c_int64(rows)))
     code = function("solve_qp", c_int)(ctypes.byref(qp), ctypes.byref(answer), address(work))
     return QpAnswer(code, answer.iterations, answer.mu, dx, dw, mul)

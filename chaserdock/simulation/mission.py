@@ -72,6 +72,7 @@ def simulate(
         mode=conditions.mode,
         out=folder,
         viewer_layer=False,
+        compressed_log=False,  # it is read once, if at all
         signals=False,
     )
     printed = io.StringIO()

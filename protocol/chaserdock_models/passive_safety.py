@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arrays import Array, IntArray
-from .native import address, function, scratch
+from .native import address, function, location, scratch
 from .relative_motion import cw_transition
 
 STEP_S = 10.0
@@ -158,7 +158,7 @@ class CoastModel:
         """Return ``closest`` within these steps (L,) of the coasts (native/coast.c)."""
         padded, found = _columns(states), np.empty((3, -(-len(states) // 4) * 4))
         steps, spread = np.ascontiguousarray(columns, dtype=np.int64), np.ascontiguousarray(covariance)
-        approaches = (c_void_p * 3)(*(address(row).value for row in found))
+        approaches = (c_void_p * 3)(*map(location, found))
         function("coast_closest")(
             c_int64(len(steps)), address(steps), address(self._transitions), c_int64(padded.shape[1]), address(padded),
             address(spread), c_double(keep_out_m), c_double(self._sagitta_share * self._step_s), approaches,

@@ -55,43 +55,19 @@ def rk4_step(derivative: Callable[[Array], Array], y: Array, step_s: float) -> A
     return y + step_s / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
 
 
-def newton_euler(state: Array, wrench: list[float], mass_kg: float, inertia: Vector3) -> Array:
-    """Return the derivative (13,) of a state as in ``propagate``; ``wrench`` is force and torque in body axes."""
-    _, _, _, vx, vy, vz, w, i, j, k, a, b, c = state.tolist()
-    fx, fy, fz, tx, ty, tz = wrench
-    ia, ib, ic = inertia
-    cx, cy, cz = 2.0 * (j * fz - k * fy), 2.0 * (k * fx - i * fz), 2.0 * (i * fy - j * fx)
-    return np.array(
-        [
-            vx,
-            vy,
-            vz,
-            (fx + w * cx + (j * cz - k * cy)) / mass_kg,
-            (fy + w * cy + (k * cx - i * cz)) / mass_kg,
-            (fz + w * cz + (i * cy - j * cx)) / mass_kg,
-            0.5 * (-i * a - j * b - k * c),
-            0.5 * (w * a + j * c - k * b),
-            0.5 * (w * b + k * a - i * c),
-            0.5 * (w * c + i * b - j * a),
-            (tx - (b * ic * c - c * ib * b)) / ia,
-            (ty - (c * ia * a - a * ic * c)) / ib,
-            (tz - (a * ib * b - b * ia * a)) / ic,
-        ]
-    )
-
-
 def propagate(state: Array, wrench: Array, body: RigidBody, duration_s: float) -> Array:
     """Return the state (13,) after ``duration_s`` under a constant wrench.
 
     The state is position and velocity (WRF), q_wxyz (body to WRF) and angular rate (body axes); the wrench (6,) is
     force and torque in body axes.
     """
-    u, mass_kg, inertia = wrench.tolist(), body.mass_kg, body.inertia
-    steps = max(1, math.ceil(duration_s / MAX_STEP_S))
+    steps, y = max(1, math.ceil(duration_s / MAX_STEP_S)), np.array(state, dtype=float)
+    step, moving = function("rigid_step"), (address(y), address(np.array(wrench, dtype=float)))
+    with_inertia = c_double(body.mass_kg), (c_double * 3)(*body.inertia), c_double(duration_s / steps)
     for _ in range(steps):
-        state = rk4_step(lambda y: newton_euler(y, u, mass_kg, inertia), state, duration_s / steps)
-        state[6:10] /= math.hypot(*state[6:10].tolist())
-    return state
+        step(*moving, *with_inertia)
+        y[6:10] /= math.hypot(*y[6:10].tolist())
+    return y
 
 
 def free_rotation(

@@ -10,12 +10,14 @@ inner loops. Formulas: J. Sola, "Quaternion kinematics for the error-state Kalma
 from __future__ import annotations
 
 import math
+from ctypes import c_int64
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Array
+from .native import address, function
 from .scalar_rotations import cross_components, matrix_components, product_components, rotated_components
 
 IDENTITY: Array = np.array([1.0, 0.0, 0.0, 0.0])
@@ -30,10 +32,10 @@ def normalize(q: ArrayLike) -> Array:
         if not 0.0 < length < math.inf:
             raise ValueError(f"quaternion cannot be normalized: {q.tolist()}")
         return q / length
-    n = np.linalg.norm(q, axis=-1, keepdims=True)
-    if not np.all(np.isfinite(n)) or np.any(n == 0.0):
+    out = np.empty(q.shape)
+    if not function("unit_rows", c_int64)(c_int64(q.size // 4), _operand(q), address(out)):
         raise ValueError(f"quaternion cannot be normalized: {q.tolist()}")
-    return q / n
+    return out
 
 
 def conjugate(q: ArrayLike) -> Array:
@@ -46,15 +48,41 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:  # Python floats: several times faster than NumPy on so few numbers
         return np.array(product_components(*a.tolist(), *b.tolist()))
-    return _stack_last(product_components(*(a[..., i] for i in range(4)), *(b[..., i] for i in range(4))))
+    return _by_rows("multiply_rows", a, b)
 
 
-def _stack_last(parts: list[Array]) -> Array:
-    """Stack arrays of one shape (...) along a new last axis, in a third of the time of ``np.stack``."""
-    whole = np.empty((*parts[0].shape, len(parts)))
-    for k, part in enumerate(parts):
-        whole[..., k] = part
-    return whole
+def _by_rows(kernel: str, a: Array, b: Array) -> Array:
+    """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along leading axes."""
+    lead_a, lead_b = a.shape[:-1], b.shape[:-1]
+    lead = lead_a if lead_a == lead_b else np.broadcast_shapes(lead_a, lead_b)
+    out = np.empty((*lead, b.shape[-1]))
+    a, b = _repeatable(a, lead), _repeatable(b, lead)
+    function(kernel)(
+        c_int64(out.size // out.shape[-1]),
+        _operand(a),
+        c_int64(a.size // a.shape[-1]),
+        _operand(b),
+        c_int64(b.size // b.shape[-1]),
+        address(out),
+    )
+    return out
+
+
+def _repeatable(operand: Array, lead: tuple[int, ...]) -> Array:
+    """Return rows whose repetition is ``operand`` with the leading axes ``lead``."""
+    own = operand.shape[:-1]
+    if own != lead[len(lead) - len(own) :]:
+        operand = np.broadcast_to(operand, (*lead, operand.shape[-1]))
+    return operand
+
+
+def _operand(array: Array) -> Any:
+    """Return an array, which may be read-only, as an argument of a kernel."""
+    array = np.ascontiguousarray(array)
+    try:
+        return address(array)
+    except TypeError:
+        return address(array.copy())
 
 
 def rotate(q: ArrayLike, v: ArrayLike) -> Array:
@@ -62,7 +90,7 @@ def rotate(q: ArrayLike, v: ArrayLike) -> Array:
     q, v = np.asarray(q, dtype=float), np.asarray(v, dtype=float)
     if q.ndim == v.ndim == 1:
         return np.array(rotated_components(*q.tolist(), *v.tolist()))
-    return _stack_last(rotated_components(*(q[..., i] for i in range(4)), *(v[..., i] for i in range(3))))
+    return _by_rows("rotate_rows", q, v)
 
 
 def cross(a: ArrayLike, b: ArrayLike) -> Array:
@@ -70,7 +98,7 @@ def cross(a: ArrayLike, b: ArrayLike) -> Array:
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
         return np.array(cross_components(*a.tolist(), *b.tolist()))
-    return _stack_last(cross_components(*(a[..., i] for i in range(3)), *(b[..., i] for i in range(3))))
+    return _by_rows("cross_rows", a, b)
 
 
 def rotate_inverse(q: ArrayLike, v: ArrayLike) -> Array:
@@ -160,8 +188,8 @@ def from_matrix(r: ArrayLike) -> Array:
     return -q if q[0] < 0.0 else q
 
 
-def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float) -> Array:
-    """Return the attitude (..., 4) after ``dt_s`` at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
+def integrate(q: ArrayLike, omega_body: ArrayLike, dt_s: float | Array) -> Array:
+    """Return the attitude (..., 4) after ``dt_s`` (or (..., 1)) at constant body rate ``omega_body`` (..., 3), rad/s (exact)."""
     return multiply(q, exp(np.asarray(omega_body, dtype=float) * dt_s))
 
 

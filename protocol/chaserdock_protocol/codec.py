@@ -76,6 +76,7 @@ class _FieldGetters(NamedTuple):
     quaternions: Callable[[Any], tuple[tuple[float, ...], ...]] | None
     covariances: Callable[[Any], tuple[tuple[float, ...], ...]] | None
     parts: Callable[[Any], tuple[tuple[Struct, ...], ...]] | None
+    optional: Callable[[Any], tuple[Struct | None, ...]] | None
 
 
 def _passes_fast_check(message: Struct) -> bool:
@@ -86,7 +87,7 @@ def _passes_fast_check(message: Struct) -> bool:
     getters = _field_getters(type(message))
     if getters is None:
         return False
-    numbers, rows, quaternions, covariances, parts = getters
+    numbers, rows, quaternions, covariances, *_ = getters
     if numbers is not None and not hypot(*numbers(message)) <= MAX_MAGNITUDE:
         return False
     if rows is not None:
@@ -101,17 +102,25 @@ def _passes_fast_check(message: Struct) -> bool:
         for covariance in covariances(message):
             if not covariance or min(covariance[:: isqrt(len(covariance)) + 1]) < 0.0:
                 return False
+    return _parts_pass_fast_check(message, getters)
+
+
+def _parts_pass_fast_check(message: Struct, getters: _FieldGetters) -> bool:
+    parts, optional = getters.parts, getters.optional
+    if optional is not None and not all(p is None or _passes_fast_check(p) for p in optional(message)):
+        return False
     return parts is None or all(_passes_fast_check(part) for several in parts(message) for part in several)
 
 
 @cache
 def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
-    """Return None for a type with other fields that hold floats, such as optional ones."""
+    """Return None for a type with other fields that hold floats, such as optional numbers."""
     numbers: list[str] = []
     rows: list[str] = []
     quaternions: list[str] = []
     covariances: list[str] = []
     parts: list[str] = []
+    optional: list[str] = []
     info: Any = inspect.type_info(kind)
     for field in info.fields:
         match field.type:
@@ -119,6 +128,8 @@ def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
                 numbers.append(field.name)
             case inspect.VarTupleType(item_type=inspect.StructType()):
                 parts.append(field.name)
+            case inspect.UnionType(types=(inspect.StructType(), inspect.NoneType())):
+                optional.append(field.name)
             case inspect.TupleType() | inspect.VarTupleType() if _is_row(field.type):
                 if field.name == "q_wxyz":
                     quaternions.append(field.name)
@@ -128,7 +139,7 @@ def _field_getters(kind: type[Struct]) -> _FieldGetters | None:
                     covariances.append(field.name)
             case other if holds_floats(other):
                 return None
-    return _FieldGetters(*map(_getter, (numbers, rows, quaternions, covariances, parts)))
+    return _FieldGetters(*map(_getter, (numbers, rows, quaternions, covariances, parts, optional)))
 
 
 def _is_row(kind: inspect.TupleType | inspect.VarTupleType) -> bool:
@@ -219,7 +230,7 @@ def vector(array: Any) -> Any:
 
     Typed Any, as the type checker cannot know the length.
     """
-    return tuple(array.ravel().tolist())
+    return tuple((array if array.ndim == 1 else array.ravel()).tolist())
 
 
 _LATER_FIELDS = frozenset({"given_thrusters_N_s", "geometry"})

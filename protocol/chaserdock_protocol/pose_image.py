@@ -8,6 +8,7 @@ them as ``mono8`` images, so that everything but rendering and detection stays a
 from __future__ import annotations
 
 import math
+import struct
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -19,6 +20,7 @@ NAME = "statistical"
 """Value of ``perception.name``."""
 _NUMBERS = 9
 WIDTH_PX = 8 * _NUMBERS
+_NUMBERS_OF = struct.Struct(f"<{_NUMBERS}d")
 
 
 def encode_pose(position_irf_m: Array, q_irf_trf_wxyz: Array, seed: tuple[int, int]) -> bytes:
@@ -30,9 +32,10 @@ def decode_pose(image: NDArray[np.uint8]) -> tuple[Array, Array, tuple[int, int]
     """Return position, rotation and seed. Raises ValueError for any other image."""
     if image.shape != (1, WIDTH_PX):
         raise ValueError(f"an image of {image.shape} is none of perception {NAME!r}")
-    numbers = np.frombuffer(image.tobytes(), dtype="<f8")
-    seeds_valid = 0.0 <= numbers[7:].min() <= numbers[7:].max() < 2.0**32
-    length = math.hypot(*numbers[3:7].tolist())
-    if not np.isfinite(numbers).all() or not seeds_valid or abs(length - 1.0) > UNIT_QUATERNION_TOLERANCE:
+    numbers = _NUMBERS_OF.unpack(image.tobytes())
+    position, q, seeds = numbers[:3], numbers[3:7], numbers[7:]
+    seeds_valid = all(0.0 <= seed < 2.0**32 for seed in seeds)
+    unit = abs(math.hypot(*q) - 1.0) <= UNIT_QUATERNION_TOLERANCE
+    if not (all(map(math.isfinite, position)) and unit and seeds_valid):
         raise ValueError("damaged image")
-    return numbers[:3], numbers[3:7], (int(numbers[7]), int(numbers[8]))
+    return np.array(position), np.array(q), (int(seeds[0]), int(seeds[1]))

@@ -68,6 +68,7 @@ class ProcessOptions:
     out: Path = Path("runs")
     rotation: Rotation = Rotation()
     viewer_layer: bool = True
+    compressed_log: bool = True
     recorder_expected: bool = True
     watch_parent: bool = False
     patience_s: float | None = None

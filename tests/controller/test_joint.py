@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
-from chaserdock_controller.estimation.joint.estimator import JointInputs, relative_pose
+from chaserdock_controller.estimation.joint.estimator import JointInputs, relative_poses
 from chaserdock_controller.estimation.joint.measurements import (
     linearize,
     measurement,
@@ -416,10 +416,10 @@ def test_relative_pose_has_the_covariance_of_its_errors() -> None:
     state, rng = random_state(9), np.random.default_rng(9)
     a = rng.normal(size=(TARGET + 2 * CHASER,) * 2) * 1e-4
     state = replace(state, covariance=a @ a.T)
-    pose = relative_pose(state, 1)
+    pose = relative_poses(state, [0, 1])[1]
     draws = []
     for _ in range(4000):
-        other = relative_pose(inject(state, a @ rng.normal(size=len(a))), 1)
+        other = relative_poses(inject(state, a @ rng.normal(size=len(a))), [1])[0]
         turn = rotations.log(rotations.multiply(rotations.conjugate(pose.q_wxyz), other.q_wxyz))
         draws.append(np.concatenate([other.position_m - pose.position_m, turn]))
     sample = np.cov(np.array(draws).T)

@@ -359,3 +359,16 @@ def test_functions_leave_their_arguments_alone() -> None:
     rotations.exp(v)[0] = 9.0
     close(q, before[0], 0)
     close(v, before[1], 0)
+
+
+def test_arrays_that_are_read_only_or_repeated_are_operands() -> None:
+    q = rotations.normalize(np.random.default_rng(5).standard_normal((3, 2, 4)))
+    v = np.arange(6.0).reshape(2, 3)
+    whole = np.broadcast_arrays(v, np.zeros((3, 2, 3)))[0]
+    frozen = q.copy()
+    frozen.flags.writeable = False
+    rotated = np.array([[rotations.rotate(q[i, k], v[k]) for k in range(2)] for i in range(3)])
+    for operand in (v, whole):
+        np.testing.assert_array_equal(rotations.rotate(frozen, operand), rotated)
+    np.testing.assert_array_equal(rotations.normalize(frozen[::-1]), rotations.normalize(q)[::-1])
+    np.testing.assert_array_equal(rotations.cross(whole, v[:, ::-1]), np.cross(whole, v[:, ::-1]))

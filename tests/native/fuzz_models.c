@@ -44,5 +44,46 @@ static void coast_closest(void) {
     for (int64_t n = 0; n < m && count && !special_drawn; n++) CHECK(found.away[n] >= least - 1e-9);
 }
 
-static const Target TARGETS[] = {{"free_rotation", free_rotation}, {"coast_room", coast_room}, {"coast_closest", coast_closest}};
+static void rigid_step(void) {
+    double *y = doubles(13, -2.0, 2.0), *wrench = doubles(6, -1.0, 1.0), *inertia = doubles(3, 0.01, 1.0), *before = outputs(13);
+    copy(y, before, 13);
+    NAME(rigid_step)(y, wrench, value(0.1, 10.0), inertia, value(0.0, 0.1));
+    if (special_drawn) return;
+    CHECK(all_finite(y, 13));
+    NAME(rigid_step)(before, wrench, 1.0, inertia, 0.0);
+    CHECK(all_finite(before, 13));
+}
+
+typedef void (*Rows)(int64_t, const double *, int64_t, const double *, int64_t, double *);
+
+/* Up to six rows of the result, from operands of which one may have fewer: equal rows give equal results. */
+static void by_operands(Rows rows, int64_t a_width, int64_t width) {
+    const int64_t a_rows = whole(1, 3), n = a_rows * whole(0, 2);
+    double *a = doubles(a_width * a_rows, -2.0, 2.0), *b = doubles(width, -2.0, 2.0), *out = outputs(width * n);
+    rows(n, a, a_rows, b, 1, out);
+    for (int64_t i = a_rows; i < n; i++) CHECK(same_bits(out + width * i, out + width * (i - a_rows), width));
+    double *whole_b = doubles(width * n, -2.0, 2.0);
+    rows(n, a, a_rows, whole_b, n, out);
+    if (!special_drawn) CHECK(all_finite(out, width * n));
+}
+static void multiply_rows(void) { by_operands(NAME(multiply_rows), 4, 4); }
+static void rotate_rows(void) { by_operands(NAME(rotate_rows), 4, 3); }
+static void cross_rows(void) { by_operands(NAME(cross_rows), 3, 3); }
+
+static void unit_rows(void) {
+    const int64_t n = whole(0, 5);
+    double *q = doubles(4 * n, -2.0, 2.0), *out = outputs(4 * n);
+    const int64_t valid = NAME(unit_rows)(n, q, out);
+    for (int64_t i = 0; i < n && valid; i++) {
+        const double *u = out + 4 * i;
+        /* The square of a denormal number is inexact. */
+        CHECK(special_drawn || abs_of((u[0] * u[0] + u[1] * u[1]) + (u[2] * u[2] + u[3] * u[3]) - 1.0) < 1e-9);
+    }
+    if (any_nan(q, 4 * n)) CHECK(!valid);
+}
+
+static const Target TARGETS[] = {{"free_rotation", free_rotation}, {"coast_room", coast_room}, {"coast_closest", coast_closest},
+                                 {"rigid_step", rigid_step},
+                                 {"multiply_rows", multiply_rows}, {"rotate_rows", rotate_rows},
+                                 {"cross_rows", cross_rows}, {"unit_rows", unit_rows}};
 FUZZ_MAIN(TARGETS)

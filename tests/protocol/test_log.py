@@ -76,13 +76,15 @@ def test_a_log_states_the_blas_in_use(tmp_path: Path) -> None:
     assert re.fullmatch(r"openblas \d+\.\d+\.\S+ Nehalem\n", stated)
 
 
-def librarys_writer(stream: Any) -> Writer:
-    return Writer(
-        stream, chunk_size=chunk_index.CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True
-    )
+def librarys_writer(stream: Any, compressed: bool = True) -> Writer:
+    compression = CompressionType.ZSTD if compressed else CompressionType.NONE
+    return Writer(stream, chunk_size=chunk_index.CHUNK_BYTES, compression=compression, enable_data_crcs=True)
 
 
-def test_the_file_is_the_librarys_own_to_the_byte(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("compressed", [True, False])
+def test_the_file_is_the_librarys_own_to_the_byte(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, compressed: bool
+) -> None:
     """Full chunks and flushed ones, times that go back, both layers, channels that come late or stay empty."""
     # If the library renames this attribute, replacing it has no effect.
     private = {name: type(value).__name__ for name, value in vars(librarys_writer(io.BytesIO())).items()}
@@ -90,7 +92,7 @@ def test_the_file_is_the_librarys_own_to_the_byte(tmp_path: Path, monkeypatch: p
 
     def made(path: Path) -> bytes:
         monkeypatch.setattr(time, "time_ns", lambda: 17)
-        writer, schema = LogWriter(path, Clock()), ("Seen", "protobuf", b"of it")
+        writer, schema = LogWriter(path, Clock(), compressed), ("Seen", "protobuf", b"of it")
         writer.describe(SCENARIO, {"run_id": "r1"})
         for n, (topic, place, message) in enumerate(flight(30)):
             record(writer, topic, place, message, 5)
@@ -109,6 +111,7 @@ def test_the_file_is_the_librarys_own_to_the_byte(tmp_path: Path, monkeypatch: p
     ours = made(tmp_path / "ours.mcap")
     monkeypatch.setattr(log, "create_writer", librarys_writer)
     assert made(tmp_path / "theirs.mcap") == ours
+    assert (len(ours) < 500_000) == compressed
     with (tmp_path / "ours.mcap").open("rb") as file:
         summary = make_reader(file, validate_crcs=True).get_summary()
     assert summary is not None

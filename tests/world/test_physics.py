@@ -133,7 +133,7 @@ def test_bodies_start_at_the_scenario_state(worlds: Any) -> None:
 
 
 def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> None:
-    """A chaser that turns flies against another until they touch; a third is thrust alone."""
+    """A chaser that turns flies against another until they touch; a third is thrust alone. The target moves as prescribed."""
     chasers = [
         {
             "position_m": [-5.0, 0.0, 0.0],
@@ -144,9 +144,14 @@ def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> Non
         {"position_m": [5.0, 1.0, 0.0], "q_wxyz": [1.0, 0.0, 0.0, 0.0]},
     ]
     wrench = np.array([0.1, -0.05, 0.02, 1e-3, 2e-3, -1e-3])
+    moving = {
+        "motion": "constant_rates",
+        "velocity_m_s": [0.01, 0.0, 0.02],
+        "omega_rad_s": [0.02, -0.1, 0.3],
+    }
     flown: list[tuple[list[Any], list[set[tuple[str, str]]]]] = []
     for in_c in (True, False):
-        physics = worlds(chasers=chasers, limits=NONE)
+        physics = worlds(chasers=chasers, limits=NONE, target=moving)
         engine = physics._engine
         assert engine._stepper is not None, "this build of PyBullet offers no plugin with its C interface"
         if not in_c:
@@ -155,6 +160,7 @@ def test_bullets_steps_in_c_have_the_bits_of_those_in_python(worlds: Any) -> Non
         flown.append(([engine.motion(body) for body in range(4)], touched))
     assert flown[0] == flown[1]
     assert any(flown[0][1])
+    assert flown[0][0][0][0][2] > 0.11  # the target: 6 s at 0.02 m/s
 
 
 # -- forces -----------------------------------------------------------------------------------------------

@@ -88,7 +88,7 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         **header,
         status="seen" if solutions else "nothing",
         solutions=solutions,
-        marker_ids=tuple(int(i) for i in seen.marker_ids),
+        marker_ids=tuple(np.asarray(seen.marker_ids).tolist()),
         corners_px=vector(np.asarray(seen.corners_px, dtype=float)),
         rejected_ids=tuple(int(i) for i in seen.rejected_ids),
         geometry=_geometry(seen.geometry),

@@ -73,7 +73,13 @@ def record(options: ProcessOptions, node: Node, mission: JoinReply, instance: st
     scenario = flight_scenario_from_json(mission.scenario_json, "the world's scenario")
     out = options.out / run_name(mission) if options.by_run else options.out
     recording = Recording(
-        out, mission, full, options.rotation, scenario if options.viewer_layer else None, node.host.now_s
+        out,
+        mission,
+        full,
+        options.rotation,
+        scenario if options.viewer_layer else None,
+        node.host.now_s,
+        options.compressed_log,
     )
     try:
         injected = process_faults_from_json(mission.faults)
@@ -122,6 +128,7 @@ class Recorder:
 
     def __post_init__(self) -> None:
         self._queue: BoundedQueue[RawSample] = self.node.host.new_queue()
+        self._decoded = _READ | SHOWN if self.recording.shows else _READ
 
     def open(self, instance: str, stall_s: float) -> None:
         """Subscribe to all topics, then start the heartbeat."""
@@ -150,7 +157,7 @@ class Recorder:
 
     def _write(self, raw: RawSample) -> None:
         found, message = topics.topic_of_key(raw.key), None
-        if found is not None and found[0] in _DECODED:
+        if found is not None and found[0] in self._decoded:
             with suppress(Rejected):
                 message = self.node.decode(found[0].kind, raw)
         self.recording.write(raw, message)
@@ -230,7 +237,7 @@ class Recorder:
         return complete or self.node.host.now_s() - self.ended_s > _DRAIN_S
 
 
-_DECODED = SHOWN | {
-    topics.TICK, topics.ACTUATORS, topics.SOLVER, topics.PRESENCE, topics.FAREWELL, topics.END
-}  # fmt: skip
-"""Topics whose messages are decoded: those of the viewer layer, and those that ``_process`` reads."""
+_READ = frozenset(
+    {topics.TICK, topics.ACTUATORS, topics.SOLVER, topics.PRESENCE, topics.FAREWELL, topics.END}
+)
+"""Topics whose messages ``_process`` reads; others are decoded for the viewer layer only."""

@@ -32,7 +32,9 @@ class Recording:
         rotation: Rotation,
         scenario: FlightScenario | None,
         now_s: Callable[[], float] = time.monotonic,
+        compressed: bool = True,
     ) -> None:
+        self._compressed = compressed
         self._folder, self._mission, self._rotation, self._scenario = folder, mission, rotation, scenario
         self._full_scenario_json = full_scenario_json
         self._now_s, self._part = now_s, 0
@@ -46,6 +48,11 @@ class Recording:
         self._open()
 
     @property
+    def shows(self) -> bool:
+        """Return whether there is a viewer layer."""
+        return self._scenario is not None
+
+    @property
     def path(self) -> Path:
         """The file being written."""
         return self._writer.path
@@ -55,7 +62,7 @@ class Recording:
         name = LOG_NAME
         if self._rotation.wanted:
             name, run["part"] = part_name(self._part), str(self._part)
-        self._writer = LogWriter(self._folder / name, self._now_s)
+        self._writer = LogWriter(self._folder / name, self._now_s, self._compressed)
         self._writer.describe(self._full_scenario_json, run)
         self._viewer = ViewerLayer(self._scenario, self._writer.write_view) if self._scenario else None
         self._from_ns = None

@@ -49,9 +49,14 @@ def rows_of(covariance: Array) -> Matrix9:
     return tuple(tuple(row) for row in covariance.tolist())
 
 
+def centre_in_target(target: TargetState, odometry: Odometry) -> Array:
+    """Return a chaser's estimated centre (3,) in TRF."""
+    return rotations.rotate_inverse(target.q_wxyz, np.array(odometry.position_m) - target.position_m)
+
+
 def pose_in_target(target: TargetState, odometry: Odometry) -> tuple[Array, Array]:
     """Return a chaser's estimated centre (3,) and attitude (4,) in TRF."""
-    centre = rotations.rotate_inverse(target.q_wxyz, np.array(odometry.position_m) - target.position_m)
+    centre = centre_in_target(target, odometry)
     return centre, rotations.multiply(rotations.conjugate(target.q_wxyz), odometry.q_wxyz)
 
 

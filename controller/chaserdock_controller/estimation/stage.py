@@ -195,19 +195,23 @@ def camera_calibrations(
     """Return the estimated errors of the cameras used so far, in CRF axes; ``camera``: the nominal calibration."""
     if not isinstance(estimator, Mekf | JointEstimator):
         return ()
+    errors = estimator.cameras()
+    if not errors:
+        return ()
     axes = rotations.to_matrix(camera.q_crf_irf_wxyz)
-    calibrations = []
-    for e in estimator.cameras():
-        turn, shift = (axes @ e.covariance[i : i + 3, i : i + 3] @ axes.T for i in (0, 3))
-        calibrations.append(
-            CameraCalibration(
-                chaser=e.chaser,
-                turn_rad=vector(axes @ e.turn_rad),
-                turn_sigma_rad=vector(np.sqrt(np.diag(turn))),
-                shift_m=vector(axes @ e.shift_m),
-                shift_sigma_m=vector(np.sqrt(np.diag(shift))),
-                focal_share=e.focal_share,
-                focal_sigma_share=float(np.sqrt(e.covariance[6, 6])),
-            )
+    covariances = np.array([e.covariance for e in errors])
+    turns, shifts = (axes @ covariances[:, i : i + 3, i : i + 3] @ axes.T for i in (0, 3))
+    diagonals = [np.einsum("nii->ni", part) for part in (turns, shifts, covariances[:, 6:, 6:])]
+    sigmas = np.sqrt(np.concatenate(diagonals, axis=1)).tolist()
+    return tuple(
+        CameraCalibration(
+            chaser=e.chaser,
+            turn_rad=vector(axes @ e.turn_rad),
+            turn_sigma_rad=(t1, t2, t3),
+            shift_m=vector(axes @ e.shift_m),
+            shift_sigma_m=(s1, s2, s3),
+            focal_share=e.focal_share,
+            focal_sigma_share=focal,
         )
-    return tuple(calibrations)
+        for e, (t1, t2, t3, s1, s2, s3, focal) in zip(errors, sigmas, strict=True)
+    )

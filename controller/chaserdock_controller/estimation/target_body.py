@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 
 import numpy as np
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, IntArray
 from chaserdock_models.rigid_body import free_rotation
 from chaserdock_models.rotations import cross, normalize, rotate, to_matrix
 from numpy.typing import ArrayLike
@@ -36,9 +36,9 @@ class TargetPath:
     alpha_rad_s2: Array
     acceleration_m_s2: Array
 
-    def every_second(self, first: int) -> TargetPath:
-        """Return every second instant from number ``first`` on."""
-        return TargetPath(*(getattr(self, f.name)[first::2] for f in fields(self)))
+    def at(self, instants: slice | IntArray) -> TargetPath:
+        """Return the target at some of the times."""
+        return TargetPath(*(getattr(self, f.name)[instants] for f in fields(self)))
 
 
 def attach_bodies(target: TargetBody, attached: Sequence[tuple[float, Array, Array, Array]]) -> TargetBody:

@@ -26,19 +26,17 @@ _GREATEST_MARGIN_M = 0.1
 
 def target_path(
     body: TargetBody, torque_free: bool, start: TargetState, step_s: float, steps: int
-) -> tuple[TargetPath, TargetPath]:
-    """Return the target's predicted motion at 0, step_s, ... steps * step_s, and in the middles between."""
+) -> TargetPath:
+    """Return the target's predicted motion at 0, step_s, ... steps * step_s, and then in the middles between."""
     state = (start.position_m, start.velocity_m_s, start.q_wxyz, start.omega_rad_s)
     if torque_free:
         path = predict_path(body, *state, step_s / 2, 2 * steps)
-        return path.every_second(0), path.every_second(1)
+        return path.at(np.concatenate([np.arange(0, 2 * steps + 1, 2), np.arange(1, 2 * steps, 2)]))
     times_s = np.arange(steps + 1) * step_s
     both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
     positions, attitudes = reference.predict_target(*state, both_s)
-    zeros = np.zeros((steps + 1, 3))
-    rates, k = zeros + start.omega_rad_s, steps + 1
-    nodes = TargetPath(positions[:k], attitudes[:k], rates, zeros, zeros)
-    return nodes, TargetPath(positions[k:], attitudes[k:], rates[1:], zeros[1:], zeros[1:])
+    zeros = np.zeros((len(both_s), 3))
+    return TargetPath(positions, attitudes, zeros + start.omega_rad_s, zeros, zeros)
 
 
 class ReferenceBuilder:
@@ -79,23 +77,26 @@ class ReferenceBuilder:
         """
         s, step_s = self._scenario, self._step_s
         torque_free = s.target.motion == "torque_free"
-        nodes, middles = target_path(body, torque_free, start, step_s, self._stages)
-        times_s = start.time_ns / 1e9 + np.arange(self._stages + 1, dtype=float) * step_s
-        (offsets, _, _), q_off = self._offsets(chasers, times_s, nodes)
+        path, k = target_path(body, torque_free, start, step_s, self._stages), self._stages + 1
+        nodes, middles = path.at(slice(k)), path.at(slice(k, None))
+        times_s = start.time_ns / 1e9 + np.arange(k, dtype=float) * step_s
+        both_s = np.concatenate([times_s, times_s[:-1] + step_s / 2])
+        (positions, velocities, accelerations), q_off = self._offsets(chasers, both_s, path)
         u_ref = np.zeros((len(chasers), self._stages, 6))
         if s.controller.feed_forward:
-            motion, q_middle = self._offsets(chasers, times_s[:-1] + step_s / 2, middles)
             u_ref = reference.feed_forward(
                 middles.omega_rad_s,
-                *motion,
-                q_middle,
+                positions[:, k:],
+                velocities[:, k:],
+                accelerations[:, k:],
+                q_off[:, k:],
                 s.chaser.mass_kg,
                 np.diag(s.chaser.inertia),
                 middles.alpha_rad_s2,
                 middles.acceleration_m_s2,
             )
         known = {r.chaser: r.covariance for r in relative}
-        margins = np.array([self._margin_m(known.get(i, start.covariance)) for i in chasers])
+        margins = self._margins_m([known.get(i, start.covariance) for i in chasers])
         distances = np.array([self._machine.min_distance_target_m(i) for i in chasers]) + margins
         boxes = clearance = None
         if self._boxes is not None:
@@ -104,7 +105,9 @@ class ReferenceBuilder:
             clearance = np.where(kept > 0.0, kept + margins, 0.0)
         return HorizonReference(
             chasers=chasers,
-            references=reference.references_on(nodes.positions_m, nodes.q_wxyz, offsets, q_off),
+            references=reference.references_on(
+                nodes.positions_m, nodes.q_wxyz, positions[:, :k], q_off[:, :k]
+            ),
             u_ref=u_ref,
             target_positions=nodes.positions_m,
             min_distance_target_m=distances,
@@ -140,7 +143,7 @@ class ReferenceBuilder:
         turns = self._machine.body_rotations(i, times_s)
         return q if turns is None else rotations.multiply(q, turns)
 
-    def _margin_m(self, covariance: Array) -> float:
-        """Return the addition to the distance from the target for an uncertain position, the first block of ``covariance``."""
-        sigma_m = float(np.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1]))
-        return min(self._scenario.limits.estimate_margin_sigmas * sigma_m, _GREATEST_MARGIN_M)
+    def _margins_m(self, covariances: Sequence[Array]) -> Array:
+        """Return the additions (N,) to the distance from the target for uncertain positions, the first blocks of ``covariances``."""
+        sigmas_m = np.sqrt(np.linalg.eigvalsh(np.array([c[:3, :3] for c in covariances]))[:, -1])
+        return np.minimum(self._scenario.limits.estimate_margin_sigmas * sigmas_m, _GREATEST_MARGIN_M)

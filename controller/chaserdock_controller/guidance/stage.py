@@ -13,7 +13,7 @@ from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import CameraCalibration, CommandReply, Odometry, OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 
-from chaserdock_controller.estimation.composite_body import pose_in_target
+from chaserdock_controller.estimation.composite_body import centre_in_target, pose_in_target
 from chaserdock_controller.interfaces import (
     DirectCommand,
     Directive,
@@ -116,7 +116,7 @@ class GuidanceStage:
         self.machine.target_acquired(now_s)
         if is_settled(target):
             for i, odometry in estimation.own.items():
-                self.machine.target_settled(i, now_s, pose_in_target(target, odometry)[0])
+                self.machine.target_settled(i, now_s, centre_in_target(target, odometry))
 
     def _follow_relative_states(self, estimation: TargetEstimation) -> None:
         escapes, target = self.machine.escapes, estimation.target
@@ -234,7 +234,7 @@ class GuidanceStage:
         pose = self.references.pose(i, target, now_s)
         error_m = float(np.linalg.norm(pose[0] - odometry.position_m))
         error_rad = float(rotations.angle_between(pose[1], odometry.q_wxyz))
-        self.machine.set_position(i, pose_in_target(target, odometry)[0])
+        self.machine.set_position(i, centre_in_target(target, odometry))
         self.machine.update_tracking(i, now_s, error_m, error_rad)
         observed = self._observe_docking(i, odometry, observation, estimation)
         if observed is not None:

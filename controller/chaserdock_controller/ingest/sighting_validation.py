@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import msgspec
 import numpy as np
@@ -29,12 +29,31 @@ def why_invalid(solution: PoseSolution) -> str:
     return ""
 
 
+def _are_valid(solutions: Sequence[PoseSolution]) -> bool:
+    """Return whether ``why_invalid`` finds nothing in any solution, without a call for each."""
+    if not all(abs(math.hypot(*s.q_wxyz) - 1.0) <= _UNIT_WITHIN for s in solutions):
+        return False
+    covariances = np.array([s.covariance for s in solutions]).reshape(-1, 6, 6)
+    largest = np.abs(covariances).max(axis=(1, 2))
+    differences = np.abs(covariances - covariances.transpose(0, 2, 1)).max(axis=(1, 2))
+    if not (differences <= _ROUNDING * largest).all():
+        return False
+    try:
+        np.linalg.cholesky(covariances)
+    except np.linalg.LinAlgError:
+        return False
+    return True
+
+
 def valid_sightings(
     sightings: Iterable[Sighting],
 ) -> tuple[tuple[Sighting, ...], list[tuple[Level, str]]]:
     """Return the sightings with their valid solutions only, and an event for each sighting that loses one."""
     valid: list[Sighting] = []
     events: list[tuple[Level, str]] = []
+    sightings = tuple(sightings)
+    if _are_valid([s for sighting in sightings for s in sighting.solutions]):
+        return sightings, events
     for sighting in sightings:
         reasons = {id(s): reason for s in sighting.solutions if (reason := why_invalid(s))}
         if reasons:

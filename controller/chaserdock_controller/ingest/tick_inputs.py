@@ -37,6 +37,7 @@ class TickInputCollector:
         self._sightings: list[Sighting] = []
         self._received_sightings: set[tuple[int, int]] = set()
         self._usable_sightings: dict[tuple[int, int], bool] = {}
+        self._forgotten_tick = 0
         self._lost: set[tuple[str, int, int]] = set()
         self._has_thrusters = scenario.chaser.actuation == "thrusters"
         self._has_port = [scenario.docking.port_of(i) is not None for i in range(len(scenario.chasers))]
@@ -124,8 +125,11 @@ class TickInputCollector:
         )
         self._sightings.clear()
         self._received_sightings = {key for key in self._received_sightings if key[0] > tick.tick}
-        oldest = tick.tick - _REMEMBERED_TICKS
-        self._usable_sightings = {k: usable for k, usable in self._usable_sightings.items() if k[0] > oldest}
+        if tick.tick >= self._forgotten_tick + 2 * _REMEMBERED_TICKS:
+            self._forgotten_tick = oldest = tick.tick - _REMEMBERED_TICKS
+            self._usable_sightings = {
+                k: usable for k, usable in self._usable_sightings.items() if k[0] > oldest
+            }
         self._lost = {lost for lost in self._lost if lost[2] > tick.tick}
         return inputs
 

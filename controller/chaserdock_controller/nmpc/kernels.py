@@ -10,7 +10,7 @@ import ctypes
 from ctypes import Structure, c_double, c_int64, c_void_p
 
 import numpy as np
-from chaserdock_models.native import address, scratch
+from chaserdock_models.native import address, location, scratch
 
 from .native import function
 from .types import Array, IntArray, NmpcInput, NmpcParameters
@@ -91,7 +91,7 @@ class Weights:
     def __init__(self, params: NmpcParameters) -> None:
         self.position, self.orientation = params.stage_weights()
         self.input = np.array([params.weight_force] * 3 + [params.weight_torque] * 3)
-        arrays = (address(a) for a in (self.position, self.orientation, self.input))
+        arrays = (location(a) for a in (self.position, self.orientation, self.input))
         self.native = _Weights(params.stages, *arrays)
 
 
@@ -132,10 +132,10 @@ def zones_of(problem: NmpcInput, outer: float, step_s: float = 1.0) -> _Zones:
     assert clearance is not None
     coasts = problem.coasts
     return _Zones(
-        n, nodes - 1, address(problem.references), address(problem.target_positions),
-        address(problem.min_distance_target_m), address(between), address(corridors), outer,
-        boxes.shape[1], address(boxes), address(clearance),
-        *((0, None) if coasts is None else (coasts.shape[2], address(coasts))), step_s,
+        n, nodes - 1, location(problem.references), location(problem.target_positions),
+        location(problem.min_distance_target_m), location(between), location(corridors), outer,
+        boxes.shape[1], location(boxes), location(clearance),
+        *((0, None) if coasts is None else (coasts.shape[2], location(coasts))), step_s,
     )  # fmt: skip
 
 
@@ -180,9 +180,9 @@ def solve_tick(
     zones = zones_of(problem, outer_m, model.step_s)
     code, iterations = np.empty(n, dtype=np.int64), np.empty(n, dtype=np.int64)
     tick = _Tick(
-        ctypes.addressof(model), ctypes.addressof(weights.native), ctypes.addressof(zones), address(problem.states),
-        address(problem.u_ref), address(problem.input_max), address(reach_m_per_N), address(w1), address(inputs), w2,
-        budget, address(code), address(iterations),
+        ctypes.addressof(model), ctypes.addressof(weights.native), ctypes.addressof(zones), location(problem.states),
+        location(problem.u_ref), location(problem.input_max), location(reach_m_per_N), location(w1), location(inputs), w2,
+        budget, location(code), location(iterations),
     )  # fmt: skip
     function("solve_tick")(ctypes.byref(tick), address(workspace))
     return code, iterations

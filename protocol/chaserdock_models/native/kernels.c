@@ -3,3 +3,4 @@
 #include "base.h"
 #include "coast.c"
 #include "rigid_body.c"
+#include "rotations.c"

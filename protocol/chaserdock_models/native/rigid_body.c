@@ -1,6 +1,36 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* Rotation of a free rigid body. */
+/* Motion of a rigid body. */
 #include "base.h"
+
+/* Derivative (13) of position, velocity (WRF), attitude and rate (body axes) under force and torque in body axes. */
+static void newton_euler(const double *y, const double *wrench, double mass, const double *inertia, double *out) {
+    const double w = y[6], i = y[7], j = y[8], k = y[9], a = y[10], b = y[11], c = y[12];
+    const double fx = wrench[0], fy = wrench[1], fz = wrench[2], ia = inertia[0], ib = inertia[1], ic = inertia[2];
+    const double cx = 2.0 * (j * fz - k * fy), cy = 2.0 * (k * fx - i * fz), cz = 2.0 * (i * fy - j * fx);
+    copy(y + 3, out, 3);
+    out[3] = (fx + w * cx + (j * cz - k * cy)) / mass;
+    out[4] = (fy + w * cy + (k * cx - i * cz)) / mass;
+    out[5] = (fz + w * cz + (i * cy - j * cx)) / mass;
+    out[6] = 0.5 * (-i * a - j * b - k * c);
+    out[7] = 0.5 * (w * a + j * c - k * b);
+    out[8] = 0.5 * (w * b + k * a - i * c);
+    out[9] = 0.5 * (w * c + i * b - j * a);
+    out[10] = (wrench[3] - (b * ic * c - c * ib * b)) / ia;
+    out[11] = (wrench[4] - (c * ia * a - a * ic * c)) / ib;
+    out[12] = (wrench[5] - (a * ib * b - b * ia * a)) / ic;
+}
+
+/* Step of ``h`` by RK4 of a state (13), in place, without normalization of its attitude. */
+EXPORT void NAME(rigid_step)(double *y, const double *wrench, double mass, const double *inertia, double h) {
+    double k[4][13], at[13];
+    newton_euler(y, wrench, mass, inertia, k[0]);
+    for (int s = 1; s < 4; s++) {
+        const double c = s == 3 ? h : 0.5 * h;
+        for (int n = 0; n < 13; n++) at[n] = y[n] + c * k[s - 1][n];
+        newton_euler(at, wrench, mass, inertia, k[s]);
+    }
+    for (int n = 0; n < 13; n++) y[n] += h / 6.0 * (k[0][n] + 2.0 * k[1][n] + 2.0 * k[2][n] + k[3][n]);
+}
 
 /* q' = 1/2 q (0, w) and Euler's equations I w' = (I w) x w. */
 static void derivative(const double *q, const double *w, const double *inertia, const double *inverse, double *dq,

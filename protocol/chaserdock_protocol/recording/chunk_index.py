@@ -32,18 +32,16 @@ _HEAD_BYTES = 22
 """Length of a message record without its data."""
 
 
-def create_writer(output: Any) -> Writer:
-    """Return a writer with zstd chunks, indexes and checksums."""
-    return _LogFileWriter(output)
+def create_writer(output: Any, compressed: bool = True) -> Writer:
+    """Return a writer with chunks, compressed by zstd or not, indexes and checksums."""
+    return _LogFileWriter(output, CompressionType.ZSTD if compressed else CompressionType.NONE)
 
 
 class _LogFileWriter(Writer):
     """The package's writer, whose parts for messages are replaced: private attributes, as no option selects them."""
 
-    def __init__(self, output: Any) -> None:
-        super().__init__(
-            output, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD, enable_data_crcs=True
-        )
+    def __init__(self, output: Any, compression: CompressionType) -> None:
+        super().__init__(output, chunk_size=CHUNK_BYTES, compression=compression, enable_data_crcs=True)
         private = vars(self)
         self._chunk = private["_Writer__chunk_builder"] = _Chunk(private["_Writer__statistics"])
         private["_Writer__chunk_indices"] = _ChunkIndexes()

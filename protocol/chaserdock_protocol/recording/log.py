@@ -129,7 +129,9 @@ class LogWriter:
     Raises LogError if the file cannot be created or written. What was written before stays readable.
     """
 
-    def __init__(self, path: Path, now_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self, path: Path, now_s: Callable[[], float] = time.monotonic, compressed: bool = True
+    ) -> None:
         self.path = path
         self.messages = 0
         self.unreadable = 0
@@ -145,7 +147,7 @@ class LogWriter:
         except OSError as error:
             raise LogError(f"{path}: cannot be created: {error.strerror or error}") from None
         self._sink: Any = _Sink(self._file)
-        self._writer = create_writer(self._sink)
+        self._writer = create_writer(self._sink, compressed)
         with self._writing():
             self._writer.start(profile="chaserdock", library=f"chaserdock {provenance.version('chaserdock')}")
         self._flushed_s, self._flushed_ns = now_s(), 0

@@ -22,6 +22,7 @@ from .engine import (
     BodyMotion,
     CollisionSolid,
     EngineSetup,
+    PlacementPath,
     RigidBodyDefinition,
     SolidBox,
     SolidCapsule,
@@ -132,11 +133,13 @@ class BulletEngine:
         """See ``RigidBodyEngine.step``. Bullet clears external loads after it."""
         pybullet.stepSimulation(self._client)
 
-    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+    def advance(
+        self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None = None
+    ) -> tuple[int, bool]:
         """See ``RigidBodyEngine.advance``."""
         if self._stepper is None:
-            return advance_free(self, bodies, loads, steps, self._step_s)
-        return self._stepper.advance(bodies, loads, steps)
+            return advance_free(self, bodies, loads, steps, path, self._step_s)
+        return self._stepper.advance(bodies, loads, steps, path)
 
     def touching(self) -> bool:
         """See ``RigidBodyEngine.touching``."""

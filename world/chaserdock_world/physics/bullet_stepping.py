@@ -13,10 +13,12 @@ from functools import cache
 from typing import Any
 
 import numpy as np
+from chaserdock_models import rotations
 from chaserdock_models.arrays import Array, IntArray
-from chaserdock_models.native import address
+from chaserdock_models.native import address, location
 
 from .bullet import pybullet, silenced
+from .engine import PlacementPath
 from .native import LIBRARY, function
 
 FUNCTIONS = (
@@ -29,6 +31,11 @@ FUNCTIONS = (
     "b3InitStepSimulationCommand",
     "b3InitRequestContactPointInformation",
     "b3GetContactPointInformation",
+    "b3CreatePoseCommandInit",
+    "b3CreatePoseCommandSetBasePosition",
+    "b3CreatePoseCommandSetBaseOrientation",
+    "b3CreatePoseCommandSetBaseLinearVelocity",
+    "b3CreatePoseCommandSetBaseAngularVelocity",
 )
 
 
@@ -42,6 +49,21 @@ def _addresses() -> IntArray | None:
     return np.array(found, dtype=np.int64)
 
 
+class _Path(ctypes.Structure):
+    """``Path`` of native/bullet.c."""
+
+    _fields_ = [(name, ctypes.c_int64) for name in ("body", "next", "every")] + [("motion", ctypes.c_void_p)]
+
+
+def _motion_of(path: PlacementPath) -> Array:
+    """Return position, attitude x, y, z, w, velocity and rate (K, 13) of the placements, as Bullet takes them."""
+    s = path.states
+    motion = np.empty((len(s.position_m), 13))
+    motion[:, 0:3], motion[:, 3:6], motion[:, 6] = s.position_m, s.q_wxyz[:, 1:], s.q_wxyz[:, 0]
+    motion[:, 7:10], motion[:, 10:13] = s.velocity_m_s, rotations.rotate(s.q_wxyz, s.omega_rad_s)
+    return motion
+
+
 class BulletStepper:
     """Makes the steps of free bodies in one PyBullet client; ``bodies``: their identities there."""
 
@@ -50,9 +72,15 @@ class BulletStepper:
         self._functions, self._client, self._step_s = functions, ctypes.c_void_p(client), step_s
         self._advance, self._touching = function("advance", ctypes.c_int64), np.zeros(1, dtype=np.int64)
 
-    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+    def advance(
+        self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None
+    ) -> tuple[int, bool]:
         """See ``RigidBodyEngine.advance``."""
-        identities = self._identities[bodies]
+        identities, moved = self._identities[bodies], None
+        if path is not None:
+            motion = _motion_of(path)
+            body = int(self._identities[path.body])
+            moved = ctypes.byref(_Path(body, path.first, path.every, location(motion)))
         made = self._advance(
             address(self._functions),
             self._client,
@@ -61,6 +89,7 @@ class BulletStepper:
             address(loads),
             ctypes.c_int64(steps),
             ctypes.c_double(self._step_s),
+            moved,
             address(self._touching),
         )
         if made < 0:

@@ -94,6 +94,27 @@ class EngineSetup:
     joints: Sequence[tuple[int, int]] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class PlacementPath:
+    """States at which a body is placed after the ``first`` step from now, and then every ``every`` steps.
+
+    ``states``: position (K, 3), velocity (3,), attitude (K, 4) and rate (3,) of K placements.
+    """
+
+    body: int
+    first: int
+    every: int
+    states: BodyState
+
+    def placement(self, steps: int) -> BodyState | None:
+        """Return the state at which the body is placed after so many steps, if it is."""
+        k, rest = divmod(steps - self.first, self.every)
+        if rest or k < 0:
+            return None
+        s = self.states
+        return BodyState(s.position_m[k], s.velocity_m_s, s.q_wxyz[k], s.omega_rad_s)
+
+
 class BodyContact(NamedTuple):
     """Two bodies in contact, and the point (3,), WRF, on the surface of each."""
 
@@ -128,11 +149,14 @@ class RigidBodyEngine(Protocol):
         """Make one step."""
         ...
 
-    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+    def advance(
+        self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None = None
+    ) -> tuple[int, bool]:
         """Make at most ``steps`` steps of free ``bodies`` (n,) under constant loads, and stop after one with contacts.
 
-        ``loads`` (n, 9): principal moments, force and torque in body axes; gyroscopic.py corrects the torque. Return the
-        number of steps made, and whether ``contacts`` may return any.
+        ``loads`` (n, 9): principal moments, force and torque in body axes; gyroscopic.py corrects the torque. ``path``: of
+        another body; its placement after a step with contacts is left to the caller. Return the number of steps made, and
+        whether ``contacts`` may return any.
         """
         ...
 

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from chaserdock_models.arrays import Array, IntArray
 
-from .engine import RigidBodyEngine
+from .engine import PlacementPath, RigidBodyEngine
 
 
 def _gyroscopic_torque(inertia: Sequence[float], a: float, b: float, c: float) -> tuple[float, float, float]:
@@ -75,7 +75,12 @@ def split_loads(bodies: IntArray, loads: Array) -> list[tuple[int, list[float], 
 
 
 def advance_free(
-    engine: RigidBodyEngine, bodies: IntArray, loads: Array, steps: int, step_s: float
+    engine: RigidBodyEngine,
+    bodies: IntArray,
+    loads: Array,
+    steps: int,
+    path: PlacementPath | None,
+    step_s: float,
 ) -> tuple[int, bool]:
     """Make the steps of ``RigidBodyEngine.advance`` one by one, of ``step_s`` each."""
     rows = split_loads(bodies, loads)
@@ -87,4 +92,6 @@ def advance_free(
         engine.step()
         if engine.touching():
             return made, True
+        if path is not None and (state := path.placement(made)) is not None:
+            engine.place(path.body, state)
     return steps, False

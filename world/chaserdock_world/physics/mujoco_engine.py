@@ -29,6 +29,7 @@ from .engine import (
     CollisionSolid,
     ContactSpring,
     EngineSetup,
+    PlacementPath,
     RigidBodyDefinition,
     SolidBox,
     SolidCapsule,
@@ -145,9 +146,11 @@ class MujocoEngine:
         self._load = [0.0] * len(self._load)
         self._motions.clear()
 
-    def advance(self, bodies: IntArray, loads: Array, steps: int) -> tuple[int, bool]:
+    def advance(
+        self, bodies: IntArray, loads: Array, steps: int, path: PlacementPath | None = None
+    ) -> tuple[int, bool]:
         """See ``RigidBodyEngine.advance``."""
-        return advance_free(self, bodies, loads, steps, self._step_s)
+        return advance_free(self, bodies, loads, steps, path, self._step_s)
 
     def touching(self) -> bool:
         """See ``RigidBodyEngine.touching``."""

@@ -30,6 +30,7 @@ from .engine import (
     CollisionSolid,
     ContactSpring,
     EngineSetup,
+    PlacementPath,
     RigidBodyDefinition,
     SolidBox,
     SolidCapsule,
@@ -196,18 +197,23 @@ class Physics:
         touched: set[tuple[str, str]] = set()
         end = self.step_count + steps
         while self.step_count < end:
-            until = end
-            if self._moves_target:
-                until = min(end, self.step_count + self._steps_to_target_update())
-            made, touching = self._engine.advance(self._free_bodies, loads, until - self.step_count)
+            path = self._target_path(end) if self._moves_target else None
+            made, touching = self._engine.advance(self._free_bodies, loads, end - self.step_count, path)
             self.step_count += made
             if touching:
                 touched.update(self._process_contacts())
-            self._move_target()
+                self._move_target()
         return touched
 
-    def _steps_to_target_update(self) -> int:
-        return self._steps_per_target_update - self.step_count % self._steps_per_target_update
+    def _target_path(self, end: int) -> PlacementPath | None:
+        """Return where the engine's copy of a prescribed target is placed until the step ``end``, None if nowhere."""
+        every = self._steps_per_target_update
+        first = self.step_count - self.step_count % every + every
+        if first > end:
+            return None
+        times_s = np.arange(first, end + 1, every)[:, None] / self._scenario.time.physics_hz
+        states = _moved(self._prescribed_start, times_s)
+        return PlacementPath(self._bodies[TARGET], first - self.step_count, every, states)
 
     def _move_target(self) -> None:
         """Move the engine's copy of a prescribed target, if it is due."""
@@ -481,8 +487,8 @@ def _prescribed_start(scenario: Scenario) -> BodyState:
     return BodyState(np.asarray(target.position_m), velocity, np.asarray(target.q_wxyz), omega)
 
 
-def _moved(start: BodyState, time_s: float) -> BodyState:
-    """Return a state after a time at constant velocity and body rate."""
+def _moved(start: BodyState, time_s: float | Array) -> BodyState:
+    """Return a state after a time, or after times (K, 1), at constant velocity and body rate."""
     velocity, omega = start.velocity_m_s, start.omega_rad_s
     position = start.position_m + velocity * time_s
     return BodyState(position, velocity, rotations.integrate(start.q_wxyz, omega, time_s), omega)

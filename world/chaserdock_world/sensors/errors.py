@@ -22,6 +22,8 @@ from chaserdock_protocol.scenario.navigation import NavigationErrors
 
 from chaserdock_world.random_draws import GaussMarkov, Stream, generator
 
+_NO_DRIFT = np.zeros(6)
+
 
 @dataclass(frozen=True, eq=False)
 class CameraErrors:
@@ -94,6 +96,14 @@ class OdometrySensor:
         self._drift = [GaussMarkov(seed, Stream.DRIFT, i, times_s.tolist(), period_s) for i in chasers]
         self._drifts = bool(self._errors.position_drift_m or self._errors.attitude_drift_rad)
         self.covariances = white_covariances(self._errors)
+        cross, roll = self._errors.attitude_noise_rad, self._errors.attitude_roll_noise_rad
+        position, velocity, omega = (
+            self._errors.position_noise_m,
+            self._errors.velocity_noise_m_s,
+            self._errors.omega_noise_rad_s,
+        )
+        self._sigmas = np.array([*[position] * 3, roll, cross, cross, *[velocity] * 3, *[omega] * 3])
+        self._biases = [self.biases(i) for i in chasers]
 
     def biases(self, chaser: int) -> tuple[Array, Array, Array]:
         """Return the constant errors of a chaser: position (3,), m, attitude (3,), rad, and rate (3,), rad/s."""
@@ -110,18 +120,13 @@ class OdometrySensor:
         if errors.exact_odometry:
             return state
         noise = generator(self._seed, Stream.NOISE, chaser, tick).standard_normal(12) * self._noise_factor
-        position_bias, attitude_bias, gyro_bias = self.biases(chaser)
-        drift = self._drift[chaser].at(tick) if self._drifts else np.zeros(6)
-        cross, roll = errors.attitude_noise_rad, errors.attitude_roll_noise_rad
-        turn = (
-            attitude_bias
-            + np.array([roll, cross, cross]) * noise[3:6]
-            + errors.attitude_drift_rad * drift[3:]
-        )
+        white, (position_bias, attitude_bias, gyro_bias) = self._sigmas * noise, self._biases[chaser]
+        drift = self._drift[chaser].at(tick) if self._drifts else _NO_DRIFT
+        turn = attitude_bias + white[3:6] + errors.attitude_drift_rad * drift[3:]
         offset = position_bias + errors.position_drift_m * drift[:3]
         return BodyState(
-            state.position_m + offset + errors.position_noise_m * noise[:3],
-            state.velocity_m_s + errors.velocity_noise_m_s * noise[6:9],
+            state.position_m + offset + white[:3],
+            state.velocity_m_s + white[6:9],
             rotations.multiply(state.q_wxyz, rotations.exp(turn)),
-            state.omega_rad_s + gyro_bias + errors.omega_noise_rad_s * noise[9:],
+            state.omega_rad_s + gyro_bias + white[9:],
         )

@@ -7,7 +7,7 @@ exposure, and the later ticks are processed again, so the state does not depend 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -50,8 +50,10 @@ from .parameters import JointParameters
 from .prediction import predict, predict_target
 from .state import (
     CHANNELS,
+    CHASER,
     FOCAL,
     SIGHTING_CHANNEL,
+    TARGET,
     TURN,
     VELOCITY,
     JointState,
@@ -164,7 +166,7 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         s = self.state
         if s is None or not s.target_known:
             return ()
-        return tuple(relative_pose(s, i) for i in np.flatnonzero(s.alive).tolist())
+        return tuple(relative_poses(s, np.flatnonzero(s.alive).tolist()))
 
     def motion_covariance(self, chaser: int) -> Array | None:
         """Return the covariance (6, 6) of a chaser's position and velocity relative to the target, WRF, if both are known."""
@@ -394,15 +396,20 @@ def _report_odometry(
     return replace(now, dropped=frozenset(dropped), overconfident=frozenset(overconfident))
 
 
-def relative_pose(s: JointState, i: int) -> RelativePose:
-    """Return the pose of a chaser in TRF with its covariance (6, 6): position in TRF, rotation in CRF."""
-    rt, c = so3.to_matrix(s.q_wxyz), so3.to_matrix(s.attitudes_wxyz[i])
-    place = rt.T @ (s.positions_m[i] - s.position_m)
-    own = block(i)
-    rows = np.concatenate([POSE, own.start + POSE])
-    j = np.zeros((6, 12))
-    j[0:3, 0:3], j[0:3, 3:6] = -rt.T, so3.skew(place)
-    j[0:3, 6:9] = rt.T
-    j[3:6, 3:6], j[3:6, 9:12] = -(c.T @ rt), np.eye(3)
-    covariance = j @ s.covariance[np.ix_(rows, rows)] @ j.T
-    return RelativePose(i, place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
+def relative_poses(s: JointState, chasers: Sequence[int]) -> list[RelativePose]:
+    """Return the poses of chasers in TRF with their covariances (6, 6): position in TRF, rotation in CRF."""
+    ids = np.array(chasers, dtype=np.int64)
+    rt, n = so3.to_matrix(s.q_wxyz), len(ids)
+    c = np.array([so3.matrix_components(*q) for q in s.attitudes_wxyz[ids].tolist()]).reshape(n, 3, 3)
+    places = [rt.T @ (s.positions_m[i] - s.position_m) for i in chasers]
+    j = np.zeros((n, 6, 12))
+    j[:, 0:3, 0:3], j[:, 0:3, 6:9], j[:, 3:6, 9:12] = -rt.T, rt.T, np.eye(3)
+    j[:, 3:6, 3:6] = -(c.transpose(0, 2, 1) @ rt)
+    for row, place in enumerate(places):
+        j[row, 0:3, 3:6] = so3.skew(place)
+    rows = np.concatenate([np.broadcast_to(POSE, (n, 6)), TARGET + CHASER * ids[:, None] + POSE], axis=1)
+    covariances = j @ s.covariance[rows[:, :, None], rows[:, None, :]] @ j.transpose(0, 2, 1)
+    return [
+        RelativePose(i, place, so3.inverse_multiply(s.q_wxyz, s.attitudes_wxyz[i]), covariance)
+        for i, place, covariance in zip(chasers, places, covariances, strict=True)
+    ]

@@ -8,12 +8,13 @@ states (44). Of a covariance within an update only the lower triangle is valid; 
 from __future__ import annotations
 
 import ctypes
+import itertools
 from ctypes import Structure, c_double, c_int64, c_void_p
 from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
-from chaserdock_models.native import address, scratch
+from chaserdock_models.native import address, location, scratch
 from numpy.typing import NDArray
 
 from chaserdock_controller.estimation.body_shape import SHAPE
@@ -87,11 +88,11 @@ class ChaserMeasurement:
         self.rows = (0 if odometry is None else 12) + (0 if sighting is None else 6)
         self.chaser, self.n = i, n
         self._kept = mounting, odometry, sighting  # the kernels use the addresses of these arrays
-        state, noise = (None, None) if odometry is None else map(address, odometry)
+        state, noise = (None, None) if odometry is None else map(location, odometry)
         pose, stated, *ratios = (
-            (None, None, 0.0, 0.0) if sighting is None else (*map(address, sighting[:2]), *sighting[2:])
+            (None, None, 0.0, 0.0) if sighting is None else (*map(location, sighting[:2]), *sighting[2:])
         )
-        self.native = _Measurement(n, i, *map(address, mounting), state, noise, pose, stated, *ratios)
+        self.native = _Measurement(n, i, *map(location, mounting), state, noise, pose, stated, *ratios)
 
 
 class JointInnovation:
@@ -99,22 +100,20 @@ class JointInnovation:
 
     def __init__(self, n: int, size: int) -> None:
         stride = -(-size // 8) * 8
-        self.values: Array = np.empty(_CHANNELS + 1)
-        self._arrays = [
-            np.empty(count)
-            for count in (
-                MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
-            )
-        ] + [self.values]  # fmt: skip
-        self._native = _Innovation(*map(address, self._arrays), stride, size)
+        sizes = (
+            MOST_ROWS, MOST_ROWS * _SEEN, MOST_ROWS**2, MOST_ROWS**2, MOST_ROWS * stride, MOST_ROWS * stride, size,
+            _CHANNELS + 1,
+        )  # fmt: skip
+        *starts, end = itertools.accumulate(sizes, initial=0)
+        memory = scratch(end)
+        self.correction: Array = memory[starts[-2] : starts[-1]]
+        """Last correction (D,)."""
+        self.values: Array = memory[starts[-1] :]
+        begin = location(memory)
+        self._native = _Innovation(*(begin + 8 * start for start in starts), stride, size)
         self._work = scratch(_work_size("innovate_workspace", size))
         self._address, self._work_address = ctypes.byref(self._native), address(self._work)
         self._n = c_int64(n)
-
-    @property
-    def correction(self) -> Array:
-        """Return the last correction (D,)."""
-        return self._arrays[6]
 
     def innovate(self, z: ChaserMeasurement, mean: Array, prior: Array, covariance: Array) -> None:
         """Compute the innovation of measurements linearized at ``mean``, about ``prior`` (the same array or another one)."""

@@ -14,10 +14,12 @@ import math
 from collections.abc import Set
 from ctypes import c_double
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_wrench
+from chaserdock_protocol.scenario.navigation import NavigationErrors
 
 from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
 from chaserdock_controller.estimation.motion_models import free_shape, process_noise, propagate_target
@@ -146,7 +148,11 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
 
 def _target_noise(dt: float, p: JointParameters) -> Array:
     linear, angular = p.target_noise[p.target.motion_model]
-    return process_noise(dt, linear**2, angular**2)
+    return _process_noise(dt, linear**2, angular**2)
+
+
+_process_noise = lru_cache(maxsize=16)(process_noise)
+"""Process noise over the few durations that occur. No caller changes it."""
 
 
 def _couple_shape(covariance: Array, by_shape: Array) -> None:
@@ -182,15 +188,26 @@ def disturbance(state: JointState, i: int, wrench: Array, p: JointParameters) ->
 
 def chaser_prior(p: JointParameters) -> Array:
     """Return the prior variances (EXTRA,) of a chaser's additive states."""
-    n, prior = p.navigation, np.zeros(EXTRA)
+    return _prior_of(
+        p.navigation,
+        p.disturbance_force_N,
+        p.disturbance_torque_N_m,
+        p.centre_of_mass_m,
+        p.camera_turn_rad,
+    ).copy()
+
+
+@lru_cache(maxsize=8)
+def _prior_of(n: NavigationErrors, force_N: float, torque_N_m: float, centre_m: float, turn: float) -> Array:
+    prior = np.zeros(EXTRA)
     for part, sigma in (
-        (FORCE, p.disturbance_force_N),
-        (TORQUE, p.disturbance_torque_N_m),
-        (CENTRE, p.centre_of_mass_m),
+        (FORCE, force_N),
+        (TORQUE, torque_N_m),
+        (CENTRE, centre_m),
         (POSITION_DRIFT, math.hypot(n.position_drift_m, n.position_bias_m)),
         (ATTITUDE_DRIFT, math.hypot(n.attitude_drift_rad, n.attitude_bias_rad)),
         (GYRO_BIAS, n.gyro_bias_rad_s),
-        (TURN, p.camera_turn_rad),
+        (TURN, turn),
         (SHIFT, n.camera_shift_m),
         (FOCAL, n.camera_focal_share),
         (VIEW, 1.0),

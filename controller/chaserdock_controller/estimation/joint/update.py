@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -75,7 +76,7 @@ class UpdateReport:
 
 class _Channel(NamedTuple):
     number: int
-    rows: slice
+    rows: range
     gate: float
 
 
@@ -284,16 +285,16 @@ def _update_chaser(
     if odometry is None and solution is None:
         return {}
     z = measurement(chasers, i, odometry, solution, markers, mounting, p)
-    channels = _channels(odometry is not None, solution is not None, p)
+    channels = _channels(odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry)
     gates = _gate(running, i, channels, running.values(z), p)
     if any(not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES):
         gates = _follow_unexpected_motion(running, i, z, channels, gates, p)
     running.rejections[i], running.nis[i] = gates.rejections, gates.nis
     running.log_likelihood = gates.log_likelihood
-    used = [row for c in channels if gates.fits[c.number] for row in range(c.rows.start, c.rows.stop)]
-    if used:
+    used = _rows(tuple(c.rows for c in channels if gates.fits[c.number]))
+    if len(used):
         nonlinear = gates.fits.get(SIGHTING_CHANNEL, False) and running.state.updates < p.iterated_updates
-        running.correct(z, np.array(used), p.iterations if nonlinear else 1)
+        running.correct(z, used, p.iterations if nonlinear else 1)
     return gates.fits
 
 
@@ -375,16 +376,25 @@ def _likeliest(
     return max(solutions, key=log_density)
 
 
-def _channels(has_odometry: bool, has_sighting: bool, p: JointParameters) -> list[_Channel]:
+@cache
+def _channels(
+    has_odometry: bool, has_sighting: bool, gate_sighting: float, gate_odometry: float
+) -> tuple[_Channel, ...]:
     channels, row = [], 0
     if has_sighting:
-        channels.append(_Channel(SIGHTING_CHANNEL, slice(0, 6), p.gate_sighting))
+        channels.append(_Channel(SIGHTING_CHANNEL, range(6), gate_sighting))
         row = 6
     if has_odometry:
         for k in range(1, len(CHANNELS)):
-            channels.append(_Channel(k, slice(row, row + 3), p.gate_odometry))
+            channels.append(_Channel(k, range(row, row + 3), gate_odometry))
             row += 3
-    return channels
+    return tuple(channels)
+
+
+@cache
+def _rows(parts: tuple[range, ...]) -> NDArray[np.int64]:
+    """Return the rows of channels. No caller changes them."""
+    return np.array([row for part in parts for row in part], dtype=np.int64)
 
 
 def _count(count: int, value: float, gate: float, p: JointParameters) -> tuple[int, bool]:

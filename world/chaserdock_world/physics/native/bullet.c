@@ -47,7 +47,19 @@ typedef struct {
     void *(*begin_step)(void *client);
     void *(*begin_contacts)(void *client);
     void (*read_contacts)(void *client, Contacts *found);
+    void *(*begin_placement)(void *client, int body);
+    int (*place_at)(void *command, double x, double y, double z);
+    int (*turn_to)(void *command, double x, double y, double z, double w);
+    int (*set_velocity)(void *command, const double *velocity);
+    int (*set_rate)(void *command, const double *omega);
 } Bullet;
+
+/* Placements of a body after the step ``next`` and then every ``every`` steps. ``motion`` (., 13): position, attitude x, y, z, w,
+ * velocity and rate in world axes. */
+typedef struct {
+    int64_t body, next, every;
+    const double *motion;
+} Path;
 
 /* Torque (3), body axes, to add to ``torque`` for a step of ``step_s``: ``midpoint_torque`` of gyroscopic.py, to the bit.
  * ``q``: attitude x, y, z, w; ``omega``: rate in world axes. */
@@ -66,11 +78,23 @@ static inline void midpoint_torque(const double *inertia, const double *q, const
     out[2] = gz - ma * mb * ab;
 }
 
+/* Place a body as resetBasePositionAndOrientation and resetBaseVelocity of PyBullet do. */
+static void place(const Bullet *bullet, void *client, int body, const double *motion) {
+    void *pose = bullet->begin_placement(client, body);
+    bullet->place_at(pose, motion[0], motion[1], motion[2]);
+    bullet->turn_to(pose, motion[3], motion[4], motion[5], motion[6]);
+    bullet->submit(client, pose);
+    void *rates = bullet->begin_placement(client, body);
+    bullet->set_velocity(rates, motion + 7);
+    bullet->set_rate(rates, motion + 10);
+    bullet->submit(client, rates);
+}
+
 /* Make at most ``steps`` steps of ``count`` bodies under constant loads, and stop after one in which bodies touched.
- * ``loads`` (count, 9): principal moments, force and torque in body axes. ``touching``: whether bodies touched in the last
- * step. Returns the number of steps made, -1 for a body that Bullet does not know. */
+ * ``loads`` (count, 9): principal moments, force and torque in body axes. ``path``: of a body that is placed after steps without
+ * contacts, or null. ``touching``: whether bodies touched in the last step. Returns the number of steps made, -1 for a body that Bullet does not know. */
 EXPORT int64_t NAME(advance)(const Bullet *bullet, void *client, int64_t count, const int64_t *bodies, const double *loads,
-                             int64_t steps, double step_s, int64_t *touching) {
+                             int64_t steps, double step_s, Path *path, int64_t *touching) {
     static const double origin[3] = {0.0, 0.0, 0.0};
     *touching = 0;
     for (int64_t step = 0; step < steps; step++) {
@@ -98,6 +122,11 @@ EXPORT int64_t NAME(advance)(const Bullet *bullet, void *client, int64_t count, 
         bullet->read_contacts(client, &found);
         *touching = found.count > 0;
         if (*touching) return step + 1;
+        if (path && step + 1 == path->next) {
+            place(bullet, client, (int)path->body, path->motion);
+            path->next += path->every;
+            path->motion += 13;
+        }
     }
     return steps;
 }

@@ -2,7 +2,7 @@
 """Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario v-bar r-bar] [--seeds N]``.
 
 One process, with statistical perception. ``--markers``: markers in rendered images instead of statistical ones, and ranging where none
-is seen. ``--images``: only the last leg, from 2.5 m on (``--images-from``), with rendered images and without ranging.
+is seen. ``--images``: only the last leg, with rendered images and without ranging.
 ``--leg N``: one leg. Prints time, change of velocity, tracking at the hold points, step of the estimate at the first markers, and
 contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the controller's events.
 """
@@ -17,7 +17,7 @@ from common import Figures, make_parser, print_figures, write_json
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.perception import ImagesAndRanging, RenderedImages
-from chaserdock.evaluation.rendezvous import IMAGES_FROM_M, last_leg, leg, rendezvous
+from chaserdock.evaluation.rendezvous import last_leg, leg, rendezvous
 from chaserdock.evaluation.transfers import load_shipped
 
 
@@ -27,7 +27,7 @@ def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
     if options.leg is not None:
         scenario = leg(scenario, options.leg)
     elif options.quick or options.images:
-        scenario = last_leg(scenario, images=options.images, images_from_m=options.images_from)
+        scenario = last_leg(scenario, images=options.images)
     begin_s, shown = time.process_time(), [0]
 
     def report(record: TickRecord, flight: InProcessMission) -> None:
@@ -78,9 +78,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each, from 0")
     parser.add_argument("--images", action="store_true", help="last leg with rendered images")
     parser.add_argument("--markers", action="store_true", help="rendered images, and ranging far away")
-    parser.add_argument(
-        "--images-from", type=float, default=IMAGES_FROM_M, help="distance where it begins, m"
-    )
     parser.add_argument(
         "--leg",
         type=int,

@@ -12,7 +12,7 @@ Complete missions in one process (``chaserdock.evaluation.in_process``). Parts:
 - ``tracking-images``: the same with rendered images: servicer, two chasers on the paper's target, stronger actuators;
 
 ``--first`` and ``--flights`` choose seeds (20 by default, of ``clutter`` 100); ``--quick`` flies two variations and shorter runs.
-Distances are true, between centres, at every tick.
+Distances are true, at every tick, between centres and, in clutter, between shapes.
 """
 
 from __future__ import annotations
@@ -60,7 +60,9 @@ def variations(
         print(f"  {outcomes[-1].line()}", flush=True)
     limits = scenario_of(0).limits
     safe = [
-        o.to_target_m >= limits.min_distance_target_m and o.between_m >= limits.min_distance_chasers_m
+        o.to_target_m >= limits.min_distance_target_m
+        and o.between_m >= limits.min_distance_chasers_m
+        and o.shapes_m >= limits.min_distance_shape_m
         for o in outcomes
     ]
     key = name.replace("-", "_")
@@ -71,6 +73,7 @@ def variations(
         f"{key}_chasers_not_at_goal": sum(o.missed for o in outcomes),
         f"{key}_min_distance_target_m": min(o.to_target_m for o in outcomes),
         f"{key}_min_distance_chasers_m": min(o.between_m for o in outcomes),
+        f"{key}_min_distance_shapes_m": min(o.shapes_m for o in outcomes),
         f"{key}_max_time_to_goal_s": max(
             math.inf if math.isnan(o.reached_s) else o.reached_s for o in outcomes
         ),

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Whole rendezvous from 200 m to the verified latch: ``python benchmarks/rendezvous.py [--scenario v-bar r-bar] [--seeds N]``.
 
-One process, with statistical perception. ``--images``: only the last leg, from 2.5 m on, with rendered images and without ranging.
+One process, with statistical perception. ``--markers``: markers in rendered images instead of statistical ones, and ranging where none
+is seen. ``--images``: only the last leg, with rendered images and without ranging.
 ``--leg N``: one leg. Prints time, change of velocity, tracking at the hold points, step of the estimate at the first markers, and
 contact. ``--quick``: only the last leg, from the last hold point on. ``--events``: print the controller's events.
 """
@@ -15,8 +16,8 @@ import time
 from common import Figures, make_parser, print_figures, write_json
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rendezvous import IMAGES_FROM_M, last_leg, leg, rendezvous
+from chaserdock.evaluation.perception import ImagesAndRanging, RenderedImages
+from chaserdock.evaluation.rendezvous import last_leg, leg, rendezvous
 from chaserdock.evaluation.transfers import load_shipped
 
 
@@ -26,7 +27,7 @@ def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
     if options.leg is not None:
         scenario = leg(scenario, options.leg)
     elif options.quick or options.images:
-        scenario = last_leg(scenario, images=options.images, images_from_m=options.images_from)
+        scenario = last_leg(scenario, images=options.images)
     begin_s, shown = time.process_time(), [0]
 
     def report(record: TickRecord, flight: InProcessMission) -> None:
@@ -36,7 +37,8 @@ def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
             print(f"    {at_s:.1f} s {level}: {text}", flush=True)
         shown[0] = len(flight.events)
 
-    out = rendezvous(scenario, RenderedImages(scenario), report)
+    perception = ImagesAndRanging(scenario) if options.markers else RenderedImages(scenario)
+    out = rendezvous(scenario, perception, report)
     begin = f"{name}_{seed}_"
     figures = {
         f"{begin}verified": float(out.verified_s is not None),
@@ -75,9 +77,7 @@ def main() -> None:
     parser.add_argument("--scenario", nargs="+", default=["v-bar", "r-bar"], help="shipped scenarios")
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each, from 0")
     parser.add_argument("--images", action="store_true", help="last leg with rendered images")
-    parser.add_argument(
-        "--images-from", type=float, default=IMAGES_FROM_M, help="distance where it begins, m"
-    )
+    parser.add_argument("--markers", action="store_true", help="rendered images, and ranging far away")
     parser.add_argument(
         "--leg",
         type=int,

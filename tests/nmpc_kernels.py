@@ -58,6 +58,7 @@ class _Rows(Structure):
         ("a", c_void_p),
         ("c", c_void_p),
         ("b", c_void_p),
+        ("relief", c_void_p),
     ]
 
 
@@ -85,10 +86,9 @@ def build_rows(problem: NmpcInput, x: Array, outer_m: float, reach_m: Array) -> 
         np.zeros((n, width), dtype=np.int64), np.zeros((n, width, 3)), np.zeros((n, width)), np.zeros(n, dtype=np.int64),
         np.zeros((n, width, 3)),
     )  # fmt: skip
-    zones, reach = zones_of(problem, outer_m), np.ascontiguousarray(reach_m)
-    native = _Rows(
-        width, nodes, *(location(a) for a in (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b))
-    )
+    zones, reach, relief = zones_of(problem, outer_m), np.ascontiguousarray(reach_m), np.empty(n)
+    arrays = (reach, rows.stage, rows.n_rows, rows.a, rows.c, rows.b, relief)
+    native = _Rows(width, nodes, *(location(a) for a in arrays))
     function("build_rows")(ctypes.byref(zones), address(x), ctypes.byref(native))
     return rows
 

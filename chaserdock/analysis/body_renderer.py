@@ -16,7 +16,6 @@ from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.orbit import earth_disc, to_sun
 from chaserdock_world.rendering.background import Background, Earth, Light
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
-from chaserdock_world.rendering.rasterizer import chaser_boxes
 from numpy.typing import NDArray
 
 from .chase_camera import BgrImage, BodyPose, RenderedBodies, Viewpoint
@@ -38,7 +37,7 @@ class BodyRenderer:
         earth = None if disc is None else Earth(*disc)
         x, y, z = to_sun(scenario)
         self._light = Light((x, y, z), 1.0 - _AMBIENT, _AMBIENT)
-        body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
+        body, probe = scenario.chaser.boxes()
         self._boxes = (body, probe)
         self._black = tuple(replace(box, shade=0.0) for box in self._boxes)
         substitutes: dict[Box, TriangleMesh] = {}

@@ -23,7 +23,6 @@ from chaserdock_world.plant import true_mesh, true_target
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
 from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer, mesh_of_boxes
-from chaserdock_world.rendering.rasterizer import chaser_boxes
 from chaserdock_world.rendering.scene_geometry import Obstacle
 from chaserdock_world.sensors.errors import true_camera
 from numpy.typing import NDArray
@@ -132,7 +131,7 @@ class ViewRenderer:
         self.mesh = target_mesh(scenario)
         self.shape = shape_of(self.mesh, symmetric=not true_target(scenario).markers)
         self._mask = _Coverage(self.camera, self.mesh)
-        _, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
+        _, probe = scenario.chaser.boxes()
         self._visible = _Coverage(self.camera, self.mesh, probe)
         self._margin_px = (self.camera.width_px, self.camera.height_px)
         self._wide = _Coverage(_padded(self.camera, self._margin_px), self.mesh)

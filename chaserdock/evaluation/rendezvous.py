@@ -20,7 +20,6 @@ from .perception import PerceptionModel
 
 HOLD_S = 20.0
 """Time before the next command over which tracking at a hold point is measured."""
-IMAGES_FROM_M = 2.5
 _AFTER_CAPTURE_S, _AFTER_COMMAND_S = 1.0, 1.0
 
 
@@ -198,19 +197,13 @@ def leg(scenario: Scenario, index: int, wait_s: float = 30.0) -> Scenario:
     )
 
 
-def last_leg(
-    scenario: Scenario, wait_s: float = 20.0, images: bool = False, images_from_m: float = IMAGES_FROM_M
-) -> Scenario:
+def last_leg(scenario: Scenario, wait_s: float = 20.0, images: bool = False) -> Scenario:
     """Return the scenario from its last hold point on.
 
-    ``images``: with images and markers in place of statistical perception and ranging, from ``images_from_m`` on. At `IMAGES_FROM_M` a
-    camera of 960 x 540 measures the servicer's attitude well enough; from 5 m on it does not.
+    ``images``: with images and markers in place of statistical perception and ranging.
     """
     part = leg(scenario, len(scenario.timeline) - 1, wait_s)
     if not images:
         return part
-    x, y, z = part.chasers[0].position_m
-    share = images_from_m / math.hypot(x, y)
-    chaser = part.chasers[0].model_copy(update={"position_m": (share * x, share * y, z)})
     perception = part.perception.model_copy(update={"name": "default"})
-    return part.model_copy(update={"chasers": (chaser,), "perception": perception, "ranging": None})
+    return part.model_copy(update={"perception": perception, "ranging": None})

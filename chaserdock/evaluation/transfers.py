@@ -4,16 +4,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.attitude_reference import facing_attitudes
+from chaserdock_models.shape_distance import box_table, distance_between, moved, separations
 from chaserdock_protocol.scenario import Scenario, load_scenario
 from chaserdock_protocol.shipped_scenarios import shipped_scenario
-from chaserdock_world.physics.simulation import TARGET
+from chaserdock_world.physics.simulation import TARGET, BodyState
 from chaserdock_world.rendering.cameras import States
+from numpy.typing import ArrayLike
 
 from .in_process import InProcessMission
 from .perception import PerceptionModel
@@ -86,6 +89,8 @@ def swap(seed: int) -> Scenario:
     return scenario.model_copy(update={"chasers": chasers, "target": target})
 
 
+CLUTTER_SHAPES_M = 0.02
+"""Distance of the shapes of chasers from each other and from the target in clutter, m."""
 CLUTTER, DENSE_CLUTTER = (0.8, 1.4, 0.5), (0.7, 1.15, 0.42)
 """Smallest and largest distance of places from the target, and least distance from each other, m, in `clutter`."""
 
@@ -99,18 +104,19 @@ def clutter(
     """Return a scenario in which chasers at random places around the tumbling target fly to random places, all at once."""
     rng = np.random.default_rng([seed, 0xC107])
     base = load_shipped(
-        "swap", f"seed={seed}", "navigation.grade='exact'", f"duration_s={duration_s}", *CLUTTER_TIMING
+        "swap",
+        f"seed={seed}",
+        "navigation.grade='exact'",
+        f"limits.min_distance_shape_m={CLUTTER_SHAPES_M}",
+        f"duration_s={duration_s}",
+        *CLUTTER_TIMING,
     )
-    starts, goals = _places(rng, chasers, places_m), _places(rng, chasers, places_m)
-    nominal, entry = base.chasers[0], base.timeline[0]
+    nominal, entry, shape = base.chasers[0], base.timeline[0], box_table(base.chaser.boxes())
+    starts, attitudes = _places(rng, places_m, shape, [(nominal.position_m, nominal.q_wxyz)] * chasers)
+    goals, _ = _places(rng, places_m, shape, list(zip(starts, attitudes, strict=True)))
     made = [
-        nominal.model_copy(
-            update={
-                "position_m": tuple(place.tolist()),
-                "q_wxyz": tuple(facing_attitudes(nominal.position_m, nominal.q_wxyz, place)[0].tolist()),
-            }
-        )
-        for place in starts
+        nominal.model_copy(update={"position_m": tuple(place.tolist()), "q_wxyz": tuple(q.tolist())})
+        for place, q in zip(starts, attitudes, strict=True)
     ]
     timeline = [
         entry.model_copy(update={"at_s": 1.0, "chasers": (i,), "offset_m": tuple(goal.tolist())})
@@ -119,27 +125,39 @@ def clutter(
     return base.model_copy(update={"chasers": tuple(made), "timeline": tuple(timeline)})
 
 
-def _places(rng: np.random.Generator, count: int, places_m: tuple[float, float, float]) -> Array:
-    """Return random places (count, 3); ``places_m`` as in `clutter`."""
+def _places(
+    rng: np.random.Generator,
+    places_m: tuple[float, float, float],
+    shape: Array,
+    nominal: Sequence[tuple[ArrayLike, ArrayLike]],
+) -> tuple[Array, Array]:
+    """Return random places (N, 3) and the attitudes (N, 4) in which chasers with ``nominal`` poses face the target there;
+    ``places_m`` as in `clutter`. The chasers' shapes (S, 15) do not come near each other."""
     nearest_m, farthest_m, apart_m = places_m
-    places = np.zeros((0, 3))
-    while len(places) < count:
+    places, attitudes = np.zeros((0, 3)), np.zeros((0, 4))
+    while len(places) < len(nominal):
         way = rng.normal(size=3)
         place = way / np.linalg.norm(way) * rng.uniform(nearest_m, farthest_m)
-        if np.all(np.linalg.norm(places - place, axis=1) >= apart_m):
-            places = np.vstack([places, place])
-    return places
+        if np.any(np.linalg.norm(places - place, axis=1) < apart_m):
+            continue
+        q = facing_attitudes(*nominal[len(places)], place)[0]
+        others = zip(places, attitudes, strict=True)
+        if all(distance_between(shape, (place, q), other) > 2.0 * CLUTTER_SHAPES_M for other in others):
+            places, attitudes = np.vstack([places, place]), np.vstack([attitudes, q])
+    return places, attitudes
 
 
 @dataclass
 class TransferOutcome:
-    """Figures of one flight: least true distances between centres; ``reached_s``: when the last of the chasers with a goal
+    """Figures of one flight: least true distances between centres; ``shapes_m``: least gap between the shapes of two bodies (probes
+    included), if the scenario limits it; ``reached_s``: when the last of the chasers with a goal
     was there for good, from its command on (NaN if never); ``end_m``: the largest final distance from a goal; ``missed``:
     chasers that are not at their goal at the end."""
 
     seed: int
     to_target_m: float = math.inf
     between_m: float = math.inf
+    shapes_m: float = math.inf
     reached_s: float = math.nan
     end_m: float = math.inf
     missed: int = 0
@@ -151,6 +169,7 @@ class TransferOutcome:
         """Return one line for people."""
         return (
             f"{self.seed:3d}  to target {self.to_target_m:.4f} m  between chasers {self.between_m:.4f} m  "
+            f"between shapes {self.shapes_m:.4f} m  "
             f"reached after {self.reached_s:.1f} s, {self.end_m * 1e3:.1f} mm  missed {self.missed}  failed {self.failed}  "
             f"relaxed {self.relaxed}  contacts {self.contacts}"
         )
@@ -169,6 +188,8 @@ def fly_transfer(
     def measure(time_s: float, states: States) -> None:
         nonlocal distances
         _note_distances(out, scenario, states)
+        if scenario.limits.min_distance_shape_m:
+            out.shapes_m = min(out.shapes_m, shape_gap_m(scenario, states))
         distances = {i: _goal_distance_m(i, offset, states) for i, (_, offset) in goals.items()}
         for i, (sent_s, _) in goals.items():
             if distances[i] > scenario.success.reached_position_m or time_s < sent_s:
@@ -203,6 +224,20 @@ def _note_distances(out: TransferOutcome, scenario: Scenario, states: States) ->
     between = np.linalg.norm(positions[:, None] - positions[None], axis=-1) + _DIAGONAL * np.eye(n)
     out.to_target_m = min(out.to_target_m, float(to_target.min()))
     out.between_m = min(out.between_m, float(between.min()))
+
+
+def shape_gap_m(scenario: Scenario, states: States) -> float:
+    """Return the least gap between the shapes of two bodies, negative exactly if two overlap, at most their distance, m."""
+    shape, names = box_table(scenario.chaser.boxes()), [f"chaser/{i}" for i in range(len(scenario.chasers))]
+    tables = [_placed(box_table(scenario.target_model().boxes), states[TARGET])]
+    tables += [_placed(shape, states[name]) for name in names]
+    cuboids, owner = np.concatenate(tables), np.repeat(np.arange(len(tables)), [len(t) for t in tables])
+    one, other = np.nonzero(owner[:, None] < owner)
+    return float(separations(cuboids[one], cuboids[other]).min())
+
+
+def _placed(table: Array, body: BodyState) -> Array:
+    return moved(table, body.position_m[None], body.q_wxyz[None])[0]
 
 
 def _goal_distance_m(chaser: int, offset_m: tuple[float, float, float], states: States) -> float:

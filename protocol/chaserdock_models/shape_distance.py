@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Signed distance from the cuboids of a body, with its gradient. Pure functions.
+"""Signed distance from the cuboids of a body, with its gradient, and distances between bodies of cuboids. Pure functions.
 
 The distance from a cuboid is that from its nearest point; inside it is negative, to the nearest face (C. Ericson, Real-Time
-Collision Detection, 2005, section 5.1.4). The NMPC's kernel computes the same (nmpc/native/planes.c).
+Collision Detection, 2005, section 5.1.4). Between bodies the distance is that of two planes that separate them: the gap along one
+direction, which is at most the distance. The NMPC's kernel computes the same (nmpc/native/planes.c).
 """
 
 from __future__ import annotations
@@ -15,6 +16,21 @@ from numpy.typing import ArrayLike
 from . import rotations
 from .arrays import Array
 from .targets import Box
+
+
+def chaser_boxes(
+    size_m: tuple[float, float, float] = (0.25, 0.25, 0.05), probe_reach_m: float = 0.35
+) -> tuple[Box, ...]:
+    """Return the boxes of a chaser in CRF: its body and a thin docking probe along +X up to ``probe_reach_m``.
+
+    Raises ValueError if the probe does not reach beyond the body.
+    """
+    front = size_m[0] / 2.0
+    if probe_reach_m <= front:
+        raise ValueError(f"the probe ({probe_reach_m} m) must reach beyond the body's front ({front} m)")
+    length = probe_reach_m - front
+    probe = Box((length, 0.012, 0.012), (front + length / 2.0, 0.0, 0.0), shade=0.45)
+    return (Box(size_m, shade=0.3), probe)
 
 
 def box_table(boxes: Sequence[Box]) -> Array:
@@ -58,3 +74,49 @@ def signed_distance(table: Array, point_m: ArrayLike) -> tuple[float, Array]:
         if distance < best:
             best, gradient = distance, axes @ normal
     return best, gradient
+
+
+def reach_along(table: Array, direction: ArrayLike, q_wxyz: ArrayLike) -> float:
+    """Return how far a body (C, 15) in the attitude (4,) reaches from its origin along a unit vector (3,), m."""
+    local = rotations.rotate_inverse(np.asarray(q_wxyz, dtype=float), np.asarray(direction, dtype=float))
+    along = table[:, 3:12].reshape(-1, 3, 3).transpose(0, 2, 1) @ local
+    return float((table[:, :3] @ local + (np.abs(along) * table[:, 12:]).sum(axis=1)).max())
+
+
+def distance_from_cuboids(table: Array, body: Array, position_m: ArrayLike, q_wxyz: ArrayLike) -> float:
+    """Return the least gap (m) between cuboids (C, 15) and a ``body`` (S, 15) in a pose (3,), (4,), along the gradients of the signed
+    distances of its origin."""
+    gaps = []
+    for row in table:
+        distance_m, normal = signed_distance(row[None], position_m)
+        gaps.append(distance_m - reach_along(body, -normal, q_wxyz))
+    return min(gaps, default=np.inf)
+
+
+def distance_between(
+    body: Array, pose: tuple[ArrayLike, ArrayLike], other: tuple[ArrayLike, ArrayLike]
+) -> float:
+    """Return the gap (m) between two bodies of equal shape (S, 15) in poses (3,), (4,), along the line between their origins."""
+    line = np.asarray(pose[0], dtype=float) - np.asarray(other[0], dtype=float)
+    apart_m = float(np.linalg.norm(line))
+    if apart_m == 0.0:
+        return -np.inf
+    line = line / apart_m
+    return apart_m - reach_along(body, -line, pose[1]) - reach_along(body, line, other[1])
+
+
+def separations(one: Array, other: Array) -> Array:
+    """Return the largest gap (M,), m, of cuboids (M, 15) from others (M, 15), in one frame, along the directions of the
+    separating-axis test: positive exactly if they are disjoint, at most the distance.
+
+    S. Gottschalk, M. Lin, D. Manocha, OBBTree, SIGGRAPH 1996.
+    """
+    axes, others = (t[:, 3:12].reshape(-1, 3, 3).transpose(0, 2, 1) for t in (one, other))
+    edges = np.cross(axes[:, :, None], others[:, None]).reshape(-1, 9, 3)
+    length = np.linalg.norm(edges, axis=2, keepdims=True)
+    edges = np.where(length > 1e-6, edges / np.maximum(length, 1e-6), axes[:, :1])
+    directions = np.concatenate([axes, others, edges], axis=1)
+    gaps = np.abs(np.einsum("mdk,mk->md", directions, other[:, :3] - one[:, :3]))
+    for table, own in ((one, axes), (other, others)):
+        gaps -= np.einsum("mdi,mi->md", np.abs(directions @ own.transpose(0, 2, 1)), table[:, 12:])
+    return gaps.max(axis=1)

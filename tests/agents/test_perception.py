@@ -166,6 +166,25 @@ def test_a_bright_face_beside_a_border_does_not_move_corners(turn_rad):
             assert np.abs(found.corners_px[0] - truth).max() < 0.25
 
 
+def test_neighbours_beside_a_part_of_a_side_do_not_enlarge_far_markers():
+    scene, generator = Scene("servicer", 960, 540), np.random.default_rng(4)
+    errors, nees = [], []
+    for number in range(24):
+        position = np.array([*generator.uniform(-0.1, 0.1, 2), generator.uniform(5.0, 5.6)])
+        q = rotations.multiply(FACING, rotations.exp(generator.normal(0.0, 0.05, 3)))
+        sighting = scene.perception.estimate(scene.image(position, q, number))
+        each = [error_of(s, position, q) for s in sighting.solutions]
+        squares = [
+            e @ np.linalg.solve(s.covariance, e) for e, s in zip(each, sighting.solutions, strict=True)
+        ]
+        if each:
+            errors.append(each[int(np.argmin(squares))])
+            nees.append(min(squares))
+    assert len(errors) > 20
+    assert abs(np.median(np.array(errors)[:, 2])) < 0.02
+    assert np.median(nees) < 8.0
+
+
 def test_a_prediction_changes_where_is_looked_but_not_what_is_found():
     scene = Scene("paper", 1280, 720)
     position, q = np.array([0.1, 0.05, 1.0]), rotations.multiply(FACING, rotations.exp([0.2, 0.5, 0.3]))

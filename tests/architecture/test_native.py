@@ -25,11 +25,11 @@ from chaserdock_models import native, passive_safety
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import KernelLibrary
 from chaserdock_models.native.build import LIBRARY_NAME, NATIVE_FOLDERS, X86_64, source_digest
-from chaserdock_models.shape_distance import box_table
+from chaserdock_models.shape_distance import box_table, chaser_boxes
 from chaserdock_models.targets import Box, target_model
 from chaserdock_world.rendering import native as rendering_native
 from chaserdock_world.rendering import scene_geometry as faces
-from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
+from chaserdock_world.rendering.rasterizer import Renderer
 from flight_cases import scenario
 from joint_cases import SyntheticFlight, navigation, parameters
 from nmpc_cases import PARAMS, Array, at_rest, fixed_problem, fly, swap

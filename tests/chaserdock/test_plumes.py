@@ -10,7 +10,13 @@ import pytest
 from chaserdock_agents.chaser.thrusters.allocation import allocator_of
 from chaserdock_agents.chaser.thrusters.plume_avoidance import PlumeAvoidance
 from chaserdock_models.wrench_set import wrench_matrix
-from chaserdock_protocol.messages import ActuatorCommand, Odometry, TargetEstimate, ThrusterPulse
+from chaserdock_protocol.messages import (
+    ActuatorCommand,
+    Odometry,
+    RelativeEstimate,
+    TargetEstimate,
+    ThrusterPulse,
+)
 from chaserdock_protocol.scenario import Scenario, ScenarioError, flight_scenario, parse_scenario
 from chaserdock_world.actuators.ideal import fly_to
 from chaserdock_world.actuators.thrusters import make_actuators
@@ -101,6 +107,39 @@ def test_allocation_fires_thrusters_at_the_target_only_where_it_must() -> None:
     assert less > 0.05
     far = Odometry(chaser=0, position_m=(-50.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero)
     assert PlumeAvoidance(s, s.plume).cost_factors(far, target) is None
+
+
+def test_allocation_spares_other_chasers_whose_poses_are_known() -> None:
+    q, zero, eye = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), tuple(np.eye(12).ravel().tolist())
+    s = flight_scenario(scenario())
+    assert s.plume is not None
+    avoidance = PlumeAvoidance(s, s.plume)
+    own = Odometry(chaser=0, position_m=(-40.0, 0.0, 0.0), velocity_m_s=zero, q_wxyz=q, omega_rad_s=zero)
+    head = {"position_m": zero, "velocity_m_s": zero, "q_wxyz": q, "omega_rad_s": zero, "covariance": eye}
+
+    def factors(*places: tuple[int, tuple[float, float, float]]) -> Any:
+        relative = tuple(
+            RelativeEstimate(
+                chaser=i,
+                position_m=place,
+                q_wxyz=q,
+                covariance=tuple(np.eye(6).ravel().tolist()),
+                force_N=zero,
+                torque_N_m=zero,
+            )
+            for i, place in places
+        )
+        target = TargetEstimate(status="tracking", accepted=(0,), rejected=(), relative=relative, **head)
+        return avoidance.cost_factors(own, target)
+
+    assert (
+        factors((0, (-40.0, 0.0, 0.0))) is None
+    )  # alone: the target is out of reach, and it does not hit itself
+    assert factors((0, (-40.0, 0.0, 0.0)), (1, (-40.0, 20.0, 0.0))) is None
+    beside = factors((0, (-40.0, 0.0, 0.0)), (1, (-40.0, 1.0, 0.0)))
+    forces = np.array([t.direction for t in s.chaser.thrusters])
+    # Only thrusters that blow towards +Y, where the other one is: they push towards -Y.
+    assert set(np.flatnonzero(beside > 1.0)) == set(np.flatnonzero(forces[:, 1] < -0.5))
 
 
 def test_plumes_need_thrusters() -> None:

@@ -51,8 +51,12 @@ static Zones *zones(int64_t n, int64_t d, int64_t boxes, int64_t coasts) {
     }
     for (int64_t i = 0; i < n; i++)
         for (int64_t j = 0; j < i; j++) between[i * n + j] = between[j * n + i];
+    const int64_t shape = whole(0, 2);
+    double *apart = doubles(n * n, -0.2, 0.3);
+    for (int64_t i = 0; i < n; i++)
+        for (int64_t j = 0; j < i; j++) apart[i * n + j] = apart[j * n + i];
     *z = (Zones){n, d, references(n * (d + 1)), doubles(3 * (d + 1), -0.2, 0.2), doubles(n * (d + 1), -0.2, 1.0), between, corridors,
-                 value(0.5, 30.0), boxes, doubles(15 * boxes * (d + 1), -0.5, 0.5), doubles(n, -0.2, 0.6),
+                 value(0.5, 30.0), boxes, doubles(15 * boxes * (d + 1), -0.5, 0.5), doubles(n, -0.2, 0.6), shape, doubles(15 * shape, -0.5, 0.5), apart,
                  coasts, doubles(7 * n * (d + 1) * coasts, -1.0, 1.0), value(0.01, 0.3)};
     return z;
 }
@@ -154,7 +158,7 @@ static void build_rows(void) {
     const int64_t n = whole(1, 3), d = whole(1, 4), boxes = whole(0, 2), coasts = whole(0, 2), width = d * (n + 2 + boxes + coasts);
     double *x = states(n * (d + 1));
     Rows rows = {width, d + 1, doubles(n * (d + 1), 0.0, 5.0), block((size_t)(n * width) * 8), block((size_t)n * 8), outputs(3 * n * width),
-                 outputs(n * width), coasts ? outputs(3 * n * width) : 0};
+                 outputs(n * width), coasts ? outputs(3 * n * width) : 0, outputs(n)};
     NAME(build_rows)(zones(n, d, boxes, coasts), x, &rows);
     for (int64_t i = 0; i < n; i++) {
         CHECK(0 <= rows.n_rows[i] && rows.n_rows[i] <= width);

@@ -29,7 +29,7 @@ static Settings settings(void) {
     s.rows = (double)whole(2, ROWS_MOST), s.taps = (double)whole(2, TAPS_MOST), s.coarse_reach_px = uniform(1.0, 5.0);
     s.border_share = uniform(0.1, 1.0), s.columns = (double)whole(1, COLUMNS_MOST), s.end_px = uniform(0.0, 5.0);
     s.end_share = uniform(0.0, 0.4), s.reach_px = uniform(1.0, 5.0), s.clear_px = uniform(0.0, 2.0);
-    s.beyond_px = uniform(0.1, 2.0), s.strip_px = uniform(0.0, 20.0), s.least_fall = uniform(-1.0, 1.0);
+    s.beyond_px = uniform(0.1, 2.0), s.strip_px = uniform(0.0, 20.0), s.partial_px = uniform(0.0, 20.0), s.least_fall = uniform(-1.0, 1.0);
     s.agreement_px = uniform(0.0, 1.0), s.log_edge_sigma = uniform(-1.0, 1.0), s.edge_sigma_spread = uniform(0.05, 0.5);
     s.rounds = (double)whole(0, 3), s.iterations = (double)whole(1, 4), s.strip_iterations = (double)whole(1, 5);
     s.uncertain_px = uniform(0.5, 4.0), s.uncertain_level = uniform(0.0, 200.0);

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from chaserdock_models import rotations
 from chaserdock_models.camera import Camera
+from chaserdock_models.shape_distance import chaser_boxes
 from chaserdock_models.targets import Box, TargetModel, target_model
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
 from chaserdock_world.rendering.effects import CameraEffects
-from chaserdock_world.rendering.rasterizer import Renderer, chaser_boxes
+from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.scene_geometry import VisibleBox, paint_order
 from chaserdock_world.rendering.textures import finest_texture, marker_cells
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer

@@ -10,7 +10,7 @@ import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
-from chaserdock_protocol.scenario.checks import angle_deg, shape_distance_m
+from chaserdock_protocol.scenario.checks import angle_deg, shape_distance_m, shapes_apart_m
 from numpy.typing import ArrayLike
 
 from .approach_cone import BESIDE_LINE_M
@@ -52,33 +52,33 @@ def why_not_calibrate(scenario: FlightScenario, phase: Phase, at_rest: bool) -> 
     return ""
 
 
-def why_not_inspect(scenario: FlightScenario, offset_m: Array, at_rest: bool) -> str:
+def why_not_inspect(scenario: FlightScenario, chaser: int, offset_m: Array, at_rest: bool) -> str:
     """Check that a chaser can fly around the target."""
     if not at_rest:
         return "the chaser moves; hold first"
     distance_m, own_m = scenario.inspection.distance_m, float(np.linalg.norm(offset_m))
-    if reason := why_not_offset(scenario, (distance_m, 0.0, 0.0)):
+    if reason := why_not_offset(scenario, chaser, (distance_m, 0.0, 0.0)):
         return reason
     if own_m > 2.0 * distance_m:
         return f"the chaser is {own_m:.3g} m from the target; fly to less than twice inspection.distance_m ({distance_m:g} m) first"
     return ""
 
 
-def why_not_offset(scenario: FlightScenario, offset_m: ArrayLike) -> str:
-    """Check the distance of an offset (3,), TRF, from the target."""
+def why_not_offset(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
+    """Check the distance of a chaser at an offset (3,), TRF, from the target."""
     distance = float(np.linalg.norm(offset_m))
     nearest = scenario.limits.min_distance_target_m
     if not nearest < distance <= scenario.limits.max_reference_distance_m:
         return f"the offset is {distance:.3g} m from the target; allowed are more than {nearest:.3g} m"
-    return why_not_off_shape(scenario, offset_m)
+    return why_not_off_shape(scenario, chaser, offset_m)
 
 
-def why_not_off_shape(scenario: FlightScenario, offset_m: ArrayLike) -> str:
-    """Check the distance of an offset (3,), TRF, from the cuboids of the target's shape."""
+def why_not_off_shape(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
+    """Check the distance of a chaser's shape at an offset (3,), TRF, from the cuboids of the target's shape."""
     least_m = scenario.limits.min_distance_shape_m
-    if not least_m or (distance_m := shape_distance_m(scenario, offset_m)) >= least_m:
+    if not least_m or (distance_m := shape_distance_m(scenario, chaser, offset_m)) >= least_m:
         return ""
-    return f"the offset is {distance_m:.3g} m from the target's shape; allowed are at least {least_m:.3g} m"
+    return f"there the chaser is {distance_m:.3g} m from the target's shape; allowed are at least {least_m:.3g} m"
 
 
 def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> str:
@@ -92,16 +92,21 @@ def why_not_in_cone(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) 
     return f"the offset is {off_deg:.3g} degrees off the approach axis; the approach cone has {cone_deg:g} degrees"
 
 
-def why_not_goto(scenario: FlightScenario, offset_m: ArrayLike | None, ends_m: Mapping[int, Array]) -> str:
-    """Check an offset (3,), TRF, against the target and the goals ``ends_m`` of the other chasers."""
+def why_not_goto(
+    scenario: FlightScenario, chaser: int, offset_m: ArrayLike | None, ends_m: Mapping[int, Array]
+) -> str:
+    """Check a chaser's offset (3,), TRF, against the target and the goals ``ends_m`` of the other chasers."""
     if offset_m is None:
         return "goto needs an offset"
-    if reason := why_not_offset(scenario, offset_m):
+    if reason := why_not_offset(scenario, chaser, offset_m):
         return reason
+    least_m = scenario.limits.min_distance_shape_m
     for j, end_m in ends_m.items():
         apart = float(np.linalg.norm(end_m - np.asarray(offset_m)))
         if apart < scenario.limits.min_distance_chasers_m:
             return f"the offset is {apart:.3g} m from the goal of chaser {j}"
+        if least_m and (apart := shapes_apart_m(scenario, (chaser, offset_m), (j, end_m))) < least_m:
+            return f"there the chaser is {apart:.3g} m from chaser {j} at its goal; allowed are at least {least_m:.3g} m"
     return ""
 
 

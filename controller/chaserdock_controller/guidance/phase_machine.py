@@ -245,7 +245,8 @@ class PhaseMachine:
             for c in commands
             if c.command == "goto"
             and c.offset_m is not None
-            and not validation.why_not_offset(self._scenario, c.offset_m)
+            and c.chaser < len(self.chasers)
+            and not validation.why_not_offset(self._scenario, c.chaser, c.offset_m)
         }
 
     def command(self, command: OperatorCommand, now_s: float) -> CommandResult:
@@ -339,7 +340,7 @@ class PhaseMachine:
                 for j, other in enumerate(self.chasers)
                 if j != i
             }
-            reason = validation.why_not_goto(self._scenario, command.offset_m, goals)
+            reason = validation.why_not_goto(self._scenario, i, command.offset_m, goals)
             reason = reason or validation.why_not_in_cone(self._scenario, i, np.asarray(command.offset_m))
             return reason or self._why_not_safe(i, np.asarray(command.offset_m), now_s)
         return ""
@@ -355,7 +356,7 @@ class PhaseMachine:
         """Return why a chaser may not fly around the target, or an empty string."""
         c = self.chasers[i]
         path = self._circuit(i, now_s)
-        if reason := validation.why_not_inspect(self._scenario, path.from_m, c.move.over_at(now_s)):
+        if reason := validation.why_not_inspect(self._scenario, i, path.from_m, c.move.over_at(now_s)):
             return reason
         others = {j: o for j, o in enumerate(self.chasers) if j != i}
         if any(o.phase is Phase.INSPECT and o.since_s != now_s for o in others.values()):
@@ -588,7 +589,7 @@ class PhaseMachine:
         return 0.0 if self._is_held(i) else min(limit, dock.keep_out_m())
 
     def min_distance_shape_m(self, i: int) -> float:
-        """Return the distance from the cuboids of the target's shape that a chaser's plan keeps; 0 in its corridor and at its port."""
+        """Return the distance from the target's shape that a chaser's plan keeps; 0 in its corridor and at its port."""
         free = self.corridor(i) is None and not self.in_corridor(i) and not self._is_held(i)
         return self._scenario.limits.min_distance_shape_m if free else 0.0
 

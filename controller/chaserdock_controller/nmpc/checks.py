@@ -32,7 +32,8 @@ def _poses(name: str, array: Array, first: int) -> None:
 
 def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcInput:
     """Return a copy of ``problem`` with contiguous arrays, unit quaternions and all optional values expanded:
-    (N, D+1) target distances, (N, N) chaser distances, corridors, cuboids.
+    (N, D+1) target distances, (N, N) chaser distances, corridors, cuboids and
+    distances of shapes.
 
     Raises ValueError for a wrong shape, a value that is not finite, a quaternion more than 10 % off unit
     length, a negative distance or limit, an asymmetric distance matrix, an invalid corridor, or more than
@@ -50,8 +51,13 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
     if between.ndim == 0:
         between = np.full((n, n), float(between))
     between = _array("min_distance_chasers_m", between, (n, n))
-    if n > 1 and (between != between.T).any():
-        raise ValueError("min_distance_chasers_m must be symmetric")
+    apart = np.zeros((n, n)) if problem.min_distance_shapes_m is None else problem.min_distance_shapes_m
+    apart = _array("min_distance_shapes_m", apart, (n, n))
+    for name, value in (("min_distance_chasers_m", between), ("min_distance_shapes_m", apart)):
+        if n > 1 and (value != value.T).any():
+            raise ValueError(f"{name} must be symmetric")
+    shape = np.zeros((0, 15)) if problem.chaser_shape is None else np.asarray(problem.chaser_shape)
+    shape = _array("chaser_shape", shape, (len(shape), 15))
     to_target = np.asarray(problem.min_distance_target_m, dtype=np.float64)
     if to_target.ndim == 1:
         to_target = np.repeat(to_target[:, None], d + 1, axis=1)
@@ -76,6 +82,8 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         ("corridors", corridors, True),
         ("boxes", boxes, True),
         ("box_clearance_m", clearance, False),
+        ("chaser_shape", shape, True),
+        ("min_distance_shapes_m", apart, False),
     ):
         code = sign_of(value)
         if code == 1:
@@ -95,6 +103,8 @@ def check_input(problem: NmpcInput, params: NmpcParameters, n_max: int) -> NmpcI
         corridors=corridors,
         boxes=boxes,
         box_clearance_m=clearance,
+        chaser_shape=shape,
+        min_distance_shapes_m=apart,
         coast_safety=problem.coast_safety,
     )
 

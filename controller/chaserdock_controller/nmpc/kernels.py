@@ -116,6 +116,9 @@ class _Zones(Structure):
         ("n_boxes", c_int64),
         ("boxes", c_void_p),
         ("clearance", c_void_p),
+        ("n_shape", c_int64),
+        ("shape", c_void_p),
+        ("apart", c_void_p),
         ("n_coasts", c_int64),
         ("coasts", c_void_p),
         ("step_s", c_double),
@@ -127,14 +130,17 @@ def zones_of(problem: NmpcInput, outer: float, step_s: float = 1.0) -> _Zones:
     between, corridors = problem.min_distance_chasers_m, problem.corridors
     assert isinstance(between, np.ndarray)
     boxes, clearance = problem.boxes, problem.box_clearance_m
+    shape, apart = problem.chaser_shape, problem.min_distance_shapes_m
     assert corridors is not None
     assert boxes is not None
     assert clearance is not None
+    assert shape is not None
+    assert apart is not None
     coasts = problem.coasts
     return _Zones(
         n, nodes - 1, location(problem.references), location(problem.target_positions),
         location(problem.min_distance_target_m), location(between), location(corridors), outer,
-        boxes.shape[1], location(boxes), location(clearance),
+        boxes.shape[1], location(boxes), location(clearance), len(shape), location(shape), location(apart),
         *((0, None) if coasts is None else (coasts.shape[2], location(coasts))), step_s,
     )  # fmt: skip
 

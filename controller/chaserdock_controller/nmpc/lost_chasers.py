@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,13 +41,10 @@ def with_lost_chasers(
         places, q = coasting(last, from_ns, times_s), np.asarray(last.q_wxyz)
         states.append(np.concatenate([places[0], last.velocity_m_s, q, np.zeros(3)]))
         references.append(np.concatenate([places, np.tile(q, (nodes, 1))], axis=1))
-    total = n + len(lost)
-    between = np.zeros((total, total))
-    between[:n, :n] = problem.min_distance_chasers_m
-    least_m = float(np.max(problem.min_distance_chasers_m))
-    for row, last in enumerate(lost.values(), start=n):
-        lost_s = (from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1])
-        between[row, :n] = between[:n, row] = least_m + margin_m(lost_s)
+    lost_s = [(from_ns - last.sim_time_ns) / 1e9 + float(times_s[-1]) for last in lost.values()]
+    margins_m = [margin_m(s) for s in lost_s]
+    between = _with_margins(problem.min_distance_chasers_m, n, margins_m)
+    apart = problem.min_distance_shapes_m
     to_target = problem.min_distance_target_m
     corridors = problem.corridors
     if corridors is not None:
@@ -62,7 +59,18 @@ def with_lost_chasers(
         u_ref=np.concatenate([problem.u_ref, np.zeros((len(lost), *problem.u_ref.shape[1:]))]),
         min_distance_target_m=np.concatenate([to_target, np.zeros((len(lost), *to_target.shape[1:]))]),
         min_distance_chasers_m=between,
+        min_distance_shapes_m=None if apart is None else _with_margins(apart, n, margins_m),
         input_max=np.concatenate([problem.input_max, np.full((len(lost), 6), _LIMIT)]),
         corridors=corridors,
         box_clearance_m=clearance,
     )
+
+
+def _with_margins(distances_m: Array | float, n: int, margins_m: Sequence[float]) -> Array:
+    """Return distances (N, N) with a row for each lost chaser: the largest of them and its margin; lost ones ignore each other."""
+    total = n + len(margins_m)
+    out = np.zeros((total, total))
+    out[:n, :n] = distances_m
+    for row, margin in enumerate(margins_m, start=n):
+        out[row, :n] = out[:n, row] = float(np.max(distances_m)) + margin
+    return out

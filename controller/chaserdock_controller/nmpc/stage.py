@@ -9,6 +9,7 @@ from typing import cast
 
 import numpy as np
 from chaserdock_models.arrays import Array
+from chaserdock_models.shape_distance import box_table
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import FlightScenario
 
@@ -61,7 +62,10 @@ class PlanningStage:
     ) -> None:
         c = scenario.controller
         self._parameters, self._now_s = parameters, now_s
-        self._min_distance_chasers_m = scenario.limits.min_distance_chasers_m
+        self._limits = scenario.limits
+        self._shape = None
+        if scenario.limits.min_distance_shape_m > 0.0:
+            self._shape = box_table(scenario.chaser.boxes())
         self.solver = make_solver(c.solver, parameters, len(scenario.chasers), c.max_iterations)
         self.monitor = PlanMonitor()
         self._passive_safety = None
@@ -141,12 +145,21 @@ class PlanningStage:
             u_ref=horizon.u_ref,
             target_positions=horizon.target_positions,
             min_distance_target_m=horizon.min_distance_target_m,
-            min_distance_chasers_m=self._min_distance_chasers_m,
+            min_distance_chasers_m=self._limits.min_distance_chasers_m,
             input_max=limits,
             corridors=horizon.corridors,
             boxes=horizon.boxes,
             box_clearance_m=horizon.box_clearance_m,
+            chaser_shape=self._shape,
+            min_distance_shapes_m=self._between_shapes(horizon.box_clearance_m),
         )
+
+    def _between_shapes(self, box_clearance_m: Array | None) -> Array | None:
+        """Return the distances (N, N) of the shapes of chasers: none between two in their corridors or at their ports."""
+        if box_clearance_m is None:
+            return None
+        free = box_clearance_m > 0.0
+        return np.where(free[:, None] | free, self._limits.min_distance_shape_m, 0.0)
 
 
 def _bounded(disturbance: Array, limits: Array) -> Array:

@@ -136,7 +136,9 @@ class NmpcInput:
     the keep-out ball, which is smaller or 0 for a docking chaser.
     boxes (D+1, C, 15) or None: cuboids of the target's shape at each stage: centre (3; WRF, m), rotation cuboid to WRF (9,
     row-major), half edges (3; m). box_clearance_m (N,) or None: distance that each chaser's centre keeps from them; 0 switches it
-    off. Only the back end `rti` keeps it.
+    off. chaser_shape (S, 15) or None: cuboids of a chaser, as boxes but in body axes: then that distance, and
+    min_distance_shapes_m (N, N), symmetric, between two chasers, 0 for none, are between shapes, in addition to
+    those between centres. Only the back end `rti` keeps these.
     coast_safety: passive safety to keep, or None. Where a plan without it is not safe, the back end `rti` linearizes it
     about its start into coasts (N, D+1, C, 7): half-spaces a' p + b' v >= d of position and velocity at a stage,
     [a (3), b (3), d]; a and b zero for none (`coast_rows`). Other back ends do not keep it.
@@ -152,6 +154,8 @@ class NmpcInput:
     corridors: Array | None = None
     boxes: Array | None = None
     box_clearance_m: Array | None = None
+    chaser_shape: Array | None = None
+    min_distance_shapes_m: Array | None = None
     coast_safety: CoastSafety | None = None
     coasts: Array | None = None
 

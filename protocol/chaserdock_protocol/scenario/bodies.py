@@ -11,7 +11,8 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.decimation import simplified
 from chaserdock_models.meshes import TriangleMesh, mass_properties, without_parts
 from chaserdock_models.satellites import FINE_M, satellite
-from chaserdock_models.targets import TargetModel, target_model, target_names
+from chaserdock_models.shape_distance import chaser_boxes
+from chaserdock_models.targets import Box, TargetModel, target_model, target_names
 from chaserdock_models.thruster_bodies import BODIES
 from pydantic import Field, model_validator
 
@@ -294,3 +295,7 @@ class Body(Section):
     @property
     def inertia(self) -> tuple[float, float, float]:
         return self.inertia_kg_m2 or cuboid_inertia(self.mass_kg, self.size_m)
+
+    def boxes(self) -> tuple[Box, ...]:
+        """Return body and probe as cuboids (CRF). Raises ValueError as `chaser_boxes`."""
+        return chaser_boxes(self.size_m, self.probe_reach_m)

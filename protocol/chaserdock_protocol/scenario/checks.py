@@ -5,16 +5,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
+from chaserdock_models.attitude_reference import facing_attitudes
 from chaserdock_models.docking_geometry import axis_error_deg, centre_offset
 from chaserdock_models.meshes import mass_properties
 from chaserdock_models.port_load import CarriedBody, tumble_load
 from chaserdock_models.satellites import satellite_names
-from chaserdock_models.shape_distance import box_table, signed_distance
+from chaserdock_models.shape_distance import box_table, distance_between, distance_from_cuboids
 from chaserdock_models.wrench_set import wrench_matrix
 from numpy.typing import ArrayLike
 
@@ -124,9 +126,26 @@ def _check_references(scenario: FlightScenario) -> None:
                 )
 
 
-def shape_distance_m(scenario: FlightScenario, offset_m: ArrayLike) -> float:
-    """Return the signed distance (m) of an offset (3,), TRF, from the cuboids of the target's shape."""
-    return signed_distance(box_table(scenario.target_model().boxes), offset_m)[0]
+def shape_distance_m(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> float:
+    """Return the distance (m) of a chaser's shape at an offset (3,), TRF, from the cuboids of the target's shape."""
+    pose = _reference_pose(scenario, chaser, offset_m)
+    return distance_from_cuboids(
+        box_table(scenario.target_model().boxes), box_table(scenario.chaser.boxes()), *pose
+    )
+
+
+def shapes_apart_m(scenario: FlightScenario, *places: tuple[int, ArrayLike]) -> float:
+    """Return the distance (m) between the shapes of two chasers at offsets (3,), TRF: ``places`` are (chaser, offset)."""
+    one, other = (_reference_pose(scenario, i, offset_m) for i, offset_m in places)
+    return distance_between(box_table(scenario.chaser.boxes()), one, other)
+
+
+def _reference_pose(scenario: FlightScenario, chaser: int, offset_m: ArrayLike) -> tuple[ArrayLike, Array]:
+    """Return an offset (3,) and the attitude (4,) of a chaser that holds there, in TRF."""
+    c = scenario.chasers[chaser]
+    if scenario.approach.face_target:
+        return offset_m, facing_attitudes(c.position_m, c.q_wxyz, offset_m)[0]
+    return offset_m, np.array(c.q_wxyz)
 
 
 def _check_shape_distance(scenario: FlightScenario) -> None:
@@ -137,13 +156,24 @@ def _check_shape_distance(scenario: FlightScenario) -> None:
         raise ValueError(
             f'limits.min_distance_shape_m: needs controller.solver = "rti", not {scenario.controller.solver!r}'
         )
-    places = [(f"chasers.{i}.position_m", c.position_m) for i, c in enumerate(scenario.chasers)]
-    places += [(f"timeline.{k}.offset_m", e.offset_m) for k, e in enumerate(scenario.timeline) if e.offset_m]
-    for name, offset_m in places:
-        if (distance_m := shape_distance_m(scenario, offset_m)) < least_m:
+    places = [(f"chasers.{i}.position_m", i, c.position_m) for i, c in enumerate(scenario.chasers)]
+    places += [
+        (f"timeline.{k}.offset_m", i, e.offset_m)
+        for k, e in enumerate(scenario.timeline)
+        for i in e.chasers
+        if e.offset_m and i < len(scenario.chasers)
+    ]
+    for name, i, offset_m in places:
+        if (distance_m := shape_distance_m(scenario, i, offset_m)) < least_m:
             raise ValueError(
-                f"{name}: {distance_m:.3g} m from the target's shape, nearer than limits.min_distance_shape_m ({least_m:g} m) "
-                "allows"
+                f"{name}: chaser {i} is {distance_m:.3g} m from the target's shape there, nearer than "
+                f"limits.min_distance_shape_m ({least_m:g} m) allows"
+            )
+    for (i, a), (j, b) in combinations(enumerate(c.position_m for c in scenario.chasers), 2):
+        if (distance_m := shapes_apart_m(scenario, (i, a), (j, b))) < least_m:
+            raise ValueError(
+                f"chasers.{i} and chasers.{j} at their positions: {distance_m:.3g} m between their shapes, nearer than "
+                f"limits.min_distance_shape_m ({least_m:g} m) allows"
             )
 
 

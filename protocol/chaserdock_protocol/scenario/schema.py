@@ -168,8 +168,9 @@ class Limits(Section):
     )
     min_distance_shape_m: NotNegative = Field(
         default=0.0,
-        description="Smallest distance of a chaser's centre from each cuboid of the target's shape (bus, panels, booms), m, outside "
-        "of its corridor, in addition to `min_distance_target_m`, which may then be smaller or 0. 0: off. Needs the solver `rti`.",
+        description="Smallest distance of a chaser's shape (body and probe) from each cuboid of the target's shape (bus, panels, "
+        "booms) and from the shapes of other chasers, m, outside of corridors, in addition to `min_distance_target_m` and "
+        "`min_distance_chasers_m`, which may then be smaller or 0. 0: off. Needs the solver `rti`.",
     )
     min_distance_chasers_m: NotNegative = Field(
         default=0.35, description="Smallest distance between chasers, m."

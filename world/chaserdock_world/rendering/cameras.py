@@ -32,7 +32,7 @@ from .effects import CameraEffects
 from .glare import Glare, is_occluded
 from .mesh_markers import with_markers
 from .mesh_renderer import MeshRenderer
-from .rasterizer import Renderer, chaser_boxes
+from .rasterizer import Renderer
 from .scene_geometry import Obstacle
 
 if TYPE_CHECKING:
@@ -62,7 +62,7 @@ class Cameras:
         self._orbit = None if scenario.orbit is None else TargetOrbit(scenario.orbit)
         self._exposure_s = effects.exposure_s
         background = None if disc is None else Earth(*disc)
-        body, probe = chaser_boxes(scenario.chaser.size_m, scenario.chaser.probe_reach_m)
+        body, probe = scenario.chaser.boxes()
         mesh, substitutes = true_mesh(scenario), {}
         if mesh is not None:
             mesh = with_markers(mesh, self._target)

@@ -19,7 +19,7 @@ import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.targets import Box, TargetModel
+from chaserdock_models.targets import TargetModel
 from numpy.typing import ArrayLike, NDArray
 
 from . import textures
@@ -33,21 +33,6 @@ from .scene_geometry import Frustum, Obstacle, Shapes, paint_order, place_textur
 _SAMPLES = ((4, 600_000), (2, 1_000_000))
 
 DAYLIGHT = Light()
-
-
-def chaser_boxes(
-    size_m: tuple[float, float, float] = (0.25, 0.25, 0.05), probe_reach_m: float = 0.35
-) -> tuple[Box, ...]:
-    """Return the boxes of a chaser in CRF: its body and a thin docking probe along +X up to ``probe_reach_m``.
-
-    Raises ValueError if the probe does not reach beyond the body.
-    """
-    front = size_m[0] / 2.0
-    if probe_reach_m <= front:
-        raise ValueError(f"the probe ({probe_reach_m} m) must reach beyond the body's front ({front} m)")
-    length = probe_reach_m - front
-    probe = Box((length, 0.012, 0.012), (front + length / 2.0, 0.0, 0.0), shade=0.45)
-    return (Box(size_m, shade=0.3), probe)
 
 
 @dataclass(frozen=True)

@@ -39,9 +39,9 @@ class _Settings(Structure):
             "columns", "end_px", "end_share",
             # Length outwards across a side, at most to so much before a border's outer edge, or to so much beyond it.
             "reach_px", "clear_px", "beyond_px",
-            # The outer edge is used of narrower borders, or if grey levels fall by this share of the rise at the side, and it
-            # agrees with the side to so many pixels.
-            "strip_px", "least_fall", "agreement_px",
+            # The outer edge is used of narrower borders (the second: of such that end at neighbours beside a part of the side), or
+            # if grey levels fall by this share of the rise at the side, and it agrees with the side to so many pixels.
+            "strip_px", "partial_px", "least_fall", "agreement_px",
             # Logarithm of an edge's sigma, pixels (pixel and lens together), and how well that is known, a standard deviation.
             "log_edge_sigma", "edge_sigma_spread",
             "rounds", "iterations", "strip_iterations",
@@ -58,7 +58,7 @@ _SETTINGS = _Settings(
     0.1, 0.9, 8, 11, 3.5, 0.6,
     48, 2.5, 0.2,
     2.75, 1.2, 1.5,
-    2.5, 0.25, 0.08,
+    2.5, 1.5, 0.25, 0.08,
     float(np.log(0.67)), 0.15,
     2, 2, 4,
     2.0, 120.0,

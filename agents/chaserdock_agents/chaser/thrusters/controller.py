@@ -237,7 +237,8 @@ class ThrusterController:
         return msgspec.structs.replace(command, pulses=tuple(pulses), isolated=isolated)
 
     def avoid_plumes(self, target: TargetEstimate | None) -> None:
-        """Make the thrusters whose plume hits the target dear from now on; ``target``: an estimate of it, None if unknown."""
+        """Make the thrusters whose plume hits the target or another chaser dear from now on; ``target``: an estimate of it and of the
+        chasers' poses, None if unknown."""
         self._cost_factors = None
         if self._avoidance is not None and target is not None and target.status != "none":
             self._cost_factors = self._avoidance.cost_factors(self._odometry, target)

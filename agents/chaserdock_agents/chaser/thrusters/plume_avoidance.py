@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cost of thrusters whose plume hits the target. No I/O."""
+"""Cost of thrusters whose plume hits the target or another chaser. No I/O."""
 
 from __future__ import annotations
 
@@ -8,36 +8,58 @@ import math
 import numpy as np
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
-from chaserdock_models.plume import plume_hits
-from chaserdock_protocol.messages import Odometry, TargetEstimate
+from chaserdock_models.plume import angle_to_point, plume_hits
+from chaserdock_models.targets import Box
+from chaserdock_protocol.messages import Odometry, RelativeEstimate, TargetEstimate
 from chaserdock_protocol.scenario import FlightScenario
 from chaserdock_protocol.scenario.plume import PlumeSection
 
 
 class PlumeAvoidance:
-    """Cost factors of the thrusters of one chaser, from its pose relative to the target."""
+    """Cost factors of the thrusters of one chaser, from its pose and those of other chasers relative to the target."""
 
     def __init__(self, scenario: FlightScenario, plume: PlumeSection) -> None:
         self._nozzles = np.array([t.position_m for t in scenario.chaser.thrusters])
         self._forces = np.array([t.direction for t in scenario.chaser.thrusters])
         self._boxes = scenario.target_model().boxes
+        self._size_m = scenario.chaser.size_m
+        self._radius_m = math.hypot(*scenario.chaser.size_m) / 2.0
         self._half_angle_rad = math.radians(scenario.detumble.plume_deg)
         self._reach_m, self._factor = plume.reach_m, 1.0 + plume.avoid_factor
 
     def cost_factors(self, own: Odometry | None, target: TargetEstimate) -> Array | None:
-        """Return the factors (n,), above 1 for thrusters whose plume hits the target; None without a state or out of reach.
+        """Return the factors (n,), above 1 for thrusters whose plume hits the target or the body of a chaser whose pose ``target``
+        states; None without an own state, or with nothing within reach.
 
         The states may be those of different ticks, a fraction of a second apart.
         """
         if own is None:
             return None
         away = np.subtract(own.position_m, target.position_m)
-        if float(np.linalg.norm(away)) > self._reach_m:
+        at = rotations.rotate_inverse(target.q_wxyz, away)
+        boxes = self._boxes if float(np.linalg.norm(away)) <= self._reach_m else ()
+        others = [
+            r
+            for r in target.relative
+            if r.chaser != own.chaser and float(np.linalg.norm(at - r.position_m)) <= self._reach_m
+        ]
+        if not boxes and not others:
             return None
         nozzles = rotations.rotate_inverse(target.q_wxyz, away + rotations.rotate(own.q_wxyz, self._nozzles))
         forces = rotations.rotate_inverse(target.q_wxyz, rotations.rotate(own.q_wxyz, self._forces))
         hits = [
-            plume_hits(nozzle, force, self._half_angle_rad, self._boxes)
+            plume_hits(nozzle, force, self._half_angle_rad, (*boxes, *self._near(nozzle, force, others)))
             for nozzle, force in zip(nozzles, forces, strict=True)
         ]
         return np.where(hits, self._factor, 1.0)
+
+    def _near(self, nozzle: Array, force: Array, others: list[RelativeEstimate]) -> list[Box]:
+        """Return the bodies (TRF) of the chasers whose bounding sphere the plume of a thruster meets."""
+        near = []
+        for r in others:
+            centre = np.array(r.position_m)
+            distance_m = float(np.linalg.norm(centre - nozzle))
+            spread = math.asin(min(1.0, self._radius_m / distance_m)) if distance_m else math.pi
+            if angle_to_point(nozzle, -force, centre) - spread < self._half_angle_rad:
+                near.append(Box(self._size_m, r.position_m, r.q_wxyz))
+        return near

@@ -4,7 +4,8 @@
  * A chaser-target constraint becomes the plane tangent to the keep-out ball; a chaser-chaser constraint a separating
  * plane at the midpoint, half the distance to each side; the outer bound a plane tangent to the ball about the
  * reference; an approach corridor the plane tangent to its cone where the chaser is nearest; a cuboid of the target's shape the
- * plane that separates it from the chaser, normal to the line from its nearest point; the coast after a loss of thrust a
+ * plane that separates it from the chaser's shape, normal to the line from its nearest point to the chaser's centre; for a pair of
+ * chasers with shapes the distance is at least what these need along the line between the centres; the coast after a loss of thrust a
  * half-space of position and velocity (nmpc/coast_rows.py). A row of stage k reads a' dp_k + b' dv_k >= c with dp_k and dv_k
  * the changes of the rolled position and velocity.
  */
@@ -20,6 +21,8 @@
 #define INSIDE 0.8
 /* A tilted normal sees 1 / sqrt(1 + TILT^2) of the gap: bound for `out_of_reach`, with a small margin. */
 #define TILTED_SHARE 0.98
+/* Most by which the planes between chasers move in favour of one that cannot keep its own distances, m. */
+#define RELIEF_MAX_M 0.02
 
 typedef struct {
     int64_t n, stages;
@@ -27,6 +30,8 @@ typedef struct {
     double outer;
     int64_t n_boxes;
     const double *boxes, *clearance; /* (D+1, n_boxes, 15): centre, rotation to WRF, half edges; (N,) */
+    int64_t n_shape;
+    const double *shape, *apart; /* (n_shape, 15): a chaser's cuboids, as boxes but in body axes; (N, N): distance of shapes */
     int64_t n_coasts;
     const double *coasts; /* (N, D+1, n_coasts, 7): a (3), b (3), d of a' p + b' v >= d; a and b zero for none */
     double step_s;
@@ -39,6 +44,7 @@ typedef struct {
     const double *reach;
     int64_t *stage, *n_rows;
     double *a, *c, *b; /* b: NULL if no coast is restricted */
+    double *relief;    /* (N,) working memory */
 } Rows;
 
 /* Tilt the unit normal n sideways by TILT. Odd in n: both chasers of a pair tilt the same plane. The side is n x e,
@@ -107,6 +113,39 @@ static double corridor_room(const double *r, const double *corridor, double *n) 
     return madd(s, along - corridor[4], -(c * aside));
 }
 
+/* How far a chaser's shape reaches from its centre along sign n, n (3) in WRF, m; q (4): body to WRF. 0 without a shape. */
+static double reach_along(const Zones *zones, const double *q, double sign, const double *n) {
+    double t[3], u[3], local[3], furthest = 0.0;
+    if (!zones->n_shape) return 0.0;
+    cross3(q + 1, n, t);
+    cross3(q + 1, t, u);
+    for (int c = 0; c < 3; c++) local[c] = sign * madd(2.0, u[c] - q[0] * t[c], n[c]);
+    for (const double *box = zones->shape; box < zones->shape + 15 * zones->n_shape; box += 15) {
+        double reach = dot3(box, local);
+        for (int c = 0; c < 3; c++)
+            reach = madd(abs_of(madd(box[9 + c], local[2], madd(box[6 + c], local[1], box[3 + c] * local[0]))), box[12 + c], reach);
+        furthest = box == zones->shape ? reach : max_of(furthest, reach);
+    }
+    return furthest;
+}
+
+/* Distance that the centres of two chasers in states x and y (13) keep along n (3), unit, from the second to the first. */
+static double centre_distance(const Zones *zones, int64_t i, int64_t j, const double *x, const double *y, const double *n) {
+    const double d = zones->between[i * zones->n + j], apart = zones->apart[i * zones->n + j];
+    if (!(apart > 0.0)) return d;
+    return max_of(d, apart + reach_along(zones, x + 6, -1.0, n) + reach_along(zones, y + 6, 1.0, n));
+}
+
+/* Largest `centre_distance` in any attitude. */
+static double largest_distance(const Zones *zones, int64_t i, int64_t j) {
+    const double d = zones->between[i * zones->n + j], apart = zones->apart[i * zones->n + j];
+    double radius = 0.0;
+    if (!(apart > 0.0)) return d;
+    for (const double *box = zones->shape; box < zones->shape + 15 * zones->n_shape; box += 15)
+        radius = max_of(radius, sqrt_of(dot3(box, box)) + sqrt_of(dot3(box + 12, box + 12)));
+    return max_of(d, apart + 2.0 * radius);
+}
+
 /* Test whether two chasers stay so far apart over the whole rollout that no row between them could be reached. */
 static int out_of_reach(const Rows *rows, const double *x, const double *y, const double *reach_x,
                         const double *reach_y, double d) {
@@ -121,23 +160,27 @@ static int out_of_reach(const Rows *rows, const double *x, const double *y, cons
     return 1;
 }
 
-static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j, const double *x, const double *y) {
+/* Rows of the separating planes of two chasers; `relief`: how far the planes move away from i, m. */
+static void pair_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t j, const double *x, const double *y, double relief) {
     const int64_t nodes = rows->nodes;
-    const double d = zones->between[i * zones->n + j];
     const double *here = zones->references + 7 * nodes * i, *there = zones->references + 7 * nodes * j;
-    if (out_of_reach(rows, x, y, rows->reach + i * nodes, rows->reach + j * nodes, d)) return;
+    if (out_of_reach(rows, x, y, rows->reach + i * nodes, rows->reach + j * nodes, largest_distance(zones, i, j))) return;
     double last[3] = {0}, n[3], want[3], gap, heading;
     int held = 0;
     first_side(x, y, here, there, last);
     for (int64_t k = 1; k < nodes; k++) {
         subtract3(x + 13 * k, y + 13 * k, n);
+        copy(n, want, 3);
+        normalize3(want);
+        double d = centre_distance(zones, i, j, x + 13 * k, y + 13 * k, want);
         subtract3(here + 7 * k, there + 7 * k, want);
         double length = side(n, want, d, &held, last, &gap, &heading);
         if (heading > COS_HEAD_ON && length >= d) tilt(n);
+        d = centre_distance(zones, i, j, x + 13 * k, y + 13 * k, n);
         subtract3(x + 13 * k, y + 13 * k, want);
         double room = 0.5 * (dot3(n, want) - d - MARGIN_M);
-        push(rows, i, k, n, 1.0, room);
-        push(rows, j, k, n, -1.0, room);
+        push(rows, i, k, n, 1.0, room + relief);
+        push(rows, j, k, n, -1.0, room - relief);
     }
 }
 
@@ -164,6 +207,12 @@ static double box_distance(const double *point, const double *box, double *n) {
     return distance;
 }
 
+/* Signed distance of a chaser's shape from a cuboid along the gradient n (3) of its centre's; x (13): its state. */
+static double shape_gap(const Zones *zones, const double *x, const double *box, double *n) {
+    double distance = box_distance(x, box, n);
+    return distance - reach_along(zones, x + 6, -1.0, n);
+}
+
 /* Distance of a point (3) from the plane with the unit normal n (3) that touches a cuboid (15) from outside, m. */
 static double plane_distance(const double *point, const double *box, const double *n) {
     double r[3], support = 0.0;
@@ -182,12 +231,13 @@ static void box_rows(const Zones *zones, const Rows *rows, int64_t i, int64_t bo
     for (int64_t k = 1; k < rows->nodes; k++) {
         const double *at = zones->boxes + 15 * (zones->n_boxes * k + box);
         double gap = box_distance(x + 13 * k, at, n);
-        if (held || gap < INSIDE * clearance || dot3(n, last) < 0.0) {
+        if (held || gap < INSIDE * (clearance + reach_along(zones, x + 13 * k + 6, -1.0, n)) || dot3(n, last) < 0.0) {
             held = 1;
             copy(last, n, 3);
         }
         copy(n, last, 3);
-        push(rows, i, k, n, 1.0, plane_distance(x + 13 * k, at, n) - clearance - MARGIN_M);
+        double needed = clearance + reach_along(zones, x + 13 * k + 6, -1.0, n);
+        push(rows, i, k, n, 1.0, plane_distance(x + 13 * k, at, n) - needed - MARGIN_M);
     }
 }
 
@@ -206,6 +256,14 @@ static void coast_rows(const Zones *zones, const Rows *rows, int64_t i, const do
             rows->c[m] = -room;
             rows->stage[m] = k;
         }
+}
+
+/* How far a chaser's rollout violates its present rows, without their margin, m, up to RELIEF_MAX_M. Its neighbours give way by so
+ * much: halves of the gaps between chasers alone could hold one of them inside a keep-out. */
+static double violation(const Rows *rows, int64_t i) {
+    double worst = 0.0;
+    for (int64_t m = rows->width * i; m < rows->width * i + rows->n_rows[i]; m++) worst = max_of(worst, rows->c[m] - MARGIN_M);
+    return min_of(worst, RELIEF_MAX_M);
 }
 
 static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const double *x) {
@@ -242,16 +300,18 @@ static void own_rows(const Zones *zones, const Rows *rows, int64_t i, const doub
 /* Write the rows of all chasers about the rollouts x (N, D+1, 13). stage (N, M), a (N, M, 3), c (N, M), n_rows (N,); M
  * at least D (N + 2 + n_boxes + n_coasts); b (N, M, 3) if there are coasts. None at stage 0, and none whose distance is NaN. */
 EXPORT void NAME(build_rows)(const Zones *zones, const double *x, const Rows *rows) {
-    for (int64_t i = 0; i < zones->n; i++) rows->n_rows[i] = 0;
     for (int64_t i = 0; i < zones->n; i++) {
+        rows->n_rows[i] = 0;
         own_rows(zones, rows, i, x + 13 * rows->nodes * i);
         if (zones->clearance[i] > 0.0)
             for (int64_t b = 0; b < zones->n_boxes; b++) box_rows(zones, rows, i, b, x + 13 * rows->nodes * i);
+        rows->relief[i] = violation(rows, i);
         if (zones->n_coasts) coast_rows(zones, rows, i, x + 13 * rows->nodes * i);
-        for (int64_t j = i + 1; j < zones->n; j++)
-            if (zones->between[i * zones->n + j] > 0.0)
-                pair_rows(zones, rows, i, j, x + 13 * rows->nodes * i, x + 13 * rows->nodes * j);
     }
+    for (int64_t i = 0; i < zones->n; i++)
+        for (int64_t j = i + 1; j < zones->n; j++)
+            if (zones->between[i * zones->n + j] > 0.0 || zones->apart[i * zones->n + j] > 0.0)
+                pair_rows(zones, rows, i, j, x + 13 * rows->nodes * i, x + 13 * rows->nodes * j, rows->relief[i] - rows->relief[j]);
 }
 
 /* Write the deepest violation (N,), m, of the distance constraints by plans x (N, D+1, 13); 0 if none. All stages 0..D
@@ -270,13 +330,15 @@ EXPORT void NAME(plan_violation)(const Zones *zones, const double *x, double *wo
             if (dot3(corridor, corridor) > 0.0) worst[i] = max_or_nan(worst[i], -corridor_room(r, corridor, n));
             worst[i] = max_or_nan(worst[i], zones->to_target[nodes * i + k] - sqrt_of(dot3(r, r)));
             for (int64_t b = 0; b < zones->n_boxes && zones->clearance[i] > 0.0; b++) {
-                double gap = box_distance(at, zones->boxes + 15 * (zones->n_boxes * k + b), n);
+                double gap = shape_gap(zones, at, zones->boxes + 15 * (zones->n_boxes * k + b), n);
                 worst[i] = max_or_nan(worst[i], zones->clearance[i] - gap);
             }
             for (int64_t j = i + 1; j < zones->n; j++) {
-                const double d = zones->between[i * zones->n + j];
                 subtract3(at, x + 13 * (nodes * j + k), r);
                 double square = dot3(r, r);
+                copy(r, n, 3);
+                normalize3(n);
+                const double d = centre_distance(zones, i, j, at, x + 13 * (nodes * j + k), n);
                 if (square >= d * d) continue;
                 worst[i] = max_or_nan(worst[i], d - sqrt_of(square));
                 worst[j] = max_or_nan(worst[j], d - sqrt_of(square));

@@ -23,15 +23,15 @@ static int64_t tick_width(int64_t n, int64_t d, int64_t extra) { return d * (n +
 
 EXPORT int64_t NAME(tick_workspace)(int64_t n, int64_t d, int64_t extra) {
     int64_t width = tick_width(n, d, extra);
-    return n * (14 * (d + 1) + 8 * width + 1) + 144 * n * d + (9 + 9 + 12 + 12) * (d + 1) + 4 * 6 * d + 2 * width +
-           12 * d + ipm_workspace(d, width) + width + 40 * 8;
+    return n * (14 * (d + 1) + 8 * width + 2) + 144 * n * d + (9 + 9 + 12 + 12) * (d + 1) + 4 * 6 * d + 2 * width +
+           12 * d + ipm_workspace(d, width) + width + 41 * 8;
 }
 
 EXPORT void NAME(solve_tick)(const Tick *tick, double *work) {
     const int64_t n = tick->zones->n, d = tick->zones->stages, width = tick_width(n, d, tick->zones->n_boxes + tick->zones->n_coasts);
     double *x = allocate(&work, 13 * n * (d + 1)), *mats = allocate(&work, 144 * n * d);
     double *reach = allocate(&work, n * (d + 1));
-    Rows rows = {width, d + 1, reach, 0, 0, 0, 0, 0};
+    Rows rows = {width, d + 1, reach, 0, 0, 0, 0, 0, allocate(&work, n)};
     rows.stage = (int64_t *)allocate(&work, n * width);
     rows.n_rows = (int64_t *)allocate(&work, n);
     rows.a = allocate(&work, 3 * n * width);

@@ -25,7 +25,7 @@ typedef struct {
     double first, last, rows, taps, coarse_reach_px, border_share;
     /* Fit to pixels: samples along a side, ends that are left out, looks across an edge, prior of the logarithm of the edge's
      * sigma, rounds and iterations per round. */
-    double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, least_fall, agreement_px;
+    double columns, end_px, end_share, reach_px, clear_px, beyond_px, strip_px, partial_px, least_fall, agreement_px;
     double log_edge_sigma, edge_sigma_spread, rounds, iterations, strip_iterations;
     double uncertain_px, uncertain_level;
 } Settings;
@@ -378,17 +378,18 @@ static int fit_band(const Settings *set, const Edge *edge, const Band *band, int
     return levels[1] >= set->min_contrast && used >= set->min_rows_share * band->columns && finite(ends[0]) && finite(ends[1]);
 }
 
-/* Fits a side's line and its contrast, grey levels. The outer edge of a border, used if `outlined`, must be a fall in brightness
- * and agree with the side itself: otherwise another face adjoins it. */
+/* Fits a side's line and its contrast, grey levels. The outer edge of a border, used in the last round if `outlined`, must be a fall
+ * in brightness and agree with the side itself: otherwise another face adjoins it. A border that ends at neighbours beside parts of
+ * the side only is not fitted with its outer edge, as long as enough of it is clear. */
 static int fit_side(const Image *p, const Settings *set, const Edge *edge, const Side *side, const Border *border, int outlined,
-                    double inner, Band *band, double *at_start, double *at_end, double *contrast) {
+                    int last, double inner, Band *band, double *at_start, double *at_end, double *contrast) {
     double width = border->at + 0.5 * border->rise * side->extent, ends[2] = {0.0}, both[2], change[2];
-    int fine = 0, narrow = width < set->strip_px;
+    int fine = 0, narrow = width < (outlined ? set->strip_px : set->partial_px);
     if (!narrow) {
         collect(p, set, side, border, 0, inner, band);
         fine = fit_band(set, edge, band, 0, (int)set->iterations, ends, change);
     }
-    if (narrow || (fine && outlined)) {
+    if (narrow || (fine && outlined && last)) {
         collect(p, set, side, border, 1, inner, band);
         int fits = fit_band(set, edge, band, 1, (int)(narrow ? set->strip_iterations : set->iterations), both, change);
         if (narrow) fine = fits;
@@ -425,10 +426,10 @@ EXPORT void NAME(refine_corners)(const uint8_t *image, int64_t height, int64_t w
         for (int round = 0; round < (int)set->rounds && fine; round++) {
             sides_of(refined, sides);
             borders_of(refined, sides, margin[m], borders);
-            int ends = outlined[m] && round + 1 == (int)set->rounds;
+            int last = round + 1 == (int)set->rounds;
             for (int i = 0; i < 4 && fine; i++) {
                 double inner = reach_of(set, sides + i, cells, set->reach_px);
-                fine = fit_side(&p, set, &edge, sides + i, borders + i, ends, inner, &band, at_start + i, at_end + i, contrast + i);
+                fine = fit_side(&p, set, &edge, sides + i, borders + i, outlined[m], last, inner, &band, at_start + i, at_end + i, contrast + i);
             }
             fine = fine && crossings(sides, at_start, at_end, refined);
         }

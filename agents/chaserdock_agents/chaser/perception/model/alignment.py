@@ -169,7 +169,12 @@ def control_points(
 
 
 def _on_textured(
-    mesh: TrackerMesh, pose: PoseInCamera, window: PixelWindow, view: SyntheticView, points: Array, ahead: Array
+    mesh: TrackerMesh,
+    pose: PoseInCamera,
+    window: PixelWindow,
+    view: SyntheticView,
+    points: Array,
+    ahead: Array,
 ) -> NDArray[np.bool_]:
     """Return which points (n,) are edges between surfaces that both have a grid of solar cells: the lines of the grid beside such
     an edge move it to either side."""

@@ -120,11 +120,9 @@ def prior_steps(
     Starts from light from everywhere, for a prior that may be far off. If that explains the image badly, as where sunlight only
     grazes the target, starts from the light at the prior as well, and returns the better one.
     """
+    found = yield from rough_prior_steps(pyramid, mesh, prior, modes)
     levels = levels_of(pyramid, mesh, prior)
-    if not levels:
-        return None
-    found = yield from _unlit_steps(pyramid, mesh, prior, levels, modes)
-    if found is not None and found[0].inlier_share >= _SETTLED_SHARE:
+    if (found is not None and found[0].inlier_share >= _SETTLED_SHARE) or not levels:
         return found
     yield LIGHT_MS + VIEWS_MS
     light = light_at(pyramid, mesh, prior, levels[0], by_view=True)
@@ -134,14 +132,17 @@ def prior_steps(
     return max((f for f in (found, other) if f is not None), key=lambda f: f[0].score, default=None)
 
 
-def _unlit_steps(
-    pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, levels: tuple[int, ...], modes: Array | None
+def rough_prior_steps(
+    pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
 ) -> Steps[tuple[Alignment, Lighting] | None]:
-    """Return pose and light from light from everywhere.
+    """Return pose and light, starting from light from everywhere; None also for a pose that does not settle.
 
     The outline and the borders of materials give a coarse pose; from it follows the light, which improves the coarse pose, which
     improves the light.
     """
+    levels = levels_of(pyramid, mesh, prior)
+    if not levels:
+        return None
     pose, light = prior, _EVEN_LIGHT
     for by_view in (False, True):
         coarse = yield from pose_steps(pyramid, mesh, pose, light, levels[:1], modes=modes)

@@ -49,10 +49,10 @@ _MIN_AREA_PX, _MIN_CONTRAST = 60, 5.0
 _AMBIGUOUS_SCORE, _DISTINCT_RAD = 0.04, math.radians(8.0)
 _WORSE_START = 0.2
 """Once a pose has been found, coarse poses with a score lower than its own by this much are not refined."""
-_RATED_AT_ONCE = 25
+_RATED_AT_ONCE, _FITTED_AT_ONCE, _REGION_POINTS = 25, 9, 10_000
 _REGION_MS, _SILHOUETTES_MS, _RATE_MS, _APPEARANCE_MS = 10.0, 20.0, 10.0, 10.0
-"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes, to rate suns for
-``_RATED_AT_ONCE`` of them, to compare a synthetic view with the image."""
+"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes at
+``_FITTED_AT_ONCE`` places, to rate suns for ``_RATED_AT_ONCE`` of them, to compare a synthetic view with the image."""
 
 Found = tuple[Alignment, Lighting]
 """A pose that passes the gate, and its light."""
@@ -183,6 +183,7 @@ class Acquisition:
         self.prepare()
         camera = self._camera
         y, x = np.nonzero(region)
+        y, x = (axis[:: max(1, len(axis) // _REGION_POINTS)] for axis in (y, x))
         px = camera.undistort(np.column_stack([x, y]).astype(float))
         ideal = (px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
         ideal = ideal[np.isfinite(ideal).all(axis=1)]
@@ -194,10 +195,12 @@ class Acquisition:
         middle = flat.mean(axis=0)
         spread = math.sqrt(float(((flat - middle) ** 2).sum(axis=1).mean()))
         t = self._templates_at(spread)
-        fits = [
-            self._fit(t, pyramid, region, towards, *place)
-            for place in self._places(region, towards, middle, spread)
-        ]
+        places = self._places(region, towards, middle, spread)
+        fits: list[_SilhouetteFit] = []
+        for first in range(0, len(places), _FITTED_AT_ONCE):
+            if first:
+                yield _SILHOUETTES_MS
+            fits += self._fits(t, pyramid, region, towards, places[first : first + _FITTED_AT_ONCE])
         overlaps = np.array([fit.overlap for fit in fits])
         chosen = overlaps.argmax(axis=0)
         likely = np.argsort(-overlaps.max(axis=0))[:_BY_SILHOUETTE]
@@ -233,14 +236,20 @@ class Acquisition:
             centres += [middle + shift * spread * outwards for shift in _CUT_SHIFTS]
         return [(centre, size * spread) for centre in centres for size in _CUT_SIZES]
 
-    def _fit(
-        self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
-    ) -> _SilhouetteFit:  # fmt: skip
-        """Compare a region with the silhouettes, with its centre at ``middle`` and an rms radius of ``spread``, inside the image."""
-        mask, grey, visible = self._normalized(pyramid, region, towards, middle, spread)
-        common = t.masks @ mask
-        union = t.masks @ visible + mask.sum() - common
-        return _SilhouetteFit(middle, spread, mask, grey, common / np.maximum(union, 1.0))
+    def _fits(
+        self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, places: list[tuple[Array, float]]
+    ) -> list[_SilhouetteFit]:  # fmt: skip
+        """Compare a region with the silhouettes, inside the image, for each centre and rms radius in ``places``."""
+        seen = [self._normalized(pyramid, region, towards, *place) for place in places]
+        masks = np.array([mask for mask, _, _ in seen])
+        # One product, as reading the templates takes the most time.
+        product = t.masks @ np.concatenate([masks, [visible for _, _, visible in seen]]).T
+        common, inside = product[:, : len(places)].T, product[:, len(places) :].T
+        overlaps = common / np.maximum(inside + masks.sum(axis=1, keepdims=True) - common, 1.0)
+        return [
+            _SilhouetteFit(middle, spread, mask, grey, overlap)
+            for (middle, spread), (mask, grey, _), overlap in zip(places, seen, overlaps, strict=True)
+        ]
 
     def _normalized(
         self, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
@@ -255,9 +264,10 @@ class Acquisition:
         level = max(0, min(4, int(math.log2(max(step * self._camera.fx_px, 1.0)))))
         scale = 0.5**level
         at = (px + 0.5) * scale - 0.5
-        grey = cv2.remap(pyramid.level(level), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        soft = cv2.GaussianBlur(region * np.float32(255.0), (0, 0), max(0.3, 0.4 / scale))
-        mask = cv2.remap(soft, px[..., 0], px[..., 1], cv2.INTER_LINEAR) > 127.0
+        grid = pyramid.level(level)
+        grey = cv2.remap(grid, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        soft = cv2.resize(255 * region, (grid.shape[1], grid.shape[0]), interpolation=cv2.INTER_AREA)
+        mask = cv2.remap(soft, at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 127
         last = np.array([region.shape[1] - 1, region.shape[0] - 1])
         visible = ((px >= 0.0) & (px <= last)).all(axis=-1)
         return (

@@ -55,6 +55,8 @@ def test_geometry_is_estimated_in_flight_and_corrects_the_trackers() -> None:
     assert np.trace(covariance) < np.trace(
         np.array(first.covariance).reshape(covariance.shape) / np.outer(last.sigmas, last.sigmas)
     )
+    known = make_perception(scenario)
     for perception in perceptions:
         assert isinstance(perception, ModelPerception)
-        assert not np.array_equal(perception.mesh.vertices_m, make_perception(scenario).mesh.vertices_m)
+        assert isinstance(known, ModelPerception)
+        assert not np.array_equal(perception.mesh.vertices_m, known.mesh.vertices_m)

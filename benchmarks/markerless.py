@@ -12,7 +12,9 @@ front of the target are random. Parts:
 - ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are averaged by their covariances;
 - ``independent``: as ``exact``, with images by the ray tracer Embree, without texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
-  target is darker than 5 grey levels are left out;
+  target is darker than 5 grey levels are left out, here and with the lamp;
+- ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp, that of `harsh-light`, and at 1 to 3 m
+  of a target that moves by four pixels during the exposure; the pose is that in the middle of it;
 - ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and those that pass the
   gate;
 - ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the Earth, and in front of space by one
@@ -74,6 +76,7 @@ RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0]
 
 ViewRow = dict[str, float]
 """Figures of one view."""
+_EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
 
@@ -90,6 +93,15 @@ class SatelliteImages:
         q = rotations.from_matrix(pose.rotation)
         exact = self._renderer.render(np.zeros(3), rotations.IDENTITY, pose.position, q, (), light)
         return self._effects.apply(exact, 0, number)
+
+    def blurred(self, pose: PoseInCamera, step_m: Array, light: Light, number: int) -> NDArray[np.uint8]:
+        """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure, ``pose`` in the middle of it."""
+        q, total = rotations.from_matrix(pose.rotation), np.zeros((CAMERA.height_px, CAMERA.width_px))
+        shares = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
+        for share in shares:
+            at = pose.position + share * step_m
+            total += self._renderer.render(np.zeros(3), rotations.IDENTITY, at, q, (), light)
+        return self._effects.apply(np.rint(total / _EXPOSURES).astype(np.uint8), 0, number)
 
     def coverage(self, position: Array, q: Array) -> NDArray[np.bool_]:
         """Return the mask (h, w) of the pixels on the target: those that light from everywhere brightens."""
@@ -314,6 +326,35 @@ def backlit(cells: Cells, views: int) -> Figures:
     return tracking_figures("backlit", [row for row in rows if row["grey"] >= LEAST_GREY])
 
 
+def lamp(cells: Cells, views: int) -> Figures:
+    """Track single images in eclipse, by the light of the camera's lamp."""
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        pose, _ = random_view(rng, rng.uniform(1.0, 2.0), CAMERA)
+        image = scene.image(pose, Light(sun=0.0, ambient=0.01, lamp=_LAMP), number)
+        covered = scene.coverage(pose.position, rotations.from_matrix(pose.rotation))
+        row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
+        return row | {"grey": float(image[covered].mean())}
+
+    rows = cells.rows("lamp", views, view)
+    return tracking_figures("lamp", [row for row in rows if row["grey"] >= LEAST_GREY])
+
+
+def blur(cells: Cells, views: int) -> Figures:
+    """Track single images of a target that moves during the exposure."""
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        pose, light = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
+        along = rng.uniform(0.0, 2.0 * np.pi)
+        step_m = _BLUR_PX * pose.position[2] / CAMERA.fx_px * np.array([np.cos(along), np.sin(along), 0.0])
+        image = scene.blurred(pose, step_m, light, number)
+        return tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
+
+    return tracking_figures("blur", cells.rows("blur", views, view))
+
+
 def earth_behind(rng: np.random.Generator) -> Earth:
     """Draw the place of the Earth behind a target."""
     return Earth((rng.normal(0.0, 0.5), rng.normal(0.0, 0.5), 1.0), EARTH_RADIUS_RAD)
@@ -437,6 +478,8 @@ def main() -> None:
         "independent",
         "behind",
         "backlit",
+        "lamp",
+        "blur",
         "gate",
         "acquisition",
         "earth",
@@ -472,6 +515,8 @@ def main() -> None:
             "independent": lambda: at_ranges(lambda m: independent(cells, m, views)),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),
+            "lamp": lambda: lamp(cells, views),
+            "blur": lambda: blur(cells, views),
             "gate": lambda: gate(cells, views),
             "acquisition": lambda: acquire(cells, "acquisition", views),
             "earth": lambda: acquire(cells, "earth", views),

@@ -27,6 +27,9 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
 _PROFILE, _PER_CELL_MOST = 9, 4
 _CELL_PX, _PER_CELL = 8, 2
+_LEAST_GRADIENT = (0.5, 1.5)
+"""Least gradient of control points, grey levels per pixel, in light from everywhere and in estimated light. In a dim image, noise hides
+weaker edges, which would count as outliers."""
 _MARGIN_PX = 14
 """Border of a window around the target: reach of the search and half a profile."""
 _MIN_CORRELATION = 0.6
@@ -151,10 +154,11 @@ def control_points(
     work = np.empty(h * w + cells * 5 * _PER_CELL_MOST)
     vertices, triangles, _, _ = mesh.contiguous
     at = pose_array(pose)
+    least = _LEAST_GRADIENT[light.shadows]
     n = function("control_points", c_int64)(
         address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
         (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
-        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * (light.direct + light.ambient), 0.5), 4.0)),
+        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * (light.direct + light.ambient), least), 4.0)),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
     if n < MIN_POINTS:

@@ -28,8 +28,8 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 _PROFILE, _PER_CELL_MOST = 9, 4
 _CELL_PX, _PER_CELL = 8, 2
 _LEAST_GRADIENT = (0.5, 1.5)
-"""Least gradient of control points, grey levels per pixel, in light from everywhere and in estimated light. In a dim image, noise hides
-weaker edges, which would count as outliers."""
+"""Least gradient of control points, grey levels per pixel, in light from everywhere and in estimated light. In a dim image, noise
+hides weaker edges, which would count as outliers."""
 _MARGIN_PX = 14
 """Border of a window around the target: reach of the search and half a profile."""
 _MIN_CORRELATION = 0.6

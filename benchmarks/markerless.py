@@ -9,9 +9,12 @@ front of the target are random. Parts:
 - ``exact`` and ``knowledge``: tracking from a prior 1 % of the range and 1.5 degrees off, at 1, 3 and 10 m, with the exact mesh, and
   with one that is simplified to 1 mm, with panels wrong by 0.5 degrees and a scale wrong by 0.3 % (standard deviations, drawn for each
   view; the truth stays the same);
-- ``independent``: as ``exact`` at 3 m, a tenth of the views, with images by the ray tracer Embree, without texture;
+- ``crossed``: as ``knowledge``, by two cameras that see the target at right angles, whose poses are averaged by their covariances;
+- ``independent``: as ``exact``, with images by the ray tracer Embree, without texture;
 - ``behind`` and ``backlit``: as ``exact`` at 1 to 3 m, in front of the Earth, and with the sun behind the target; views in which the
-  target is darker than 5 grey levels are left out;
+  target is darker than 5 grey levels are left out, here and with the lamp;
+- ``lamp`` and ``blur``: as ``exact`` at 1 to 2 m in eclipse, by the light of the camera's lamp, that of `harsh-light`, and at 1 to 3 m
+  of a target that moves by four pixels during the exposure; the pose is that in the middle of it;
 - ``gate``: as ``exact``, but from priors up to 5 % of the range and 12 degrees off at 1 to 3 m: gross errors, and those that pass the
   gate;
 - ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the Earth, and in front of space by one
@@ -73,6 +76,7 @@ RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0]
 
 ViewRow = dict[str, float]
 """Figures of one view."""
+_EXPOSURES, _BLUR_PX, _LAMP = 8, 4.0, 60.0
 _VIEWS_BEFORE, _VIEWS_AFTER = 36, 12
 """Views of an inspection, and views of each mesh after it."""
 
@@ -89,6 +93,15 @@ class SatelliteImages:
         q = rotations.from_matrix(pose.rotation)
         exact = self._renderer.render(np.zeros(3), rotations.IDENTITY, pose.position, q, (), light)
         return self._effects.apply(exact, 0, number)
+
+    def blurred(self, pose: PoseInCamera, step_m: Array, light: Light, number: int) -> NDArray[np.uint8]:
+        """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure, ``pose`` in the middle of it."""
+        q, total = rotations.from_matrix(pose.rotation), np.zeros((CAMERA.height_px, CAMERA.width_px))
+        shares = (np.arange(_EXPOSURES) + 0.5) / _EXPOSURES - 0.5
+        for share in shares:
+            at = pose.position + share * step_m
+            total += self._renderer.render(np.zeros(3), rotations.IDENTITY, at, q, (), light)
+        return self._effects.apply(np.rint(total / _EXPOSURES).astype(np.uint8), 0, number)
 
     def coverage(self, position: Array, q: Array) -> NDArray[np.bool_]:
         """Return the mask (h, w) of the pixels on the target: those that light from everywhere brightens."""
@@ -225,8 +238,47 @@ def track_cell(cells: Cells, name: str, range_m: float, views: int) -> Figures:
     return tracking_figures(key, cells.rows(key, views, view))
 
 
-def independent(cells: Cells, views: int) -> Figures:
-    """Track images of an independent renderer, at 3 m."""
+def crossed(cells: Cells, range_m: float, views: int) -> Figures:
+    """Track single images of two cameras at right angles, and average their poses."""
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        mesh = _drawn_mesh(rng)
+        pose, light = random_view(rng, range_m, CAMERA)
+        total, weighted, took_s = np.zeros((6, 6)), np.zeros(6), 0.0
+        for turn in (np.eye(3), RIGHT_ANGLE):
+            seen = PoseInCamera(pose.position, turn @ pose.rotation)
+            image = scene.image(seen, replace(light, to_sun_w=tuple(turn @ light.to_sun_w)), number)
+            prior = perturbed(seen, rng, *PRIOR)
+            begin_s = time.process_time()
+            found = _track(image, mesh, prior)
+            took_s += time.process_time() - begin_s
+            if found is None or not tracking.is_valid(found):
+                return {"s": took_s, "valid": 0.0, "wrong": 0.0}
+            # In the axes of the first camera; the attitude's error is in those of the target.
+            axes = np.eye(6)
+            axes[:3, :3] = turn.T
+            information = np.linalg.inv(axes @ found.covariance @ axes.T)
+            total += information
+            weighted += information @ (axes @ tracking.pose_error(found.pose, seen))
+        e = np.linalg.solve(total, weighted)
+        error = float(np.linalg.norm(e[:3])), float(np.linalg.norm(e[3:]))
+        return {
+            "s": took_s,
+            "valid": 1.0,
+            "wrong": float(is_gross(error, range_m)),
+            "m": error[0],
+            "rad": error[1],
+            "along_m": abs(float(e[:3] @ pose.position)) / range_m,
+            "nees": float(e @ total @ e),
+        }
+
+    key = f"crossed_{range_m:g}m"
+    return tracking_figures(key, cells.rows(key, views, view))
+
+
+def independent(cells: Cells, range_m: float, views: int) -> Figures:
+    """Track images of an independent renderer at one range."""
     from embree_images import plain, trace
 
     effects = CameraEffects(CAMERA.width_px, CAMERA.height_px, Effects(), 11)
@@ -234,13 +286,14 @@ def independent(cells: Cells, views: int) -> Figures:
     tracker = TrackerMesh.of_mesh(mesh, 0.0, 0.0)
 
     def view(rng: np.random.Generator, number: int) -> ViewRow:
-        pose, light = random_view(rng, 3.0, CAMERA)
+        pose, light = random_view(rng, range_m, CAMERA)
         exact = trace(mesh, CAMERA, pose.position, rotations.from_matrix(pose.rotation), light, 3).level
         spread = cv2.GaussianBlur(exact, (0, 0), Effects().point_spread_px)
         image = effects.apply(np.rint(np.clip(spread, 0.0, 255.0)).astype(np.uint8), 0, number)
         return tracked_view(image, tracker, pose, perturbed(pose, rng, *PRIOR))
 
-    return tracking_figures("independent_3m", cells.rows("independent_3m", max(views // 10, 1), view))
+    key = f"independent_{range_m:g}m"
+    return tracking_figures(key, cells.rows(key, views, view))
 
 
 def behind(cells: Cells, views: int) -> Figures:
@@ -271,6 +324,35 @@ def backlit(cells: Cells, views: int) -> Figures:
 
     rows = cells.rows("backlit", views, view)
     return tracking_figures("backlit", [row for row in rows if row["grey"] >= LEAST_GREY])
+
+
+def lamp(cells: Cells, views: int) -> Figures:
+    """Track single images in eclipse, by the light of the camera's lamp."""
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        pose, _ = random_view(rng, rng.uniform(1.0, 2.0), CAMERA)
+        image = scene.image(pose, Light(sun=0.0, ambient=0.01, lamp=_LAMP), number)
+        covered = scene.coverage(pose.position, rotations.from_matrix(pose.rotation))
+        row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
+        return row | {"grey": float(image[covered].mean())}
+
+    rows = cells.rows("lamp", views, view)
+    return tracking_figures("lamp", [row for row in rows if row["grey"] >= LEAST_GREY])
+
+
+def blur(cells: Cells, views: int) -> Figures:
+    """Track single images of a target that moves during the exposure."""
+    scene = SatelliteImages()
+
+    def view(rng: np.random.Generator, number: int) -> ViewRow:
+        pose, light = random_view(rng, rng.uniform(1.0, 3.0), CAMERA)
+        along = rng.uniform(0.0, 2.0 * np.pi)
+        step_m = _BLUR_PX * pose.position[2] / CAMERA.fx_px * np.array([np.cos(along), np.sin(along), 0.0])
+        image = scene.blurred(pose, step_m, light, number)
+        return tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
+
+    return tracking_figures("blur", cells.rows("blur", views, view))
 
 
 def earth_behind(rng: np.random.Generator) -> Earth:
@@ -391,10 +473,13 @@ def main() -> None:
     parts = (
         "exact",
         "knowledge",
+        "crossed",
         "inspect",
         "independent",
         "behind",
         "backlit",
+        "lamp",
+        "blur",
         "gate",
         "acquisition",
         "earth",
@@ -414,21 +499,24 @@ def main() -> None:
     views = options.views or (20 if options.quick else 300)
     cells = Cells(options.results)
 
-    def at_ranges(name: str) -> Figures:
+    def at_ranges(cell: Callable[[float], Figures]) -> Figures:
         figures = Figures()
         for range_m in options.ranges:
-            figures |= track_cell(cells, name, range_m, views)
+            figures |= cell(range_m)
         return figures
 
     run_parts(
         options,
         {
-            "exact": lambda: at_ranges("exact"),
-            "knowledge": lambda: at_ranges("knowledge"),
+            "exact": lambda: at_ranges(lambda m: track_cell(cells, "exact", m, views)),
+            "knowledge": lambda: at_ranges(lambda m: track_cell(cells, "knowledge", m, views)),
+            "crossed": lambda: at_ranges(lambda m: crossed(cells, m, views)),
             "inspect": lambda: inspect(views),
-            "independent": lambda: independent(cells, views),
+            "independent": lambda: at_ranges(lambda m: independent(cells, m, views)),
             "behind": lambda: behind(cells, views),
             "backlit": lambda: backlit(cells, views),
+            "lamp": lambda: lamp(cells, views),
+            "blur": lambda: blur(cells, views),
             "gate": lambda: gate(cells, views),
             "acquisition": lambda: acquire(cells, "acquisition", views),
             "earth": lambda: acquire(cells, "earth", views),

@@ -6,7 +6,8 @@ Complete missions in one process (``chaserdock.evaluation.in_process``), with re
 target's geometry, of sensors and of images.
 
 - ``docking``: ``markerless-docking`` to its end;
-- ``capture``: ``markerless-capture`` until the docking is verified, or to its end.
+- ``capture``: ``markerless-capture`` until the docking is verified, or to its end;
+- ``inspection``: ``markerless-inspection`` to its end; trackers correct their mesh by the controller's estimate.
 
 A flight's line states how it ended; the figures are the worst over flights, and times are CPU times of this process by part.
 ``--results FILE`` appends every flight to FILE (JSON lines) and does not repeat flights that are in it. ``--quick``: one flight
@@ -24,11 +25,12 @@ from pathlib import Path
 import msgspec
 import numpy as np
 from chaserdock_agents.chaser.perception import make_perception
-from chaserdock_agents.chaser.sighting import look
+from chaserdock_agents.chaser.sighting import apply_geometry, look
 from chaserdock_controller.interfaces import TickInputs, TickOutputs
-from chaserdock_protocol.messages import Sighting
+from chaserdock_protocol.messages import GeometryEstimate, Sighting
 from chaserdock_protocol.scenario import Scenario
 from chaserdock_world.physics.simulation import TARGET
+from chaserdock_world.plant import true_geometry_errors
 from chaserdock_world.rendering.cameras import States
 from chaserdock_world.rendering.pose_cameras import make_cameras
 from common import Figures, append_line, commit, make_parser, read_lines, run_parts
@@ -37,7 +39,11 @@ from chaserdock.analysis.pose_errors import normalized_square, pose_covariance, 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
 from chaserdock.evaluation.transfers import load_shipped
 
-SCENARIOS = {"docking": "markerless-docking", "capture": "markerless-capture"}
+SCENARIOS = {
+    "docking": "markerless-docking",
+    "capture": "markerless-capture",
+    "inspection": "markerless-inspection",
+}
 QUICK = ("duration_s=30.0", "steady_until_s=30.0", "timeline=[]")
 PROGRESS_S = 5.0
 STEADY_RAD = math.radians(0.3)
@@ -50,6 +56,7 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     ``estimate_*``: of the target's estimate from its first sighting on, RMS and most; ``nees``: mean, 6 expected.
     ``seen_share``: of the images, by chaser. ``unseen_s``: longest time without a sighting after the first, by chaser.
     ``*_ms``: CPU time per tick by part; ``image_*_ms``: of the perception, per image. ``touch_m``, ``touch_deg``: at the latch.
+    ``geometry_views``: views of an inspection; ``geometry_nees``: normalized squared error of its estimate per parameter, 1 expected.
     """
 
     seed: int
@@ -74,6 +81,8 @@ class MarkerlessOutcome(msgspec.Struct, frozen=True):
     perception_ms: float
     controller_ms: float
     tick_ms: float
+    geometry_views: int = 0
+    geometry_nees: float | None = None
     touch_m: float | None = None
     touch_deg: float | None = None
     retreats: list[str] = msgspec.field(default_factory=list)
@@ -85,7 +94,7 @@ class TimedImages:
     def __init__(self, scenario: Scenario) -> None:
         self._ticks_per_image = scenario.timing.ticks_per_image
         self._cameras = make_cameras(scenario)
-        self._perceptions = [make_perception(scenario) for _ in scenario.chasers]
+        self.perceptions = [make_perception(scenario) for _ in scenario.chasers]
         self.render_s: list[float] = []
         self.perception_s: list[float] = []
         self.seen: list[list[bool]] = [[] for _ in scenario.chasers]
@@ -94,7 +103,7 @@ class TimedImages:
         begin_s = time.process_time()
         image = self._cameras.image(chaser, tick // self._ticks_per_image, tick, time_ns, states)
         drawn_s = time.process_time()
-        sighting = look(self._perceptions[chaser], image, None)
+        sighting = look(self.perceptions[chaser], image, None)
         self.perception_s.append(time.process_time() - drawn_s)
         self.render_s.append(drawn_s - begin_s)
         self.seen[chaser].append(sighting.status == "seen")
@@ -102,14 +111,23 @@ class TimedImages:
 
 
 class TimedMission(InProcessMission):
-    """A mission that keeps the CPU times of its controller."""
+    """A mission that keeps the CPU times of its controller, and passes its estimates of the geometry on to the perceptions."""
 
     controller_s = 0.0
+    geometry: GeometryEstimate | None = None
+
+    def __init__(self, scenario: Scenario, images: TimedImages) -> None:
+        super().__init__(scenario, images)
+        self._images = images
 
     def _control(self, inputs: TickInputs) -> TickOutputs | None:
         begin_s = time.process_time()
         outputs = super()._control(inputs)
         self.controller_s += time.process_time() - begin_s
+        for i, wrench in outputs.wrenches.items() if outputs is not None else ():
+            if refused := apply_geometry(self._images.perceptions[i], wrench.geometry):
+                raise RuntimeError(refused)
+            self.geometry = wrench.geometry or self.geometry
         return outputs
 
 
@@ -231,7 +249,20 @@ def outcome(
         touch_m=None if touch is None else touch.lateral_m,
         touch_deg=None if touch is None else math.degrees(touch.angle_rad),
         retreats=retreats,
+        geometry_views=0 if flight.geometry is None else flight.geometry.views,
+        geometry_nees=None if flight.geometry is None else geometry_nees(scenario, flight.geometry),
     )
+
+
+def geometry_nees(scenario: Scenario, estimate: GeometryEstimate) -> float:
+    """Return the normalized squared error of estimated joints and scale, per parameter."""
+    scale, turns = true_geometry_errors(scenario)
+    known = {f"{joint} {axis}": turn[k] for joint, turn in turns.items() for k, axis in enumerate("xyz")}
+    known["scale"] = scale
+    at = [k for k, name in enumerate(estimate.names) if name in known]
+    off = np.array([estimate.values[k] - known[estimate.names[k]] for k in at])
+    covariance = np.array(estimate.covariance).reshape(len(estimate.names), -1)[np.ix_(at, at)]
+    return float(off @ np.linalg.solve(covariance, off)) / len(at)
 
 
 def line_of(o: MarkerlessOutcome) -> str:
@@ -243,6 +274,8 @@ def line_of(o: MarkerlessOutcome) -> str:
     )
     if o.touch_m is not None and o.touch_deg is not None:
         text += f"; contact {1e3 * o.touch_m:.2f} mm {o.touch_deg:.2f} deg"
+    if o.geometry_nees is not None:
+        text += f"; geometry from {o.geometry_views} views, NEES {o.geometry_nees:.2f} per parameter"
     return text + "".join(f"; retreat: {reason}" for reason in o.retreats)
 
 
@@ -277,6 +310,7 @@ def fly_part(part: str, seeds: range, changes: tuple[str, ...], results: Path | 
         f"{part}_estimate_rms_m": worst(lambda o: o.estimate_rms_m),
         f"{part}_estimate_rms_rad": worst(lambda o: o.estimate_rms_rad),
         f"{part}_nees_mean": float(np.mean([o.nees for o in outcomes])),
+        f"{part}_geometry_views": min(o.geometry_views for o in outcomes),
         f"{part}_first_seen_s": worst(lambda o: max(o.first_seen_s)),
         f"{part}_unseen_s": worst(lambda o: max(o.unseen_s)),
         f"{part}_image_mean_s": 1e-3 * float(np.mean([o.image_mean_ms for o in outcomes])),

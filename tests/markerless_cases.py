@@ -11,10 +11,12 @@ from chaserdock_agents.chaser.perception.refine import PoseInCamera
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.satellites import satellite
 from chaserdock_models.targets import Box
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import WHITE_LEVEL, Light
 from chaserdock_world.rendering.effects import CameraEffects
+from chaserdock_world.rendering.mesh_renderer import MeshRenderer
 from numpy.typing import NDArray
 
 # Bus, panels on booms, instruments and thrusters: different on every side.
@@ -165,6 +167,15 @@ def _enter(box: Box, origin: Array, rays: Array) -> tuple[Array, NDArray[np.int6
 def lighting_of(light: Light) -> Lighting:
     """Return the light as flight software knows it."""
     return Lighting(np.array(light.direction_w), light.sun, light.ambient)
+
+
+def satellite_image(pose: PoseInCamera, light: Light, number: int) -> NDArray[np.uint8]:
+    """Return an image (540, 960), 60 degrees wide, of `geo_servicer` by the world's renderer, as benchmarks/markerless.py makes it."""
+    camera = Camera.from_hfov(960, 540, np.deg2rad(60.0))
+    renderer = MeshRenderer(camera, satellite("geo_servicer"), None, Effects().point_spread_px)
+    q = rotations.from_matrix(pose.rotation)
+    exact = renderer.render(np.zeros(3), rotations.IDENTITY, pose.position, q, (), light)
+    return CameraEffects(960, 540, Effects(), 11).apply(exact, 0, number)
 
 
 def random_view(rng: np.random.Generator, range_m: float, camera: Camera) -> tuple[PoseInCamera, Light]:

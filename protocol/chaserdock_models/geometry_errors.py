@@ -17,7 +17,7 @@ from .arrays import Array
 from .meshes import MeshPart, TriangleMesh, with_geometry_errors
 from .targets import box_around
 
-_RIM_SIGMA_M = 0.0005
+_RIM_SIGMA_M = 0.001
 """Standard deviation of where the visible border of solar panels lies."""
 
 

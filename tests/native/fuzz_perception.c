@@ -191,7 +191,7 @@ static void control_points(void) {
 static void align_points(void) {
     const int64_t height = whole(2, 60), width = whole(2, 60), n = whole(0, 60);
     LevelCamera camera = {value(20.0, 90.0), value(20.0, 90.0), value(0.0, 60.0), value(0.0, 60.0), {0}, (double)height, (double)width};
-    AlignSettings set = {(double)whole(0, 30), (double)whole(0, 6), value(0.0, 0.5), value(0.5, 4.0), value(0.05, 0.5), value(0.5, 3.0)};
+    AlignSettings set = {(double)whole(0, 30), (double)whole(0, 6), value(0.0, 0.5), value(0.5, 4.0), value(0.5, 3.0)};
     for (int i = 0; i < 5; i++) camera.distortion[i] = value(-0.2, 0.2);
     float *image = floats(height * width);
     for (int64_t i = 0; i < height * width; i++) image[i] = (float)value(0.0, 255.0);
@@ -200,7 +200,7 @@ static void align_points(void) {
     for (int64_t i = 0; i < 3 * n; i++) ahead[i] = points[i] + value(0.0, 0.02);
     for (int i = 0; i < 3; i++) pose[3 + 4 * i] += 1.0;
     pose[2] += 1.5;
-    int64_t inside = NAME(align_points)(&camera, image, &set, points, ahead, profiles, n, pose, residual, weight, correlation,
+    int64_t inside = NAME(align_points)(&camera, image, &set, points, ahead, profiles, doubles(n, 0.0, 0.002), n, pose, residual, weight, correlation,
                                         outputs(6 * n), outputs(2 * n));
     CHECK(inside >= 0 && inside <= n);
     if (inside) CHECK(all_finite(pose, 12));

@@ -248,14 +248,17 @@ def true_mesh(scenario: Scenario) -> TriangleMesh | None:
 
     None for a target without a mesh.
     """
+    mesh = scenario.target.nominal_mesh()
+    return None if mesh is None else with_geometry_errors(mesh, *true_geometry_errors(scenario))
+
+
+def true_geometry_errors(scenario: Scenario) -> tuple[float, dict[str, Array]]:
+    """Return the errors of the known mesh that a seed draws: of the scale, a share, and the turn (3,) of each joint, rad."""
     mesh, knowledge = scenario.target.nominal_mesh(), scenario.target.knowledge
-    if mesh is None:
-        return None
-    draw = _normal(scenario.seed, Stream.MESH, TARGET_KEY, 1 + 3 * len(mesh.joints))
+    joints = () if mesh is None else tuple(mesh.joints)
+    draw = _normal(scenario.seed, Stream.MESH, TARGET_KEY, 1 + 3 * len(joints))
     turns = np.radians(knowledge.panel_deg) * draw[1:].reshape(-1, 3)
-    return with_geometry_errors(
-        mesh, knowledge.scale_share * float(draw[0]), dict(zip(mesh.joints, turns, strict=True))
-    )
+    return knowledge.scale_share * float(draw[0]), dict(zip(joints, turns, strict=True))
 
 
 def _moved(marker: Marker, offset: Array) -> Marker:

@@ -25,12 +25,14 @@ from .lighting import appearance, light_at, points_on, rate_suns
 from .mesh import ShadowMaps, TrackerMesh, spread_directions
 from .rendering import Lighting, PixelWindow, render
 from .steps import LIGHT_MS, Steps, result_of
-from .tracking import is_valid, levels_of, pose_steps, prior_steps, turn_between
+from .tracking import is_valid, levels_of, pose_steps, rough_prior_steps, turn_between
 
 _TEMPLATES, _SIDE_PX = 3000, 40
 _SPREAD_PX = 8.0
 """Root mean square distance of a normalized silhouette's pixels from their centre."""
-_DISTANCE_RADII = 6.0
+_DISTANCES_RADII, _NEAR_RADII = (6.0, 2.2), 3.6
+"""Distances of the templates, far and near ones, in radii of the target: perspective changes near silhouettes; distance at which the
+near ones begin."""
 _BY_SILHOUETTE, _BY_LIGHT, _FULL = 250, 24, 6
 _TEMPLATE_POINTS, _TEMPLATE_SUNS, _BY_LIGHT_WEIGHT = 100, 100, 0.1
 _APPEARANCE_LEVEL = 1
@@ -38,14 +40,19 @@ _SHARP_PER_PX = (1.5, 4.0)
 """Least slopes, grey levels per pixel, of edges that clouds do not have: over dark and over bright parts of the Earth."""
 MIN_APPEARANCE = 0.85
 """Gate of an acquisition: a smaller correlation of the synthetic view with the image rejects a pose."""
+_CUT_SHIFTS, _CUT_SIZES = (0.3, 0.6), (1.0, 1.2, 1.4, 1.6)
+"""Assumed places of a silhouette that leaves the image: shifts of its centre towards one of those sides, in rms radii of what is
+visible, and ratios of its rms radius to that."""
+_SAME_REGION = 0.8
+"""Common share of two regions of which only one is searched."""
 _MIN_AREA_PX, _MIN_CONTRAST = 60, 5.0
 _AMBIGUOUS_SCORE, _DISTINCT_RAD = 0.04, math.radians(8.0)
 _WORSE_START = 0.2
 """Once a pose has been found, coarse poses with a score lower than its own by this much are not refined."""
-_RATED_AT_ONCE = 25
+_RATED_AT_ONCE, _FITTED_AT_ONCE, _REGION_POINTS = 25, 9, 10_000
 _REGION_MS, _SILHOUETTES_MS, _RATE_MS, _APPEARANCE_MS = 10.0, 20.0, 10.0, 10.0
-"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes, to rate suns for
-``_RATED_AT_ONCE`` of them, to compare a synthetic view with the image."""
+"""Expected CPU times of steps: to find the region of the target, to compare it with the silhouettes at
+``_FITTED_AT_ONCE`` places, to rate suns for ``_RATED_AT_ONCE`` of them, to compare a synthetic view with the image."""
 
 Found = tuple[Alignment, Lighting]
 """A pose that passes the gate, and its light."""
@@ -64,6 +71,18 @@ class _Templates:
     distance_m: float
 
 
+@dataclass(frozen=True)
+class _SilhouetteFit:
+    """A region compared with n templates: its assumed centre ``middle`` (2,) and rms radius ``spread``, tangents of angles;
+    ``mask`` and ``grey`` (pixels,) on the grid of the templates; ``overlap`` (n,): common share of both silhouettes, 0 to 1."""
+
+    middle: Array
+    spread: float
+    mask: NDArray[np.float32]
+    grey: Array
+    overlap: Array
+
+
 def spread_rotations(n: int) -> Array:
     """Return ``n`` quaternions (n, 4) spread evenly over all rotations: super-Fibonacci spirals (M. Alexa, CVPR 2022)."""
     s = np.arange(n) + 0.5
@@ -77,7 +96,7 @@ class Acquisition:
 
     def __init__(self, camera: Camera, mesh: TrackerMesh) -> None:
         self._camera, self._mesh = camera, mesh
-        self._templates: _Templates | None = None
+        self._templates: tuple[_Templates, ...] = ()
         # Templates are compared without cast shadows.
         towards = spread_directions(_TEMPLATE_SUNS)
         self._suns = ShadowMaps(
@@ -85,9 +104,9 @@ class Acquisition:
         )
 
     def prepare(self) -> None:
-        """Render the templates, if that has not been done; takes about a second."""
-        if self._templates is None:
-            self._templates = _make_templates(self._mesh)
+        """Render the templates, if that has not been done; takes about two seconds."""
+        if not self._templates:
+            self._templates = tuple(_make_templates(self._mesh, radii) for radii in _DISTANCES_RADII)
 
     def find(self, image: NDArray[np.uint8]) -> tuple[Found, ...]:
         """Return the alignments that pass the gate, and their light, best first; several if they explain the image about equally
@@ -106,12 +125,16 @@ class Acquisition:
         behind = _touches_border(bright)
         if not behind:
             found = yield from self._search_in(pyramid, bright)
-        for slope in _SHARP_PER_PX:
-            if not found:
-                yield _REGION_MS
-                found = yield from self._search_in(pyramid, _sharp_region(level, slope))
-        if behind and not found:
-            found = yield from self._search_in(pyramid, bright)
+        searched = [] if behind else [bright]
+        for slope in (*_SHARP_PER_PX, *([None] if behind else [])):
+            if found:
+                break
+            yield _REGION_MS
+            region = bright if slope is None else _sharp_region(level, slope)
+            if region is None or any(_overlap(region, other) > _SAME_REGION for other in searched):
+                continue
+            searched.append(region)
+            found = yield from self._search_in(pyramid, region)
         return found
 
     def _search_in(self, pyramid: Pyramid, region: NDArray[np.uint8] | None) -> Steps[tuple[Found, ...]]:
@@ -137,7 +160,7 @@ class Acquisition:
             if any(turn_between(start.pose, other) < _DISTINCT_RAD for other in tried):
                 continue
             tried.append(start.pose)
-            refined = yield from prior_steps(pyramid, self._mesh, start.pose)
+            refined = yield from rough_prior_steps(pyramid, self._mesh, start.pose)
             if refined is None or not is_valid(refined[0]):
                 continue
             if any(turn_between(refined[0].pose, a.pose) < _DISTINCT_RAD for a, _ in fine):
@@ -158,9 +181,9 @@ class Acquisition:
         """Return coarse poses of a target that covers ``region`` (h, w), the most likely first."""
         yield _SILHOUETTES_MS
         self.prepare()
-        assert self._templates is not None
-        t, camera = self._templates, self._camera
+        camera = self._camera
         y, x = np.nonzero(region)
+        y, x = (axis[:: max(1, len(axis) // _REGION_POINTS)] for axis in (y, x))
         px = camera.undistort(np.column_stack([x, y]).astype(float))
         ideal = (px - (camera.cx_px, camera.cy_px)) / (camera.fx_px, camera.fy_px)
         ideal = ideal[np.isfinite(ideal).all(axis=1)]
@@ -171,27 +194,67 @@ class Acquisition:
         flat = rays[:, :2] / rays[:, 2:]
         middle = flat.mean(axis=0)
         spread = math.sqrt(float(((flat - middle) ** 2).sum(axis=1).mean()))
-        mask, grey = self._normalized(pyramid, region, towards, middle, spread)
-        common = t.masks @ mask
-        union = t.masks.sum(axis=1) + mask.sum() - common
-        likely = np.argsort(-common / union)[:_BY_SILHOUETTE]
+        t = self._templates_at(spread)
+        places = self._places(region, towards, middle, spread)
+        fits: list[_SilhouetteFit] = []
+        for first in range(0, len(places), _FITTED_AT_ONCE):
+            if first:
+                yield _SILHOUETTES_MS
+            fits += self._fits(t, pyramid, region, towards, places[first : first + _FITTED_AT_ONCE])
+        overlaps = np.array([fit.overlap for fit in fits])
+        chosen = overlaps.argmax(axis=0)
+        likely = np.argsort(-overlaps.max(axis=0))[:_BY_SILHOUETTE]
         errors: list[float] = []
         for some in np.array_split(likely, _BY_SILHOUETTE // _RATED_AT_ONCE):
             yield _RATE_MS
-            errors += [self._unexplained(int(i), mask, grey, common[i] / union[i]) for i in some]
+            errors += [self._unexplained(t, int(i), fits[chosen[i]]) for i in some]
         poses = []
         for i in likely[np.argsort(errors)[:_BY_LIGHT]]:
+            fit = fits[chosen[i]]
             # The same silhouette at another distance: sizes are inversely proportional to it.
-            ratio = t.spread[i] / spread
-            aside = middle - t.centre[i] / ratio
+            ratio = t.spread[i] / fit.spread
+            aside = fit.middle - t.centre[i] / ratio
             position = t.distance_m * ratio * np.append(aside, 1.0)
             poses.append(PoseInCamera(towards.T @ position, towards.T @ t.rotations[i]))
         return poses
 
+    def _templates_at(self, spread: float) -> _Templates:
+        """Return the templates for a silhouette of this rms radius, the tangent of an angle."""
+        far, near = self._templates
+        distance_m = far.distance_m * float(np.median(far.spread)) / spread
+        return near if distance_m < _NEAR_RADII * self._mesh.radius_m else far
+
+    def _places(
+        self, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
+    ) -> list[tuple[Array, float]]:
+        """Return the centre and the rms radius of the silhouette that a region shows: several for one that leaves the image."""
+        if not _touches_border(region):
+            return [(middle, spread)]
+        centres = [middle]
+        for side in _border_sides(region):
+            outwards = (towards @ np.append(side, 0.0))[:2]
+            centres += [middle + shift * spread * outwards for shift in _CUT_SHIFTS]
+        return [(centre, size * spread) for centre in centres for size in _CUT_SIZES]
+
+    def _fits(
+        self, t: _Templates, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, places: list[tuple[Array, float]]
+    ) -> list[_SilhouetteFit]:  # fmt: skip
+        """Compare a region with the silhouettes, inside the image, for each centre and rms radius in ``places``."""
+        seen = [self._normalized(pyramid, region, towards, *place) for place in places]
+        masks = np.array([mask for mask, _, _ in seen])
+        # One product, as reading the templates takes the most time.
+        product = t.masks @ np.concatenate([masks, [visible for _, _, visible in seen]]).T
+        common, inside = product[:, : len(places)].T, product[:, len(places) :].T
+        overlaps = common / np.maximum(inside + masks.sum(axis=1, keepdims=True) - common, 1.0)
+        return [
+            _SilhouetteFit(middle, spread, mask, grey, overlap)
+            for (middle, spread), (mask, grey, _), overlap in zip(places, seen, overlaps, strict=True)
+        ]
+
     def _normalized(
         self, pyramid: Pyramid, region: NDArray[np.uint8], towards: Array, middle: Array, spread: float
-    ) -> tuple[NDArray[np.float32], Array]:
-        """Return the region's mask and the image on the grid of the templates, each (pixels,)."""
+    ) -> tuple[NDArray[np.float32], Array, NDArray[np.float32]]:
+        """Return the region's mask, the image, and a mask of what is inside the image, each (pixels,) on the grid of the templates."""
         step = spread / _SPREAD_PX
         axis = (np.arange(_SIDE_PX) - (_SIDE_PX - 1) / 2.0) * step
         u, v = np.meshgrid(axis + middle[0], axis + middle[1])
@@ -201,22 +264,29 @@ class Acquisition:
         level = max(0, min(4, int(math.log2(max(step * self._camera.fx_px, 1.0)))))
         scale = 0.5**level
         at = (px + 0.5) * scale - 0.5
-        grey = cv2.remap(pyramid.level(level), at[..., 0], at[..., 1], cv2.INTER_LINEAR)
-        soft = cv2.GaussianBlur(region * np.float32(255.0), (0, 0), max(0.3, 0.4 / scale))
-        mask = cv2.remap(soft, px[..., 0], px[..., 1], cv2.INTER_LINEAR) > 127.0
-        return mask.ravel().astype(np.float32), np.asarray(grey, dtype=float).ravel()
+        grid = pyramid.level(level)
+        grey = cv2.remap(grid, at[..., 0], at[..., 1], cv2.INTER_LINEAR)
+        soft = cv2.resize(255 * region, (grid.shape[1], grid.shape[0]), interpolation=cv2.INTER_AREA)
+        mask = cv2.remap(soft, at[..., 0], at[..., 1], cv2.INTER_LINEAR) > 127
+        last = np.array([region.shape[1] - 1, region.shape[0] - 1])
+        visible = ((px >= 0.0) & (px <= last)).all(axis=-1)
+        return (
+            (mask & visible).ravel().astype(np.float32),
+            np.asarray(grey, dtype=float).ravel(),
+            visible.ravel().astype(np.float32),
+        )
 
-    def _unexplained(self, i: int, mask: NDArray[np.float32], grey: Array, overlap: float) -> float:
+    def _unexplained(self, t: _Templates, i: int, fit: _SilhouetteFit) -> float:
         """Return the share of the grey levels that no light explains, plus that of the silhouette."""
-        t = self._templates
-        assert t is not None
-        inside = np.flatnonzero((t.owners[i] >= 0) & (mask > 0.0))
+        inside = np.flatnonzero((t.owners[i] >= 0) & (fit.mask > 0.0))
         inside = inside[:: max(1, len(inside) // _TEMPLATE_POINTS)]
         if len(inside) < 30:
             return math.inf
         owners, nowhere = t.owners[i][inside], np.zeros((len(inside), 3))
-        points = points_on(self._mesh, owners, nowhere, -t.rotations[i][2], grey[inside], t.rotations[i])
-        return float(rate_suns(points, self._suns)[:, 0].min()) * _BY_LIGHT_WEIGHT + 2.0 * (1.0 - overlap)
+        points = points_on(self._mesh, owners, nowhere, -t.rotations[i][2], fit.grey[inside], t.rotations[i])
+        return float(rate_suns(points, self._suns)[:, 0].min()) * _BY_LIGHT_WEIGHT + 2.0 * (
+            1.0 - fit.overlap[i]
+        )
 
 
 def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
@@ -227,9 +297,23 @@ def _brightest_region(image: NDArray[np.float32]) -> NDArray[np.uint8] | None:
     return _largest_region(bright)
 
 
+def _border_sides(region: NDArray[np.uint8]) -> list[tuple[float, float]]:
+    """Return the directions, right and down, of the sides of the image that a mask (h, w) reaches, and of corners between two."""
+    edges = (region[:, 0], region[:, -1], region[0], region[-1])
+    sides = ((-1.0, 0.0), (1.0, 0.0), (0.0, -1.0), (0.0, 1.0))
+    reached = [side for side, edge in zip(sides, edges, strict=True) if edge.any()]
+    across, along = ([side for side in reached if side[k] != 0.0] for k in (0, 1))
+    return reached + [(0.7 * a[0], 0.7 * b[1]) for a in across for b in along]
+
+
 def _touches_border(region: NDArray[np.uint8]) -> bool:
     """Return whether a mask (h, w) reaches the border of the image."""
-    return any(bool(edge.any()) for edge in (region[0], region[-1], region[:, 0], region[:, -1]))
+    return bool(_border_sides(region))
+
+
+def _overlap(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> float:
+    """Return the common share of two masks (h, w), 0 to 1."""
+    return float(np.count_nonzero(a & b)) / max(float(np.count_nonzero(a | b)), 1.0)
 
 
 def _largest_region(mask: NDArray[Any]) -> NDArray[np.uint8] | None:
@@ -272,14 +356,14 @@ def _look_at(ray: Array) -> Array:
     return rotations.to_matrix(rotations.exp(axis * (angle / sine if sine > 1e-12 else 0.0)))
 
 
-def _make_templates(mesh: TrackerMesh) -> _Templates:
+def _make_templates(mesh: TrackerMesh, radii: float) -> _Templates:
     quaternions = spread_rotations(_TEMPLATES)
-    distance = _DISTANCE_RADII * mesh.radius_m
+    distance = radii * mesh.radius_m
     light = Lighting(np.array([0.0, 0.0, -1.0]), shadows=False)
     masks = np.zeros((_TEMPLATES, _SIDE_PX**2), dtype=np.float32)
     owners = np.full((_TEMPLATES, _SIDE_PX**2), -1, dtype=np.int16)
     turns, spread, centre = np.empty((_TEMPLATES, 3, 3)), np.empty(_TEMPLATES), np.empty((_TEMPLATES, 2))
-    middle, whole = (_SIDE_PX - 1) / 2.0, 0.45 * _SIDE_PX * _DISTANCE_RADII
+    middle, whole = (_SIDE_PX - 1) / 2.0, 0.45 * _SIDE_PX * math.sqrt(radii**2 - 1.0)
     for i, q in enumerate(quaternions):
         pose = PoseInCamera(np.array([0.0, 0.0, distance]), rotations.to_matrix(q))
         view = render(mesh, pose, PixelWindow(_SIDE_PX, _SIDE_PX, (whole, whole, middle, middle)), light)

@@ -27,15 +27,19 @@ from .rendering import Lighting, PixelWindow, SyntheticView, pose_array, render
 
 _PROFILE, _PER_CELL_MOST = 9, 4
 _CELL_PX, _PER_CELL = 8, 2
+_LEAST_GRADIENT = (0.5, 1.5)
+"""Least gradient of control points, grey levels per pixel, in light from everywhere and in estimated light. In a dim image, noise
+hides weaker edges, which would count as outliers."""
 _MARGIN_PX = 14
 """Border of a window around the target: reach of the search and half a profile."""
 _MIN_CORRELATION = 0.6
 _NOISE = 2.0
 """Standard deviation of a grey level by noise and by texture that the mesh does not have."""
-_FLOOR_PX = 0.1
 INLIER_PX = 1.5
 _DISPLACED_INLIER_PX, _REFINED_REACH_PX = 5.0, 3
 MIN_POINTS = 24
+_BESIDE_PX = 3.0
+"""Distance from an edge at which the surfaces beside it are looked up."""
 _CORRELATED_POINTS, _INDEPENDENT_MOST = 5.5, 60.0
 """Number of neighbouring control points that err together, so that their information counts once; and largest number of points
 that count: shading and facets that the mesh does not have do not become more accurate with more pixels."""
@@ -77,7 +81,7 @@ class Pyramid:
 class ControlPoints:
     """n control points of a rendering: ``points_m`` (n, 3) and ``ahead_m`` (n, 3), a pixel further along the gradient, in TRF;
     ``profiles`` (n, 9), grey levels; ``owners`` (n,): triangles; ``level``; ``pose`` of the rendering; ``displaced_m`` (k, n, 3):
-    displacements by the modes of the mesh."""
+    displacements by the modes of the mesh; ``border_m`` (n,): standard deviation of where each is seen."""
 
     points_m: Array
     ahead_m: Array
@@ -86,6 +90,7 @@ class ControlPoints:
     level: int
     pose: PoseInCamera
     displaced_m: Array
+    border_m: Array
 
 
 @dataclass(frozen=True)
@@ -149,17 +154,47 @@ def control_points(
     work = np.empty(h * w + cells * 5 * _PER_CELL_MOST)
     vertices, triangles, _, _ = mesh.contiguous
     at = pose_array(pose)
+    least = _LEAST_GRADIENT[light.shadows]
     n = function("control_points", c_int64)(
         address(view), address(synthetic.nearest), address(synthetic.owner), c_int64(h), c_int64(w),
         (c_double * 4)(*window.lens), address(at), address(vertices), address(triangles),
-        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * (light.direct + light.ambient), 0.5), 4.0)),
+        (c_double * 3)(_CELL_PX, _PER_CELL, min(max(0.02 * gain * (light.direct + light.ambient), least), 4.0)),
         address(points), address(ahead), address(profiles), address(owners), address(work),
     )  # fmt: skip
     if n < MIN_POINTS:
         return None
     points, owners = points[:n].copy(), owners[:n].copy()
-    displaced = mesh.mode_displacements(owners, points)
-    return ControlPoints(points, ahead[:n].copy(), profiles[:n].copy(), owners, k, pose, displaced)
+    used = ~_on_textured(mesh, pose, window, synthetic, points, ahead[:n])
+    if used.sum() < MIN_POINTS:
+        return None
+    points, owners = points[used], owners[used]
+    displaced, border = mesh.mode_displacements(owners, points), mesh.border_of(owners)
+    return ControlPoints(points, ahead[:n][used], profiles[:n][used], owners, k, pose, displaced, border)
+
+
+def _on_textured(
+    mesh: TrackerMesh,
+    pose: PoseInCamera,
+    window: PixelWindow,
+    view: SyntheticView,
+    points: Array,
+    ahead: Array,
+) -> NDArray[np.bool_]:
+    """Return which points (n,) are edges between surfaces that both have a grid of solar cells: the lines of the grid beside such
+    an edge move it to either side."""
+    if not mesh.border_m.any():
+        return np.zeros(len(points), dtype=bool)
+    fx, fy, cx, cy = window.lens
+    at, next_to = (p @ pose.rotation.T + pose.position for p in (points, ahead))
+    px = at[:, :2] / at[:, 2:] * (fx, fy) + (cx, cy)
+    step = next_to[:, :2] / next_to[:, 2:] * (fx, fy) + (cx, cy) - px
+    last = np.array([window.width - 1, window.height - 1])
+    both = np.ones(len(points), dtype=bool)
+    for side in (-_BESIDE_PX, _BESIDE_PX):
+        column, row = np.clip(np.rint(px + side * step).astype(np.int64), 0, last).T
+        owner = view.owner[row, column]
+        both &= (owner >= 0) & (mesh.border_m[owner] > 0.0)
+    return both
 
 
 def image_window(pyramid: Pyramid, k: int, window: PixelWindow, left: int, top: int) -> NDArray[np.float32]:
@@ -256,13 +291,13 @@ def _match(
     n = len(points.points_m)
     distortion = (*pyramid.camera.distortion, 0.0, 0.0, 0.0, 0.0, 0.0)[:5]
     camera = (c_double * 11)(*pyramid.lens(points.level), *distortion, *image.shape)
-    settings = (c_double * 6)(reach_px, iterations, _MIN_CORRELATION, _NOISE, _FLOOR_PX, inlier_px)
+    settings = (c_double * 5)(reach_px, iterations, _MIN_CORRELATION, _NOISE, inlier_px)
     displacement = np.einsum("k,kni->ni", modes, points.displaced_m) if len(modes) else 0.0
     at, ahead = points.points_m + displacement, points.ahead_m + displacement
     pose, residual, weight = pose_array(prior), np.empty(n), np.empty(n)
     correlation, rows, work = np.empty(n), np.empty((n, 6)), np.empty(2 * n)
     inside = function("align_points", c_int64)(
-        camera, address(image), settings, address(at), address(ahead), address(points.profiles),
+        camera, address(image), settings, address(at), address(ahead), address(points.profiles), address(points.border_m),
         c_int64(n), address(pose), address(residual), address(weight), address(correlation), address(rows), address(work),
     )  # fmt: skip
     if inside < MIN_POINTS or int((weight > 0.0).sum()) < MIN_POINTS:

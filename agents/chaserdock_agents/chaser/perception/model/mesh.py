@@ -32,6 +32,9 @@ _PLAIN_TEXTURE, _FOIL_TEXTURE = 0.1, 0.3
 """Relative standard deviation of grey levels by texture that the mesh does not have: of plain surfaces, and of wrinkled foil."""
 _FOIL_SLOPE = 0.35
 """Standard deviation of the slopes of wrinkled foil, which widen its highlights."""
+_CELLS_BORDER_M = 0.0002
+"""Standard deviation of where points of the border of solar cells are seen, beside what all have in common (mode ``rim``): the known
+mesh does not have the grid."""
 _SUNS, _SUN_TEXELS = 400, 64
 
 
@@ -73,7 +76,8 @@ class TrackerMesh:
     ``vertices_m`` (n, 3) in TRF; ``triangles`` (m, 3) int64, counter-clockwise seen from outside; ``reflectance`` (m,), 0 to 1.
     ``modes_m`` (k, n, 3): displacement of the vertices by one standard deviation of each of k independent errors of the
     geometry, such as the angle of a panel. ``gloss`` (m, 2): specular reflectance and Blinn's exponent, empty for dull surfaces;
-    ``texture`` (m,): relative standard deviation of the grey levels by texture, empty for that of plain surfaces.
+    ``texture`` (m,): relative standard deviation of the grey levels by texture, empty for that of plain surfaces;
+    ``border_m`` (m,): standard deviation of where the borders of a surface are seen, empty for none.
     Raises MeshError for arrays that are not such a mesh.
     """
 
@@ -83,6 +87,7 @@ class TrackerMesh:
     modes_m: Array = field(default_factory=lambda: np.zeros((0, 0, 3)))
     gloss: Array = field(default_factory=lambda: np.zeros((0, 2)))
     texture: Array = field(default_factory=lambda: np.zeros(0))
+    border_m: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         vertices, triangles, reflectance = self.vertices_m, self.triangles, self.reflectance
@@ -99,6 +104,7 @@ class TrackerMesh:
         for name, values, shape in (
             ("gloss", self.gloss, (len(triangles), 2)),
             ("texture", self.texture, (len(triangles),)),
+            ("border_m", self.border_m, (len(triangles),)),
         ):
             if len(values) and not (values.shape == shape and np.all((values >= 0.0) & (values < 1000.0))):
                 raise MeshError(f"{name} must be numbers from 0 to 1000 of shape {shape}")
@@ -129,7 +135,13 @@ class TrackerMesh:
 
         known = np.concatenate([part.vertices_m for part in mesh.parts])
         modes = error_modes(mesh, joint_sigma_rad, scale_sigma)
-        return cls(known, triangles.astype(np.int64), surfaces[:, 0], modes, surfaces[:, 1:3], surfaces[:, 3])
+        border = np.repeat(
+            [_CELLS_BORDER_M * (p.material.texture == "cells") for p in mesh.parts],
+            [len(p.triangles) for p in mesh.parts],
+        )
+        return cls(
+            known, triangles.astype(np.int64), surfaces[:, 0], modes, surfaces[:, 1:3], surfaces[:, 3], border
+        )
 
     def corrected(self, mean: Array, covariance: Array) -> TrackerMesh:
         """Return the mesh after its modes have been estimated: ``mean`` (k,) and ``covariance`` (k, k), standard deviations of now.
@@ -161,6 +173,10 @@ class TrackerMesh:
     def texture_share(self) -> Array:
         """Relative standard deviation (m,) of the grey levels of each triangle by texture."""
         return self.texture if len(self.texture) else np.full(len(self.triangles), _PLAIN_TEXTURE)
+
+    def border_of(self, owners: NDArray[np.int64]) -> Array:
+        """Return the standard deviation (n,), m, of where the borders of the triangles ``owners`` (n,) are seen."""
+        return self.border_m[owners] if len(self.border_m) else np.zeros(len(owners))
 
     @cached_property
     def mean_normals(self) -> Array:

@@ -25,9 +25,10 @@ MIN_SCORE = 0.56
 MAX_POSITION_SIGMA_SHARE, MAX_ATTITUDE_SIGMA_RAD = 0.02, math.radians(2.0)
 """Gate: a larger standard deviation in any direction, of position as a share of the range, rejects a pose."""
 _FINEST_AREA_PX, _COARSEST_AREA_PX, _UPSAMPLED_AREA_PX = 600_000, 12_000, 24_000
-_LARGEST_PX = 1300.0
-"""Largest diameter of the target at the finest level. Nearer targets are aligned at a coarser level: they show texture that the
-mesh does not have at the size of profiles, and a whole image of them takes the most time."""
+_LARGEST_PX = (1300.0, 740.0)
+"""Largest diameter of the target at the finest level, in pixels of it: if that is the image's own, or a coarser one. Nearer targets
+are aligned at a coarser level: they show texture that the mesh does not have at the size of profiles, and a whole image of them
+takes the most time."""
 _FIRST_REACH_PX, _NEXT_REACH_PX = 10, 5
 _START_SHARE, _START_RAD = 0.02, math.radians(3.0)
 _SETTLED_SHARE, _SETTLED_RAD, _MOST_REPEATED = 0.85, math.radians(0.5), 3
@@ -50,7 +51,7 @@ def is_valid(alignment: Alignment | None) -> TypeGuard[Alignment]:
 def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[int, ...]:
     """Return the levels at which a target at ``pose`` is aligned, coarse to fine; empty if it is out of view.
 
-    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time, and at most 1,300 pixels
+    The finest one shows the target on at most 600,000 pixels, so that a rendering takes bounded time, and at most ``_LARGEST_PX``
     wide, of which it may show a part; small targets are upsampled twice.
     """
     found = window_of(pyramid, 0, mesh, pose)
@@ -59,7 +60,7 @@ def levels_of(pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera) -> tuple[
     area = found[0].height * found[0].width
     finest = -1 if area < _UPSAMPLED_AREA_PX else 0
     diameter_px = 2.0 * mesh.radius_m * pyramid.camera.fx_px / float(np.linalg.norm(pose.position))
-    while area / 4**finest > _FINEST_AREA_PX or diameter_px / 2**finest > _LARGEST_PX:
+    while area / 4**finest > _FINEST_AREA_PX or diameter_px / 2**finest > _LARGEST_PX[finest > 0]:
         finest += 1
     coarsest = finest
     while area / 4**coarsest > _COARSEST_AREA_PX and coarsest < finest + 4:
@@ -116,8 +117,28 @@ def prior_steps(
 ) -> Steps[tuple[Alignment, Lighting] | None]:
     """Do what `refine_from_prior` does, in steps; None also for a pose that does not settle.
 
-    The outline and the borders of materials give a coarse pose by light from everywhere; from it follows the light, which improves
-    the coarse pose, which improves the light. Both are improved again until the fine pose settles.
+    Starts from light from everywhere, for a prior that may be far off. If that explains the image badly, as where sunlight only
+    grazes the target, starts from the light at the prior as well, and returns the better one.
+    """
+    found = yield from rough_prior_steps(pyramid, mesh, prior, modes)
+    levels = levels_of(pyramid, mesh, prior)
+    if (found is not None and found[0].inlier_share >= _SETTLED_SHARE) or not levels:
+        return found
+    yield LIGHT_MS + VIEWS_MS
+    light = light_at(pyramid, mesh, prior, levels[0], by_view=True)
+    if light is None:
+        return found
+    other = yield from _settling_steps(pyramid, mesh, prior, light, levels, modes)
+    return max((f for f in (found, other) if f is not None), key=lambda f: f[0].score, default=None)
+
+
+def rough_prior_steps(
+    pyramid: Pyramid, mesh: TrackerMesh, prior: PoseInCamera, modes: Array | None = None
+) -> Steps[tuple[Alignment, Lighting] | None]:
+    """Return pose and light, starting from light from everywhere; None also for a pose that does not settle.
+
+    The outline and the borders of materials give a coarse pose; from it follows the light, which improves the coarse pose, which
+    improves the light.
     """
     levels = levels_of(pyramid, mesh, prior)
     if not levels:
@@ -131,6 +152,13 @@ def prior_steps(
         if found is None:
             return None
         light = found
+    return (yield from _settling_steps(pyramid, mesh, pose, light, levels, modes))
+
+
+def _settling_steps(
+    pyramid: Pyramid, mesh: TrackerMesh, pose: PoseInCamera, light: Lighting, levels: tuple[int, ...], modes: Array | None
+) -> Steps[tuple[Alignment, Lighting] | None]:  # fmt: skip
+    """Align the two finest levels, and improve light and pose again until the pose settles; None if it does not."""
     fine = yield from pose_steps(pyramid, mesh, pose, light, levels[-2:], _NEXT_REACH_PX, modes)
     for number in range(_MOST_REPEATED):
         if fine is None or _is_settled(fine, 0.0 if number else _SETTLED_SHARE):

@@ -12,6 +12,8 @@
 #define REACH_MOST 24
 #define TAPS_OF_REACH (2 * (REACH_MOST + HALF) + 1)
 #define PER_CELL_MOST 4
+/* Standard deviation of a match that contrast does not explain. */
+#define FLOOR_PX 0.1
 
 /* Selection of control points. */
 typedef struct {
@@ -24,9 +26,9 @@ typedef struct {
 } LevelCamera;
 
 /* ``reach_px``: searched at first on both sides; ``iterations``; ``min_correlation`` of a match; ``noise``: grey levels;
- * ``floor_px``: standard deviation of a match that contrast does not explain; ``inlier_px``: largest residual of an inlier. */
+ * ``inlier_px``: largest residual of an inlier. */
 typedef struct {
-    double reach_px, iterations, min_correlation, noise, floor_px, inlier_px;
+    double reach_px, iterations, min_correlation, noise, inlier_px;
 } AlignSettings;
 
 static inline double gradient_at(const float *image, int64_t width, int64_t at, double *g) {
@@ -199,8 +201,8 @@ static double select_rank(double *a, int64_t n, int64_t rank) {
 /* Measure all points at a pose: ``residual`` (n), pixels along the gradient, ``weight`` (n): inverse variance, 0 without a match
  * and -1 outside the image, ``rows`` (n, 6): derivative by a rotation in camera axes and by position. */
 static void measure(const LevelCamera *camera, const float *image, const AlignSettings *set, const double *pose,
-                    const double *points, const double *ahead, const double *profiles, int64_t n, int reach, double *residual,
-                    double *weight, double *correlation, double *rows) {
+                    const double *points, const double *ahead, const double *profiles, const double *border, int64_t n, int reach,
+                    double *residual, double *weight, double *correlation, double *rows) {
     int64_t height = (int64_t)camera->height, width = (int64_t)camera->width;
     for (int64_t i = 0; i < n; i++) {
         double turned[3], at[3], next[3], taps[TAPS_OF_REACH], shift, variance;
@@ -231,7 +233,8 @@ static void measure(const LevelCamera *camera, const float *image, const AlignSe
         cross3(turned, by, row);
         copy(by, row + 3, 3);
         if (correlation[i] < set->min_correlation) continue;
-        double sigma_square = set->floor_px * set->floor_px + set->noise * set->noise * variance * step * step;
+        double floor_px = border[i] * camera->fx / at[2];
+        double sigma_square = FLOOR_PX * FLOOR_PX + floor_px * floor_px + set->noise * set->noise * variance * step * step;
         weight[i] = 1.0 / sigma_square;
     }
 }
@@ -248,16 +251,16 @@ static void turn_pose(const double *phi, double *rotation) {
 }
 
 /* Align ``n`` control points with a level of an image, float (height, width); ``pose``, position (3) and rotation (3, 3) TRF to
- * IRF, is updated. Return the number of points within the image at the final pose, or 0 without a solution. Output at the final
+ * IRF, is updated. ``border`` (n), m: standard deviation of where the edge of a point is seen. Return the number of points within the image at the final pose, or 0 without a solution. Output at the final
  * pose: ``residual`` (n), ``weight`` (n): inverse variance times Tukey's weight, 0 for outliers and -1 outside the image;
  * ``correlation`` (n), ``rows`` (n, 6). ``work``: 2 n doubles. */
 EXPORT int64_t NAME(align_points)(const LevelCamera *camera, const float *image, const AlignSettings *set, const double *points,
-                                 const double *ahead, const double *profiles, int64_t n, double *pose, double *residual,
-                                 double *weight, double *correlation, double *rows, double *work) {
+                                 const double *ahead, const double *profiles, const double *border, int64_t n, double *pose,
+                                 double *residual, double *weight, double *correlation, double *rows, double *work) {
     int reach = (int)set->reach_px, iterations = (int)set->iterations;
     if (reach > REACH_MOST) reach = REACH_MOST;
     for (int iteration = 0; iteration <= iterations; iteration++) {
-        measure(camera, image, set, pose, points, ahead, profiles, n, reach, residual, weight, correlation, rows);
+        measure(camera, image, set, pose, points, ahead, profiles, border, n, reach, residual, weight, correlation, rows);
         int64_t inside = 0, matched = 0;
         for (int64_t i = 0; i < n; i++) {
             inside += weight[i] >= 0.0;

@@ -55,8 +55,8 @@ from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_c
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
-PLAN_S = {1: 50.0, 2: 14.4}
-"""Time of the plan by number of chasers, s; of more than two 13.5. With one, a second plan of 30 s follows if needed."""
+PLAN_S = {2: 14.4}
+"""Time of the plan by number of chasers, s; of more than two 13.5."""
 
 
 _Outcome = TypeVar("_Outcome")

@@ -78,15 +78,21 @@ class WatchedMission(StackMission):
         return own
 
 
-def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same() -> None:
+@pytest.mark.parametrize("joins_s", [1.9, 3.3])
+def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins_s: float) -> None:
+    """Also in the search for the first plan, while the stack coasts."""
     limits = "docking.ports.0.force_limit_N=3.0"
     scenario = stack_scenario(1, (0, 3), [*wrong_knowledge(1, 0.1, False), "detumble.plan_s=6", limits])
     with WatchedMission(scenario, RenderedImages(scenario)) as mission:
         while mission.time_s < 1.5:
             mission.step()
         mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(2)))
-        while mission.time_s < 3.3:
+        while mission.time_s < joins_s:
             mission.step()
+        planner = mission.controller.guidance.detumble.planner
+        assert planner.active is not None
+        assert planner.search is not None
+        assert bool(planner.active.plan.thrusts_N.any()) == (joins_s > 2.5)
         mission.follow()
         while mission.time_s < 5.0:
             mission.step()

@@ -33,8 +33,8 @@ from .stack import StackMotion, thruster_wrenches
 
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
-_STOPPED_SHARE = 0.6
-"""Share of the rest limits below which the stack counts as stopped."""
+_STOPPED_SHARE = 0.4
+"""Share of the rest limits below which the stack counts as stopped: less than ``_MOVING_SHARE``, so that phases do not alternate."""
 _MOVING_SHARE = 0.5
 """Share of the rest limits above which a stopped stack moves again.
 
@@ -104,9 +104,8 @@ class DetumbleControl:
         self._own = wrench_matrix(self._thrusters)
         self._target = scenario.target_model()
         self._plume_free = lru_cache(maxsize=32)(partial(plume_free_thrusters, scenario))
-        self.planner = StackPlanner(self._settings.plan_s)
+        self.planner = StackPlanner(self._settings.plan_s, scenario.time.rate_hz)
         self.sequencer = Sequencer(scenario)
-        self._judged: tuple[tuple[tuple[int, ...], tuple[bool, ...]] | None, str] = (None, "")
         self._pulse: tuple[int, int | None] = (-1, None)
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
@@ -192,8 +191,7 @@ class DetumbleControl:
         if self.share_of_limits(state) <= _DEADBAND_SHARE:
             return np.zeros(len(thrusters.limits_N))
         if self.planner.enabled:
-            can = spans_all_directions(thrusters.wrenches, thrusters.limits_N)
-            planned = self.planner.thrusts(self._problem(state, thrusters), now_ns, can)
+            planned = self.planner.thrusts(self._problem(state, thrusters), now_ns)
             if planned is not None:
                 return planned
         return self._feedback(state.motion.momentum, thrusters)
@@ -286,30 +284,12 @@ class DetumbleControl:
                 f"{(row > 0.0).sum()} of {len(row)} of chaser {i}"
                 for i, row in zip(active, limits.reshape(len(active), -1), strict=True)
             )
-            reason = f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
-            return self._why_no_plan(state, thrusters, reason)
+            return f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
         least = minimum_time(thrusters.wrenches, state.motion.momentum, limits)
         if least is None or least.time_s > self._settings.timeout_s:
             time = "without end" if least is None else f"at least {least.time_s:.0f} s"
             return f"stopping the stack takes {time}; detumble.timeout_s is {self._settings.timeout_s:g} s"
         return ""
-
-    def _why_no_plan(self, state: StackState, thrusters: _Thrusters, reason: str) -> str:
-        """Return why these thrusters cannot stop the stack even by a plan that uses its rotation. Judged once for each set."""
-        if not self.planner.enabled:
-            return reason
-        key = (thrusters.chasers, tuple((thrusters.limits_N > 0.0).tolist()))
-        if self._judged[0] != key:
-            plan = self.planner.trial(self._problem(state, thrusters))
-            left = StackMotion(plan.remaining[:3], rotations.rotate_inverse(state.q_wxyz, plan.remaining[3:]))
-            speed, rate = left.rates(state.body)
-            stops = speed < self._settings.speed_m_s and math.degrees(rate) < self._settings.rate_deg_s
-            left_over = (
-                f"{reason}, and a plan of {plan.duration_s:.0f} s (detumble.plan_s) leaves {speed * 1e3:.2g} mm/s and "
-                f"{math.degrees(rate):.2g} degrees/s"
-            )
-            self._judged = key, "" if stops else left_over
-        return self._judged[1]
 
     # -- models ----------------------------------------------------------------------------------------------
 

@@ -168,11 +168,30 @@ def test_a_stack_at_rest_is_stopped_again_before_it_exceeds_the_limits() -> None
     """Where disturbances act, the estimate is late and the thrusters take time."""
     stack = ControlledStack(stack_scenario(1, (0, 3)))
     state, limit_rad_s = stack.state(), math.radians(0.05)
-    for share, moves in ((0.4, False), (0.7, True)):
+    for share, stopped, moves in ((0.35, True, False), (0.45, False, False), (0.7, False, True)):
         angular = state.body.inertia_kg_m2 @ (share * limit_rad_s * np.array([0.6, 0.0, 0.8]))
         at = replace(state, motion=StackMotion(np.zeros(3), angular))
+        stack.control.reset()
+        stack.control.follow(at)
+        assert stack.control.is_stopped(at) == stopped
         assert stack.control.moves_again(at) == moves
-        assert stack.control.is_stopped(at) != moves
+
+
+def test_rest_is_judged_by_the_mean_motion_not_by_noise_of_single_ticks() -> None:
+    """Noise of half of the limit in every tick; the stack itself turns at a fifth of it."""
+    stack, rng = ControlledStack(stack_scenario(1, (0, 3))), np.random.default_rng(4)
+    state, limit_rad_s = stack.state(), math.radians(0.05)
+    single, mean = [], []
+    for k in range(60):
+        omega = limit_rad_s * (np.array([0.2, 0.0, 0.0]) + rng.normal(0.0, 0.3, 3))
+        at = replace(state, motion=StackMotion(np.zeros(3), state.body.inertia_kg_m2 @ omega))
+        stack.control.follow(at)
+        if k >= 20:
+            single.append(stack.control.share_of_limits(at) < 0.4)
+            mean.append(stack.control.is_stopped(at))
+            assert not stack.control.moves_again(at)
+    assert sum(mean) > 0.8 * len(mean)
+    assert sum(single) < 0.5 * len(single)
 
 
 def hold(stack: ControlledStack, seconds: float) -> None:

@@ -99,6 +99,7 @@ class SafetyState(Struct, forbid_unknown_fields=True):
 
 class StackControlState(Struct, forbid_unknown_fields=True):
     _pulse: tuple[int, int | None]
+    _mean_rates: Array | None
 
 
 class StackPlanState(Struct, forbid_unknown_fields=True):

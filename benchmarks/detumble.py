@@ -200,7 +200,7 @@ def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> Stac
     if case not in ("fast", "silent"):
         settings.append(f"detumble.plan_s={PLAN_S.get(len(numbers), 13.5)}")
     if one:
-        settings += ["detumble.timeout_s=120", "detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002"]
+        settings += ["detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002"]
     rng = np.random.default_rng([seed, 0xFA])
     match case:
         case "stuck" | "reported":

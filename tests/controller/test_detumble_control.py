@@ -119,6 +119,14 @@ def test_hold_ends_the_detumbling_and_abort_releases_the_latch() -> None:
             ("docking.ports=[{chaser=0,position_m=[-0.5,0,-0.05],axis=[-1,0,0]}]", "success.latched=[]"),
             "has no port",
         ),
+        (
+            ("detumble.plan_s=60.0",),
+            "detumble.plan_s: a plan of 60 s does not end before detumble.timeout_s, 60 s",
+        ),
+        (
+            ("timeline=[{at_s=10.0,command='identify',chasers=[0]}]",),
+            "timeline.0: identify needs detumble.identification.enabled = true",
+        ),
         (("chaser.actuation='ideal'",), 'detumble needs chaser.actuation = "thrusters"'),
         (("detumble.plume_deg=89.0",), "none of the 12 thrusters of chaser 0 may fire at its port"),
         (

@@ -20,6 +20,7 @@ from chaserdock_protocol.scenario import Scenario, ScenarioError
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chaserdock.analysis.pose_errors import normalized_square, pose_error, relative_pose
 from chaserdock.evaluation.detumble_flights import StackMission, moving_with, stack_scenario
 from chaserdock.evaluation.perception import RenderedImages
 from chaserdock.evaluation.transfers import load_shipped
@@ -180,3 +181,21 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
     found = observed_motion(body, target, own, (1e-6, 1e-6))
     exact = stack_motion(body, target.velocity_m_s, q, target.omega_rad_s)
     assert found.momentum == pytest.approx(exact.momentum, abs=1e-8)
+
+
+def test_relative_poses_of_a_disturbed_stack_stay_consistent() -> None:
+    """Disturbances of its latched chasers accelerate the target, which without them moves by no force."""
+    changes = ("perception.name=statistical", "navigation.grade=lab", "truth.preset=mismatch")
+    scenario, nees = stack_scenario(3, (0, 3), changes), []
+    with StackMission(scenario, RenderedImages(scenario)) as mission:
+        while mission.time_s < 20.0:
+            record = mission.step()
+            if record.outputs is None or mission.time_s < 15.0:
+                continue
+            for pose in record.outputs.target.relative:
+                own, target = record.states[f"chaser/{pose.chaser}"], record.states["target"]
+                true = relative_pose(own.position_m, own.q_wxyz, target.position_m, target.q_wxyz)
+                error = pose_error(*true, np.array(pose.position_m), np.array(pose.q_wxyz))
+                nees.append(float(normalized_square(error, np.reshape(pose.covariance, (6, 6)))))
+    assert len(nees) > 100
+    assert np.mean(nees) < 15.0

@@ -191,7 +191,7 @@ def test_the_body_of_a_stack_is_as_uncertain_as_the_masses_of_its_chasers() -> N
             mission.step()
         estimator = mission.controller.estimator
         assert isinstance(estimator, JointEstimator)
-        known = np.array(estimator.parameters.target.body_covariance)
+        known = np.array(estimator.target.body_covariance)
     chaser, target = scenario.chaser.mass_kg, scenario.target.mass_kg
     expected = math.sqrt(2.0) * 0.1 * chaser * 0.85 / (target + 2.0 * chaser)
     assert math.sqrt(known[0, 0]) == pytest.approx(expected, rel=0.15)

@@ -55,8 +55,8 @@ from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_c
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
-PLAN_S = {1: 50.0, 2: 14.4}
-"""Time of the plan by number of chasers, s; of more than two 13.5. With one, a second plan of 30 s follows if needed."""
+PLAN_S = {2: 14.4}
+"""Time of the plan by number of chasers, s; of more than two 13.5."""
 
 
 _Outcome = TypeVar("_Outcome")
@@ -200,7 +200,7 @@ def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> Stac
     if case not in ("fast", "silent"):
         settings.append(f"detumble.plan_s={PLAN_S.get(len(numbers), 13.5)}")
     if one:
-        settings += ["detumble.timeout_s=120", "detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002"]
+        settings += ["detumble.rate_deg_s=0.1", "detumble.speed_m_s=0.002"]
     rng = np.random.default_rng([seed, 0xFA])
     match case:
         case "stuck" | "reported":

@@ -245,6 +245,7 @@ class _Tasks:
             return (
                 None if tick < _SETTLE_TICKS else StackTask.IDENTIFY if tick < self._begin else StackTask.STOP
             )
+        control.follow(state)
         rests = control.is_stopped(state) or (self._holding and not control.moves_again(state))
         self._holding = self._holding + 1 if rests else 0
         return StackTask.HOLD if self._holding > self._rest_ticks else StackTask.STOP

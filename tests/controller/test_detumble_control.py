@@ -8,6 +8,7 @@ import re
 
 import numpy as np
 import pytest
+from chaserdock_controller.estimation.joint import JointEstimator
 from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.control import observed_motion
@@ -119,6 +120,14 @@ def test_hold_ends_the_detumbling_and_abort_releases_the_latch() -> None:
             ("docking.ports=[{chaser=0,position_m=[-0.5,0,-0.05],axis=[-1,0,0]}]", "success.latched=[]"),
             "has no port",
         ),
+        (
+            ("detumble.plan_s=60.0",),
+            "detumble.plan_s: a plan of 60 s does not end before detumble.timeout_s, 60 s",
+        ),
+        (
+            ("timeline=[{at_s=10.0,command='identify',chasers=[0]}]",),
+            "timeline.0: identify needs detumble.identification.enabled = true",
+        ),
         (("chaser.actuation='ideal'",), 'detumble needs chaser.actuation = "thrusters"'),
         (("detumble.plume_deg=89.0",), "none of the 12 thrusters of chaser 0 may fire at its port"),
         (
@@ -172,3 +181,17 @@ def test_exact_states_give_the_exact_momentum_whatever_the_weights(seed: int) ->
     found = observed_motion(body, target, own, (1e-6, 1e-6))
     exact = stack_motion(body, target.velocity_m_s, q, target.omega_rad_s)
     assert found.momentum == pytest.approx(exact.momentum, abs=1e-8)
+
+
+def test_the_body_of_a_stack_is_as_uncertain_as_the_masses_of_its_chasers() -> None:
+    """Ten per cent of a chaser's mass at a port 0.85 m from the middle move the common centre of mass by a centimetre."""
+    scenario = stack_scenario(0, (0, 3), ("perception.name=statistical",))
+    with StackMission(scenario, RenderedImages(scenario)) as mission:
+        for _ in range(20):
+            mission.step()
+        estimator = mission.controller.estimator
+        assert isinstance(estimator, JointEstimator)
+        known = np.array(estimator.target.body_covariance)
+    chaser, target = scenario.chaser.mass_kg, scenario.target.mass_kg
+    expected = math.sqrt(2.0) * 0.1 * chaser * 0.85 / (target + 2.0 * chaser)
+    assert math.sqrt(known[0, 0]) == pytest.approx(expected, rel=0.15)

@@ -78,15 +78,21 @@ class WatchedMission(StackMission):
         return own
 
 
-def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same() -> None:
+@pytest.mark.parametrize("joins_s", [1.9, 3.3])
+def test_a_standby_that_joins_while_the_stack_is_stopped_commands_the_same(joins_s: float) -> None:
+    """Also in the search for the first plan, while the stack coasts."""
     limits = "docking.ports.0.force_limit_N=3.0"
     scenario = stack_scenario(1, (0, 3), [*wrong_knowledge(1, 0.1, False), "detumble.plan_s=6", limits])
     with WatchedMission(scenario, RenderedImages(scenario)) as mission:
         while mission.time_s < 1.5:
             mission.step()
         mission.step(tuple(OperatorCommand(command="detumble", chaser=i) for i in range(2)))
-        while mission.time_s < 3.3:
+        while mission.time_s < joins_s:
             mission.step()
+        planner = mission.controller.guidance.detumble.planner
+        assert planner.active is not None
+        assert planner.search is not None
+        assert bool(planner.active.plan.thrusts_N.any()) == (joins_s > 2.5)
         mission.follow()
         while mission.time_s < 5.0:
             mission.step()
@@ -162,11 +168,30 @@ def test_a_stack_at_rest_is_stopped_again_before_it_exceeds_the_limits() -> None
     """Where disturbances act, the estimate is late and the thrusters take time."""
     stack = ControlledStack(stack_scenario(1, (0, 3)))
     state, limit_rad_s = stack.state(), math.radians(0.05)
-    for share, moves in ((0.4, False), (0.7, True)):
+    for share, stopped, moves in ((0.35, True, False), (0.45, False, False), (0.7, False, True)):
         angular = state.body.inertia_kg_m2 @ (share * limit_rad_s * np.array([0.6, 0.0, 0.8]))
         at = replace(state, motion=StackMotion(np.zeros(3), angular))
+        stack.control.reset()
+        stack.control.follow(at)
+        assert stack.control.is_stopped(at) == stopped
         assert stack.control.moves_again(at) == moves
-        assert stack.control.is_stopped(at) != moves
+
+
+def test_rest_is_judged_by_the_mean_motion_not_by_noise_of_single_ticks() -> None:
+    """Noise of half of the limit in every tick; the stack itself turns at a fifth of it."""
+    stack, rng = ControlledStack(stack_scenario(1, (0, 3))), np.random.default_rng(4)
+    state, limit_rad_s = stack.state(), math.radians(0.05)
+    single, mean = [], []
+    for k in range(60):
+        omega = limit_rad_s * (np.array([0.2, 0.0, 0.0]) + rng.normal(0.0, 0.3, 3))
+        at = replace(state, motion=StackMotion(np.zeros(3), state.body.inertia_kg_m2 @ omega))
+        stack.control.follow(at)
+        if k >= 20:
+            single.append(stack.control.share_of_limits(at) < 0.4)
+            mean.append(stack.control.is_stopped(at))
+            assert not stack.control.moves_again(at)
+    assert sum(mean) > 0.8 * len(mean)
+    assert sum(single) < 0.5 * len(single)
 
 
 def hold(stack: ControlledStack, seconds: float) -> None:

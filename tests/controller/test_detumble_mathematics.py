@@ -141,8 +141,8 @@ def test_feedback_is_exact_in_direction_and_within_limits(
     )
     shortest = minimum_time(wrenches, momentum, limits)
     if shortest is None:
-        # Of a small momentum, thrusts within the tolerance of the solver are a larger share.
-        assert found.scale < 1e-6 or found.thrusts_N.max() < 1e-8
+        # What is given in a direction that cannot be served is within the tolerance of the solver.
+        assert found.scale * np.linalg.norm(asked) <= 1e-5
     else:
         assert found.scale == pytest.approx(min(1.0, 0.5 / shortest.time_s), rel=1e-3)
 

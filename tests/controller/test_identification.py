@@ -16,11 +16,12 @@ from chaserdock_controller.estimation.mass_properties import (
     MassProperties,
     attach,
     body_of,
+    covariance_by_chasers,
     detach,
     prior_of,
     properties_of,
 )
-from chaserdock_controller.estimation.target_body import TargetBody
+from chaserdock_controller.estimation.target_body import TargetBody, attach_bodies
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.rigid_body import BodyState, free_rotation
@@ -86,6 +87,22 @@ class Stack:
     def pulses(self, share: float = 0.2) -> dict[int, Array]:
         on = {i: FREE & (self.rng.random(12) < share) for i in self.chasers}
         return {i: np.where(mask, 1.5 * STEP_S, 0.0) for i, mask in on.items()}
+
+
+def test_covariance_by_chasers_is_that_of_drawn_masses_and_centres() -> None:
+    rng, chasers, target = np.random.default_rng(1), mounted((0, 1, 3)), target_alone()
+    drawn = []
+    for _ in range(3000):
+        parts = []
+        for c in chasers.values():
+            share = 1.0 + 0.1 * rng.normal()
+            place = c.position_m + rng.normal(0.0, 0.01, 3)
+            parts.append((share * BODY.mass_kg, share * np.asarray(BODY.inertia), place, c.q_wxyz))
+        drawn.append(properties_of(attach_bodies(target, parts)))
+    found = covariance_by_chasers(target, chasers, BODY, 0.1, 0.01)
+    expected = np.cov(np.array(drawn).T)
+    size = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
+    assert np.abs((found - expected) / size).max() < 0.1
 
 
 @settings(deadline=None, max_examples=20)

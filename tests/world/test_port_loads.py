@@ -173,9 +173,8 @@ def test_two_latches_close_in_one_step() -> None:
         physics.close()
 
 
-@both
-def test_a_tumbling_stack_conserves_momentum(worlds: Any) -> None:
-    """Thirty seconds of a free tumble: to a tenth of the 1e-3 that 300 s are allowed."""
+def momentum_drifts(worlds: Any, seconds: int) -> list[float]:
+    """Return the changes of linear and angular momentum of a free tumbling stack, as shares, after ``seconds``."""
     physics = worlds(omega_rad_s=(0.045, 0.135, 0.09), lateral_m=0.003, turn_rad=0.02, **MISMATCH)
     latch(physics)
     physics.advance(10, {})
@@ -187,6 +186,17 @@ def test_a_tumbling_stack_conserves_momentum(worlds: Any) -> None:
 
     disturbance = {"chaser/0": -physics.plants["chaser/0"].disturbance}
     before = total()
-    physics.advance(30 * HZ, disturbance)
-    for a, b in zip(before, total(), strict=True):
-        assert np.linalg.norm(b - a) <= 1e-4 * np.linalg.norm(a)
+    physics.advance(seconds * HZ, disturbance)
+    return [float(np.linalg.norm(b - a) / np.linalg.norm(a)) for a, b in zip(before, total(), strict=True)]
+
+
+@both
+def test_a_tumbling_stack_conserves_momentum(worlds: Any) -> None:
+    """To a tenth of what 300 s are allowed."""
+    assert max(momentum_drifts(worlds, 30)) <= 1e-4
+
+
+@both
+@pytest.mark.slow
+def test_a_tumbling_stack_conserves_momentum_for_300_s(worlds: Any) -> None:
+    assert max(momentum_drifts(worlds, 300)) <= 1e-3

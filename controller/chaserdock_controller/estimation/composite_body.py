@@ -17,13 +17,15 @@ from chaserdock_controller.interfaces import AppliedImpulse
 
 from .body_shape import BodyShape
 from .joint import JointEstimator
-from .mass_properties import MassProperties, attach, prior_of, with_shape
+from .mass_properties import MassProperties, attach, covariance_by_chasers, prior_of, with_shape
 from .parameters import Matrix9
 from .target_body import TargetBody
 from .types import Estimator, Shock, TargetState
 
 _TOUCH = Shock(0.005, 0.01)
 """One sigma of the rate changes by a touch or a capture at the limits' speed (m/s, rad/s)."""
+_CHASER_MASS_SHARE, _CHASER_CENTRE_M = 0.1, 0.01
+"""One sigma of a chaser's mass, as a share, and of its centre of mass per axis."""
 _COMMANDED_UNKNOWN = 0.1
 """Share of a commanded impulse's effect that is unknown."""
 _MEASURED_UNKNOWN = 1.0
@@ -153,7 +155,11 @@ class CompositeBody:
         centre = self.body.centre_trf_m.tolist()
         inertia = (tuple(rows[0]), tuple(rows[1]), tuple(rows[2]))
         if isinstance(self._estimator, JointEstimator):
-            self._estimator.change_body(inertia, tuple(centre), rows_of(stack.covariance[1:, 1:]))
+            alone = self._target_alone.body
+            covariance = stack.covariance + covariance_by_chasers(
+                alone, mounted, chaser, _CHASER_MASS_SHARE, _CHASER_CENTRE_M
+            )
+            self._estimator.change_body(inertia, tuple(centre), rows_of(covariance[1:, 1:]))
         else:
             self._estimator.change_body(inertia, tuple(centre))
         self._changed = False

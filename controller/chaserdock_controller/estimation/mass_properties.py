@@ -69,6 +69,33 @@ def attach(target: MassProperties, chasers: Mapping[int, MountedChaser], body: R
     return MassProperties(stack.body, stack.covariance + 3.0 * np.outer(curvature, curvature))
 
 
+def covariance_by_chasers(
+    target: TargetBody,
+    chasers: Mapping[int, MountedChaser],
+    body: RigidBody,
+    mass_share: float,
+    centre_m: float,
+) -> Array:
+    """Return the covariance (10, 10) of the mass properties of a stack by what is not known of its chasers: standard deviations of
+    their masses, as a share, and of their centres of mass, per axis."""
+    total = np.zeros((10, 10))
+    for k in range(len(chasers)):
+        for change in (*np.diag([centre_m] * 3), None):
+            ends = []
+            for sign in (1.0, -1.0):
+                parts = _parts(chasers, body, 1.0)
+                mass, inertia, place, q = parts[k]
+                if change is None:
+                    scale = 1.0 + sign * mass_share
+                    parts[k] = (scale * mass, scale * inertia, place, q)
+                else:
+                    parts[k] = (mass, inertia, place + sign * change, q)
+                ends.append(properties_of(attach_bodies(target, parts)))
+            half = (ends[0] - ends[1]) / 2.0
+            total += np.outer(half, half)
+    return total
+
+
 def detach(stack: MassProperties, chasers: Mapping[int, MountedChaser], body: RigidBody) -> MassProperties:
     """Return the mass properties of the target of a stack: those of the stack without the chasers."""
     return _transformed(stack, _parts(chasers, body, -1.0))

@@ -51,9 +51,9 @@ _SEARCH_AFTER_S = 1.0
 _REST_S = 0.5
 """Time for which a stack must be below its limits to count as stopped."""
 _MOVING_S = 0.2
-"""Time for which a stopped stack must be above half of them to be stopped again; it drifts meanwhile."""
-_SETTLING_S = 1.0
-"""Time after the last thrust in which the estimate of the stack's motion is still late."""
+"""Time for which a stopped stack must move to be stopped again; it drifts meanwhile."""
+_SETTLING_S = 0.5
+"""Time after the last thrust in which the mean motion of the stack is still late."""
 _SIGHT_LOSS_S = 3.0
 """An approach stops when no chaser has seen the target for this long."""
 _HELD_MARGIN_M = 0.03

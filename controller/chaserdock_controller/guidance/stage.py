@@ -220,6 +220,7 @@ class GuidanceStage:
         active = self.machine.detumbling()
         if not active or stack is None:
             return
+        self.detumble.follow(stack)
         present = active & stack.chasers.keys()
         if present and (reason := self.detumble.why_not(stack, present, observation.isolated)):
             self.machine.detumble_failed(observation.time_s, reason)

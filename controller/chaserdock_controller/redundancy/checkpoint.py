@@ -30,7 +30,7 @@ from chaserdock_controller.estimation.target_body import TargetBody
 from chaserdock_controller.estimation.target_shape import ShapeFilter
 from chaserdock_controller.estimation.types import EstimatorEvent, Measurement
 from chaserdock_controller.guidance.chaser_state import ChaserGuidance
-from chaserdock_controller.guidance.detumble.planner import ActivePlan
+from chaserdock_controller.guidance.detumble.planner import ActivePlan, PlanSearch
 from chaserdock_controller.guidance.docking import DockingObservation
 from chaserdock_controller.ingest.odometry_validation import Known, OdometryValidation
 from chaserdock_controller.nmpc.plan_monitor import ChaserPlan, PlanningFailure
@@ -98,12 +98,13 @@ class SafetyState(Struct, forbid_unknown_fields=True):
 
 
 class StackControlState(Struct, forbid_unknown_fields=True):
-    _judged: tuple[tuple[tuple[int, ...], tuple[bool, ...]] | None, str]
     _pulse: tuple[int, int | None]
+    _mean_rates: Array | None
 
 
 class StackPlanState(Struct, forbid_unknown_fields=True):
     active: ActivePlan | None
+    search: PlanSearch | None
 
 
 class SequencerState(Struct, forbid_unknown_fields=True):

@@ -393,6 +393,15 @@ def _detumblings(scenario: FlightScenario) -> list[tuple[int, TimelineEntry]]:
 
 
 def _check_detumble(scenario: FlightScenario) -> None:
+    detumble = scenario.detumble
+    if detumble.plan_s is not None and detumble.plan_s >= detumble.timeout_s:
+        raise ValueError(
+            f"detumble.plan_s: a plan of {detumble.plan_s:g} s does not end before detumble.timeout_s, {detumble.timeout_s:g} s, "
+            "when the thrusters close"
+        )
+    for k, entry in enumerate(scenario.timeline):
+        if entry.command == "identify" and not detumble.identification.enabled:
+            raise ValueError(f"timeline.{k}: identify needs detumble.identification.enabled = true")
     for k, entry in _detumblings(scenario):
         for i in entry.chasers:
             if scenario.docking.port_of(i) is None:

@@ -58,6 +58,8 @@ class JointParameters:
     floor_*: sigmas added to stated odometry, so that exact odometry gives no singular covariance.
     target_noise: square roots of the spectral densities of the target's white acceleration (m/s²/√Hz) and angular acceleration
         (rad/s²/√Hz), by motion model. Of a torque-free target the inertia is estimated.
+    stack_noise: the same of the disturbances that latched chasers exert on the target. A constant one of 10 mN on 170 kg, which is
+        to be followed within 3 s, is like white acceleration of 1e-4 m/s²/√Hz.
     ratio_memory: exponent by which measurements of the inertia of a torque-free target lose weight with time.
     single_marker, several_markers: errors of a sighting with one marker, and with several smaller ones, whose corners depend
         more on the pixel grid. shape: errors of a sighting of the target's shape, without markers.
@@ -100,6 +102,7 @@ class JointParameters:
     floor_sighting_m: float = 2e-5
     floor_sighting_rad: float = math.radians(0.002)
     target_noise: Mapping[str, tuple[float, float]] = field(default_factory=lambda: TARGET_NOISE)
+    stack_noise: tuple[float, float] = (1e-4, 2e-4)
     ratio_memory: float = 1.0
     single_marker: SightingNoise = SINGLE_MARKER
     several_markers: SightingNoise = SEVERAL_MARKERS

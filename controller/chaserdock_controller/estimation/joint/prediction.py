@@ -76,7 +76,7 @@ def predict(
     covariance = kernels.predict(
         _motion(dt, p, max(0.0, dt - nominal_s)),
         np.ascontiguousarray(target_transition[:, :TARGET]),
-        _target_noise(dt, p) if state.target_known else np.zeros((TARGET, TARGET)),
+        _target_noise(dt, p, bool(latched)) if state.target_known else np.zeros((TARGET, TARGET)),
         np.array(impulses, dtype=float),
         orbital,
         np.array([math.exp(-dt / p.sighting_noise(k).view_time_s) for k in state.markers.tolist()]),
@@ -146,8 +146,11 @@ def _predict_target(state: JointState, dt: float, p: JointParameters) -> tuple[J
     return replace(state, position_m=position, velocity_m_s=velocity, q_wxyz=q, omega_rad_s=omega), f
 
 
-def _target_noise(dt: float, p: JointParameters) -> Array:
+def _target_noise(dt: float, p: JointParameters, is_stack: bool = False) -> Array:
+    """Return the process noise (12, 12) of the target. ``is_stack``: disturbances of latched chasers act on it, too."""
     linear, angular = p.target_noise[p.target.motion_model]
+    if is_stack:
+        linear, angular = math.hypot(linear, p.stack_noise[0]), math.hypot(angular, p.stack_noise[1])
     return _process_noise(dt, linear**2, angular**2)
 
 

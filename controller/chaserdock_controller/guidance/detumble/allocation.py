@@ -21,6 +21,8 @@ _SCALE_FIRST = 1e3
 _EQUALITY = 5  # daqp's codes for an equality constraint and for success
 _SOLVED = 1
 _NOTHING = 1e-12
+_TOLERANCE = 1e-5
+"""Wrench (N, N m) that is within the tolerance of the solver: no more is given in a direction that cannot be served."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,8 +107,9 @@ def minimum_time(wrenches: Array, momentum: Array, limits_N: Array) -> MinimumTi
     if not momentum.any():
         return MinimumTime(0.0, 0.0)
     most = float(np.linalg.norm(momentum)) * 1e-3
-    found = allocate(wrenches, -momentum / most, limits_N)
-    if found.scale <= 1e-9:
+    asked = -momentum / most
+    found = allocate(wrenches, asked, limits_N)
+    if found.scale * float(np.linalg.norm(asked)) <= _TOLERANCE:
         return None
     time_s = most / found.scale
     return MinimumTime(time_s, float(found.thrusts_N.sum()) * time_s)

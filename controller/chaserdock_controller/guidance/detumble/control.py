@@ -33,14 +33,16 @@ from .stack import StackMotion, thruster_wrenches
 
 _DEADBAND_SHARE = 0.3
 """Share of the rest limits below which no thruster fires."""
-_STOPPED_SHARE = 0.6
-"""Share of the rest limits below which the stack counts as stopped."""
+_STOPPED_SHARE = 0.4
+"""Share of the rest limits below which the stack counts as stopped: less than ``_MOVING_SHARE``, so that phases do not alternate."""
 _MOVING_SHARE = 0.5
 """Share of the rest limits above which a stopped stack moves again.
 
-Disturbances of 5 mN and 0.5 mN m on each of two chasers turn the stack faster by 0.01 degrees/s every second, and the estimate is a
-second late: if the thrusters waited for the limit, the true rate would exceed it. The thrusters fire down to ``_DEADBAND_SHARE``.
+Disturbances of 5 mN and 0.5 mN m on each of two chasers turn the stack faster by 0.01 degrees/s every second. Until the thrusters act,
+the true rate rises by another quarter of the limit; they fire down to ``_DEADBAND_SHARE``.
 """
+_MEAN_S = 0.5
+"""Time constant of the mean motion. In single ticks noise of `lab` odometry is half of the limits."""
 _SLEW_SHARE = 20.0
 """Share of the rest limits beyond which a stack that turns to its commanded attitude counts as moving."""
 _ATTITUDE_DEADBAND_RAD = math.radians(0.3)
@@ -62,7 +64,8 @@ class StackState:
     """The stack as estimated for the time at which the commands take effect; ``chasers``: those latched, by number.
 
     ``q_wxyz``: TRF to WRF. ``thrust_factors`` (n,): estimated over stated thrust, by chaser, if estimated. ``failed``: thrusters
-    found stuck. ``informative``: see ``IdentifiedStack``.
+    found stuck. ``informative``: see ``IdentifiedStack``. ``measured_omega_rad_s`` (3,): angular rate, TRF axes, by the odometry
+    of the chasers alone: with noise, but not late where disturbances act.
     """
 
     body: TargetBody
@@ -72,6 +75,7 @@ class StackState:
     thrust_factors: Mapping[int, Array] = field(default_factory=dict)
     failed: Mapping[int, tuple[int, ...]] = field(default_factory=dict)
     informative: Callable[[], tuple[tuple[int, int], ...]] = tuple
+    measured_omega_rad_s: Array | None = None
 
     @property
     def omega_rad_s(self) -> Array:
@@ -104,10 +108,11 @@ class DetumbleControl:
         self._own = wrench_matrix(self._thrusters)
         self._target = scenario.target_model()
         self._plume_free = lru_cache(maxsize=32)(partial(plume_free_thrusters, scenario))
-        self.planner = StackPlanner(self._settings.plan_s)
+        self.planner = StackPlanner(self._settings.plan_s, scenario.time.rate_hz)
         self.sequencer = Sequencer(scenario)
-        self._judged: tuple[tuple[tuple[int, ...], tuple[bool, ...]] | None, str] = (None, "")
         self._pulse: tuple[int, int | None] = (-1, None)
+        self._mean_share = 1.0 - math.exp(-1.0 / (scenario.time.rate_hz * _MEAN_S))
+        self._mean_rates: Array | None = None
 
     def state(self, observation: Observation, estimation: TargetEstimation) -> StackState | None:
         """Return the stack's state; None while the target is unknown or no latched chaser has odometry."""
@@ -125,7 +130,13 @@ class DetumbleControl:
             rotations.rotate(turn, part + ahead[k : k + 3])
             for k, part in ((0, motion.linear_N_s), (3, motion.angular_N_m_s))
         ]
-        return StackState(estimation.body, chasers, StackMotion(*parts), estimation.at_effect.q_wxyz)
+        return StackState(
+            estimation.body,
+            chasers,
+            StackMotion(*parts),
+            estimation.at_effect.q_wxyz,
+            measured_omega_rad_s=_mean_omega(own, estimation.target.q_wxyz),
+        )
 
     def _identified_state(
         self, observation: Observation, identified: IdentifiedStack, known: Sequence[int]
@@ -142,7 +153,10 @@ class DetumbleControl:
         parts = StackMotion(rotations.rotate_inverse(turn, linear), rotations.rotate_inverse(turn, angular))
         q = rotations.multiply(motion.q_wxyz, turn)
         factors = {i: identified.thrust_factors[i] for i in known}
-        return StackState(body, chasers, parts, q, factors, identified.failed, identified.informative)
+        measured = _mean_omega({i: observation.odometry[i] for i in known}, motion.q_wxyz)
+        return StackState(
+            body, chasers, parts, q, factors, identified.failed, identified.informative, measured
+        )
 
     def _variances(self, chasers: int) -> tuple[float, float]:
         """Return the variances per axis of velocity and rate of the stack by the odometry of so many chasers."""
@@ -153,9 +167,20 @@ class DetumbleControl:
         return velocity / chasers + 1e-12, omega / chasers + errors.gyro_bias_rad_s**2 + 1e-12
 
     def reset(self) -> None:
-        """Forget plan and pulses that wait: no chaser stops the stack."""
+        """Forget plan, pulses that wait and mean motion: no chaser stops the stack."""
         self.planner.reset()
         self.sequencer.reset()
+        self._mean_rates = None
+
+    def follow(self, state: StackState) -> None:
+        """Take the motion of a tick into the mean by which the stack is judged to be at rest."""
+        measured = state.measured_omega_rad_s
+        omega = state.omega_rad_s if measured is None else measured
+        rates = np.concatenate([state.motion.linear_N_s / state.body.mass_kg, omega])
+        if self._mean_rates is None:
+            self._mean_rates = rates
+        else:
+            self._mean_rates = self._mean_rates + self._mean_share * (rates - self._mean_rates)
 
     def commands(
         self,
@@ -189,11 +214,10 @@ class DetumbleControl:
     # -- tasks -----------------------------------------------------------------------------------------------
 
     def _stop(self, state: StackState, thrusters: _Thrusters, now_ns: int) -> Array:
-        if self.share_of_limits(state) <= _DEADBAND_SHARE:
+        if min(self.share_of_limits(state), self._mean_share_of_limits(state)) <= _DEADBAND_SHARE:
             return np.zeros(len(thrusters.limits_N))
         if self.planner.enabled:
-            can = spans_all_directions(thrusters.wrenches, thrusters.limits_N)
-            planned = self.planner.thrusts(self._problem(state, thrusters), now_ns, can)
+            planned = self.planner.thrusts(self._problem(state, thrusters), now_ns)
             if planned is not None:
                 return planned
         return self._feedback(state.motion.momentum, thrusters)
@@ -252,21 +276,30 @@ class DetumbleControl:
     def share_of_limits(self, state: StackState, slewing: bool = False) -> float:
         """Return the larger of speed and angular rate of the stack, as share of the rest limits. ``slewing``: the rate counts from
         the one that turns the stack to its commanded attitude."""
-        speed, _ = state.motion.rates(state.body)
-        reference = self._slew_rate(state) if slewing else None
-        omega = state.omega_rad_s - (np.zeros(3) if reference is None else reference)
-        rate = float(np.linalg.norm(omega))
-        return max(speed / self._settings.speed_m_s, rate / math.radians(self._settings.rate_deg_s))
+        velocity = state.motion.linear_N_s / state.body.mass_kg
+        return self._share(state, np.concatenate([velocity, state.omega_rad_s]), slewing)
 
     def is_stopped(self, state: StackState) -> bool:
-        """Return whether the stack has stopped."""
-        return self.share_of_limits(state) < _STOPPED_SHARE
+        """Return whether the stack has stopped, by the mean motion until ``state``."""
+        return self._mean_share_of_limits(state) < _STOPPED_SHARE
 
     def moves_again(self, state: StackState) -> bool:
-        """Return whether a stack at rest moves, beside the turn to its commanded attitude, so that it has to be stopped again."""
-        share = self.share_of_limits(state, slewing=True)
+        """Return whether a stack at rest moves by its mean motion until ``state``, beside the turn to its commanded attitude, so
+        that it has to be stopped again."""
         slews = self._slew_rate(state) is not None
-        return share > (_SLEW_SHARE if slews else _MOVING_SHARE)
+        return self._mean_share_of_limits(state, slewing=True) > (_SLEW_SHARE if slews else _MOVING_SHARE)
+
+    def _mean_share_of_limits(self, state: StackState, slewing: bool = False) -> float:
+        if self._mean_rates is None:
+            return self.share_of_limits(state, slewing)
+        return self._share(state, self._mean_rates, slewing)
+
+    def _share(self, state: StackState, rates: Array, slewing: bool) -> float:
+        """Return velocity and angular rate ``rates`` (6,) as share of the rest limits."""
+        reference = self._slew_rate(state) if slewing else None
+        omega = rates[3:] - (np.zeros(3) if reference is None else reference)
+        speed, rate = float(np.linalg.norm(rates[:3])), float(np.linalg.norm(omega))
+        return max(speed / self._settings.speed_m_s, rate / math.radians(self._settings.rate_deg_s))
 
     def why_not(
         self, state: StackState | None, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
@@ -286,30 +319,12 @@ class DetumbleControl:
                 f"{(row > 0.0).sum()} of {len(row)} of chaser {i}"
                 for i, row in zip(active, limits.reshape(len(active), -1), strict=True)
             )
-            reason = f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
-            return self._why_no_plan(state, thrusters, reason)
+            return f"the thrusters whose plume is free ({usable}) cannot push and turn the stack in every direction"
         least = minimum_time(thrusters.wrenches, state.motion.momentum, limits)
         if least is None or least.time_s > self._settings.timeout_s:
             time = "without end" if least is None else f"at least {least.time_s:.0f} s"
             return f"stopping the stack takes {time}; detumble.timeout_s is {self._settings.timeout_s:g} s"
         return ""
-
-    def _why_no_plan(self, state: StackState, thrusters: _Thrusters, reason: str) -> str:
-        """Return why these thrusters cannot stop the stack even by a plan that uses its rotation. Judged once for each set."""
-        if not self.planner.enabled:
-            return reason
-        key = (thrusters.chasers, tuple((thrusters.limits_N > 0.0).tolist()))
-        if self._judged[0] != key:
-            plan = self.planner.trial(self._problem(state, thrusters))
-            left = StackMotion(plan.remaining[:3], rotations.rotate_inverse(state.q_wxyz, plan.remaining[3:]))
-            speed, rate = left.rates(state.body)
-            stops = speed < self._settings.speed_m_s and math.degrees(rate) < self._settings.rate_deg_s
-            left_over = (
-                f"{reason}, and a plan of {plan.duration_s:.0f} s (detumble.plan_s) leaves {speed * 1e3:.2g} mm/s and "
-                f"{math.degrees(rate):.2g} degrees/s"
-            )
-            self._judged = key, "" if stops else left_over
-        return self._judged[1]
 
     # -- models ----------------------------------------------------------------------------------------------
 
@@ -366,6 +381,12 @@ def _impulse_ahead(observation: Observation, chasers: Mapping[int, MountedChaser
     return ahead
 
 
+def _mean_omega(own: Mapping[int, Odometry], q_wxyz: Array) -> Array:
+    """Return the mean angular rate (3,) of chasers in the axes of a body with attitude ``q_wxyz``."""
+    omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own.values()], axis=0)
+    return rotations.rotate_inverse(q_wxyz, omega_world)
+
+
 def observed_motion(
     body: TargetBody, target: TargetState, own: Mapping[int, Odometry], variances: tuple[float, float]
 ) -> StackMotion:
@@ -374,7 +395,8 @@ def observed_motion(
     The chasers measure the stack's rates without delay, the target's estimate smooths them while nothing fires; the two are
     weighted by their covariances. ``variances`` per axis: of the chasers' mean velocity (m²/s²) and rate (rad²/s²).
     """
-    omega_world = np.mean([rotations.rotate(o.q_wxyz, o.omega_rad_s) for o in own.values()], axis=0)
+    omega = _mean_omega(own, target.q_wxyz)
+    omega_world = rotations.rotate(target.q_wxyz, omega)
     centre = target.position_m + rotations.rotate(target.q_wxyz, body.centre_trf_m)
     velocity_world = np.mean(
         [
@@ -383,12 +405,7 @@ def observed_motion(
         ],
         axis=0,
     )
-    measured = np.concatenate(
-        [
-            rotations.rotate_inverse(target.q_wxyz, velocity_world),
-            rotations.rotate_inverse(target.q_wxyz, omega_world),
-        ]
-    )
+    measured = np.concatenate([rotations.rotate_inverse(target.q_wxyz, velocity_world), omega])
     turn = rotations.to_matrix(target.q_wxyz).T
     lever = rotations.skew(body.centre_trf_m)
     estimated = np.concatenate([turn @ target.velocity_m_s - lever @ target.omega_rad_s, target.omega_rad_s])

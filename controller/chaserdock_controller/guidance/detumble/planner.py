@@ -1,26 +1,34 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Flies a stack by a plan of least propellant, which is renewed from the estimates while it is flown."""
+"""Flies a stack by a plan of least propellant, which is renewed from the estimates while it is flown.
+
+The programme of a plan has many local minima. Plans from several guesses are therefore improved by a few linear programmes in every
+tick, for the state that the stack will have when the next plan begins. Before the first plan the stack coasts meanwhile.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from chaserdock_models.arrays import Array
 
-from .planning import StackPlan, StackProblem, plan_stop
+from .planning import StackPlan, StackProblem, flown, improve, predicted
 
 _STEP_S = 0.5
-_MOST_STEPS = 120
+"""Step of a plan, to whole ticks. It is renewed after every step."""
 _FEEDBACK_S = 0.6
-"""The feedback takes over this long before the end of the plan, where it can push in every direction."""
-_REPLAN_S = 0.5
-_FIRST_ITERATIONS = 60
-_NEXT_ITERATIONS = 6
-_FIRST_GUESSES = 4
-"""Random guesses of a first plan, beside that of no thrust: the programme has many local minima, the worst 1.4 times as expensive as
-the best."""
-_OTHER_ITERATIONS = 20
+"""The feedback takes over this long before the end of the plan."""
+_RENEWAL_PROGRAMMES = 6
+_SEARCH_S, _SEARCH_SHARE = 0.5, 0.1
+"""The stack coasts for this long, but at most for this share of the planned time, until a first plan begins."""
+_PROGRAMMES_PER_S = 90.0
+"""Linear programmes that a search solves, in equal parts in every tick; one takes about 6 ms."""
+_FIRST_PROGRAMMES = 6
+"""Linear programmes after which plans from different guesses are compared. Fewer do not show which becomes the cheapest."""
+_FIRST_GUESSES = 5
+"""Guesses of a first plan: no thrust, and random ones. The worst minimum is 1.4 times as expensive as the best."""
+_NEXT_GUESSES = 2
 _OTHER_GAIN = 0.05
 """Share of the cost by which a plan from another guess must be cheaper to replace the present one."""
 _OTHER_UNTIL = 0.4
@@ -28,85 +36,138 @@ _OTHER_UNTIL = 0.4
 _GUESS_DENSITY = 0.15
 """Share of steps and thrusters that a random guess fires."""
 _LONGER = 0.6
-"""Share of the planned time that a plan is prolonged by when thrusters are lost, or the stack still moves at its end."""
+"""Share of the planned time that a plan lasts at least if thrusters are lost."""
 
 
 @dataclass(frozen=True, eq=False)
 class ActivePlan:
-    """A plan made at ``begin_ns`` from there on, which is to end at ``end_ns``; ``limits_N`` (n,): of the thrusters it was made
-    for."""
+    """A plan made at ``begin_ns``, with steps of ``step_ns``, which is renewed at ``renewal_ns``; ``limits_N`` (n,): of the thrusters
+    it was made for."""
 
     plan: StackPlan
     begin_ns: int
-    end_ns: int
+    step_ns: int
+    renewal_ns: int
     limits_N: Array
+
+    @property
+    def end_ns(self) -> int:
+        return self.begin_ns + len(self.plan.thrusts_N) * self.step_ns
 
     def thrusts_at(self, time_ns: int) -> Array:
         """Return the thrusts (n,) at a time."""
-        step = int((time_ns - self.begin_ns) / 1e9 / self.plan.step_s + 1e-9)
-        return self.plan.thrusts_N[min(max(step, 0), len(self.plan.thrusts_N) - 1)]
+        return self.plan.thrusts_N[min(self._step(time_ns), len(self.plan.thrusts_N) - 1)]
+
+    def rest(self, from_ns: int) -> Array:
+        """Return the thrusts (K, n) from a time on."""
+        return self.plan.thrusts_N[self._step(from_ns) :]
+
+    def _step(self, time_ns: int) -> int:
+        return max(0, round((time_ns - self.begin_ns) / self.step_ns - 0.5 + 1e-6))
+
+
+@dataclass(frozen=True, eq=False)
+class PlanSearch:
+    """Plans from several guesses for the state in which the stack is expected at ``begin_ns``.
+
+    ``tried``: how often one of them has been improved.
+    """
+
+    problem: StackProblem
+    begin_ns: int
+    plans: tuple[StackPlan, ...]
+    tried: int = 0
+
+    def improved(self, programmes: int) -> PlanSearch:
+        """Return the search with one plan improved: each guess in turn, then the cheapest that can still be improved."""
+        k, tried = self.tried // math.ceil(_FIRST_PROGRAMMES / programmes), self.tried + 1
+        if k >= len(self.plans):
+            open_plans = [k for k, plan in enumerate(self.plans) if plan.radius > 0.0]
+            if not open_plans:
+                return self
+            k = min(open_plans, key=lambda k: self.plans[k].cost_N_s)
+        plans = list(self.plans)
+        plans[k] = improve(self.problem, plans[k], programmes)
+        return replace(self, plans=tuple(plans), tried=tried)
+
+    def best(self) -> StackPlan | None:
+        """Return the cheapest plan."""
+        return min(self.plans, key=lambda p: p.cost_N_s, default=None)
 
 
 class StackPlanner:
-    """Keeps the plan of the stack, if it is ``enabled`` by a time to stop it in.
+    """Keeps the plan of the stack, if it is ``enabled`` by a time to stop it in, and searches for the next one.
 
-    ``active`` is None before the first plan and after the last.
+    ``active`` is None before the first plan and after the last. ``search`` is for the next renewal of the plan.
     """
 
-    def __init__(self, plan_s: float | None) -> None:
+    def __init__(self, plan_s: float | None, rate_hz: float) -> None:
         self.enabled, self._plan_s = plan_s is not None, plan_s or 0.0
+        self._programmes = max(1, round(_PROGRAMMES_PER_S / rate_hz))
+        self._step_ns = round(max(1, round(_STEP_S * rate_hz)) / rate_hz * 1e9)
         self.active: ActivePlan | None = None
-        self._rng = np.random.default_rng(0x9A2)
+        self.search: PlanSearch | None = None
+        if self.enabled:
+            import scipy.optimize  # noqa: F401  # takes longer than a tick: not in flight
 
     def reset(self) -> None:
         """Forget the plan."""
-        self.active = None
+        self.active = self.search = None
 
-    def trial(self, problem: StackProblem) -> StackPlan:
-        """Return a first plan over the whole time."""
-        return self._plan(problem, 0, self._plan_s).plan
-
-    def thrusts(self, problem: StackProblem, now_ns: int, feedback_can: bool) -> Array | None:
-        """Return the thrusts (n,) of the plan now; None if the feedback is to take over. ``feedback_can``: whether it can."""
+    def thrusts(self, problem: StackProblem, now_ns: int) -> Array | None:
+        """Return the thrusts (n,) of the plan now; None if the feedback is to take over."""
         active = self.active
         if active is None or len(active.limits_N) != len(problem.limits_N):
-            active = self._plan(problem, now_ns, self._plan_s)
+            active = self._begin(problem, now_ns, self._plan_s)
         elif np.any(active.limits_N > problem.limits_N + 1e-9):
             left_s = max((active.end_ns - now_ns) / 1e9, _LONGER * self._plan_s)
-            active = self._plan(problem, now_ns, left_s)
-        left_s = (active.end_ns - now_ns) / 1e9
-        if feedback_can and left_s < _FEEDBACK_S:
+            active = self._begin(problem, now_ns, left_s)
+        if (active.end_ns - now_ns) / 1e9 < _FEEDBACK_S:
             return None
-        if left_s <= 0.5 * active.plan.step_s:
-            active = self._plan(problem, now_ns, _LONGER * self._plan_s)
-        elif now_ns - active.begin_ns >= _REPLAN_S * 1e9:
-            active = self._plan(problem, now_ns, left_s, active)
+        if now_ns >= active.renewal_ns:
+            active = self._renew(problem, now_ns, active)
+        elif self.search is not None:
+            self.search = self.search.improved(self._programmes)
         self.active = active
         return np.minimum(active.thrusts_at(now_ns), problem.limits_N)
 
-    def _plan(
-        self, problem: StackProblem, now_ns: int, duration_s: float, last: ActivePlan | None = None
-    ) -> ActivePlan:
-        """Return a plan from the present state; its first guess is the rest of the ``last`` plan, which ends at the same time."""
-        step_s = max(_STEP_S, duration_s / _MOST_STEPS) if last is None else last.plan.step_s
-        count = max(1, round(duration_s / step_s))
-        step_s = duration_s / count
-        if last is None:
-            guesses = [np.zeros((count, len(problem.limits_N)))]
-            guesses += [self._random_guess(problem, count) for _ in range(_FIRST_GUESSES)]
-            plans = [plan_stop(problem, guess, step_s, _FIRST_ITERATIONS) for guess in guesses]
-            plan = min(plans, key=lambda p: p.cost_N_s)
-        else:
-            times = now_ns + (np.arange(count) + 0.5) * step_s * 1e9
-            guess = np.array([last.thrusts_at(int(t)) for t in times])
-            plan = plan_stop(problem, guess, step_s, _NEXT_ITERATIONS)
-            if duration_s > _OTHER_UNTIL * self._plan_s:
-                other = plan_stop(problem, self._random_guess(problem, count), step_s, _OTHER_ITERATIONS)
-                if other.cost_N_s < (1.0 - _OTHER_GAIN) * plan.cost_N_s:
-                    plan = other
-        end_ns = now_ns + round(duration_s * 1e9)
-        return ActivePlan(plan, now_ns, end_ns, problem.limits_N.copy())
+    def _begin(self, problem: StackProblem, now_ns: int, duration_s: float) -> ActivePlan:
+        """Return a plan that coasts, and begin to search for one that stops the stack at the same time."""
+        step_s = self._step_ns / 1e9
+        coasting = max(1, round(min(_SEARCH_S, _SEARCH_SHARE * duration_s) / step_s))
+        count = max(coasting + 1, round(duration_s / step_s))
+        coast = flown(problem, np.zeros((count, len(problem.limits_N))), step_s)
+        renewal_ns = now_ns + coasting * self._step_ns
+        active = ActivePlan(coast, now_ns, self._step_ns, renewal_ns, problem.limits_N.copy())
+        self.search = self._search(problem, active, _FIRST_GUESSES - 1, with_rest=True)
+        return active
 
-    def _random_guess(self, problem: StackProblem, count: int) -> Array:
-        fires = self._rng.random((count, len(problem.limits_N))) < _GUESS_DENSITY
-        return np.where(fires, problem.limits_N, 0.0)
+    def _renew(self, problem: StackProblem, now_ns: int, last: ActivePlan) -> ActivePlan:
+        """Return a plan from the present state that ends with the ``last`` one, and begin to search for the next.
+
+        It begins with the rest of the last plan, or with what the search has found, if that is cheaper.
+        """
+        thrusts_N, step_s, search = last.rest(now_ns), self._step_ns / 1e9, self.search
+        found = None if search is None else search.best()
+        if search is not None and found is not None:
+            rest = flown(search.problem, last.rest(search.begin_ns), step_s)
+            if found.cost_N_s < (1.0 - _OTHER_GAIN) * rest.cost_N_s:
+                thrusts_N = found.thrusts_N[len(found.thrusts_N) - len(thrusts_N) :]
+        plan = improve(problem, flown(problem, thrusts_N, step_s), _RENEWAL_PROGRAMMES)
+        active = ActivePlan(plan, now_ns, self._step_ns, now_ns + self._step_ns, problem.limits_N.copy())
+        goes_on = active.end_ns - active.renewal_ns > _OTHER_UNTIL * self._plan_s * 1e9
+        self.search = self._search(problem, active, _NEXT_GUESSES, with_rest=False) if goes_on else None
+        return active
+
+    def _search(self, problem: StackProblem, active: ActivePlan, guesses: int, with_rest: bool) -> PlanSearch:
+        """Return a search for the plan that follows the active one, begun with random guesses, and its rest if ``with_rest``.
+
+        The guesses follow from the time for which they are made, so that every controller draws the same.
+        """
+        begin_ns, step_s = active.renewal_ns, self._step_ns / 1e9
+        ahead_N = active.plan.thrusts_N[: len(active.plan.thrusts_N) - len(active.rest(begin_ns))]
+        problem, rest_N = predicted(problem, ahead_N, step_s), active.rest(begin_ns)
+        rng = np.random.default_rng([0x9A2, begin_ns])
+        fires = rng.random((guesses, *rest_N.shape)) < _GUESS_DENSITY
+        starts = [*([rest_N] if with_rest else []), *np.where(fires, problem.limits_N, 0.0)]
+        return PlanSearch(problem, begin_ns, tuple(flown(problem, start, step_s) for start in starts))

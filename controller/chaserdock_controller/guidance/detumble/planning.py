@@ -11,7 +11,7 @@ Its solutions are vertices: nearly all thrusters are off or fully on, as pulses 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -44,12 +44,14 @@ class StackProblem:
 @dataclass(frozen=True, eq=False)
 class StackPlan:
     """``thrusts_N`` (K, n) for K steps of ``step_s``. ``remaining`` (6,): momentum at the end, WRF axes, by the plan's own model;
-    ``impulse_N_s`` of all thrusters; ``cost_N_s``: this impulse and the penalty on the remaining momentum."""
+    ``impulse_N_s`` of all thrusters; ``cost_N_s``: this impulse and the penalty on the remaining momentum. ``radius``: of the trust
+    region, as share of full thrust, with which the next programme begins; 0 if none improves the plan."""
 
     thrusts_N: Array
     step_s: float
     remaining: Array
     cost_N_s: float
+    radius: float = 1.0
 
     @property
     def impulse_N_s(self) -> float:
@@ -62,9 +64,11 @@ class StackPlan:
 
 @dataclass(frozen=True, eq=False)
 class _Flight:
-    """States at the begin of every step, and at its middle rotation and rate."""
+    """``end`` (6,): momentum at the end, and ``attitude`` there; at the middle of every step rotation, rate and angular momentum
+    (TRF axes)."""
 
     end: Array
+    attitude: Array
     rotations: Array
     rates: Array
     momenta: Array
@@ -76,33 +80,48 @@ def plan_stop(problem: StackProblem, guess_N: Array, step_s: float, iterations: 
 
     Raises ValueError for numbers that are not finite or a step that is not positive.
     """
+    return improve(problem, flown(problem, guess_N, step_s), iterations)
+
+
+def flown(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackPlan:
+    """Return the plan that fires these thrusts (K, n) within the limits. Raises ValueError as ``plan_stop``."""
     if not (step_s > 0.0 and math.isfinite(step_s)):
         raise ValueError(f"step_s must be positive, not {step_s!r}")
     if not (np.isfinite(problem.momentum).all() and np.isfinite(problem.wrenches).all()):
         raise ValueError("momentum and wrenches must be finite")
     able = np.flatnonzero(problem.limits_N > 0.0)
     if not len(able):
-        return StackPlan(np.zeros_like(guess_N), step_s, problem.momentum.copy(), math.inf)
-    thrusts = np.clip(guess_N, 0.0, problem.limits_N)
+        return StackPlan(np.zeros_like(thrusts_N), step_s, problem.momentum.copy(), math.inf, 0.0)
+    thrusts = np.clip(thrusts_N, 0.0, problem.limits_N)
+    end = fly(problem, thrusts, step_s).end
+    return StackPlan(thrusts, step_s, end, _merit(end, thrusts, step_s, _price(problem, able)))
+
+
+def improve(problem: StackProblem, plan: StackPlan, iterations: int) -> StackPlan:
+    """Return a plan for the same problem after at most so many more linear programmes."""
+    if plan.radius == 0.0 or not iterations:
+        return plan
+    able, step_s = np.flatnonzero(problem.limits_N > 0.0), plan.step_s
     price = _price(problem, able)
+    thrusts, merit, radius = plan.thrusts_N, plan.cost_N_s, plan.radius
     flight = fly(problem, thrusts, step_s)
-    merit = _merit(flight, thrusts, step_s, price)
-    radius = 1.0
     for _ in range(iterations):
         step, predicted = _linear_step(problem, flight, thrusts, step_s, able, price, radius)
         gain = merit - predicted
         if gain <= 1e-4 * (1.0 + abs(merit)):
+            radius = 0.0
             break
         tried = np.clip(thrusts + step, 0.0, problem.limits_N)
         tried_flight = fly(problem, tried, step_s)
-        tried_merit = _merit(tried_flight, tried, step_s, price)
+        tried_merit = _merit(tried_flight.end, tried, step_s, price)
         ratio = (merit - tried_merit) / gain
         if ratio > _ACCEPT:
             thrusts, flight, merit = tried, tried_flight, tried_merit
         radius = min(1.0, 2.0 * radius) if ratio > 0.75 else radius if ratio > 0.3 else radius / 3.0
         if radius < _LEAST_RADIUS:
+            radius = 0.0
             break
-    return StackPlan(thrusts, step_s, flight.end, merit)
+    return StackPlan(thrusts, step_s, flight.end, merit, radius)
 
 
 def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
@@ -122,7 +141,13 @@ def fly(problem: StackProblem, thrusts_N: Array, step_s: float) -> _Flight:
         p = p + step_s * (middle @ bodies[k, :3])
         h = h + step_s * torque
         q = rotations.multiply(q, rotations.exp(omega * step_s))
-    return _Flight(np.concatenate([p, h]), middles, rates, momenta, bodies)
+    return _Flight(np.concatenate([p, h]), q, middles, rates, momenta, bodies)
+
+
+def predicted(problem: StackProblem, thrusts_N: Array, step_s: float) -> StackProblem:
+    """Return the problem of the same stack after thrusts (K, n)."""
+    flight = fly(problem, thrusts_N, step_s)
+    return replace(problem, momentum=flight.end, q_wxyz=flight.attitude)
 
 
 def sensitivity(problem: StackProblem, flight: _Flight, step_s: float, able: IntArray) -> Array:
@@ -163,8 +188,8 @@ def _price(problem: StackProblem, able: IntArray) -> Array:
     return _PENALTY * thrust / np.repeat([force, torque], 3)
 
 
-def _merit(flight: _Flight, thrusts_N: Array, step_s: float, price: Array) -> float:
-    return float(thrusts_N.sum()) * step_s + float(price @ np.abs(flight.end))
+def _merit(end: Array, thrusts_N: Array, step_s: float, price: Array) -> float:
+    return float(thrusts_N.sum()) * step_s + float(price @ np.abs(end))
 
 
 def _linear_step(

@@ -29,6 +29,7 @@ from chaserdock_protocol.messages import OperatorCommand
 from chaserdock_protocol.scenario import ScenarioError, parse_scenario
 from chaserdock_protocol.scenario.checks import shape_distance_m
 from nmpc_cases import PARAMS, at_rest, fixed_problem, fresh
+from nmpc_kernels import build_rows
 
 CLEARANCE_M = 0.3
 PANEL_M = (0.02, 1.0, 0.8)
@@ -181,16 +182,22 @@ def test_probe_keeps_its_distance_from_a_panel() -> None:
     assert state[0] < -0.4
 
 
-def test_neighbours_give_way_to_a_chaser_that_cannot_keep_its_own_distance() -> None:
-    # The middle one is held between the target and two others, which push on towards their goals.
-    starts = np.array([[0.0, 0.4, 0.0], [0.32, 0.72, 0.0], [-0.32, 0.72, 0.0]])
-    goals = np.array([[0.0, 1.2, 0.0], [0.1, 0.1, 0.0], [-0.1, 0.1, 0.0]])
-    solver, states, least = fresh("rti", 3), np.array([at_rest(p) for p in starts]), np.inf
-    for tick in range(150):
-        problem = replace(fixed_problem(states, goals, d_target=0.35), min_distance_chasers_m=0.35)
-        states = solver.solve(problem, PARAMS.dt_s if tick else 0.0).states[:, 1]
-        least = min(least, float(np.linalg.norm(states[:, :3], axis=1).min()))
-    assert least > 0.35
+def test_planes_move_away_from_a_chaser_that_cannot_keep_its_own_distance() -> None:
+    """The first chaser is 1 cm too near to the target: its neighbour yields 1 cm more, and it has 1 cm more room."""
+    places = np.array([[0.0, 0.34, 0.0], [0.0, 0.80, 0.0]])
+    needed = {}
+    for limit_m in (0.0, 0.35):
+        problem = replace(
+            fixed_problem(np.array([at_rest(p) for p in places]), places), min_distance_chasers_m=0.35
+        )
+        problem = check_input(replace(problem, min_distance_target_m=np.array([limit_m, 0.0])), PARAMS, 2)
+        nodes = PARAMS.stages + 1
+        rollout = np.repeat(problem.states[:, None], nodes, axis=1)
+        rows = build_rows(problem, rollout, 25.0, np.full((2, nodes), 10.0))
+        between = [rows.c[i, rows.n_rows[i] - PARAMS.stages : rows.n_rows[i]] for i in range(2)]
+        needed[limit_m] = np.array(between)
+    np.testing.assert_allclose(needed[0.35][0] - needed[0.0][0], -0.01, atol=1e-12)
+    np.testing.assert_allclose(needed[0.35][1] - needed[0.0][1], 0.01, atol=1e-12)
 
 
 def with_shape(**limits: Any) -> dict[str, Any]:

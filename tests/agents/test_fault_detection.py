@@ -5,7 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from chaserdock_agents.chaser.thrusters.fault_detection import Flags, ThrusterFault, ThrusterFaultDetector
+from chaserdock_agents.chaser.thrusters.fault_detection import (
+    Flags,
+    ThrusterFault,
+    ThrusterFaultDetector,
+    is_consistent,
+)
 from chaserdock_agents.chaser.thrusters.impulse_residual import (
     ImpulseNoise,
     PlantMismatch,
@@ -230,3 +235,10 @@ def test_only_suspects_are_blamed() -> None:
         given = np.zeros(12)
         given[5] = 0.1
         assert case.step(np.zeros(12), given, suspects) is None
+
+
+def test_residuals_of_white_noise_are_consistent_and_larger_ones_are_not() -> None:
+    """Over 10 ticks the energy of noise has 60 degrees of freedom: 60 on average, 115 at five sigma."""
+    assert is_consistent(energy=110.0, explained=0.0, squared=0.0, ticks=10)
+    assert not is_consistent(energy=120.0, explained=0.0, squared=0.0, ticks=10)
+    assert is_consistent(energy=120.0, explained=10.0, squared=0.0, ticks=10)

@@ -201,3 +201,10 @@ def test_nothing_is_owed_for_ticks_without_a_command() -> None:
     begin, end = bench.timing.effective_ns(45), bench.timing.effective_ns(46)
     bench.modulator.pulses(np.zeros(12), bench.full, begin, end)
     assert np.abs(bench.modulator.deficit_N_s).max() < 1.5 * 0.1
+
+
+@pytest.mark.parametrize(("share", "width_ms"), [(0.2034, 20), (0.2066, 21)])
+def test_on_times_are_rounded_to_the_nearest_step(share: float, width_ms: int) -> None:
+    bench = Bench(10)
+    pulses = bench.tick(0, bench.full * share)
+    assert [p.close_ns - p.open_ns for p in pulses] == [width_ms * MS] * 12

@@ -245,6 +245,12 @@ def test_every_changed_field_is_found(sample: m.Message) -> None:
         assert [f[0] for f in found] == expected
 
 
+def test_the_difference_of_numbers_has_no_sign() -> None:
+    one, other = m.RecorderAck(tick=3), m.RecorderAck(tick=5)
+    assert list(field_differences(one, other)) == [("tick", 3, 5, 2)]
+    assert list(field_differences(other, one)) == [("tick", 5, 3, 2)]
+
+
 def test_differences_in_nested_structures_are_located() -> None:
     sample: Any = BY_TYPE[m.Sighting]
     moved = msgspec.structs.replace(sample.solutions[1], position_m=(0.25, -1.0, 3.0))

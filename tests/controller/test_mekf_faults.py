@@ -213,3 +213,17 @@ def test_a_single_first_marker_starts_wider() -> None:
         e = Mekf(NO_BIAS).update([see(np.random.default_rng(0), 0, 0, markers=markers)], 0)
         covariances.append(np.diag(e.covariance)[[0, 1, 2, 6, 7, 8]])
     np.testing.assert_allclose(covariances[0], 9.0 * covariances[1])
+
+
+def test_one_of_two_cameras_that_errs_does_not_re_initialise() -> None:
+    """Half of the cameras are no majority."""
+    f = Mekf()
+    rng = np.random.default_rng(11)
+    fly(f, 2, 5.0, seed=11)
+    e = no_estimate(0)
+    for k in range(75, 105):
+        shift = np.array([0.0, 0.5, 0.0])
+        e = f.update([see(rng, 0, ns(k)), see(rng, 1, ns(k), shift=shift)], ns(k))
+    assert f.reinitialisations == 0
+    assert (e.sightings, e.rejected) == (1, (1,))
+    assert np.linalg.norm(errors(e)[:3]) < 5e-3

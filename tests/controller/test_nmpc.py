@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from chaserdock_controller.nmpc import NmpcPlan, make_solver
-from chaserdock_controller.nmpc.checks import shift_inputs
+from chaserdock_controller.nmpc.checks import check_input, shift_inputs, warm_start
 from chaserdock_models import rotations
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -246,3 +246,20 @@ def test_four_chasers_cross_through_the_target() -> None:
     gaps = np.linalg.norm(p[:, :, None] - p[:, None], axis=-1) + np.eye(4)
     assert np.min(gaps) > D_MIN_M
     assert np.max(np.linalg.norm(p[-1] + starts, axis=-1)) < 0.05
+
+
+def test_a_warm_start_keeps_the_limits_of_the_inputs() -> None:
+    problem = fixed_problem(at_rest(np.array([1.0, 0.0, 0.0]))[None], np.array([[1.0, 0.0, 0.0]]))
+    limits = problem.input_max[0]
+    for sign in (-1.0, 1.0):
+        beyond = replace(problem, u_ref=np.tile(2.0 * sign * limits, (1, PARAMS.stages, 1)))
+        start = warm_start({}, (0,), beyond, 0.0, PARAMS.dt_s)
+        np.testing.assert_array_equal(start[0], np.tile(sign * limits, (PARAMS.stages, 1)))
+
+
+@pytest.mark.parametrize("half_angle_rad", [0.0, np.pi / 2, 2.0])
+def test_a_corridor_that_is_no_cone_is_invalid(half_angle_rad: float) -> None:
+    problem = fixed_problem(at_rest(np.array([1.0, 0.0, 0.0]))[None], np.array([[1.0, 0.0, 0.0]]))
+    corridors = np.tile([1.0, 0.0, 0.0, half_angle_rad, 0.1], (1, PARAMS.stages + 1, 1))
+    with pytest.raises(ValueError, match="half angles"):
+        check_input(replace(problem, corridors=corridors), PARAMS, 1)

@@ -5,9 +5,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 from chaserdock_protocol import messages as m
 from chaserdock_protocol import topics
 from chaserdock_protocol.recording.log import LogError, LogWriter, count_messages, read_log, read_scenario
+from chaserdock_protocol.recording.scan import FileState, records
 from log_samples import SCENARIO, Clock, flight, record
 
 
@@ -109,3 +111,50 @@ def test_damage_is_reported_or_harmless_and_never_invents_messages(tmp_path: Pat
         rest = iter(expected)
         assert all(found in rest for found in records), place  # in order, as they were, none twice
     assert reported > 10
+
+
+def test_a_log_cut_off_at_the_end_of_a_record_has_this_record(tmp_path: Path) -> None:
+    path, cut = tmp_path / "a.mcap", tmp_path / "cut.mcap"
+    writer = LogWriter(path, Clock())
+    for k in range(3):
+        record(writer, topics.ACK, None, m.RecorderAck(tick=k), 1)
+        writer.flush()
+    writer.close()
+    found, end = list(records(path)), 8
+    assert len(found) >= 3
+    for number, (_, content) in enumerate(found, start=1):
+        end += 9 + len(content)  # opcode and length
+        cut.write_bytes(path.read_bytes()[:end])
+        state = FileState()
+        assert list(records(cut, state)) == found[:number]
+        assert state.cut_bytes == 0
+
+
+@pytest.mark.parametrize(
+    ("kept", "follows"), [((0, 1, 3), "3 follows where 2"), ((0, 1, 1), "1 follows where 2")]
+)
+def test_a_single_lost_or_repeated_message_is_damage(
+    tmp_path: Path, kept: tuple[int, ...], follows: str
+) -> None:
+    path, ends = tmp_path / "a.mcap", [8]
+    writer = LogWriter(path, Clock())
+    for k in range(4):
+        record(writer, topics.ACK, None, m.RecorderAck(tick=k), 1)
+        writer.flush()
+        ends.append(path.stat().st_size)
+    data = path.read_bytes()
+    path.write_bytes(data[:8] + b"".join(data[ends[k] : ends[k + 1]] for k in kept))
+    with pytest.raises(LogError, match=f"recorder/ack: message {follows} belongs"):
+        list(read_log(path))
+
+
+def test_a_changed_attachment_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path, Clock())
+    writer.describe(SCENARIO, {"run_id": "r1"})
+    writer.close()
+    data = path.read_bytes()
+    assert data.count(b"a scenario") == 1
+    path.write_bytes(data.replace(b"a scenario", b"A scenario"))
+    with pytest.raises(LogError, match="checksum"):
+        read_scenario(path)

@@ -140,7 +140,7 @@ class ThrusterFaultDetector:
             energy, along, squared = self._evidence.marginal(total)
             gain = np.where(suspects, along - squared / 2.0, -math.inf)
             best = int(np.argmax(gain))
-            if _is_distinct(gain, best) and _is_consistent(
+            if _is_distinct(gain, best) and is_consistent(
                 energy, float(2.0 * gain[best]), float(squared[best]), length
             ):
                 return ThrusterFault(best, "stuck_on", 1.0)
@@ -157,7 +157,7 @@ class ThrusterFaultDetector:
                 known = squared[thruster] * _LOSS_SIGMA**2 >= 1.0
                 if not known or loss[thruster] < _WEAK_LOSS or int(np.argmax(gain)) != thruster:
                     continue
-                if _is_distinct(gain, thruster) and _is_consistent(
+                if _is_distinct(gain, thruster) and is_consistent(
                     energy, float(2.0 * gain[thruster]), float(squared[thruster]), length
                 ):
                     stuck_off = loss[thruster] > _STUCK_OFF_LOSS
@@ -188,7 +188,7 @@ def _is_distinct(gain: Array, best: int) -> bool:
     return bool(gain[best] > _MIN_GAIN and gain[best] - others.max(initial=-math.inf) > _MIN_MARGIN)
 
 
-def _is_consistent(energy: float, explained: float, squared: float, ticks: int) -> bool:
+def is_consistent(energy: float, explained: float, squared: float, ticks: int) -> bool:
     """Return whether the ``energy`` of the residuals less the share that the hypothesis explains is noise.
 
     Chi-square test with 6 degrees of freedom per tick, five sigma.

@@ -253,6 +253,16 @@ def test_lost_chunk_is_detected_without_a_checksum(tmp_path: Path) -> None:
         list(read_log(path))
 
 
+def test_recovery_of_an_intact_log_skips_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    writer = LogWriter(path, lambda: 0.0)
+    for k in range(30):
+        writer.write("recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1)
+    writer.close()
+    found = recover(path, tmp_path / "b.mcap")
+    assert (found.messages, found.broken_records, found.skipped_bytes) == (30, 0, 0)
+
+
 def test_log_commands(tmp_path: Path) -> None:
     log, cut = tmp_path / "a.mcap", tmp_path / "cut.mcap"
     shutil.copy(GOLDEN, log)

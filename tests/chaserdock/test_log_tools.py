@@ -20,7 +20,7 @@ from chaserdock_protocol import messages as m
 from chaserdock_protocol.process import Rotation
 from chaserdock_protocol.recording import schema_migrations as upgrades
 from chaserdock_protocol.recording.log import LogError, LogWriter, count_messages, read_log, read_scenario
-from chaserdock_protocol.recording.scan import FileState, log_files, stored_messages
+from chaserdock_protocol.recording.scan import FileState, log_files, records, stored_messages
 from chaserdock_protocol.scenario import flight_scenario_json, scenario_from_json
 from chaserdock_protocol.transport import RawSample
 from harness import finished
@@ -253,12 +253,16 @@ def test_lost_chunk_is_detected_without_a_checksum(tmp_path: Path) -> None:
         list(read_log(path))
 
 
-def test_recovery_of_an_intact_log_skips_nothing(tmp_path: Path) -> None:
+def test_recovery_skips_nothing_where_only_the_summary_is_damaged(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     writer = LogWriter(path, lambda: 0.0)
     for k in range(30):
         writer.write("recorder/ack", m.encoding_of(m.RecorderAck), codec.encode(m.RecorderAck(tick=k)), 1)
     writer.close()
+    data = bytearray(path.read_bytes())
+    end_of_data = 8 + sum(9 + len(content) for _, content in records(path)) + 9 + 4
+    data[end_of_data] = 0  # no opcode
+    path.write_bytes(data)
     found = recover(path, tmp_path / "b.mcap")
     assert (found.messages, found.broken_records, found.skipped_bytes) == (30, 0, 0)
 

@@ -78,6 +78,18 @@ def test_body_receives_thruster_forces_at_their_positions(
     assert np.all(np.array(took.thruster_open_s) * 1.5 >= np.array(took.thruster_impulse_N_s) - 1e-9)
 
 
+@pytest.mark.parametrize("thruster", range(12))
+def test_absolute_impulse_sums_the_sizes_of_the_components(thruster: int) -> None:
+    s = mission()
+    physics, thrusters = Physics(s), thrusters_of(s)
+    thrusters.command(command((thruster, 0, 40)), 0, 0)
+    fly_to(140, physics, {"chaser/0": thrusters}, STEP_S)
+    took = thrusters.take_output(140)
+    physics.close()
+    given = wrench_matrix(s.chaser.thrusters)[:3] @ np.array(took.thruster_impulse_N_s)
+    assert took.absolute_impulse_N_s == pytest.approx(np.abs(given).sum(), rel=1e-6)
+
+
 def test_grouping_of_steps_does_not_change_thruster_output() -> None:
     states = []
     for slices in ([200], [7, 50, 51, 100, 200]):

@@ -94,6 +94,10 @@ class SatelliteImages:
         exact = self._renderer.render(np.zeros(3), rotations.IDENTITY, pose.position, q, (), light)
         return self._effects.apply(exact, 0, number)
 
+    def mean_grey(self, image: NDArray[np.uint8], pose: PoseInCamera) -> float:
+        """Return the mean grey level of the target in an image (h, w)."""
+        return float(image[self.coverage(pose.position, rotations.from_matrix(pose.rotation))].mean())
+
     def blurred(self, pose: PoseInCamera, step_m: Array, light: Light, number: int) -> NDArray[np.uint8]:
         """Return the image (h, w) of a target that moves by ``step_m`` (3,) during the exposure, ``pose`` in the middle of it."""
         q, total = rotations.from_matrix(pose.rotation), np.zeros((CAMERA.height_px, CAMERA.width_px))
@@ -307,6 +311,11 @@ def behind(cells: Cells, views: int) -> Figures:
     return tracking_figures("behind", cells.rows("behind", views, view))
 
 
+def bright_figures(key: str, rows: list[ViewRow]) -> Figures:
+    """Return the figures of the views whose target is bright enough to be seen."""
+    return tracking_figures(key, [row for row in rows if row["grey"] >= LEAST_GREY])
+
+
 def backlit(cells: Cells, views: int) -> Figures:
     """Track single images with the sun behind the target."""
     scene = SatelliteImages()
@@ -318,12 +327,9 @@ def backlit(cells: Cells, views: int) -> Figures:
         light = Light(sun, 1.0 - ambient, ambient)
         image = scene.image(pose, light, number)
         row = tracked_view(image, EXACT, pose, perturbed(pose, rng, 0.003, np.deg2rad(0.3)))
-        q = rotations.from_matrix(pose.rotation)
-        covered = scene.coverage(pose.position, q)
-        return row | {"grey": float(image[covered].mean())}
+        return row | {"grey": scene.mean_grey(image, pose)}
 
-    rows = cells.rows("backlit", views, view)
-    return tracking_figures("backlit", [row for row in rows if row["grey"] >= LEAST_GREY])
+    return bright_figures("backlit", cells.rows("backlit", views, view))
 
 
 def lamp(cells: Cells, views: int) -> Figures:
@@ -333,12 +339,10 @@ def lamp(cells: Cells, views: int) -> Figures:
     def view(rng: np.random.Generator, number: int) -> ViewRow:
         pose, _ = random_view(rng, rng.uniform(1.0, 2.0), CAMERA)
         image = scene.image(pose, Light(sun=0.0, ambient=0.01, lamp=_LAMP), number)
-        covered = scene.coverage(pose.position, rotations.from_matrix(pose.rotation))
         row = tracked_view(image, EXACT, pose, perturbed(pose, rng, *PRIOR))
-        return row | {"grey": float(image[covered].mean())}
+        return row | {"grey": scene.mean_grey(image, pose)}
 
-    rows = cells.rows("lamp", views, view)
-    return tracking_figures("lamp", [row for row in rows if row["grey"] >= LEAST_GREY])
+    return bright_figures("lamp", cells.rows("lamp", views, view))
 
 
 def blur(cells: Cells, views: int) -> Figures:

@@ -96,6 +96,8 @@ class SimulatedNetwork:
         self.traffic = Traffic()
         self.first_tick_s: float | None = None
         self._latency_s, self._jitter_s = conditions.latency_s, conditions.jitter_s
+        self._is_steady = not (conditions.jitter_s or conditions.partition)
+        """Whether all messages that are not late take the same time."""
         self._seed = seed
         self._random = random.Random(f"network {seed}")
         self._connections: dict[str, SimulatedConnection] = {}
@@ -206,6 +208,8 @@ class SimulatedNetwork:
 
     def _due_s(self, sender: str, receiver: str, late_s: float) -> float:
         """Return when a message arrives that is sent now, but for those before it."""
+        if self._is_steady and late_s == 0.0:
+            return self.scheduler.now_s + self._latency_s
         delay_s = self._latency_s
         if late_s > 0.0:
             delay_s += late_s
@@ -474,7 +478,7 @@ class SimulatedHost:
         self.pause(duration_s)
 
     def new_queue(self) -> BoundedQueue[Any]:
-        queue = VirtualQueue(self._scheduler, self._read_slowly, self._rate)
+        queue = VirtualQueue(self._scheduler, self._read_slowly if self._slow else None, self._rate)
         self._network.traffic.queues[f"{self.name} {len(self._network.traffic.queues)}"] = queue
         return queue
 

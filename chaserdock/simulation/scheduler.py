@@ -182,10 +182,10 @@ class Scheduler:
 class VirtualQueue(BoundedQueue[Any]):
     """A ``BoundedQueue`` whose reader waits in virtual time, by a clock of this rate.
 
-    ``before_take`` runs in the reader's task before it takes an item. ``most``: most items that have been in it.
+    ``before_take``, if any, runs in the reader's task before it takes an item. ``most``: most items that have been in it.
     """
 
-    def __init__(self, scheduler: Scheduler, before_take: Callable[[], None], rate: float = 1.0) -> None:
+    def __init__(self, scheduler: Scheduler, before_take: Callable[[], None] | None, rate: float = 1.0) -> None:
         super().__init__()
         self.most = 0
         self._scheduler = scheduler
@@ -212,7 +212,8 @@ class VirtualQueue(BoundedQueue[Any]):
         """See ``BoundedQueue.get``."""
         items = self._waiting_items
         if timeout_s != 0:
-            self._before_take()
+            if self._before_take is not None:
+                self._before_take()
             if not items:
                 self._reader = self._scheduler.running
                 self._scheduler.pause(None if timeout_s is None else timeout_s / self._rate)

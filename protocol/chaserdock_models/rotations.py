@@ -54,7 +54,10 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
 def _by_rows(kernel: str, a: Array, b: Array) -> Array:
     """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along leading axes."""
     lead_a, lead_b = a.shape[:-1], b.shape[:-1]
-    lead = lead_a if lead_a == lead_b else np.broadcast_shapes(lead_a, lead_b)
+    if lead_a == lead_b or not lead_b:
+        lead = lead_a
+    else:
+        lead = np.broadcast_shapes(lead_a, lead_b) if lead_a else lead_b
     out = np.empty((*lead, b.shape[-1]))
     a, b = _repeatable(a, lead), _repeatable(b, lead)
     function(kernel)(
@@ -110,15 +113,17 @@ def exp(phi: ArrayLike) -> Array:
     """Return the unit quaternion (..., 4) of a rotation vector (..., 3), rad (Sola eq. 101)."""
     phi = np.asarray(phi, dtype=float)
     if phi.ndim == 1:
-        # Repeats the operations of np.sinc below with NumPy's sine and cosine, for equal bits.
+        # Repeats the operations below with NumPy's sine and cosine, for equal bits.
         x, y, z = phi.tolist()
         angle = math.sqrt(x * x + y * y + z * z)
         half = math.pi * (angle / (2.0 * math.pi) or 1e-20)
         scale = 0.5 * (float(np.sin(half)) / half)
         return np.array([float(np.cos(angle / 2.0)), scale * x, scale * y, scale * z])
-    angle = np.linalg.norm(phi, axis=-1, keepdims=True)
-    # np.sinc(x) = sin(pi x) / (pi x) gives sin(angle / 2) / angle, also at zero.
-    return np.concatenate([np.cos(angle / 2.0), 0.5 * np.sinc(angle / (2.0 * np.pi)) * phi], axis=-1)
+    # The operations of np.linalg.norm and np.sinc, without their checks.
+    angle = np.sqrt(np.add.reduce(phi * phi, axis=-1, keepdims=True))
+    half = np.pi * (angle / (2.0 * np.pi))
+    half = np.where(half, half, 1e-20)
+    return np.concatenate([np.cos(angle / 2.0), 0.5 * (np.sin(half) / half) * phi], axis=-1)
 
 
 def log(q: ArrayLike) -> Array:

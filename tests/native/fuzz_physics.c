@@ -12,9 +12,15 @@ typedef struct {
 static World world;
 static int body_now;
 
-static void *submit(void *client, void *command) {
+static void *submitted;
+static int submit(void *client, void *command) {
     CHECK(client == &world);
-    return command;
+    submitted = command;
+    return 0;
+}
+static void *status_of(void *client) {
+    CHECK(client == &world);
+    return submitted;
 }
 static void *begin_state(void *client, int body) {
     CHECK(client == &world && body >= 0 && body < world.count);
@@ -61,7 +67,7 @@ static void read_contacts(void *client, Contacts *found) {
 }
 
 static void advance(void) {
-    const Bullet bullet = {submit, begin_state, read_state, begin, add_force, add_torque, begin_step, begin, read_contacts,
+    const Bullet bullet = {submit, status_of, begin_state, read_state, begin, add_force, add_torque, begin_step, begin, read_contacts,
                            begin_placement, place_at, turn_to, set_rates, set_rates};
     const int64_t count = whole(0, 4), steps = whole(0, 5), contact_step = whole(1, 8);
     world = (World){count, 0, contact_step, outputs(7 * count), doubles(6 * count, -1.0, 1.0), doubles(9 * count, 0.1, 1.0),

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from enum import IntEnum
 
 import numpy as np
+from chaserdock_models import random_numbers
 from chaserdock_models.arrays import Array
 
 
@@ -34,10 +35,7 @@ TARGET_KEY = 10_000
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:
     """Return the generator of a key."""
-    words = seed, int(stream), *key
-    # The same sequence, but faster as an array; only numbers below 2^32 are one word each.
-    entropy = np.array(words, dtype=np.uint32) if max(words) < 2**32 else words
-    return np.random.Generator(np.random.PCG64(np.random.SeedSequence(entropy)))
+    return random_numbers.generator((seed, int(stream), *key))
 
 
 class GaussMarkov:

@@ -2,5 +2,6 @@
 /* The kernels of chaserdock_models, compiled once per instruction set (LEVEL). See base.h. */
 #include "base.h"
 #include "coast.c"
+#include "random.c"
 #include "rigid_body.c"
 #include "rotations.c"

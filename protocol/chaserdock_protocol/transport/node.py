@@ -167,7 +167,7 @@ class Node:
 
         def arrived(raw: RawSample) -> None:
             key = raw.key
-            if self._is_foreign(raw):
+            if raw.source != self._world_source and self._is_foreign(raw):
                 return
             found = topics.topic_of_key(key)
             if found is None or found[0] is not topic:
@@ -218,7 +218,7 @@ class Node:
             raise PermissionError(f"{self.role} may not read {expression}")
 
         def own_mission(raw: RawSample) -> None:
-            if not self._is_foreign(raw):
+            if raw.source == self._world_source or not self._is_foreign(raw):
                 arrived(raw)
 
         self._connection.subscribe(expression, own_mission)

@@ -22,7 +22,8 @@ from .engine import PlacementPath
 from .native import LIBRARY, function
 
 FUNCTIONS = (
-    "b3SubmitClientCommandAndWaitStatus",
+    "b3SubmitClientCommand",
+    "b3ProcessServerStatus",
     "b3RequestActualStateCommandInit",
     "b3GetStatusActualState",
     "b3ApplyExternalForceCommandInit",

@@ -16,6 +16,7 @@ from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
+from chaserdock_models.random_numbers import generator
 from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.pose_image import decode_pose
 from chaserdock_protocol.scenario.ranging import Ranging
@@ -53,9 +54,7 @@ class StatisticalPerception:
     ) -> PerceptionResult:
         """Return one solution, or none if too little of the target is in view. Raises ValueError for a rendered image."""
         position, q, seed = decode_pose(image)
-        # As `default_rng(seed)`, in half its time: two numbers below 2^32 are the words of the sequence.
-        sequence = np.random.SeedSequence(np.array(seed, dtype=np.uint32))
-        white = np.random.Generator(np.random.PCG64(sequence)).standard_normal(6)
+        white = generator(seed).standard_normal(6)
         table = self._table
         m = len(table.ids)
         pose = np.concatenate([position, rotations.to_matrix(q).ravel()])

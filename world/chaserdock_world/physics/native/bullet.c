@@ -37,7 +37,8 @@ typedef struct {
 
 /* Addresses of Bullet's functions, in the order of FUNCTIONS in bullet_stepping.py. */
 typedef struct {
-    void *(*submit)(void *client, void *command);
+    int (*submit)(void *client, void *command);
+    void *(*status)(void *client);
     void *(*begin_state)(void *client, int body);
     int (*read_state)(void *status, int *body, int *q_count, int *u_count, const double **frame, const double **q,
                       const double **u, const double **reactions);
@@ -53,6 +54,13 @@ typedef struct {
     int (*set_velocity)(void *command, const double *velocity);
     int (*set_rate)(void *command, const double *omega);
 } Bullet;
+
+/* Execute a command and return its status. A client in the same process has done so on return: to wait for it, as
+ * b3SubmitClientCommandAndWaitStatus does, would only read the clock twice. */
+static void *execute(const Bullet *bullet, void *client, void *command) {
+    bullet->submit(client, command);
+    return bullet->status(client);
+}
 
 /* Placements of a body after the step ``next`` and then every ``every`` steps. ``motion`` (., 13): position, attitude x, y, z, w,
  * velocity and rate in world axes. */
@@ -83,11 +91,11 @@ static void place(const Bullet *bullet, void *client, int body, const double *mo
     void *pose = bullet->begin_placement(client, body);
     bullet->place_at(pose, motion[0], motion[1], motion[2]);
     bullet->turn_to(pose, motion[3], motion[4], motion[5], motion[6]);
-    bullet->submit(client, pose);
+    execute(bullet, client, pose);
     void *rates = bullet->begin_placement(client, body);
     bullet->set_velocity(rates, motion + 7);
     bullet->set_rate(rates, motion + 10);
-    bullet->submit(client, rates);
+    execute(bullet, client, rates);
 }
 
 /* Make at most ``steps`` steps of ``count`` bodies under constant loads, and stop after one in which bodies touched.
@@ -101,7 +109,7 @@ EXPORT int64_t NAME(advance)(const Bullet *bullet, void *client, int64_t count, 
         for (int64_t i = 0; i < count; i++) {
             const double *inertia = loads + 9 * i, *force = inertia + 3, *torque = inertia + 6, *q = 0, *u = 0;
             const int body = (int)bodies[i];
-            bullet->read_state(bullet->submit(client, bullet->begin_state(client, body)), 0, 0, 0, 0, &q, &u, 0);
+            bullet->read_state(execute(bullet, client, bullet->begin_state(client, body)), 0, 0, 0, 0, &q, &u, 0);
             if (!q || !u) return -1;
             double turn[3];
             midpoint_torque(inertia, q + 3, u + 3, torque, step_s, turn);
@@ -110,15 +118,15 @@ EXPORT int64_t NAME(advance)(const Bullet *bullet, void *client, int64_t count, 
             if (force[0] != 0.0 || force[1] != 0.0 || force[2] != 0.0) {
                 void *command = bullet->begin_loads(client);
                 bullet->add_force(command, body, NO_LINK, force, origin, BODY_AXES);
-                bullet->submit(client, command);
+                execute(bullet, client, command);
             }
             void *command = bullet->begin_loads(client);
             bullet->add_torque(command, body, NO_LINK, turn, BODY_AXES);
-            bullet->submit(client, command);
+            execute(bullet, client, command);
         }
-        bullet->submit(client, bullet->begin_step(client));
+        execute(bullet, client, bullet->begin_step(client));
         Contacts found = {0, 0};
-        bullet->submit(client, bullet->begin_contacts(client));
+        execute(bullet, client, bullet->begin_contacts(client));
         bullet->read_contacts(client, &found);
         *touching = found.count > 0;
         if (*touching) return step + 1;

@@ -62,9 +62,7 @@ def simulate(
     scheduler = Scheduler(scenario.seed)
     conditions = scenario.simulation
     lockstep = conditions.mode == "lockstep"
-    network = SimulatedNetwork(
-        scheduler, conditions, scenario.seed, lockstep, tap or (lambda sender, raw: None)
-    )
+    network = SimulatedNetwork(scheduler, conditions, scenario.seed, lockstep, tap)
     options = ProcessOptions(
         link=Link(network=network),
         scenario=path,

@@ -90,7 +90,7 @@ class SimulatedNetwork:
         conditions: SimulationSection,
         seed: int,
         lockstep: bool,
-        tap: Callable[[str, RawSample], None] = lambda sender, raw: None,
+        tap: Callable[[str, RawSample], None] | None = None,
     ) -> None:
         self.scheduler, self.conditions, self.lockstep, self.tap = scheduler, conditions, lockstep, tap
         self.traffic = Traffic()
@@ -132,7 +132,8 @@ class SimulatedNetwork:
             self.first_tick_s = self.scheduler.now_s
             self._schedule_partitions()
         self.traffic.sent += 1
-        self.tap(sender.name, raw)
+        if self.tap is not None:
+            self.tap(sender.name, raw)
         for subscription in self._route(raw.key):
             if subscription.owner is sender:
                 if subscription.records_all:
@@ -153,14 +154,16 @@ class SimulatedNetwork:
         link = to.links.get(name)
         if link is None:
             link = to.links[name] = self._link(name, to.owner.name)
-        copies, late_s = 1, 0.0
+        copies, late_s, now_s = 1, 0.0, self.scheduler.now_s
         if not self.lockstep:
             copies, late_s = self._draw_faults(link, name, to.owner.name, size, not blocking)
         for _ in range(copies):
             link.bytes += size
             if link.bytes > self.traffic.most_bytes:
                 self.traffic.most_bytes = link.bytes
-            due_s = self._due_s(name, to.owner.name, late_s)
+            due_s = now_s + self._latency_s
+            if late_s or not self._is_steady:
+                due_s = self._due_s(name, to.owner.name, late_s)
             self._call_in_order(link, due_s, self._arrive, qos, late_s, (link, to, raw))
 
     def _arrive(self, link: _LinkState, to: _Subscription, raw: RawSample) -> None:
@@ -208,8 +211,6 @@ class SimulatedNetwork:
 
     def _due_s(self, sender: str, receiver: str, late_s: float) -> float:
         """Return when a message arrives that is sent now, but for those before it."""
-        if self._is_steady and late_s == 0.0:
-            return self.scheduler.now_s + self._latency_s
         delay_s = self._latency_s
         if late_s > 0.0:
             delay_s += late_s

@@ -185,7 +185,9 @@ class VirtualQueue(BoundedQueue[Any]):
     ``before_take``, if any, runs in the reader's task before it takes an item. ``most``: most items that have been in it.
     """
 
-    def __init__(self, scheduler: Scheduler, before_take: Callable[[], None] | None, rate: float = 1.0) -> None:
+    def __init__(
+        self, scheduler: Scheduler, before_take: Callable[[], None] | None, rate: float = 1.0
+    ) -> None:
         super().__init__()
         self.most = 0
         self._scheduler = scheduler

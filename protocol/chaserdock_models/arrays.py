@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,3 +14,13 @@ BoolArray = NDArray[np.bool_]
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
+
+
+def length(vector: Array) -> float:
+    """Return the length of a vector (n,): the bits of ``numpy.linalg.norm`` in a fifth of its time."""
+    return math.sqrt(vector.dot(vector))
+
+
+def limited(values: Array, limits: Array) -> Array:
+    """Return values (n,) within plus and minus ``limits`` (n,), as ``numpy.clip`` does in three times the time."""
+    return np.minimum(np.maximum(values, -limits), limits)

@@ -54,9 +54,8 @@ def multiply(a: ArrayLike, b: ArrayLike) -> Array:
 def _by_rows(kernel: str, a: Array, b: Array) -> Array:
     """Return a kernel's result (..., n) for operands (..., m) and (..., n), which it repeats along leading axes."""
     lead_a, lead_b = a.shape[:-1], b.shape[:-1]
-    if lead_a == lead_b or not lead_b:
-        lead = lead_a
-    else:
+    lead = lead_a
+    if lead_b and lead_a != lead_b:
         lead = np.broadcast_shapes(lead_a, lead_b) if lead_a else lead_b
     out = np.empty((*lead, b.shape[-1]))
     a, b = _repeatable(a, lead), _repeatable(b, lead)

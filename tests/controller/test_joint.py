@@ -50,9 +50,11 @@ def random_state(seed: int, chasers: int = 2) -> JointState:
     """Return a state with a target at about 1 m, rates, and errors of every kind."""
     rng = np.random.default_rng(seed)
     spread = np.concatenate([np.full(TARGET, 0.2), *[_spread() for _ in range(chasers)]])
-    state = replace(empty_state(0, chasers), target_known=True, alive=np.ones(chasers, dtype=bool))
+    state = msgspec.structs.replace(
+        empty_state(0, chasers), target_known=True, alive=np.ones(chasers, dtype=bool)
+    )
     places = np.array([[-1.0, 0.0, 0.0], [0.0, -1.0, 0.1]])[:chasers]
-    return inject(replace(state, positions_m=places), spread * rng.normal(size=len(spread)))
+    return inject(msgspec.structs.replace(state, positions_m=places), spread * rng.normal(size=len(spread)))
 
 
 def _spread() -> list[float]:
@@ -99,7 +101,7 @@ def test_jacobians_agree_with_finite_differences(seed: int) -> None:
     extra[:, ATTITUDE_DRIFT.start - 12 : ATTITUDE_DRIFT.stop - 12] = (
         0.0  # attitude drift: the residual is linear at zero
     )
-    state = replace(state, extra=extra)
+    state = msgspec.structs.replace(state, extra=extra)
     for measured in (
         measurement(2, 1, None, sighting, 1, mounting, p),
         measurement(2, 1, odometry, None, 0, mounting, p),
@@ -122,7 +124,7 @@ def test_jacobians_agree_with_finite_differences(seed: int) -> None:
 @pytest.mark.parametrize("seed", range(2))
 def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None:
     p = parameters(SCENARIO, navigation("orbit"))
-    state = replace(random_state(seed), covariance=np.zeros((TARGET + 2 * CHASER,) * 2))
+    state = msgspec.structs.replace(random_state(seed), covariance=np.zeros((TARGET + 2 * CHASER,) * 2))
     impulses = np.random.default_rng(seed).normal(size=(2, 6)) * np.repeat([0.02, 0.002], 3)
     after = predict(state, round(PERIOD_S * 1e9), impulses, p)
     noise = after.covariance
@@ -134,7 +136,10 @@ def test_predicted_covariance_is_that_of_the_propagated_error(seed: int) -> None
         unit = np.zeros_like(noise)
         unit[k, k] = 1.0
         grown = (
-            predict(replace(state, covariance=unit), round(PERIOD_S * 1e9), impulses, p).covariance - noise
+            predict(
+                msgspec.structs.replace(state, covariance=unit), round(PERIOD_S * 1e9), impulses, p
+            ).covariance
+            - noise
         )
         np.testing.assert_allclose(grown, np.outer(column, column), atol=1e-3)
 
@@ -146,7 +151,9 @@ def test_update_is_that_of_a_kalman_filter(chasers: int) -> None:
     rng = np.random.default_rng(chasers)
     size = TARGET + chasers * CHASER
     spread = 0.01 * rng.normal(size=(size, size))
-    state = replace(random_state(4, chasers), covariance=spread @ spread.T, updates=p.iterated_updates)
+    state = msgspec.structs.replace(
+        random_state(4, chasers), covariance=spread @ spread.T, updates=p.iterated_updates
+    )
     flight, last = SyntheticFlight(SCENARIO, p.navigation, chasers, 5), chasers - 1
     odometry, sighting = flight.inputs().odometry[last], flight.inputs().sightings[last]
     mounting, wide = mounting_of(p.camera), replace(p, gate_sighting=np.inf, gate_odometry=np.inf)
@@ -171,13 +178,13 @@ def test_update_is_that_of_a_kalman_filter(chasers: int) -> None:
 def test_covariance_of_another_size_is_refused() -> None:
     """A checkpoint may hold anything, and the kernels check no sizes."""
     p, state = parameters(SCENARIO, navigation("orbit")), random_state(0)
-    wrong = replace(state, covariance=np.eye(TARGET + CHASER))
+    wrong = msgspec.structs.replace(state, covariance=np.eye(TARGET + CHASER))
     with pytest.raises(ValueError, match=r"2 chasers with a covariance of shape \(55, 55\)"):
         predict(wrong, 1, np.zeros((2, 6)), p)
     with pytest.raises(ValueError, match="2 chasers"):
         update(wrong, {}, {}, mounting_of(p.camera), p)
     with pytest.raises(ValueError, match="other numbers of chasers"):
-        predict(replace(state, alive=np.ones(1, dtype=bool)), 1, np.zeros((2, 6)), p)
+        predict(msgspec.structs.replace(state, alive=np.ones(1, dtype=bool)), 1, np.zeros((2, 6)), p)
 
 
 def test_gates_are_quantiles_of_chi_square() -> None:
@@ -415,7 +422,7 @@ def test_pushed_target_without_sightings_is_lost_and_reacquired() -> None:
 def test_relative_pose_has_the_covariance_of_its_errors() -> None:
     state, rng = random_state(9), np.random.default_rng(9)
     a = rng.normal(size=(TARGET + 2 * CHASER,) * 2) * 1e-4
-    state = replace(state, covariance=a @ a.T)
+    state = msgspec.structs.replace(state, covariance=a @ a.T)
     pose = relative_poses(state, [0, 1])[1]
     draws = []
     for _ in range(4000):

@@ -167,6 +167,8 @@ class Recorder:
     def _process(self, key: str, message: object) -> None:
         if key.startswith(topics.WORLD_BRANCHES):
             self.heartbeat.world_heard()
+        if message is None:
+            return
         match message:
             case Presence():
                 self.heartbeat.take(message)

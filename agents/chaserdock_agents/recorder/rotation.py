@@ -37,6 +37,7 @@ class Recording:
         self._compressed = compressed
         self._folder, self._mission, self._rotation, self._scenario = folder, mission, rotation, scenario
         self._full_scenario_json = full_scenario_json
+        self._rotates = rotation.wanted
         self._now_s, self._part = now_s, 0
         self._from_ns: int | None = None
         try:
@@ -60,7 +61,7 @@ class Recording:
     def _open(self) -> None:
         run = {"run_id": self._mission.run_id, "mode": self._mission.mode}
         name = LOG_NAME
-        if self._rotation.wanted:
+        if self._rotates:
             name, run["part"] = part_name(self._part), str(self._part)
         self._writer = LogWriter(self._folder / name, self._now_s, self._compressed)
         self._writer.describe(self._full_scenario_json, run)
@@ -69,7 +70,7 @@ class Recording:
 
     def write(self, raw: RawSample, message: Any) -> None:
         """Append a sample; ``message``: the decoded sample, None if it is not needed."""
-        if self._rotation.wanted and self._is_full():
+        if self._rotates and self._is_full():
             self._writer.close()
             self._part += 1
             self._open()

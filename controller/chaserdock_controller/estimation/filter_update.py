@@ -7,10 +7,12 @@ state before it and a replay of the later exposures.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import dataclasses
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
+from msgspec import field
+from msgspec.structs import replace
 
 from .hypothesis import StateHypothesis, measurements_agree, predict, start, update_hypothesis
 from .parameters import MekfParameters
@@ -28,8 +30,7 @@ from .target_hypotheses import (
 from .types import Array, EstimatorEvent, Measurement, PoseHypothesis
 
 
-@dataclass(frozen=True, eq=False)
-class FilterState(HypothesisSet[StateHypothesis]):
+class FilterState(HypothesisSet[StateHypothesis], frozen=True, eq=False):
     """Complete state of the filter after the exposure at ``time_ns``; no hypotheses before the first measurement.
 
     recent: the latest measurement of each chaser. considered: covariance (6, 6) of the pose error of the last accepted
@@ -124,7 +125,7 @@ def _recent_measurements(now: FilterState) -> list[Measurement]:
             )
             for h in m.hypotheses
         )
-        candidates.append(replace(m, hypotheses=moved))
+        candidates.append(dataclasses.replace(m, hypotheses=moved))
     return [m for m in candidates if m.hypotheses]
 
 

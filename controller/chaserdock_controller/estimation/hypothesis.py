@@ -9,11 +9,13 @@ Source of the error-state equations: J. Sola, "Quaternion kinematics for the err
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
+from msgspec import field
+from msgspec.structs import replace
 
 from . import motion_models as motion
 from .camera_calibration import ERRORS, NO_ERROR, pose_prior_covariance, predict_measurement, prior
@@ -25,8 +27,7 @@ _POSE_GRID = np.ix_(POSE, POSE)
 _EYE3 = np.eye(3)
 
 
-@dataclass(frozen=True, eq=False)
-class StateHypothesis(TargetHypothesis):
+class StateHypothesis(TargetHypothesis, frozen=True, eq=False, kw_only=True):
     """State of the target and of the cameras' errors at ``time_ns``; covariance (12 + 7 n, 12 + 7 n).
 
     cameras: chaser of each of n bias slots. bias: (n, 7). rejections: number of consecutive rejected measurements of each
@@ -240,7 +241,14 @@ def start(
     covariance[np.ix_(RATES, RATES)] = rates.covariance
     covariance[_POSE_GRID] = measurement_noise(h, p) * scale
     q = so3.normalize(h.q_wxyz)
-    hypothesis = StateHypothesis(time_ns, h.position_m, rates.velocity_m_s, q, rates.omega_rad_s, covariance)
+    hypothesis = StateHypothesis(
+        time_ns=time_ns,
+        position_m=h.position_m,
+        velocity_m_s=rates.velocity_m_s,
+        q_wxyz=q,
+        omega_rad_s=rates.omega_rad_s,
+        covariance=covariance,
+    )
     if not p.has_bias:
         return hypothesis
     hypothesis = with_cameras(hypothesis, [m.chaser], p)

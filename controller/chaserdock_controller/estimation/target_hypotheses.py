@@ -8,12 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
+from msgspec import Struct
+from msgspec.structs import replace
 
 from .parameters import MekfParameters
 from .types import EstimatorEvent, PoseHypothesis, Shock, TargetState
@@ -22,8 +23,7 @@ POSE, RATES = np.array([0, 1, 2, 6, 7, 8]), np.array([3, 4, 5, 9, 10, 11])
 """Components of a body's error that belong to its pose and to its rates."""
 
 
-@dataclass(frozen=True, eq=False)
-class TargetHypothesis:
+class TargetHypothesis(Struct, frozen=True, eq=False, kw_only=True):
     """State of the target at ``time_ns``: position, velocity, attitude and rate, as in ``TargetState``.
 
     covariance: of the filter's complete error vector. log_likelihood: of all measurements since the start of the target.
@@ -35,14 +35,13 @@ class TargetHypothesis:
     q_wxyz: Array
     omega_rad_s: Array
     covariance: Array
-    log_likelihood: float = field(default=0.0, kw_only=True)
+    log_likelihood: float = 0.0
 
 
 HypothesisT = TypeVar("HypothesisT", bound=TargetHypothesis)
 
 
-@dataclass(frozen=True, eq=False)
-class HypothesisSet(Generic[HypothesisT]):
+class HypothesisSet(Struct, Generic[HypothesisT], frozen=True, eq=False):
     """State of a filter at ``time_ns``.
 
     hypotheses: the likeliest first; two while an ambiguous start (at ``ambiguous_since_ns``) is unresolved.

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, length
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import ArrayLike
 
@@ -31,7 +31,7 @@ class Cone:
         """Return the distance of ``offset_m`` (3,), TRF, from the cone's surface (from the apex plane beside it), positive inside."""
         offset = np.asarray(offset_m, dtype=float)
         along = float(offset @ self.axis)
-        aside = float(np.linalg.norm(offset - along * self.axis))
+        aside = length(offset - along * self.axis)
         return math.sin(self.half_angle_rad) * (along - self.apex_m) - math.cos(self.half_angle_rad) * aside
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, length
 from chaserdock_protocol.messages import Latch, OperatorCommand
 from chaserdock_protocol.scenario import FlightScenario
 from numpy.typing import ArrayLike
@@ -572,7 +572,7 @@ class PhaseMachine:
         if position is None or self._is_held(i):
             return None
         if dock is None:
-            near = float(np.linalg.norm(position)) < self._scenario.limits.min_distance_target_m
+            near = length(position) < self._scenario.limits.min_distance_target_m
             applies = near or self.chasers[i].phase in (Phase.APPROACH, Phase.DOCKED)
         else:
             applies = self.in_corridor(i)

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 from chaserdock_models import rotations
+from chaserdock_models.arrays import length
 from chaserdock_models.docking_geometry import view_of
 from chaserdock_models.rigid_body import BodyState
 from chaserdock_protocol.messages import CameraCalibration, CommandReply, Odometry, OperatorCommand
@@ -233,7 +234,7 @@ class GuidanceStage:
         """Advance a chaser's phase by its errors and its docking sensor; return its reference at the start of the tick."""
         target, odometry, now_s = estimation.target, estimation.own[i], observation.time_s
         pose = self.references.pose(i, target, now_s)
-        error_m = float(np.linalg.norm(pose[0] - odometry.position_m))
+        error_m = length(pose[0] - odometry.position_m)
         error_rad = float(rotations.angle_between(pose[1], odometry.q_wxyz))
         self.machine.set_position(i, centre_in_target(target, odometry))
         self.machine.update_tracking(i, now_s, error_m, error_rad)

@@ -10,7 +10,7 @@ feed-forward.
 from __future__ import annotations
 
 import math
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from chaserdock_models.arrays import Array
@@ -48,6 +48,12 @@ class Part(Struct, frozen=True, eq=False, dict=True):
         return end
 
 
+@lru_cache(maxsize=8)
+def _at_rest(count: int) -> Array:
+    """Return velocities or accelerations (count, 3) of zero. No caller changes them."""
+    return np.zeros((count, 3))
+
+
 class Move(Struct, frozen=True, eq=False, tag=True):
     """The sum of ``parts``, which all begin at ``start_s``."""
 
@@ -67,10 +73,13 @@ class Move(Struct, frozen=True, eq=False, tag=True):
     def at(self, times_s: ArrayLike) -> tuple[Array, Array, Array]:
         """Return positions, velocities and accelerations (K, 3) at times (K,); at rest before and after."""
         t = np.asarray(times_s, dtype=float) - self.start_s
-        position, velocity, acceleration = np.zeros((3, len(t), 3))
         earliest_s = float(t.min(initial=math.inf))
+        if all(earliest_s > part.duration_s for part in self.parts):  # a chaser that holds, most of the time
+            position = sum((part.rest(len(t)) for part in self.parts), start=np.zeros((len(t), 3)))
+            return position, _at_rest(len(t)), _at_rest(len(t))
+        position, velocity, acceleration = np.zeros((3, len(t), 3))
         for part in self.parts:
-            if earliest_s > part.duration_s:  # a chaser that holds, most of the time
+            if earliest_s > part.duration_s:
                 position += part.rest(len(t))
                 continue
             inside = ((t >= 0.0) & (t <= part.duration_s))[:, None]

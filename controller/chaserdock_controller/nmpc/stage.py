@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import cast
 
 import numpy as np
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, limited
 from chaserdock_models.shape_distance import box_table
 from chaserdock_protocol.plugins import PluginError
 from chaserdock_protocol.scenario import FlightScenario
@@ -164,7 +164,7 @@ class PlanningStage:
 
 def _bounded(disturbance: Array, limits: Array) -> Array:
     """Return a disturbance (6,) of which an actuator with these limits can always cancel the whole and keep half its range."""
-    return np.clip(disturbance, -_CANCELLED_SHARE * limits, _CANCELLED_SHARE * limits)
+    return limited(disturbance, _CANCELLED_SHARE * limits)
 
 
 def _without(plan: NmpcPlan, disturbances: list[Array]) -> NmpcPlan:

@@ -222,6 +222,7 @@ def _check_inertia(i: tuple[float, float, float]) -> None:
         raise ValueError(f"inertia_kg_m2 {i}: no principal moment may exceed the sum of the other two")
 
 
+@lru_cache(maxsize=64)
 def cuboid_inertia(mass_kg: float, size_m: tuple[float, float, float]) -> tuple[float, float, float]:
     """Return the principal moments (kg m^2) of a homogeneous cuboid."""
     x, y, z = (s * s for s in size_m)

@@ -271,7 +271,7 @@ class Node:
         self, topic: Topic, place: str | None, raw: RawSample, arrived_s: float = 0.0
     ) -> ReceivedMessage | None:
         try:
-            message: Any = self.decode(topic.kind, raw)
+            message: Any = self._connection.decode(topic.kind, raw)
             if place is not None and str(getattr(message, "chaser", place)) != place:
                 raise Rejected("chaser", f"message of chaser {message.chaser} on {raw.key}")
         except Rejected as refusal:

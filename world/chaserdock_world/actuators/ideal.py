@@ -13,7 +13,7 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 from chaserdock_models import rotations
-from chaserdock_models.arrays import Array
+from chaserdock_models.arrays import Array, limited
 from chaserdock_protocol.messages import ActuatorCommand
 from chaserdock_protocol.scenario.bodies import Body
 
@@ -95,7 +95,7 @@ class IdealActuators:
         self.late += effective_step < now_step
         # A restarted chaser counts ``seq`` from zero again; the order of arrival decides, and arrays are never compared.
         self._received += 1
-        wrench = np.clip(wrench, -limit, limit)
+        wrench = limited(wrench, limit)
         if self.errors is not None:
             wrench = _given(self.errors, wrench, effective_step)
             delayed = effective_step + round(self.errors.delay(effective_step) * self.physics_hz)

@@ -88,6 +88,7 @@ class OdometrySensor:
     def __init__(self, scenario: Scenario):
         seed, chasers = scenario.seed, range(len(scenario.chasers))
         self._seed, self._errors = seed, scenario.navigation.errors()
+        self._exact = self._errors.exact_odometry
         self._noise_factor = scenario.truth.sensors.noise_factor
         self._bias = [generator(seed, Stream.BIAS, i).standard_normal(9) for i in chasers]
         # In standard deviations: position (3), attitude (3).
@@ -117,7 +118,7 @@ class OdometrySensor:
     def measure(self, chaser: int, tick: int, state: BodyState) -> BodyState:
         """Return the measured ``state`` of a chaser; ``state`` itself if odometry is exact."""
         errors = self._errors
-        if errors.exact_odometry:
+        if self._exact:
             return state
         noise = generator(self._seed, Stream.NOISE, chaser, tick).standard_normal(12) * self._noise_factor
         white, (position_bias, attitude_bias, gyro_bias) = self._sigmas * noise, self._biases[chaser]

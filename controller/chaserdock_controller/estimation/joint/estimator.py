@@ -7,13 +7,15 @@ exposure, and the later ticks are processed again, so the state does not depend 
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, Sighting
+from msgspec.structs import replace
 from threadpoolctl import ThreadpoolController
 
 from chaserdock_controller.estimation.body_shape import SHAPE, BodyShape
@@ -87,8 +89,7 @@ class JointInputs:
     last_commands: Mapping[int, Array] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class JointFilterState(HypothesisSet[JointState]):
+class JointFilterState(HypothesisSet[JointState], frozen=True, eq=False):
     """State of the filter after the tick at ``time_ns``.
 
     collective: ticks in a row in which most cameras were rejected. overconfident, dropped: reported channels of odometry, by
@@ -135,7 +136,7 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
 
     def update(self, inputs: JointInputs) -> TargetState:
         """Process a tick and return the target's estimate at its time. Ticks must come in order."""
-        records, own = self._buffer.records, replace(inputs, sightings=())
+        records, own = self._buffer.records, dataclasses.replace(inputs, sightings=())
         records.append(JointTickRecord(time_ns=inputs.time_ns, parameters=self.target, inputs=own))
         first = len(records) - 1
         for sighting in sorted(inputs.sightings, key=lambda s: (s.sim_time_ns, s.chaser)):
@@ -192,7 +193,7 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
     def _with(self, target: MekfParameters) -> JointParameters:
         """Return the parameters with another model of the target."""
         p = self.parameters
-        return p if target is p.target else replace(p, target=target)
+        return p if target is p.target else dataclasses.replace(p, target=target)
 
     def _insert(self, sighting: Sighting) -> int:
         """Add a sighting to the record of its exposure; return the record's index, or that of the newest record."""

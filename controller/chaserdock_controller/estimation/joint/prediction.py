@@ -13,13 +13,13 @@ from __future__ import annotations
 import math
 from collections.abc import Set
 from ctypes import c_double
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_wrench
 from chaserdock_protocol.scenario.navigation import NavigationErrors
+from msgspec.structs import replace
 
 from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE
 from chaserdock_controller.estimation.motion_models import free_shape, process_noise, propagate_target

@@ -8,10 +8,9 @@ The error vector has 12 components for the target, then ``CHASER`` for each chas
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-
 import numpy as np
 from chaserdock_models.arrays import Array
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from chaserdock_controller.estimation.body_shape import RATIOS, SHAPE, BodyShape, shape_covariance, shape_of
@@ -45,8 +44,7 @@ CHANNELS = ("sighting", "position", "velocity", "attitude", "rate")
 """Measurements that are gated separately."""
 
 
-@dataclass(frozen=True, eq=False)
-class JointState(TargetHypothesis):
+class JointState(TargetHypothesis, frozen=True, eq=False, kw_only=True):
     """Estimate after the tick at ``time_ns``, of the target (meaningless until ``target_known``) and of N chasers.
 
     positions_m, velocities_m_s, attitudes_wxyz, omegas_rad_s: of the chasers, (N, 3) or (N, 4). extra (N, EXTRA): their

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from typing import NamedTuple
 
@@ -22,6 +22,7 @@ import numpy as np
 from chaserdock_models import scalar_rotations as so3
 from chaserdock_models.arrays import Array
 from chaserdock_protocol.messages import Odometry, PoseSolution, Sighting
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from chaserdock_controller.estimation.body_shape import SHAPE

@@ -50,8 +50,10 @@ class Part(Struct, frozen=True, eq=False, dict=True):
 
 @lru_cache(maxsize=8)
 def _at_rest(count: int) -> Array:
-    """Return velocities or accelerations (count, 3) of zero. No caller changes them."""
-    return np.zeros((count, 3))
+    """Return velocities or accelerations (count, 3) of zero, read-only."""
+    zero = np.zeros((count, 3))
+    zero.setflags(write=False)
+    return zero
 
 
 class Move(Struct, frozen=True, eq=False, tag=True):

@@ -44,17 +44,24 @@ def why_invalid(odometry: Odometry) -> str:
     length = math.hypot(*odometry.q_wxyz)
     if abs(length - 1.0) > _UNIT_WITHIN:
         return f"q_wxyz has length {length:.3g}, not 1"
-    return next(
-        (
-            f"{name} is not a covariance"
-            for name in COVARIANCES
-            if not _is_covariance(getattr(odometry, name))
-        ),
-        "",
+    o = odometry
+    return _why_no_covariances(
+        o.position_covariance_m2,
+        o.velocity_covariance_m2_s2,
+        o.attitude_covariance_rad2,
+        o.omega_covariance_rad2_s2,
     )
 
 
-@lru_cache(maxsize=64)  # sensors mostly state the same covariance in every message
+@lru_cache(maxsize=64)  # sensors mostly state the same covariances in every message
+def _why_no_covariances(*covariances: tuple[float, ...]) -> str:
+    """Return which of ``COVARIANCES`` is none, or an empty string."""
+    named = zip(COVARIANCES, covariances, strict=True)
+    return next(
+        (f"{name} is not a covariance" for name, elements in named if not _is_covariance(elements)), ""
+    )
+
+
 def _is_covariance(elements: tuple[float, ...]) -> bool:
     """Return whether elements (9,) are a symmetric positive semi-definite (3, 3) matrix, up to rounding."""
     matrix = np.array(elements).reshape(3, 3)

@@ -49,13 +49,13 @@ class LeaseHolder:
 
     def missing(self, tick: Tick) -> list[int]:
         """Return the chasers whose lease of a tick has neither arrived nor is lost."""
+        leases, lost, newest = self.leases, self._lost, (tick.tick, tick.revision)
         return [
-            i for i in tick.chasers if not self._has_stated(i, tick) and self._lost.get(i, -1) < tick.tick
+            i
+            for i in tick.chasers
+            if ((lease := leases.get(i)) is None or (lease.tick, lease.revision) < newest)
+            and lost.get(i, -1) < tick.tick
         ]
-
-    def _has_stated(self, chaser: int, tick: Tick) -> bool:
-        lease = self.leases.get(chaser)
-        return lease is not None and (lease.tick, lease.revision) >= (tick.tick, tick.revision)
 
     def _granted(self, name: str, tick: Tick) -> list[Lease]:
         """Return the leases of a tick that a controller holds."""

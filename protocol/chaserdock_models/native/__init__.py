@@ -31,7 +31,7 @@ class KernelLibrary:
 
     def __init__(self, file: str) -> None:
         self.path = Path(file).with_name(LIBRARY_NAME)
-        self._functions: dict[tuple[str, int], Any] = {}
+        self._functions: dict[str, Any] = {}
 
     @cached_property
     def library(self) -> ctypes.CDLL:
@@ -56,12 +56,12 @@ class KernelLibrary:
 
     def function(self, name: str, result: Any = None, at_level: int | None = None) -> Any:
         """Return kernel ``name`` for this processor, or its copy for ``at_level``; ``result`` is its ctypes type."""
-        level = self.level if at_level is None else at_level
-        kernel = self._functions.get((name, level))
+        kernel = self._functions.get(name) if at_level is None else None
         if kernel is None:
-            kernel = self.library[f"v{level}_{name}"]
+            kernel = self.library[f"v{self.level if at_level is None else at_level}_{name}"]
             kernel.restype = result  # before another thread can find it
-            self._functions[name, level] = kernel
+            if at_level is None:
+                self._functions[name] = kernel
         return kernel
 
 

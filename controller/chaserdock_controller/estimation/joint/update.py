@@ -288,7 +288,9 @@ def _update_chaser(
     z = measurement(chasers, i, odometry, solution, markers, mounting, p)
     channels = _channels(odometry is not None, solution is not None, p.gate_sighting, p.gate_odometry)
     gates = _gate(running, i, channels, running.values(z), p)
-    if any(not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES):
+    if not all(gates.fits.values()) and any(
+        not gates.fits.get(k, True) and running.rejections[i, k] for k in _RATES
+    ):
         gates = _follow_unexpected_motion(running, i, z, channels, gates, p)
     running.rejections[i], running.nis[i] = gates.rejections, gates.nis
     running.log_likelihood = gates.log_likelihood

@@ -86,8 +86,12 @@ _GAP_S = 1.1
 _HARMLESS = frozenset({"camera_off", "lying_sensor", "odometry_lie", "duplicate"})
 """Kinds of faults after which a chaser flies commands nevertheless."""
 _LIES = frozenset({"odometry_lie", "clock_jump", "corrupt"})
+_BESIDE_DAMAGE = frozenset({"corrupt", "flood", "duplicate"})
+"""Kinds of faults beside which the controller still receives sightings, damaged or not."""
 ACCURACY_M, SEEN_S = 0.01, 0.5
 """Largest error (m) of the target's position beside drift, while two honest chasers see it, or saw it so long (s) ago."""
+DAMAGED_SIGHTINGS = 100.0
+"""Number of damaged sightings of which the controller names at least one as invalid; about one in 14 decodes and is."""
 _THRUSTER_FLOOR_N_S, _THRUSTER_SHARE = 0.01, 0.15
 _PLAN_SHARE = 1e-3
 
@@ -141,6 +145,8 @@ class Invariants:
     _homing_m: dict[int, float] = field(default_factory=dict)
     _planned: dict[int, Plan] = field(default_factory=dict)
     _seen_s: dict[int, float] = field(default_factory=dict)
+    _damaged: float = 0.0
+    _sighted: dict[int, int] = field(default_factory=dict)
     _unexplained: dict[int, Array] = field(default_factory=dict)
     _given_N_s: dict[int, float] = field(default_factory=dict)
     _tumble_N_m_s: tuple[float, float] | None = None
@@ -504,6 +510,22 @@ class Invariants:
         name = f"chaser/{sighting.chaser}"
         if sighting.status == "seen" and name not in self._liars:
             self._seen_s[sighting.chaser] = self.time_s
+        commander = self._commanders.get(self._tick - 1)
+        if sighting.status == "seen" and sighting.tick > self._sighted.get(sighting.chaser, -1):
+            self._sighted[sighting.chaser] = sighting.tick
+            self._damaged += self._damaged_share(name) if commander == "controller" else 0.0
+
+    def _damaged_share(self, chaser: str) -> float:
+        """Return the share of a chaser's sightings that a fault damages now for the controller, and that it receives in time."""
+        active = [
+            f for f in self.scenario.fault if f.at_s <= self.time_s < f.at_s + (f.duration_s or math.inf)
+        ]
+        if self.scenario.simulation.partition or any(
+            _concerns(f, chaser) for f in active if f.kind not in _BESIDE_DAMAGE
+        ):
+            return 0.0
+        shares = (f.share or 1.0 for f in active if _damages_sightings(f) and f.peer in (None, chaser))
+        return max(shares, default=0.0)
 
     def _check_accuracy(self, estimate: TargetEstimate, truth: BodyTruth) -> None:
         """Check that one lying sensor does not mislead the estimate while two honest chasers see the target."""
@@ -646,6 +668,10 @@ class Invariants:
             self.violate("no crash", name, trace.strip().splitlines()[-1])
         for name in stalled:
             self.violate("liveness", name, "has not ended")
+        if self._damaged >= DAMAGED_SIGHTINGS and not any("invalid sighting" in r for r in self.reasons):
+            self.violate(
+                "damage is named", "controller", f"takes about {self._damaged:.0f} damaged sightings as valid"
+            )
         if self.end is None:
             self.violate("liveness", "world", "the mission has not ended")
             return
@@ -683,6 +709,11 @@ class Invariants:
 def _concerns(fault: Fault, name: str) -> bool:
     """Return whether a fault may keep commands from a chaser, or make it refuse them."""
     return fault.kind not in _HARMLESS and fault.process in (name, "world", "controller", "standby")
+
+
+def _damages_sightings(fault: Fault) -> bool:
+    """Return whether a fault damages sightings that the controller receives."""
+    return (fault.kind, fault.process, fault.topic) == ("corrupt", "controller", "sighting")
 
 
 def _relative_nees(estimate: RelativeEstimate, own: BodyTruth, target: BodyTruth) -> float:

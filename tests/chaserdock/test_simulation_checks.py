@@ -408,6 +408,34 @@ def test_a_lying_sensor_does_not_mislead_the_estimate_of_two_others(tmp_path: Pa
     assert [log.found for log in logs] == [["accurate estimate"], []]
 
 
+@pytest.mark.parametrize(
+    ("fault", "event", "found"),
+    [
+        ({}, "no reason", ["damage is named"]),
+        ({}, "chaser 2: invalid sighting, ignored: covariance is not symmetric", []),
+        ({"share": 0.3}, "no reason", []),
+        ({"peer": "chaser/1"}, "no reason", []),
+        ({"duration_s": 2.0}, "no reason", []),
+    ],
+)
+def test_a_controller_names_damaged_sightings(
+    fault: dict[str, Any], event: str, found: list[str], tmp_path: Path
+) -> None:
+    """Where it receives enough of them for one that is an invalid pose."""
+    damage = {"kind": "corrupt", "process": "controller", "topic": "sighting", "at_s": 1.0, "duration_s": 9.0}
+    log = Log(variant(tmp_path, fault=[{**damage, **fault}]))
+    for tick in range(60):
+        log.bodies(tick)
+        log.flies(0, tick)
+        for chaser in range(4):
+            sighting: Any = msgspec.structs.replace(BY_TYPE[Sighting], chaser=chaser, tick=tick)
+            for _ in range(2):  # a copy of a flood counts once
+                log.publish(topics.SIGHTING, sighting, chaser)
+    log.event(event, "", "controller")
+    ended(log).checks.check_end({}, ())
+    assert [name for name in log.found if name != "liveness"] == found
+
+
 def test_thrusters_give_what_the_chaser_expects() -> None:
     log = Log(load_scenario(ROOT / "scenarios" / "docking-contact.toml"))
     sample: Any = BY_TYPE[ThrusterReport]

@@ -29,4 +29,7 @@ class _State(ISeedSequence):
 def generator(words: Sequence[int]) -> np.random.Generator:
     """Return the generator that ``numpy.random.default_rng(words)`` returns for numbers that are not negative."""
     small = len(words) > 0 and max(words) < 2**32 and min(words) >= 0  # each is one word of the seed
-    return np.random.Generator(np.random.PCG64(_State(words) if small else np.random.SeedSequence(words)))
+    seed: Any = (
+        _State(words) if small else np.random.SeedSequence(words)
+    )  # NumPy's stubs know no other ISeedSequence
+    return np.random.Generator(np.random.PCG64(seed))

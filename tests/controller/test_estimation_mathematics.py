@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation import CameraPose, MekfParameters, PoseHypothesis, to_world
@@ -117,7 +118,14 @@ def test_process_noise_composes_and_is_positive() -> None:
 
 def _branch(bias: np.ndarray, covariance: np.ndarray) -> StateHypothesis:
     return StateHypothesis(
-        0, np.array([1.0, 2.0, 3.0]), V, Q0, W, covariance, cameras=(7,), bias=bias.reshape(1, 7)
+        time_ns=0,
+        position_m=np.array([1.0, 2.0, 3.0]),
+        velocity_m_s=V,
+        q_wxyz=Q0,
+        omega_rad_s=W,
+        covariance=covariance,
+        cameras=(7,),
+        bias=bias.reshape(1, 7),
     )
 
 
@@ -135,7 +143,7 @@ def test_measurement_jacobian_by_differences() -> None:
     h = 1e-6
 
     def residual(d: np.ndarray) -> np.ndarray:
-        moved = replace(
+        moved = msgspec.structs.replace(
             branch,
             position_m=branch.position_m + d[:3],
             q_wxyz=rot.multiply(Q0, rot.exp(d[6:9])),

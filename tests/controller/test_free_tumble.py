@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint.prediction import predict_target
@@ -60,7 +61,7 @@ def test_a_change_of_the_body_restarts_its_shape() -> None:
     """A prediction beyond a latch uses the new body, with the uncertainty that is stated of it."""
     flight = flight_scenario(scenario_of([4.0, -3.0, 5.0]))
     p = estimator_of(flight).parameters  # type: ignore[union-attr]
-    state = replace(
+    state = msgspec.structs.replace(
         start_shape(empty_state(0, 2), p.target), target_known=True, omega_rad_s=np.radians([4.0, -3.0, 5.0])
     )
     assert with_body(state, p.target) is state

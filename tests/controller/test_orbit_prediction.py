@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation.joint import JointEstimator
@@ -38,7 +37,7 @@ def mission(*, in_orbit: bool = True) -> FlightScenario:
 def state_at(row: Array) -> JointState:
     position, velocity, q, omega = row[None, :3], row[None, 3:6], row[None, 6:10], row[None, 10:]
     known = np.ones(1, dtype=bool)
-    return replace(
+    return msgspec.structs.replace(
         empty_state(0, 1), positions_m=position, velocities_m_s=velocity, attitudes_wxyz=q, omegas_rad_s=omega,
         alive=known,
     )  # fmt: skip

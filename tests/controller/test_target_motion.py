@@ -3,8 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
+import msgspec
 import numpy as np
 import pytest
 from chaserdock_controller.estimation import motion_models as motion
@@ -49,7 +48,14 @@ def parameters(body: TargetBody) -> MekfParameters:
 
 
 def branch(s: BodyState) -> StateHypothesis:
-    return StateHypothesis(0, s.position_m, s.velocity_m_s, s.q_wxyz, s.omega_rad_s, np.eye(12) * 1e-6)
+    return StateHypothesis(
+        time_ns=0,
+        position_m=s.position_m,
+        velocity_m_s=s.velocity_m_s,
+        q_wxyz=s.q_wxyz,
+        omega_rad_s=s.omega_rad_s,
+        covariance=np.eye(12) * 1e-6,
+    )
 
 
 def test_a_captured_target_moves_as_predicted(captured: Physics) -> None:
@@ -116,7 +122,7 @@ def test_the_transition_about_another_centre_is_the_derivative() -> None:
 
     def moved(d: np.ndarray) -> StateHypothesis:
         return predict(
-            replace(
+            msgspec.structs.replace(
                 start,
                 position_m=start.position_m + d[:3],
                 velocity_m_s=start.velocity_m_s + d[3:6],

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NumPy's random generators of many short sequences, without the time of its seeding (55 of 57 us)."""
+"""NumPy's random generators of many short sequences, with a seeding in a quarter of NumPy's time (5 of 20 us)."""
 
 from __future__ import annotations
 

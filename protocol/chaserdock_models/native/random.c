@@ -1,5 +1,5 @@
 /* SPDX-License-Identifier: Apache-2.0 */
-/* State of a random generator from the words of its seed: the bits of NumPy's SeedSequence, in a hundredth of its time. */
+/* State of a random generator from the words of its seed: the bits of NumPy's SeedSequence. */
 #include "base.h"
 
 #define POOL 4

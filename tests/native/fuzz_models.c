@@ -82,21 +82,8 @@ static void unit_rows(void) {
     if (any_nan(q, 4 * n)) CHECK(!valid);
 }
 
-/* A longer seed than the pool of the hash; any word counts. */
-static void seed_state(void) {
-    const int64_t n = whole(0, 9);
-    int64_t *words = block((size_t)n * 8);
-    for (int64_t i = 0; i < n; i++) words[i] = (int64_t)(uint32_t)random_bits();
-    uint64_t *state = block(32), *other = block(32);
-    NAME(seed_state)(n, words, state);
-    if (n == 0) return;
-    words[whole(0, n - 1)] ^= 1;
-    NAME(seed_state)(n, words, other);
-    CHECK(memcmp(state, other, 32) != 0);
-}
-
 static const Target TARGETS[] = {{"free_rotation", free_rotation}, {"coast_room", coast_room}, {"coast_closest", coast_closest},
                                  {"rigid_step", rigid_step},
                                  {"multiply_rows", multiply_rows}, {"rotate_rows", rotate_rows},
-                                 {"cross_rows", cross_rows}, {"unit_rows", unit_rows}, {"seed_state", seed_state}};
+                                 {"cross_rows", cross_rows}, {"unit_rows", unit_rows}};
 FUZZ_MAIN(TARGETS)

@@ -16,10 +16,10 @@ from chaserdock_protocol.scenario.rendezvous import Arrival, ConeLimit, SpeedLim
 
 from .flight import RecordedFlight
 
-Result = dict[str, float | None]
+RendezvousResult = dict[str, float | None]
 
 
-def rendezvous_of(flight: RecordedFlight, chaser: int) -> Result | None:
+def rendezvous_of(flight: RecordedFlight, chaser: int) -> RendezvousResult | None:
     """Return what a chaser's flight has to do with the criteria, as plain values for JSON; None without any of them.
 
     ``speed_margin_m_s``: least distance from the speed limit; ``cone_angle_rad``: largest angle from the cone's axis; ``arrived_s``,
@@ -27,7 +27,10 @@ def rendezvous_of(flight: RecordedFlight, chaser: int) -> Result | None:
     of a cube about the target with the chaser's centre on its surface. None where a flight has no such part.
     """
     success = flight.scenario.success
-    if all(c is None for c in (success.speed_limit, success.approach_cone, success.arrival, success.abort_clear_m)):
+    if all(
+        c is None
+        for c in (success.speed_limit, success.approach_cone, success.arrival, success.abort_clear_m)
+    ):
         return None
     own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
     n = min(len(own.time_s), len(target.time_s))
@@ -70,7 +73,7 @@ def _largest_angle(cone: ConeLimit | None, offset: Array) -> float | None:
     return float(np.arctan2(across, along).max()) if inside.any() else None
 
 
-def _arrival(arrival: Arrival | None, time_s: Array, offset: Array, speed: Array) -> Result:
+def _arrival(arrival: Arrival | None, time_s: Array, offset: Array, speed: Array) -> RendezvousResult:
     if arrival is None:
         return {"arrived_s": None, "arrived_speed_m_s": None}
     near = np.linalg.norm(offset, axis=1) <= arrival.distance_m
@@ -88,7 +91,7 @@ def rendezvous_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
             yield from _failures(int(i), found, s)
 
 
-def _failures(i: int, found: Result, s: Scenario) -> Iterator[str]:
+def _failures(i: int, found: RendezvousResult, s: Scenario) -> Iterator[str]:
     success = s.success
     margin, angle, clear = found["speed_margin_m_s"], found["cone_angle_rad"], found["abort_clear_m"]
     if success.speed_limit is not None and margin is not None and margin < 0.0:
@@ -115,12 +118,11 @@ def _arrival_failures(i: int, arrived_s: float | None, s: Scenario) -> Iterator[
     if arrived_s is None:
         yield f"chaser {i} did not come within {arrival.distance_m:g} m of the target{allowed}"
     elif arrival.within_s is not None and arrived_s > arrival.within_s:
-        yield (
-            f"chaser {i} came within {arrival.distance_m:g} m of the target at {arrived_s:.1f} s, at most {arrival.within_s:g} s allowed"
-        )
+        near = f"chaser {i} came within {arrival.distance_m:g} m of the target"
+        yield f"{near} at {arrived_s:.1f} s, at most {arrival.within_s:g} s allowed"
 
 
-def rendezvous_text(found: Result) -> str:
+def rendezvous_text(found: RendezvousResult) -> str:
     """Describe the figures as part of a line."""
     parts = [
         ("least margin to the speed limit {:.3f} m/s", found["speed_margin_m_s"]),

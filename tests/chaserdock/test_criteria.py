@@ -177,7 +177,9 @@ def test_rest_without_truth_or_criterion_is_not_judged() -> None:
 AFRL, ARCH = (PATH.parent / f"{name}.toml" for name in ("afrl-docking", "arch-comp-rendezvous"))
 
 
-def approach_flight(s: Scenario, offsets_m: np.ndarray, speeds_m_s: np.ndarray, abort_s: float | None = None) -> Any:
+def approach_flight(
+    s: Scenario, offsets_m: np.ndarray, speeds_m_s: np.ndarray, abort_s: float | None = None
+) -> Any:
     """Return a stub of a recorded flight with one row per second: chaser 0 at offsets (K, 3), TRF of a target that is turned by 90
     degrees about +z, at speeds (K,) relative to it."""
     n = len(offsets_m)
@@ -197,6 +199,12 @@ def approach_flight(s: Scenario, offsets_m: np.ndarray, speeds_m_s: np.ndarray, 
         truth={"target": target, "chaser/0": own},
         references={0: SimpleNamespace(phases=phases)},
     )
+
+
+def with_arrival(s: Scenario, **changes: float) -> Scenario:
+    assert s.success.arrival is not None
+    arrival = s.success.arrival.model_copy(update=changes)
+    return s.model_copy(update={"success": s.success.model_copy(update={"arrival": arrival})})
 
 
 def judged(stub: Any) -> list[str]:
@@ -226,18 +234,14 @@ def test_speed_limit_of_afrl_holds_at_every_distance() -> None:
 def test_a_deputy_of_afrl_must_come_within_half_a_metre_slowly() -> None:
     s, text = load_scenario(AFRL), "chaser 0 did not come within 0.5 m of the target at 0.2 m/s or less"
     assert judged(approach_flight(s, inwards(np.linspace(100.0, 0.51, 50)), np.full(50, 0.1))) == [text]
-    slow = s.model_copy(
-        update={"success": s.success.model_copy(update={"arrival": s.success.arrival.model_copy(update={"speed_m_s": 0.05})})}
-    )  # fmt: skip
+    slow = with_arrival(s, speed_m_s=0.05)
     assert judged(approach_flight(slow, inwards(np.linspace(100.0, 0.49, 50)), np.full(50, 0.1))) == [
         "chaser 0 did not come within 0.5 m of the target at 0.05 m/s or less"
     ]
     found = rendezvous_of(approach_flight(s, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1)), 0)
     assert found is not None
     assert (found["arrived_s"], found["arrived_speed_m_s"]) == (99.0, pytest.approx(0.1))
-    early = s.model_copy(
-        update={"success": s.success.model_copy(update={"arrival": s.success.arrival.model_copy(update={"within_s": 98.0})})}
-    )  # fmt: skip
+    early = with_arrival(s, within_s=98.0)
     assert judged(approach_flight(early, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1))) == [
         "chaser 0 came within 0.5 m of the target at 99.0 s, at most 98 s allowed"
     ]
@@ -268,7 +272,9 @@ def test_an_abort_must_stay_clear_of_the_box() -> None:
     flown = np.zeros(401)
     near = np.vstack([inwards(distance), inside])
     (failure,) = judged(approach_flight(s, near, flown, abort_s=400.0))
-    assert failure.startswith("chaser 0 came within a cube of half edge 0.19 m about the target after its abort")
+    assert failure.startswith(
+        "chaser 0 came within a cube of half edge 0.19 m about the target after its abort"
+    )
     assert judged(approach_flight(s, np.vstack([inwards(distance), passing]), flown, abort_s=400.0)) == []
     early = np.vstack([inwards(distance), [[-0.1, 0.0, 0.0]], [[-3.0, 0.0, 0.0]]])
     assert judged(approach_flight(s, early, np.zeros(402), abort_s=401.0)) == []

@@ -87,7 +87,12 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
     if not solutions and image.ranging is not None:
         rejected = tuple(int(i) for i in seen.rejected_ids)
         return Sighting(
-            **header, status="seen", solutions=(image.ranging,), marker_ids=(), corners_px=(), rejected_ids=rejected
+            **header,
+            status="seen",
+            solutions=(image.ranging,),
+            marker_ids=(),
+            corners_px=(),
+            rejected_ids=rejected,
         )
     return Sighting(
         **header,

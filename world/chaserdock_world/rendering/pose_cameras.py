@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras that see the pose of the target instead of a picture, for the perception ``statistical``, and the range sensor beside cameras
-that render."""
+"""Cameras that see the pose of the target instead of a picture, for the perception ``statistical``; the range sensor of others."""
 
 from __future__ import annotations
 

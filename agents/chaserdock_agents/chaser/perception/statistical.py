@@ -85,7 +85,9 @@ class StatisticalPerception:
 
     def _by_range(self, position: Array, q: Array, white: Array) -> PerceptionResult | None:
         """Return the pose from bearing, range and the attitude that the target sends; None out of the image or of reach."""
-        found = None if self._ranging is None else ranged_pose(self._ranging, self._camera, position, q, white)
+        found = (
+            None if self._ranging is None else ranged_pose(self._ranging, self._camera, position, q, white)
+        )
         if found is None:
             return None
         pose = TargetPose(found.position_m, found.q_wxyz, found.covariance, found.bearing_px)

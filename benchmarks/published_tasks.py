@@ -2,16 +2,27 @@
 """Published rendezvous and docking tasks by their own criteria: ``python benchmarks/published_tasks.py [--quick] [--only PART]``.
 
 ``afrl``: three deputies dock from 100 to 150 m under the speed limit, 1,000 episodes. ``arch``: the spacecraft rendezvous of
-ARCH-COMP, 10^5 samples of its initial set without an abort (SRNA01) and with one at a random time within 240 minutes (SRA08).
+ARCH-COMP, 10^5 samples of its initial set without an abort (SRNA01) and with one at a random time within 240 minutes (SRA08). Both by
+laws of their own. ``afrl-scenario``, ``arch-scenario``: the shipped scenarios, flown as ``chaserdock simulate`` does, whole, with
+random starts (``--first``, ``--flights``), and judged by their own criteria.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
 from common import Figures, make_parser, run_parts
 
-from chaserdock.evaluation.published_tasks import AfrlOutcome, ArchOutcome, afrl_docking, arch_comp
+from chaserdock.evaluation.published_tasks import (
+    AfrlOutcome,
+    ArchOutcome,
+    afrl_docking,
+    afrl_starts,
+    arch_comp,
+    arch_start,
+    fly_scenario,
+)
 
 
 def afrl(options: argparse.Namespace) -> Figures:
@@ -44,9 +55,43 @@ def arch(options: argparse.Namespace) -> Figures:
     return figures
 
 
+def scenario(name: str, draw: Callable[[int], tuple[str, ...]], options: argparse.Namespace) -> Figures:
+    """Fly a shipped scenario with the starts of each seed; return how many flights meet all criteria, and the least margins."""
+    flights = range(options.first, options.first + (1 if options.quick else options.flights))
+    passed, least = 0, {"speed_margin_m_s": 1e9, "abort_clear_m": 1e9}
+    latest_s, cone_rad, apart_m = 0.0, 0.0, 1e9
+    for seed in flights:
+        found = fly_scenario(name, draw(seed))
+        passed += found["success"]
+        apart_m = min(apart_m, found["min_distance_chasers_m"] or 1e9)
+        for i, chaser in found["chasers"].items():
+            figures = chaser["rendezvous"]
+            least = {k: min(v, v if figures[k] is None else figures[k]) for k, v in least.items()}
+            latest_s, cone_rad = (
+                max(a, figures[k] or 0.0) for a, k in ((latest_s, "arrived_s"), (cone_rad, "cone_angle_rad"))
+            )
+            print(f"    seed {seed}, chaser {i}: {figures}", flush=True)
+        for failure in found["failures"]:
+            print(f"    seed {seed}: not met: {failure}", flush=True)
+    figures = {"flights": len(flights), "passed": passed, **least}
+    figures |= {"latest_arrival_s": latest_s, "cone_angle_rad": cone_rad, "chasers_apart_m": apart_m}
+    return {
+        f"{name}_{key}": value for key, value in figures.items() if value not in (0.0, 1e9) or key == "passed"
+    }
+
+
 def main() -> None:
-    options = make_parser(__doc__, ("afrl", "arch")).parse_args()
-    run_parts(options, {"afrl": lambda: afrl(options), "arch": lambda: arch(options)})
+    parser = make_parser(__doc__, ("afrl", "arch", "afrl-scenario", "arch-scenario"))
+    parser.add_argument("--first", type=int, default=0, help="first seed of the scenarios")
+    parser.add_argument("--flights", type=int, default=5, help="flights of each scenario")
+    options = parser.parse_args()
+    parts = {
+        "afrl": lambda: afrl(options),
+        "arch": lambda: arch(options),
+        "afrl-scenario": lambda: scenario("afrl-docking", afrl_starts, options),
+        "arch-scenario": lambda: scenario("arch-comp-rendezvous", arch_start, options),
+    }
+    run_parts(options, parts)
 
 
 if __name__ == "__main__":

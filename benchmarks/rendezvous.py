@@ -16,14 +16,15 @@ import time
 from common import Figures, make_parser, print_figures, write_json
 
 from chaserdock.evaluation.in_process import InProcessMission, TickRecord
-from chaserdock.evaluation.perception import ImagesAndRanging, RenderedImages
+from chaserdock.evaluation.perception import RenderedImages
 from chaserdock.evaluation.rendezvous import last_leg, leg, rendezvous
 from chaserdock.evaluation.transfers import load_shipped
 
 
 def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
     """Fly one scenario with one seed; return its figures."""
-    scenario = load_shipped(name, f"seed={seed}", *options.set)
+    markers = ('perception.name="default"',) if options.markers else ()
+    scenario = load_shipped(name, f"seed={seed}", *markers, *options.set)
     if options.leg is not None:
         scenario = leg(scenario, options.leg)
     elif options.quick or options.images:
@@ -37,8 +38,7 @@ def fly(name: str, seed: int, options: argparse.Namespace) -> Figures:
             print(f"    {at_s:.1f} s {level}: {text}", flush=True)
         shown[0] = len(flight.events)
 
-    perception = ImagesAndRanging(scenario) if options.markers else RenderedImages(scenario)
-    out = rendezvous(scenario, perception, report)
+    out = rendezvous(scenario, RenderedImages(scenario), report)
     begin = f"{name}_{seed}_"
     figures = {
         f"{begin}verified": float(out.verified_s is not None),

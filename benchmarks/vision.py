@@ -4,8 +4,10 @@
 
 Parts: ``rendering`` (time and corner errors of the renderers), ``speed`` (image to pose), ``reach`` (share of detected
 views by distance), ``near`` (the body fills the image), ``metre`` (a lit and a shadowed face at 1 m), ``accuracy`` (random
-views of both targets with all effects at default strength, by the default perception and by the paper's). Gross error:
-more than 10 degrees or 10 cm (for an ambiguous view: of the solution nearer to the truth).
+views of both targets with all effects at default strength, by the default perception and by the paper's), ``far`` (the
+servicer at 5 to 7.5 m: views without a pose, errors, and NEES over the stated covariance; ``--strip PX``: fit borders that
+end at neighbours beside a part of a side as strips below this width, 1.5 by default). Gross error: more than 10 degrees or
+10 cm (for an ambiguous view: of the solution nearer to the truth).
 """
 
 from __future__ import annotations
@@ -17,18 +19,25 @@ from typing import Any
 
 import cv2
 import numpy as np
-from chaserdock_agents.chaser.perception import Method, Perception, PerceptionResult
+from chaserdock_agents.chaser.perception import Method, Perception, PerceptionResult, make_perception
+from chaserdock_agents.chaser.perception.corners import SETTINGS
+from chaserdock_agents.chaser.sighting import decode_image
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
+from chaserdock_models.rigid_body import BodyState
 from chaserdock_models.targets import face_rotation, target_model
 from chaserdock_protocol.scenario.camera import Effects
 from chaserdock_world.rendering.background import Light
+from chaserdock_world.rendering.cameras import Cameras
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.rasterizer import Renderer
 from chaserdock_world.rendering.tinyrenderer import TinyRenderer
 from common import Figures, make_parser, percentiles, run_parts
 from numpy.typing import NDArray
+
+from chaserdock.analysis.pose_errors import normalized_square, pose_error
+from chaserdock.evaluation.transfers import load_shipped
 
 CAMERA_POSITION, CAMERA_ATTITUDE = np.zeros(3), rotations.IDENTITY  # IRF = WRF
 HFOV = np.deg2rad(60.0)
@@ -280,6 +289,39 @@ def rendering(count: int) -> Figures:
     return out
 
 
+def far(count: int) -> Figures:
+    """Return figures of views of the servicer, in whose images its markers are hardly large enough; of two solutions the nearer."""
+    scenario = load_shipped("docking-contact", 'navigation.grade="exact"')
+    cameras, perception, camera = Cameras(scenario), make_perception(scenario), scenario.camera_model()
+    zero, out = np.zeros(3), {}
+    for metres in (5.0, 6.0, 6.5, 7.0, 7.5):
+        rng, found = np.random.default_rng([24, int(10 * metres)]), []
+        for k in range(count):
+            q, turn = rotations.exp(rng.normal(0.0, 0.15, 3)), rotations.exp(rng.normal(0.0, 0.01, 3))
+            own = np.array([-metres, *rng.normal(0.0, 0.05 * metres, 2)])
+            states = {"target": BodyState(zero, zero, q, zero), "chaser/0": BodyState(own, zero, turn, zero)}
+            seen = perception.estimate(decode_image(cameras.image(0, k, k, 0, states)))
+            eye, attitude = camera.irf_pose_in_world(own, turn)
+            true_m = rotations.rotate_inverse(attitude, -eye)
+            true_q = rotations.multiply(rotations.conjugate(attitude), q)
+            errors = [
+                (pose_error(true_m, true_q, s.position_irf_m, s.q_irf_trf_wxyz), s.covariance)
+                for s in seen.solutions
+            ]
+            if errors:
+                found.append(min(errors, key=lambda e: float(np.linalg.norm(e[0][3:]))))
+        e = np.array([error for error, _ in found])
+        squares = normalized_square(e, np.array([covariance for _, covariance in found]))
+        at = f"far_{metres:g}m_"
+        out |= {
+            f"{at}without_a_pose": count - len(found),
+            f"{at}nees_mean": float(squares.mean()),
+            f"{at}depth_rms_m": float(np.sqrt(np.mean(e[:, 2] ** 2))),
+            f"{at}angle_rms_deg": float(np.degrees(np.sqrt(np.mean(np.sum(e[:, 3:] ** 2, axis=1))))),
+        }
+    return out
+
+
 def main() -> None:
     counts = {
         "rendering": (rendering, 200, 20),
@@ -288,8 +330,13 @@ def main() -> None:
         "near": (near_views, 600, 60),
         "metre": (at_one_metre, 1000, 100),
         "accuracy": (accuracy, 10_000, 150),
+        "far": (far, 80, 8),
     }
-    options = make_parser(__doc__, counts).parse_args()
+    parser = make_parser(__doc__, counts)
+    parser.add_argument("--strip", type=float, metavar="PX", help="of far: width in pixels")
+    options = parser.parse_args()
+    if options.strip is not None:
+        SETTINGS.partial_px = options.strip
     cv2.setNumThreads(1)
     run_parts(
         options,

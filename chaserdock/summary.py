@@ -55,6 +55,18 @@ class PassiveSafetySummary(Struct, frozen=True, kw_only=True):
     safe_share: float
 
 
+class RendezvousFigures(Struct, frozen=True, kw_only=True):
+    """What the criteria of a published task judge: least margin to the speed limit, largest angle from the cone's axis, arrival, and
+    the first abort with the least half edge of a cube about the target that the chaser touched since. None: no such part."""
+
+    speed_margin_m_s: float | None
+    cone_angle_rad: float | None
+    arrived_s: float | None
+    arrived_speed_m_s: float | None
+    abort_s: float | None
+    abort_clear_m: float | None
+
+
 class PoseEstimateErrors(Struct, frozen=True, kw_only=True):
     """Errors of an estimated pose after the settling time, and the mean NEES (6 expected); None without an estimate there."""
 
@@ -81,6 +93,7 @@ class ChaserSummary(Struct, frozen=True, kw_only=True, omit_defaults=True):
     relative_estimate: PoseEstimateErrors | None = None
     capture: Capture | None = None
     passive_safety: PassiveSafetySummary | None = None
+    rendezvous: RendezvousFigures | None = None
 
 
 class TargetEstimateErrors(PoseEstimateErrors, frozen=True, kw_only=True):

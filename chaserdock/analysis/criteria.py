@@ -202,7 +202,7 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
 
     A scenario that is shortened by an override can end before the part of the flight that a criterion is about: before
     ``settling_s`` (tracking and estimation errors), or before the time line commands the approach or the ``goto`` of a
-    chaser (``docked``, ``latched``, ``reached``) or the first ``detumble``. Such criteria are neither met nor violated.
+    chaser (``docked``, ``latched``, ``reached``, ``arrival``) or the first ``detumble``. Such criteria are neither met nor violated.
     """
     success, changes, skipped = scenario.success, {}, []
     end_s = min(scenario.steady_until_s or scenario.duration_s, scenario.duration_s)
@@ -229,6 +229,14 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
                 f"its {command} is at {first_s:g} s"
                 for i, first_s in late.items()
             ]
+    if late := _late_arrivals(scenario):
+        assert success.arrival is not None
+        left = tuple(i for i in success.arrival.chasers if i not in late)
+        changes["arrival"] = success.arrival.model_copy(update={"chasers": left}) if left else None
+        skipped += [
+            f"success.arrival, chaser {i}: the flight ends at {scenario.duration_s:g} s, its goto is at {first_s:g} s"
+            for i, first_s in late.items()
+        ]
     first_s = min((e.at_s for e in scenario.timeline if e.command == "detumble"), default=None)
     if success.detumbled is not None and first_s is not None and first_s >= scenario.duration_s:
         changes["detumbled"] = None
@@ -236,6 +244,13 @@ def judged_criteria(scenario: Scenario) -> tuple[Scenario, list[str]]:
             f"success.detumbled: the flight ends at {scenario.duration_s:g} s, detumble is at {first_s:g} s"
         )
     return scenario.model_copy(update={"success": success.model_copy(update=changes)}), skipped
+
+
+def _late_arrivals(scenario: Scenario) -> dict[int, float]:
+    """Return the chasers of ``success.arrival`` whose first ``goto`` is not before the end, with its time (s)."""
+    arrival = scenario.success.arrival
+    first = {i: _first_command_s(scenario, "goto", i) for i in (arrival.chasers if arrival else ())}
+    return {i: at_s for i, at_s in first.items() if at_s is not None and at_s >= scenario.duration_s}
 
 
 def _first_command_s(scenario: Scenario, command: str, chaser: int) -> float | None:

@@ -177,6 +177,7 @@ def _chasers(flight: RecordedFlight, result: dict[str, Any]) -> str:
         + '<p class="faint">Errors relative to the reference pose on the true target. '
         + f"Steady state: {s.settling_s:g} s to {until:g} s.</p>"
         + _captures(result)
+        + _rendezvous(result)
     )
 
 
@@ -221,6 +222,26 @@ def _captures(result: dict[str, Any]) -> str:
         '<p class="faint">Offset, misalignment and speeds at the touch that closed the latch. Verified: the latch held in the '
         "pull test.</p>"
     )
+
+
+def _rendezvous(result: dict[str, Any]) -> str:
+    """Return a table of what the criteria of a published task judge."""
+    rows = [
+        (
+            f"chaser {i}",
+            _quantity(k["speed_margin_m_s"], "mm/s", 1e3),
+            _quantity(k["cone_angle_rad"], "°", math.degrees(1.0)),
+            _quantity(k["arrived_s"], "s", digits=5),
+            _quantity(k["arrived_speed_m_s"], "mm/s", 1e3),
+            _quantity(k["abort_s"], "s", digits=5),
+            _quantity(k["abort_clear_m"], "m"),
+        )
+        for i, c in result["chasers"].items()
+        if (k := c.get("rendezvous")) is not None
+    ]
+    head = ("", "least margin to the speed limit", "largest angle from the cone's axis", "arrived at", "speed on arrival",
+            "aborted at", "clear of the target since")  # fmt: skip
+    return f"<h2>Rendezvous</h2>{table(head, rows)}" if rows else ""
 
 
 def _numbers(flight: RecordedFlight, result: dict[str, Any]) -> str:

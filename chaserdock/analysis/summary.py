@@ -34,6 +34,7 @@ from .criteria import (
 )
 from .flight import RecordedFlight, SafetyHistory, Track, load_flight
 from .pose_errors import normalized_square, pose_error, relative_pose
+from .rendezvous import rendezvous_failures, rendezvous_of, rendezvous_text
 
 _POSE_ERRORS = ("position_m", "orientation_rad", "nees")
 _BLOCK = 1 << 14  # rows processed at a time
@@ -245,6 +246,8 @@ def summary_of(flight: RecordedFlight) -> dict[str, Any]:
             chasers[str(i)]["relative_estimate"] = relative
         if (capture := capture_of(flight, i)) is not None:
             chasers[str(i)]["capture"] = capture
+        if (found := rendezvous_of(flight, i)) is not None:
+            chasers[str(i)]["rendezvous"] = found
         if i in flight.safety:
             chasers[str(i)]["passive_safety"] = _passive_safety(flight.safety[i])
     between = [
@@ -351,6 +354,7 @@ def failures_of(result: dict[str, Any], s: Scenario) -> list[str]:
     out += capture_failures(result, s)
     out += overloads(result, s)
     out += rest_failures(result, s)
+    out += rendezvous_failures(result, s)
     return out + list(_estimate_failures(result, s))
 
 
@@ -414,6 +418,8 @@ def text_of(result: dict[str, Any]) -> str:
             )
         if "capture" in c:
             line += capture_text(c["capture"])
+        if "rendezvous" in c:
+            line += rendezvous_text(c["rendezvous"])
         lines.append(line)
     estimate = result["target_estimate"]
     if estimate["position_rms_m"] is not None:

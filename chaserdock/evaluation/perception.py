@@ -44,23 +44,6 @@ class RenderedImages:
         return self._last[chaser]
 
 
-class ImagesAndRanging:
-    """Markers in rendered images, with perception ``default``, and `[ranging]` where none is seen, as a target with a range sensor and
-    a data link gives both."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        perception = scenario.perception.model_copy(update={"name": "default"})
-        pictured = scenario.model_copy(update={"perception": perception, "ranging": None})
-        self._images, self._ranging = RenderedImages(pictured), RenderedImages(scenario)
-
-    def __call__(self, chaser: int, tick: int, time_ns: int, states: States) -> Sighting:
-        seen = self._images(chaser, tick, time_ns, states)
-        if seen.solutions:
-            return seen
-        ranged = self._ranging(chaser, tick, time_ns, states)
-        return seen if ranged.marker_ids else ranged
-
-
 def measurement_model(
     scenario: Scenario,
     seed: int,

@@ -7,17 +7,29 @@ category of affine dynamics since ARCH-COMP18. Its controller is part of the ben
 AFRL: the docking task of the packages safe-autonomy-sims and K. Dunlap et al., Run Time Assured Reinforcement Learning for Safe
 Satellite Docking, Journal of Aerospace Information Systems 20(1), 2023, with three deputies. It is flown here by the guidance law in
 ``afrl_force``, which is ours.
+
+``afrl_starts`` and ``arch_start`` draw the starts of the shipped scenarios of both tasks, which the flight software flies.
 """
 
 from __future__ import annotations
 
 import math
+import tempfile
+from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from chaserdock_models.arrays import Array
 from chaserdock_models.relative_motion import cw_matrix, cw_transition
+from chaserdock_protocol.shipped_scenarios import shipped_scenario
 from numpy.typing import NDArray
+
+from chaserdock.analysis.summary import summarize
+from chaserdock.simulation.mission import simulate
+
+from .transfers import load_shipped
 
 # -- ARCH-COMP: metres and minutes, in the orbit's plane ---------------------------------------------------------
 
@@ -249,3 +261,64 @@ def afrl_docking(episodes: int, seed: int) -> AfrlOutcome:
         last_s,
         float(spent.mean() / AFRL_DEPUTIES),
     )
+
+
+# -- The scenarios ------------------------------------------------------------------------------------------------
+
+_APART_DEG = 60.0
+"""Least angle between the directions from which deputies start, as they dock where they come from; the task states none."""
+_HOLD_M = 2.5
+"""Distance of the hold point before the docking."""
+_ARCH_HOLD_M = 116.0
+"""Distance within which the hold point before the attempt is."""
+
+
+def _directions(rng: np.random.Generator) -> Array:
+    """Return random unit vectors (3, 3) at least `_APART_DEG` from one another."""
+    while True:
+        along = rng.normal(size=(AFRL_DEPUTIES, 3))
+        along /= np.linalg.norm(along, axis=1, keepdims=True)
+        cosines = (along @ along.T)[np.triu_indices(AFRL_DEPUTIES, 1)]
+        if cosines.max() <= math.cos(math.radians(_APART_DEG)):
+            return along
+
+
+def afrl_starts(seed: int) -> tuple[str, ...]:
+    """Return overrides of ``afrl-docking``: starts with distances and speeds as in ``afrl_docking``, and directions apart."""
+    rng = np.random.default_rng([seed, 0xAF72])
+    along, heading = _directions(rng), rng.normal(size=(AFRL_DEPUTIES, 3))
+    heading /= np.linalg.norm(heading, axis=1, keepdims=True)
+    distance = rng.uniform(*AFRL_START_M, (AFRL_DEPUTIES, 1))
+    speed = rng.uniform(0.0, _START_SHARE, distance.shape) * afrl_speed_limit(distance)
+    overrides = [f"seed={seed}"]
+    for i in range(AFRL_DEPUTIES):
+        overrides += [
+            f"chasers.{i}.position_m={_toml(along[i] * distance[i])}",
+            f"chasers.{i}.start_velocity_m_s={_toml(heading[i] * speed[i])}",
+            f"timeline.{i}.offset_m={_toml(along[i] * _HOLD_M)}",
+        ]
+    return tuple(overrides)
+
+
+def arch_start(seed: int) -> tuple[str, ...]:
+    """Return overrides of ``arch-comp-rendezvous``: a start in the task's initial set and, with an odd seed, an abort at a random
+    moment after the hold point, before which the chaser need not come nearer than that."""
+    rng = np.random.default_rng([seed, 0xA7C5])
+    start = (ARCH_CENTRE + rng.uniform(-1.0, 1.0, 4) * ARCH_HALF)[:2]
+    overrides = (f"seed={seed}", f"chasers.0.position_m={_toml([*start, 0.0])}")
+    if seed % 2 == 0:
+        return overrides
+    _, attempt, abort = load_shipped("arch-comp-rendezvous").timeline
+    at_s, hold_m = rng.uniform(attempt.at_s, abort.at_s), _ARCH_HOLD_M
+    return (*overrides, f"timeline.2.at_s={at_s:.1f}", f"success.arrival.distance_m={hold_m}")
+
+
+def fly_scenario(name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
+    """Fly a shipped scenario as ``chaserdock simulate`` does; return its summary."""
+    with tempfile.TemporaryDirectory() as folder:
+        simulate(shipped_scenario(name), Path(folder), overrides)
+        return summarize(Path(folder))
+
+
+def _toml(values: Iterable[float]) -> str:
+    return f"[{', '.join(repr(float(v)) for v in values)}]"

@@ -207,13 +207,18 @@ class MissionEnd(Message, frozen=True, kw_only=True):
 
 
 class Image(Message, frozen=True, kw_only=True):
-    """An image of chaser ``chaser``'s camera; ``sim_time_ns`` is the middle of the exposure."""
+    """An image of chaser ``chaser``'s camera; ``sim_time_ns`` is the middle of the exposure.
+
+    ``ranging``: the target's pose by bearing, range sensor and data link at that time, where the scenario has ``[ranging]`` and the
+    target is in reach and in the image; ``reprojection_rms_px`` is the bearing's standard deviation.
+    """
 
     chaser: ChaserId
     width_px: Annotated[int, Meta(ge=1, le=8192)]
     height_px: Annotated[int, Meta(ge=1, le=8192)]
     encoding: Literal["jpeg", "mono8"]
     data: Annotated[bytes, Meta(max_length=16_000_000)]
+    ranging: PoseSolution | None = None
 
 
 _EXACT = (0.0,) * 9

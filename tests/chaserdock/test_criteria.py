@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The criteria ``success.reached`` and ``success.detumbled``: evaluation and validation."""
+"""The criteria ``success.reached``, ``success.detumbled`` and those of published rendezvous tasks: evaluation and validation."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from chaserdock.analysis.criteria import (
     rest_failures,
     stack_rest,
 )
+from chaserdock.analysis.rendezvous import rendezvous_failures, rendezvous_of
 
 PATH = Path(__file__).resolve().parents[2] / "scenarios" / "collision-avoidance.toml"
 
@@ -171,3 +172,136 @@ def test_rest_without_truth_or_criterion_is_not_judged() -> None:
     assert judged.success.detumbled is None
     assert "success.detumbled: the flight ends at 40 s, detumble is at 50 s" in skipped
     assert judged_criteria(s)[0].success.detumbled is not None
+
+
+AFRL, ARCH = (PATH.parent / f"{name}.toml" for name in ("afrl-docking", "arch-comp-rendezvous"))
+
+
+def approach_flight(
+    s: Scenario, offsets_m: np.ndarray, speeds_m_s: np.ndarray, abort_s: float | None = None
+) -> Any:
+    """Return a stub of a recorded flight with one row per second: chaser 0 at offsets (K, 3), TRF of a target that is turned by 90
+    degrees about +z, at speeds (K,) relative to it."""
+    n = len(offsets_m)
+    turned = np.tile(rotations.exp([0.0, 0.0, np.pi / 2.0]), (n, 1))
+    drift = np.tile([0.0, 0.0, 0.3], (n, 1))
+    target = SimpleNamespace(
+        time_s=np.arange(n, dtype=float), position_m=np.ones((n, 3)), q_wxyz=turned, velocity_m_s=drift
+    )
+    own = SimpleNamespace(
+        time_s=target.time_s,
+        position_m=target.position_m + rotations.rotate(turned, offsets_m),
+        velocity_m_s=drift + np.outer(speeds_m_s, [1.0, 0.0, 0.0]),
+    )
+    phases = [(0.0, "hold")] + ([] if abort_s is None else [(abort_s, "abort")])
+    return SimpleNamespace(
+        scenario=s,
+        truth={"target": target, "chaser/0": own},
+        references={0: SimpleNamespace(phases=phases)},
+    )
+
+
+def with_arrival(s: Scenario, **changes: float) -> Scenario:
+    assert s.success.arrival is not None
+    arrival = s.success.arrival.model_copy(update=changes)
+    return s.model_copy(update={"success": s.success.model_copy(update={"arrival": arrival})})
+
+
+def judged(stub: Any) -> list[str]:
+    found = rendezvous_of(stub, 0)
+    assert found is not None
+    return list(rendezvous_failures({"chasers": {"0": {"rendezvous": found}}}, stub.scenario))
+
+
+def inwards(distances_m: np.ndarray, away_deg: float = 0.0) -> np.ndarray:
+    angle = np.radians(away_deg)
+    return np.outer(distances_m, [-np.cos(angle), np.sin(angle), 0.0])
+
+
+def test_speed_limit_of_afrl_holds_at_every_distance() -> None:
+    """v <= 0.2 + 2 n (d - 0.5), n = 0.001027 rad/s."""
+    s, distance = load_scenario(AFRL), np.linspace(150.0, 0.48, 60)
+    limit = 0.2 + 2.0 * 0.001027 * (distance - 0.5)
+    # On arrival the limit is that of the arrival, too, which is as large.
+    assert judged(approach_flight(s, inwards(distance), np.minimum(limit - 1e-6, 0.1999 + limit - 0.2))) == []
+    for row in (0, 30, 58):
+        fast = limit - 1e-3
+        fast[row] += 0.011
+        (failure,) = judged(approach_flight(s, inwards(distance), fast))
+        assert failure == "chaser 0 exceeded the speed limit of success.speed_limit by 0.01 m/s"
+
+
+def test_a_deputy_of_afrl_must_come_within_half_a_metre_slowly() -> None:
+    s, text = load_scenario(AFRL), "chaser 0 did not come within 0.5 m of the target at 0.2 m/s or less"
+    assert judged(approach_flight(s, inwards(np.linspace(100.0, 0.51, 50)), np.full(50, 0.1))) == [text]
+    slow = with_arrival(s, speed_m_s=0.05)
+    assert judged(approach_flight(slow, inwards(np.linspace(100.0, 0.49, 50)), np.full(50, 0.1))) == [
+        "chaser 0 did not come within 0.5 m of the target at 0.05 m/s or less"
+    ]
+    found = rendezvous_of(approach_flight(s, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1)), 0)
+    assert found is not None
+    assert (found["arrived_s"], found["arrived_speed_m_s"]) == (99.0, pytest.approx(0.1))
+    early = with_arrival(s, within_s=98.0)
+    assert judged(approach_flight(early, inwards(np.linspace(99.0, 0.0, 100)), np.full(100, 0.1))) == [
+        "chaser 0 came within 0.5 m of the target at 99.0 s, at most 98 s allowed"
+    ]
+
+
+def test_cone_and_speed_of_arch_comp_hold_nearby_and_until_the_abort() -> None:
+    s, distance = load_scenario(ARCH), np.linspace(900.0, 4.0, 400)
+    speed = np.where(distance <= 108.3, 0.054, 0.5)
+    assert judged(approach_flight(s, inwards(distance, 29.0), speed)) == []
+    (outside,) = judged(approach_flight(s, inwards(distance, 31.0), speed))
+    assert outside.startswith("chaser 0 was 31 degrees off the axis of success.approach_cone within 108.3 m")
+    offsets = inwards(distance, 29.0)
+    offsets[distance > 109.0] = [900.0, 0.0, 0.0]
+    assert judged(approach_flight(s, offsets, speed)) == []
+    (fast,) = judged(approach_flight(s, inwards(distance), np.where(distance <= 108.3, 0.056, 0.5)))
+    assert fast == "chaser 0 exceeded the speed limit of success.speed_limit by 0.001 m/s"
+    # Both end with the abort.
+    after = np.vstack([inwards(distance), np.tile([0.0, 50.0, 0.0], (10, 1))])
+    speeds = np.concatenate([speed, np.full(10, 0.2)])
+    assert judged(approach_flight(s, after, speeds, abort_s=400.0)) == []
+    assert len(judged(approach_flight(s, after, speeds, abort_s=402.0))) == 2
+
+
+def test_an_abort_must_stay_clear_of_the_box() -> None:
+    """The box has a half edge of 0.2 m along the axes of TRF; before the abort it may be entered."""
+    s, distance = load_scenario(ARCH), np.linspace(900.0, 4.0, 400)
+    inside, passing = np.array([[0.1, -0.19, 0.0]]), np.array([[0.1, -0.21, 0.0]])
+    flown = np.zeros(401)
+    near = np.vstack([inwards(distance), inside])
+    (failure,) = judged(approach_flight(s, near, flown, abort_s=400.0))
+    assert failure.startswith(
+        "chaser 0 came within a cube of half edge 0.19 m about the target after its abort"
+    )
+    assert judged(approach_flight(s, np.vstack([inwards(distance), passing]), flown, abort_s=400.0)) == []
+    early = np.vstack([inwards(distance), [[-0.1, 0.0, 0.0]], [[-3.0, 0.0, 0.0]]])
+    assert judged(approach_flight(s, early, np.zeros(402), abort_s=401.0)) == []
+
+
+def test_flights_without_criteria_of_a_rendezvous_have_no_such_figures() -> None:
+    assert rendezvous_of(approach_flight(scenario(), inwards(np.ones(3)), np.zeros(3)), 0) is None
+
+
+def test_arrival_is_not_judged_before_its_goto() -> None:
+    shortened, skipped = judged_criteria(load_scenario(AFRL, ("duration_s=30.0",)))
+    assert shortened.success.arrival is None
+    assert "success.arrival, chaser 2: the flight ends at 30 s, its goto is at 40 s" in skipped
+    assert judged_criteria(load_scenario(AFRL))[0].success.arrival is not None
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("success.arrival.chasers=[0, 3]", "success.arrival.chasers: there is no chaser 3; this mission has 0 to 2"),
+        ("success.speed_limit.speed_m_s=0", "success.speed_limit.speed_m_s"),
+        ("success.approach_cone={half_angle_deg=30, axis=[0, 0, 0], within_m=10}", "axis: must not be 0"),
+        ("success.approach_cone={half_angle_deg=95, axis=[1, 0, 0], within_m=10}", "success.approach_cone.half_angle_deg"),
+        ("success.abort_clear_m=-1", "success.abort_clear_m"),
+    ],
+)  # fmt: skip
+def test_invalid_criteria_of_a_rendezvous_are_named(override: str, message: str) -> None:
+    with pytest.raises(ScenarioError, match=message.replace(".", r"\.")) as caught:
+        load_scenario(AFRL, (override,))
+    assert str(caught.value).count("\n") <= 1

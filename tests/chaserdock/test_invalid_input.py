@@ -46,6 +46,18 @@ INVALID = [
         "run two-chaser-tracking --set chasers.1.position_m=[-1.0,0.0,0.0] --set chasers.1.start_offset_m=[-0.2,0.03,0.0]",
         "nearer than limits.min_distance_chasers_m",
     ),
+    (
+        "run v-bar --set orbit={{semi_major_axis_m=6.2e6}}",
+        "orbit: the orbit lies inside the Earth: its perigee is 178.1 km below",
+    ),
+    (
+        "run v-bar --set timeline.3.offset_m=[-0.5,0.0,0.0]",
+        "timeline.3.offset_m: 0.5 m from the target, inside the keep-out of limits.min_distance_target_m (0.75 m)",
+    ),
+    (
+        "run v-bar --set approach.cone_deg=40",
+        "from the edge of the cone the target is 40 degrees off the view of chaser 0, whose camera sees 18 degrees",
+    ),
     ("simulate single --seeds=5:3", "must be FIRST:LAST or one number, below 2^32"),
     ("simulate single --seeds=x", "must be FIRST:LAST or one number, below 2^32"),
     ("simulate single --seeds=-1", "must be FIRST:LAST or one number, below 2^32"),

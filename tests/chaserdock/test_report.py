@@ -46,7 +46,7 @@ from chaserdock.analysis.images import columns_for, pairs, shots
 from chaserdock.analysis.plots import MissingData
 from chaserdock.analysis.report import _chasers, _quantity, report_of, table, write_report
 from chaserdock.analysis.scene import scene_of
-from chaserdock.analysis.summary import summary_of, tracking_components, tracking_errors
+from chaserdock.analysis.summary import summary_of, text_of, tracking_components, tracking_errors
 from chaserdock.analysis.time_series import OUTCOMES, ActuatorHistory, ImageOutcomes, Traces, load_traces
 from chaserdock.analysis.video import _ExternalView, frames, wrapped, write_video
 
@@ -356,6 +356,29 @@ def test_captured_chaser_is_reported_by_its_latch(tmp_path: Path) -> None:
         assert part in text
     assert "docked since" not in text
     assert "docked since" in _chasers(flight, summary_of(flight))
+
+
+def test_figures_of_a_published_task_are_reported_and_part_of_the_line(tmp_path: Path) -> None:
+    flight = load_flight(made_log(tmp_path / "a.mcap", 3))
+    result = summary_of(flight)
+    assert "Rendezvous" not in _chasers(flight, result)
+    result["chasers"]["0"]["rendezvous"] = {
+        "speed_margin_m_s": 0.0575,
+        "cone_angle_rad": 0.2,
+        "arrived_s": 1121.6,
+        "arrived_speed_m_s": 0.0163,
+        "abort_s": None,
+        "abort_clear_m": 3.25,
+    }
+    text = _chasers(flight, result)
+    for part in ("Rendezvous", "57.5 mm/s", "11.5 °", "1121.6 s", "16.3 mm/s", "3.25 m"):
+        assert part in text
+    line = text_of(result).splitlines()[1]
+    assert (
+        "least margin to the speed limit 0.058 m/s; at most 11.46 deg off the cone's axis; arrived at 1121.6 s"
+        in line
+    )
+    assert "aborted" not in line
 
 
 def test_quantities_have_three_digits_and_no_exponent() -> None:

@@ -18,7 +18,7 @@ GOLDEN = ROOT / "tests" / "golden" / "two-chasers.mcap"
 RUN_ONLY = {"peak_memory_bytes", "cpu_s"}
 DETUMBLING_ONLY = {"stack"}
 PLUMES_ONLY = {"plumes"}
-IN_SOME_FLIGHTS = {"capture", "passive_safety"}
+IN_SOME_FLIGHTS = {"capture", "passive_safety", "rendezvous"}
 """Fields of a chaser."""
 
 

@@ -98,6 +98,13 @@ def test_the_approach_tapers_and_stays_on_the_axis() -> None:
     assert fastest == pytest.approx(docking.approach_speed_m_s, rel=1e-6)
 
 
+def test_a_preset_states_what_its_source_does_and_leaves_the_rest() -> None:
+    default = Pilot().scenario.docking
+    soyuz = Pilot(docking={"final": {"preset": "soyuz"}, "tolerances": {"preset": "soyuz"}}).scenario.docking
+    assert soyuz.final == default.final.model_copy(update={"preset": "soyuz", "closing_m_s": 0.15})
+    assert soyuz.tolerances == default.tolerances.model_copy(update={"preset": "soyuz", "closing_m_s": 0.15})
+
+
 def test_contact_conditions_of_a_preset_limit_the_final_approach() -> None:
     pilot = Pilot(docking={"final": {"preset": "idss", "lateral_m": 0.02}})
     final = pilot.scenario.docking.final

@@ -109,8 +109,8 @@ def test_goto_out_of_the_approach_cone_is_refused() -> None:
         ({"orbit": {"altitude_m": 1e5, "inclination_deg": 200.0}}, r"orbit\.inclination_deg"),
         ({"orbit": {"semi_major_axis_m": 6e6}}, r"orbit: the orbit lies inside the Earth"),
         (
-            {"perception": {"name": "default"}},
-            r'ranging: needs perception\.name = "statistical", not \'default\'',
+            {"perception": {"name": "model"}},
+            r"ranging: needs a perception by markers \(default, paper, paper_iterative, statistical\), not 'model'",
         ),
     ],
 )

@@ -52,3 +52,33 @@ def test_last_leg_of_v_bar_ends_with_a_verified_latch_and_a_hand_over_without_a_
     assert out.hand_over.step_sigmas < 4.0
     assert out.contact_lateral_m < scenario.docking.tolerances.lateral_m
     assert out.contact_closing_m_s < scenario.docking.tolerances.closing_m_s
+
+
+def test_target_at_a_kilometre_is_not_lost_by_the_error_of_the_mounting() -> None:
+    """At 985 m the mounting of the camera (0.05 degrees) makes the position uncertain by 0.9 m."""
+    scenario = load_shipped("arch-comp-rendezvous", "duration_s=5.0", "timeline=[]", "settling_s=0.0")
+    with InProcessMission(scenario, RenderedImages(scenario)) as flight:
+        while flight.tick < scenario.ticks:
+            record = flight.step()
+            assert record.outputs is not None
+            assert record.outputs.target.status == "tracking"
+        assert flight.phase(0) == "hold"
+
+
+@pytest.mark.slow
+def test_ranging_and_images_hand_over_in_one_flight_without_a_jump() -> None:
+    """From 8 m, where no marker is detected, to 5 m."""
+    scenario = load_shipped(
+        "v-bar-images",
+        "duration_s=80.0",
+        "chasers.0.position_m=[-8.0, 0.0, -0.05]",
+        "timeline.0.at_s=15.0",
+        "approach.max_speed_m_s=0.06",
+        "time.rate_hz=5",
+        "time.image_hz=5",
+    )
+    out = rendezvous(scenario, RenderedImages(scenario))
+    assert out.hand_over is not None
+    assert 5.5 < out.hand_over.range_m < 7.5
+    assert out.hand_over.step_sigmas < 4.0
+    assert out.hand_over.error_sigmas < 4.0

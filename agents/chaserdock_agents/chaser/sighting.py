@@ -61,7 +61,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int] | None:
 
 
 def look(perception: PerceptionMethod, image: Image, predicted: Prediction | None) -> Sighting:
-    """Return the sighting of the target in an image; the caller sets ``wall_estimate_s``."""
+    """Return the sighting of the target in an image, by ranging where nothing is detected; the caller sets ``wall_estimate_s``."""
     header: dict[str, Any] = {"tick": image.tick, "sim_time_ns": image.sim_time_ns, "chaser": image.chaser}
     try:
         seen = perception.estimate(decode_image(image), predicted)
@@ -84,6 +84,16 @@ def look(perception: PerceptionMethod, image: Image, predicted: Prediction | Non
         )
         for s in seen.solutions
     )
+    if not solutions and image.ranging is not None:
+        rejected = tuple(int(i) for i in seen.rejected_ids)
+        return Sighting(
+            **header,
+            status="seen",
+            solutions=(image.ranging,),
+            marker_ids=(),
+            corners_px=(),
+            rejected_ids=rejected,
+        )
     return Sighting(
         **header,
         status="seen" if solutions else "nothing",

@@ -44,8 +44,10 @@ def check_flight(scenario: FlightScenario) -> None:
     _check_detumble(scenario)
     _check_hold_points(scenario)
     _check_approach_cone(scenario)
-    if scenario.ranging is not None and scenario.perception.name != "statistical":
-        raise ValueError(f'ranging: needs perception.name = "statistical", not {scenario.perception.name!r}')
+    if scenario.ranging is not None and scenario.perception.name not in MARKER_PERCEPTIONS:
+        raise ValueError(
+            f"ranging: needs a perception by markers ({', '.join(MARKER_PERCEPTIONS)}), not {scenario.perception.name!r}"
+        )
     if scenario.plume is not None and scenario.chaser.actuation != "thrusters":
         raise ValueError('plume: only thrusters have plumes; it needs chaser.actuation = "thrusters"')
     if scenario.limits.passive_safety != "off" and scenario.estimator.name != "joint":
@@ -291,6 +293,8 @@ def _check_named_chasers(scenario: FlightScenario) -> None:
 
 def _check_success(scenario: Scenario) -> None:
     named = [(f"success.{key}", getattr(scenario.success, key)) for key in ("docked", "latched", "reached")]
+    if scenario.success.arrival is not None:
+        named.append(("success.arrival.chasers", scenario.success.arrival.chasers))
     _check_chaser_numbers(named, len(scenario.chasers))
 
 

@@ -45,13 +45,15 @@ CONTACT_CONDITIONS: dict[str, dict[str, float]] = {
         "rate_deg_s": 0.20,
     },
     "atv": {"lateral_m": 0.10, "closing_m_s": 0.10},
+    "soyuz": {"closing_m_s": 0.15},
 }
 """Contact conditions by preset. ``idss``: International Docking System Standard, Interface Definition Document, revision E, October
 2016, table 3.3.1.1-2 (closing 0.05 to 0.10 m/s; the smaller bound is not checked); low-impact docking systems as NASA's NDS follow
 it. ``atv``: ESA, "One hour to docking", 24 February 2011 (blogs.esa.int/orion): within 10 cm, and at less than 10 cm/s; it states
-nothing else."""
+nothing else. ``soyuz``: S. Cristoforetti, logbook L-210, "Passed my manual docking exam", ESA (outpost42.esa.int): manual docking
+within the allowed range of 6 to 15 cm/s (the smaller bound is not checked); it states nothing else."""
 
-Preset = Literal["none", "idss", "atv"]
+Preset = Literal["none", "idss", "atv", "soyuz"]
 _PRESET_TEXT = (
     "Contact conditions of a docking system, in place of the defaults of the keys that it states; keys that are given override it "
     "([docking.md](docking.md#contact-conditions-of-docking-systems))."

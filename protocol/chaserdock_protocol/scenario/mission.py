@@ -14,6 +14,7 @@ from .detumble import RestLimits
 from .faults import Fault
 from .fields import Index, NotNegative, Positive, Section, Vector
 from .flight import FlightScenario
+from .rendezvous import Arrival, ConeLimit, SpeedLimit
 from .schema import FlightChaser
 from .simulation import SimulationSection
 from .thrusters import ThrusterFailure
@@ -49,6 +50,14 @@ class Success(Section):
     detumbled: RestLimits | None = Field(
         default=None,
         description="Rates that the stack of target and latched chasers must not exceed at the end.",
+    )
+    speed_limit: SpeedLimit | None = None
+    approach_cone: ConeLimit | None = None
+    arrival: Arrival | None = None
+    abort_clear_m: Positive | None = Field(
+        default=None,
+        description="Half edge of the cube about the target's centre, along the axes of TRF, out of which the centre of a chaser must "
+        "stay from its first abort on, m.",
     )
     max_collisions: int = Field(default=0, ge=0, description="Largest number of collisions.")
     keep_distances: bool = Field(

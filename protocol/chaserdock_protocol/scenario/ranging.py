@@ -3,6 +3,9 @@
 
 from __future__ import annotations
 
+import math
+
+from chaserdock_models.ranging import RangingErrors
 from pydantic import Field
 
 from .fields import Fraction, NotNegative, Positive, Section
@@ -10,9 +13,9 @@ from .fields import Fraction, NotNegative, Positive, Section
 
 class Ranging(Section):
     """Measurements at far range, of a target too small in the image for its markers: its bearing, from the image, its range, from a
-    range sensor, and its attitude, as a cooperative target sends it. The errors are white. Only with `perception.name =
-    "statistical"`; where markers are detected, they alone are used ([estimation.md](estimation.md#far-range)). Without this section:
-    a target whose markers are too small is not seen."""
+    range sensor, and its attitude, as a cooperative target sends it. The errors are white. With images as with
+    `perception.name = "statistical"`; where markers are detected, they alone are used ([estimation.md](estimation.md#far-range)).
+    Without this section: a target whose markers are too small is not seen."""
 
     range_noise_m: Positive = Field(
         default=0.02, description="Standard deviation of the range, m, of a target nearby."
@@ -29,3 +32,8 @@ class Ranging(Section):
         default=0.02, lt=90, description="Standard deviation of the attitude that the target sends, degrees."
     )
     reach_m: NotNegative = Field(default=1000.0, description="Greatest range, m.")
+
+    def errors(self) -> RangingErrors:
+        """Return the errors in SI units and radians."""
+        bearing, attitude = math.radians(self.bearing_noise_deg), math.radians(self.attitude_noise_deg)
+        return RangingErrors(self.range_noise_m, self.range_share, bearing, attitude, self.reach_m)

@@ -52,7 +52,7 @@ class _Settings(Structure):
     ]  # fmt: skip
 
 
-_SETTINGS = _Settings(
+SETTINGS = _Settings(
     0.45, 1.25,
     8.0, 0.4, 4.0,
     0.1, 0.9, 8, 11, 3.5, 0.6,
@@ -128,7 +128,7 @@ def refine(
     lens = (c_double * 9)(k.fx_px, k.fy_px, k.cx_px, k.cy_px, *k.distortion)
     function("refine_corners")(
         c_void_p(image.ctypes.data), c_int64(image.shape[0]), c_int64(image.shape[1]),
-        lens, c_int64(bool(k.distortion)), byref(_SETTINGS), c_double(cells),
+        lens, c_int64(bool(k.distortion)), byref(SETTINGS), c_double(cells),
         c_int64(n), address(margin), address(ends), address(corners), address(good), address(sigma),
     )  # fmt: skip
     return Refined(corners, good.view(np.bool_), sigma)

@@ -8,7 +8,6 @@ compares both with rendered images. Where no marker is seen, ``[ranging]`` gives
 
 from __future__ import annotations
 
-import math
 from ctypes import c_double, c_int64
 
 import numpy as np
@@ -17,6 +16,7 @@ from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
 from chaserdock_models.native import address
 from chaserdock_models.random_numbers import generator
+from chaserdock_models.ranging import ranged_pose
 from chaserdock_models.targets import TargetModel
 from chaserdock_protocol.pose_image import decode_pose
 from chaserdock_protocol.scenario.ranging import Ranging
@@ -43,7 +43,7 @@ class StatisticalPerception:
     """Measures the pose that an image of ``pose_image`` contains. Stateless, as `Perception`."""
 
     def __init__(self, camera: Camera, model: TargetModel, ranging: Ranging | None = None) -> None:
-        self._camera, self._ranging = camera, ranging
+        self._camera, self._ranging = camera, ranging.errors() if ranging else None
         self._table = MarkerTable.of(model)
         self._lens = (c_double * 6)(
             camera.fx_px, camera.fy_px, camera.cx_px, camera.cy_px, camera.width_px, camera.height_px
@@ -84,23 +84,10 @@ class StatisticalPerception:
 
     def _by_range(self, position: Array, q: Array, white: Array) -> PerceptionResult | None:
         """Return the pose from bearing, range and the attitude that the target sends; None out of the image or of reach."""
-        ranging, camera = self._ranging, self._camera
-        distance = float(np.linalg.norm(position))
-        if ranging is None or distance > ranging.reach_m:
-            return None
-        u, v = camera.project_ideal(position[None])[0]
-        if not (0.0 <= u <= camera.width_px - 1.0 and 0.0 <= v <= camera.height_px - 1.0):
-            return None
-        along = position / distance
-        range_m = np.hypot(ranging.range_noise_m, ranging.range_share * distance)
-        across_m = math.radians(ranging.bearing_noise_deg) * distance
-        covariance = np.zeros((6, 6))
-        line = np.outer(along, along)
-        covariance[:3, :3] = range_m**2 * line + across_m**2 * (np.eye(3) - line)
-        covariance[3:, 3:] = math.radians(ranging.attitude_noise_deg) ** 2 * np.eye(3)
-        error = np.linalg.cholesky(covariance) @ white
-        sigma_px = math.radians(ranging.bearing_noise_deg) * camera.fx_px
-        pose = TargetPose(
-            position + error[:3], rotations.multiply(q, rotations.exp(error[3:])), covariance, sigma_px
+        found = (
+            None if self._ranging is None else ranged_pose(self._ranging, self._camera, position, q, white)
         )
+        if found is None:
+            return None
+        pose = TargetPose(found.position_m, found.q_wxyz, found.covariance, found.bearing_px)
         return PerceptionResult((pose,), _NOTHING.marker_ids, _NOTHING.corners_px, ())

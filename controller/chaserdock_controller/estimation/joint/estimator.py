@@ -8,6 +8,7 @@ exposure, and the later ticks are processed again, so the state does not depend 
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -66,6 +67,8 @@ from .state import (
 )
 from .update import SightedPose, UpdateReport, sighted_pose, start_chaser, start_target, update
 
+FAR_LOST_SHARE = 2e-3
+"""Largest standard deviation of the position of a target beyond 100 m, as a share of its distance."""
 _BLAS = ThreadpoolController()
 """Products of matrices are computed by one thread, as their last bits depend on the number of threads."""
 
@@ -159,7 +162,7 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         predicted = [predict_target(with_body(h, p.target), time_ns, p) for h in state.hypotheses]
         hypotheses, covariances = zip(*predicted, strict=True)
         covariance = mixture_covariance(hypotheses, covariances)
-        lost = is_lost(covariance, p.target)
+        lost = is_lost(covariance, lost_limits(state.hypotheses[0], p.target))
         return target_state(state, time_ns, hypotheses[0], covariance, lost, p.target)
 
     def relative_poses(self) -> tuple[RelativePose, ...]:
@@ -214,6 +217,16 @@ class JointEstimator(ReplayingFilter[JointTickRecord, JointFilterState]):
         return process_tick(before, record, self.chasers, self._mounting, self._with(record.parameters))
 
 
+def lost_limits(state: JointState, target: MekfParameters) -> MekfParameters:
+    """Return the parameters with the standard deviation of the target's position beyond which it is lost: of a far target at least
+    `FAR_LOST_SHARE` of its distance from the nearest chaser, as the error of a camera's mounting grows with the distance."""
+    if not state.alive.any():
+        return target
+    away = state.positions_m[state.alive] - state.position_m
+    limit_m = FAR_LOST_SHARE * math.sqrt(float(np.einsum("ij,ij->i", away, away).min()))
+    return target if limit_m <= target.lost_position_m else dataclasses.replace(target, lost_position_m=limit_m)
+
+
 def process_tick(
     before: JointFilterState | None,
     record: JointTickRecord,
@@ -234,7 +247,7 @@ def process_tick(
     now = replace(old, time_ns=record.time_ns, hypotheses=updated, seen=(), rejected=())
     if seen and not now.hypotheses[0].target_known:
         now = _start(now, seen, unknown_rates(p.target), mounting, p, "initialised", events)
-    elif seen and all_lost(now, p.target):
+    elif seen and all_lost(now, lost_limits(now.hypotheses[0], p.target)):
         now = _reacquire(now, seen, mounting, p, events)
     elif seen:
         report = max(results, key=lambda r: r[0].log_likelihood)[1]
@@ -366,7 +379,7 @@ def _reacquire(
     """Reinitialize the target from the status "lost", keeping its rates; unless it would be lost again."""
     new_events: list[EstimatorEvent] = []
     fresh = _start(now, seen, rates_of(now.hypotheses[0]), mounting, p, "reacquired", new_events)
-    if all_lost(fresh, p.target):
+    if all_lost(fresh, lost_limits(fresh.hypotheses[0], p.target)):
         return now
     events += new_events
     return replace(fresh, reinitialisations=now.reinitialisations + 1)

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Criteria of published rendezvous and docking tasks, evaluated on ground truth at every tick: ``success.speed_limit``,
+``approach_cone``, ``arrival``, ``abort_clear_m``. WRF, in an orbit the Hill frame; distances between centres."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+from chaserdock_models import rotations
+from chaserdock_models.arrays import Array
+from chaserdock_protocol.scenario import Scenario
+from chaserdock_protocol.scenario.rendezvous import Arrival, ConeLimit, SpeedLimit
+
+from .flight import RecordedFlight
+
+RendezvousResult = dict[str, float | None]
+
+
+def rendezvous_of(flight: RecordedFlight, chaser: int) -> RendezvousResult | None:
+    """Return what a chaser's flight has to do with the criteria, as plain values for JSON; None without any of them.
+
+    ``speed_margin_m_s``: least distance from the speed limit; ``cone_angle_rad``: largest angle from the cone's axis; ``arrived_s``,
+    ``arrived_speed_m_s``: at the arrival; ``abort_s``: begin of the first abort; ``abort_clear_m``: from then on, the least half edge
+    of a cube about the target with the chaser's centre on its surface. None where a flight has no such part.
+    """
+    success = flight.scenario.success
+    if all(
+        c is None
+        for c in (success.speed_limit, success.approach_cone, success.arrival, success.abort_clear_m)
+    ):
+        return None
+    own, target = flight.truth[f"chaser/{chaser}"], flight.truth["target"]
+    n = min(len(own.time_s), len(target.time_s))
+    offset = rotations.rotate_inverse(target.q_wxyz[:n], own.position_m[:n] - target.position_m[:n])
+    speed = np.linalg.norm(own.velocity_m_s[:n] - target.velocity_m_s[:n], axis=1)
+    time_s, abort_s = target.time_s[:n], _first_abort_s(flight, chaser)
+    before = n if abort_s is None else int(np.searchsorted(time_s, abort_s))
+    arrived = _arrival(success.arrival, time_s[:before], offset[:before], speed[:before])
+    return {
+        "speed_margin_m_s": _speed_margin(success.speed_limit, offset[:before], speed[:before]),
+        "cone_angle_rad": _largest_angle(success.approach_cone, offset[:before]),
+        **arrived,
+        "abort_s": abort_s,
+        "abort_clear_m": float(np.abs(offset[before:]).max(axis=1).min()) if before < n else None,
+    }
+
+
+def _first_abort_s(flight: RecordedFlight, chaser: int) -> float | None:
+    history = flight.references.get(chaser)
+    return next((at_s for at_s, phase in history.phases if phase == "abort"), None) if history else None
+
+
+def _speed_margin(limit: SpeedLimit | None, offset: Array, speed: Array) -> float | None:
+    if limit is None:
+        return None
+    distance = np.linalg.norm(offset, axis=1)
+    inside = distance <= (math.inf if limit.within_m is None else limit.within_m)
+    margins = limit.speed_m_s + limit.per_s * (distance[inside] - limit.from_m) - speed[inside]
+    return float(margins.min()) if len(margins) else None
+
+
+def _largest_angle(cone: ConeLimit | None, offset: Array) -> float | None:
+    if cone is None:
+        return None
+    distance = np.linalg.norm(offset, axis=1)
+    inside = distance <= cone.within_m
+    axis = np.asarray(cone.axis) / np.linalg.norm(cone.axis)
+    along = offset[inside] @ axis
+    across = np.linalg.norm(offset[inside] - along[:, None] * axis, axis=1)
+    return float(np.arctan2(across, along).max()) if inside.any() else None
+
+
+def _arrival(arrival: Arrival | None, time_s: Array, offset: Array, speed: Array) -> RendezvousResult:
+    if arrival is None:
+        return {"arrived_s": None, "arrived_speed_m_s": None}
+    near = np.linalg.norm(offset, axis=1) <= arrival.distance_m
+    slow = near & (speed <= (math.inf if arrival.speed_m_s is None else arrival.speed_m_s))
+    first = np.flatnonzero(slow)
+    if not len(first):
+        return {"arrived_s": None, "arrived_speed_m_s": None}
+    return {"arrived_s": float(time_s[first[0]]), "arrived_speed_m_s": float(speed[first[0]])}
+
+
+def rendezvous_failures(result: dict[str, Any], s: Scenario) -> Iterator[str]:
+    """Yield a message for each of the criteria that a summary violates."""
+    for i, c in result["chasers"].items():
+        if (found := c.get("rendezvous")) is not None:
+            yield from _failures(int(i), found, s)
+
+
+def _failures(i: int, found: RendezvousResult, s: Scenario) -> Iterator[str]:
+    success = s.success
+    margin, angle, clear = found["speed_margin_m_s"], found["cone_angle_rad"], found["abort_clear_m"]
+    if success.speed_limit is not None and margin is not None and margin < 0.0:
+        yield f"chaser {i} exceeded the speed limit of success.speed_limit by {-margin:.4g} m/s"
+    cone = success.approach_cone
+    if cone is not None and angle is not None and math.degrees(angle) > cone.half_angle_deg:
+        yield (
+            f"chaser {i} was {math.degrees(angle):.4g} degrees off the axis of success.approach_cone within {cone.within_m:g} m; at "
+            f"most {cone.half_angle_deg:g} degrees allowed"
+        )
+    yield from _arrival_failures(i, found["arrived_s"], s)
+    if success.abort_clear_m is not None and clear is not None and clear < success.abort_clear_m:
+        yield (
+            f"chaser {i} came within a cube of half edge {clear:.4g} m about the target after its abort; it must stay out of "
+            f"{success.abort_clear_m:g} m"
+        )
+
+
+def _arrival_failures(i: int, arrived_s: float | None, s: Scenario) -> Iterator[str]:
+    arrival = s.success.arrival
+    if arrival is None or i not in arrival.chasers:
+        return
+    allowed = "" if arrival.speed_m_s is None else f" at {arrival.speed_m_s:g} m/s or less"
+    if arrived_s is None:
+        yield f"chaser {i} did not come within {arrival.distance_m:g} m of the target{allowed}"
+    elif arrival.within_s is not None and arrived_s > arrival.within_s:
+        near = f"chaser {i} came within {arrival.distance_m:g} m of the target"
+        yield f"{near} at {arrived_s:.1f} s, at most {arrival.within_s:g} s allowed"
+
+
+def rendezvous_text(found: RendezvousResult) -> str:
+    """Describe the figures as part of a line."""
+    parts = [
+        ("least margin to the speed limit {:.3f} m/s", found["speed_margin_m_s"]),
+        ("at most {:.2f} deg off the cone's axis", _degrees(found["cone_angle_rad"])),
+        ("arrived at {:.1f} s", found["arrived_s"]),
+        ("aborted at {:.1f} s", found["abort_s"]),
+        ("clear of it by {:.2f} m since", found["abort_clear_m"]),
+    ]
+    return "".join(f"; {text.format(value)}" for text, value in parts if value is not None)
+
+
+def _degrees(angle_rad: float | None) -> float | None:
+    return None if angle_rad is None else math.degrees(angle_rad)

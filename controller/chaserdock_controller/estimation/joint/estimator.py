@@ -224,7 +224,9 @@ def lost_limits(state: JointState, target: MekfParameters) -> MekfParameters:
         return target
     away = state.positions_m[state.alive] - state.position_m
     limit_m = FAR_LOST_SHARE * math.sqrt(float(np.einsum("ij,ij->i", away, away).min()))
-    return target if limit_m <= target.lost_position_m else dataclasses.replace(target, lost_position_m=limit_m)
+    return (
+        target if limit_m <= target.lost_position_m else dataclasses.replace(target, lost_position_m=limit_m)
+    )
 
 
 def process_tick(

@@ -18,7 +18,7 @@ the physics engine's joints in every step, or with ``--rigid`` from the equation
 
 ``--rigid CASE``: identification and plan in closed loop with one rigid body (``chaserdock.evaluation.rigid_control``). The stated
 mass and inertia are 30 % wrong, the stated centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (13.5 s;
-two chasers 14.4 s, one 50 s), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck``
+two chasers 14.4 s, one 50 s), ``known`` (the same, but the stated mass properties are right), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck``
 (a thruster drawn from the seed is stuck off from the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser
 dies at a random moment), ``silent`` (feedback; no controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
 
@@ -51,7 +51,7 @@ from chaserdock.evaluation.detumble_flights import (
 )
 from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, tumble_scenario, watch_tumble
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_controlled, wrong_knowledge
+from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_controlled, right_knowledge, wrong_knowledge
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 VISION_DEG_S, VISION_S = 7.0, 60.0
@@ -196,7 +196,8 @@ class RigidRow(msgspec.Struct, frozen=True):
 def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> StackFlight:
     """Fly one case."""
     numbers, one = numbers_of(chasers), len(chasers) == 1
-    settings, events = [*wrong_knowledge(seed), *o.set], FlightEvents()
+    known = right_knowledge() if case == "known" else []
+    settings, events = [*wrong_knowledge(seed), *known, *o.set], FlightEvents()
     if case not in ("fast", "silent"):
         settings.append(f"detumble.plan_s={PLAN_S.get(len(numbers), 13.5)}")
     if one:
@@ -217,7 +218,7 @@ def fly_rigid(case: str, chasers: str, seed: int, o: argparse.Namespace) -> Stac
     limits = o.limits or ([2.5, 0.9] if case == "limited" else None)
     if limits:
         scenario = with_load_limits(scenario, *limits)
-    durations_s = {"plan": 20.0, "identify": 20.0, "fast": 20.0, "silent": 120.0}
+    durations_s = {"plan": 20.0, "known": 20.0, "identify": 20.0, "fast": 20.0, "silent": 120.0}
     return fly_controlled(
         scenario,
         90.0 if one else durations_s.get(case, 40.0),
@@ -368,7 +369,7 @@ def numbers_of(chasers: str) -> list[int]:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.add_argument("--silent", action="store_true", help="without a controller")
-    cases = ("plan", "identify", "fast", "stuck", "reported", "lost", "silent", "limited")
+    cases = ("plan", "known", "identify", "fast", "stuck", "reported", "lost", "silent", "limited")
     parser.add_argument("--rigid", choices=cases, help="identification and plan, on one rigid body")
     parser.add_argument("--vision", action="store_true", help="what the free tumble shows, without a capture")
     parser.add_argument(

@@ -296,18 +296,33 @@ def identification_errors(flight: ControlledStack | None) -> dict[str, float | N
     }
 
 
+_MASS, _MOMENTS, _PRODUCTS, _CENTRE = "150.0", "16.73,20.29,22.98", "-2.41,1.95,-1.41", "[0.06,-0.05,0.04]"
+"""Mass properties of the target in ``wrong_knowledge``: kg, kg m² and m, TRF axes."""
+
+
+def right_knowledge() -> list[str]:
+    """Return scenario overrides after those of ``wrong_knowledge`` by which the controllers' stated mass properties are right."""
+    return [
+        f"target.mass_kg={_MASS}",
+        f"target.inertia_kg_m2=[{_MOMENTS}]",
+        f"target.inertia_products_kg_m2=[{_PRODUCTS}]",
+        f"target.centre_of_mass_m={_CENTRE}",
+        "target.mass_sigma_share=0.003",
+        "target.inertia_sigma_share=0.003",
+        "target.centre_of_mass_sigma_m=0.001",
+    ]
+
+
 def wrong_knowledge(seed: int, share: float = 0.3, errors: bool = True) -> list[str]:
     """Return scenario overrides of ``detumble``: the controllers' stated mass and inertia are wrong by ``share``, the stated
     inertia is that of a ball, and its centre of mass the middle of the body; thrusts and pulses have errors with ``errors``."""
     rng = np.random.default_rng([seed, 0xBAD])
     mass, inertia = (1.0 + share * rng.choice([-1.0, 1.0]) for _ in range(2))
-    true = (
-        "mass_kg=150.0,inertia_kg_m2=[16.73,20.29,22.98,-2.41,1.95,-1.41],centre_of_mass_m=[0.06,-0.05,0.04]"
-    )
+    true = f"mass_kg={_MASS},inertia_kg_m2=[{_MOMENTS},{_PRODUCTS}],centre_of_mass_m={_CENTRE}"
     moment = 20.0 * inertia
     out = [
         f"truth.values=[{{target=true,{true}}}]",
-        f"target.mass_kg={150.0 * mass}",
+        f"target.mass_kg={float(_MASS) * mass}",
         f"target.inertia_kg_m2=[{moment},{moment},{moment}]",
         "target.inertia_products_kg_m2=[0.0,0.0,0.0]",
         "target.centre_of_mass_m=[0.0,0.0,0.0]",

@@ -18,9 +18,10 @@ the physics engine's joints in every step, or with ``--rigid`` from the equation
 
 ``--rigid CASE``: identification and plan in closed loop with one rigid body (``chaserdock.evaluation.rigid_control``). The stated
 mass and inertia are 30 % wrong, the stated centre of mass 88 mm; thrusts (3 %) and pulses (2 %) have errors. CASE: ``plan`` (13.5 s;
-two chasers 14.4 s, one 50 s), ``known`` (the same, but the stated mass properties are right), ``identify`` (10 s of identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck``
-(a thruster drawn from the seed is stuck off from the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser
-dies at a random moment), ``silent`` (feedback; no controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
+two chasers 14.4 s, one 50 s), ``known`` (the same, but mass, centre and inertia are stated as they are), ``identify`` (10 s of
+identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck`` (a thruster drawn from the seed is stuck off from
+the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser dies at a random moment), ``silent`` (feedback; no
+controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
 
 ``--vision``: no capture; the chasers of each set keep their places around the free target for 60 s, which tumbles at 7 degrees/s
 about an axis drawn from the seed, with the same wrong statements. Prints the errors of the ratios of the inertia (its elements over
@@ -51,7 +52,13 @@ from chaserdock.evaluation.detumble_flights import (
 )
 from chaserdock.evaluation.free_tumble_flights import TumbleOutcome, tumble_scenario, watch_tumble
 from chaserdock.evaluation.perception import RenderedImages
-from chaserdock.evaluation.rigid_control import FlightEvents, StackFlight, fly_controlled, right_knowledge, wrong_knowledge
+from chaserdock.evaluation.rigid_control import (
+    FlightEvents,
+    StackFlight,
+    fly_controlled,
+    right_knowledge,
+    wrong_knowledge,
+)
 from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 
 VISION_DEG_S, VISION_S = 7.0, 60.0

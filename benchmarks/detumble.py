@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Stopping a tumbling client: ``python benchmarks/detumble.py [--quick] [--json FILE] [--tumbles N] [--first SEED]
-[--sets 0123 013 03] [--silent | --rigid CASE | --vision] [--limits FORCE TORQUE] [--set KEY=VALUE]
+[--sets 0123 013 03] [--silent | --rigid CASE | --vision | --optimum] [--limits FORCE TORQUE] [--set KEY=VALUE]
 [--results FILE]``.
 
 Flies stacks of the client of ``detumble`` and some of its chasers, latched from the start, in one process with the
@@ -22,6 +22,9 @@ two chasers 14.4 s, one 50 s), ``known`` (the same, but mass, centre and inertia
 identifying pulses before it, 30 s in all), ``fast`` (feedback only), ``stuck`` (a thruster drawn from the seed is stuck off from
 the start, not reported), ``reported`` (the same, reported), ``lost`` (a chaser dies at a random moment), ``silent`` (feedback; no
 controller from 1 s on, 120 s at most), ``limited`` (``--limits 2.5 0.9``).
+
+``--optimum``: no flight; the least impulse found that stops the stack in 15.5 s, over that of the linear programme, with the true
+stack, from 40 random guesses: what no controller can be expected to undercut.
 
 ``--vision``: no capture; the chasers of each set keep their places around the free target for 60 s, which tumbles at 7 degrees/s
 about an axis drawn from the seed, with the same wrong statements. Prints the errors of the ratios of the inertia (its elements over
@@ -56,6 +59,7 @@ from chaserdock.evaluation.rigid_control import (
     FlightEvents,
     StackFlight,
     fly_controlled,
+    optimum_share,
     right_knowledge,
     wrong_knowledge,
 )
@@ -64,6 +68,7 @@ from chaserdock.evaluation.rigid_stack import SilentOutcome, fly_silent
 VISION_DEG_S, VISION_S = 7.0, 60.0
 PLAN_S = {2: 14.4}
 """Time of the plan by number of chasers, s; of more than two 13.5."""
+OPTIMUM_S, OPTIMUM_GUESSES = 15.5, 40
 
 
 _Outcome = TypeVar("_Outcome")
@@ -300,6 +305,20 @@ def fly_sets_rigid(o: argparse.Namespace, seeds: range) -> Figures:
     )
 
 
+def print_optima(o: argparse.Namespace, seeds: range) -> Figures:
+    """Search the least impulse for every set of chasers; return the figures."""
+    figures: Figures = {}
+    for chasers in o.sets:
+        shares = []
+        for seed in seeds:
+            scenario = stack_scenario(seed, numbers_of(chasers), [*wrong_knowledge(seed), *o.set])
+            shares.append(optimum_share(scenario, OPTIMUM_S, OPTIMUM_GUESSES))
+            print(f"{chasers}: seed {seed}: {shares[-1]:.3f}", file=sys.stderr, flush=True)
+        figures |= (part := percentiles(shares, f"optimum_{chasers}_over_lp", "ratio", "median", "max"))
+        print_figures(part)
+    return figures
+
+
 class VisionRow(msgspec.Struct, frozen=True):
     """One tumble without capture in the results file."""
 
@@ -379,6 +398,7 @@ def main() -> None:
     cases = ("plan", "known", "identify", "fast", "stuck", "reported", "lost", "silent", "limited")
     parser.add_argument("--rigid", choices=cases, help="identification and plan, on one rigid body")
     parser.add_argument("--vision", action="store_true", help="what the free tumble shows, without a capture")
+    parser.add_argument("--optimum", action="store_true", help="the least impulse, without a flight")
     parser.add_argument(
         "--limits", type=float, nargs=2, metavar=("FORCE", "TORQUE"), help="of every port, N and N m"
     )
@@ -394,6 +414,8 @@ def main() -> None:
         fly = fly_sets_silent
     elif o.vision:
         fly = fly_sets_vision
+    elif o.optimum:
+        fly = print_optima
     elif o.rigid:
         fly = fly_sets_rigid
     write_json(o.json, fly(o, range(o.first, o.first + (2 if o.quick else o.tumbles))))

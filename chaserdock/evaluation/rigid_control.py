@@ -18,6 +18,7 @@ from chaserdock_controller.estimation.mass_properties import properties_of
 from chaserdock_controller.estimation.types import TargetState
 from chaserdock_controller.guidance.detumble.allocation import MinimumTime
 from chaserdock_controller.guidance.detumble.control import DetumbleControl, StackState, StackTask
+from chaserdock_controller.guidance.detumble.planning import plan_stop
 from chaserdock_controller.guidance.detumble.stack import StackMotion
 from chaserdock_controller.interfaces import Observation, TargetEstimation
 from chaserdock_models import rotations
@@ -30,6 +31,7 @@ from .rigid_stack import RigidStack, StackStep
 
 _POSE_M, _POSE_RAD = 0.001, math.radians(0.1)
 _SETTLE_TICKS = 2
+_OPTIMUM_STEP_S = 0.5
 _SILENT_REST_S = 10.0
 """A flight without controller ends so long after the stack came to rest."""
 
@@ -296,18 +298,50 @@ def identification_errors(flight: ControlledStack | None) -> dict[str, float | N
     }
 
 
+def optimum_share(scenario: Scenario, seconds: float, guesses: int, programmes: int = 20) -> float:
+    """Return the least impulse found that stops a stack in ``seconds``, over that of the programme with a frozen attitude: planned
+    at once with the true stack, from so many random guesses, each with so many linear programmes."""
+    flight = ControlledStack(scenario)
+    state = flight.state()
+    problem = flight.control.problem(state, set(state.chasers), {})
+    count, rng = round(seconds / _OPTIMUM_STEP_S), np.random.default_rng([scenario.seed, 0x0971])
+    shape, plans = (count, len(problem.limits_N)), []
+    for _ in range(guesses):
+        guess = np.where(rng.random(shape) < rng.choice([0.05, 0.15, 0.3]), problem.limits_N, 0.0)
+        plans.append(plan_stop(problem, guess, seconds / count, programmes).cost_N_s)
+    least = least_time(scenario, state.body, dict(state.chasers), state.motion)
+    if least is None:
+        raise ValueError("the stack cannot be stopped with a frozen attitude")
+    return min(plans) / least.impulse_N_s
+
+
+_MASS, _MOMENTS, _PRODUCTS, _CENTRE = "150.0", "16.73,20.29,22.98", "-2.41,1.95,-1.41", "[0.06,-0.05,0.04]"
+"""Mass properties of the target in ``wrong_knowledge``: kg, kg m² and m, TRF axes."""
+
+
+def right_knowledge() -> list[str]:
+    """Return scenario overrides after those of ``wrong_knowledge`` by which the controllers' stated mass properties are right."""
+    return [
+        f"target.mass_kg={_MASS}",
+        f"target.inertia_kg_m2=[{_MOMENTS}]",
+        f"target.inertia_products_kg_m2=[{_PRODUCTS}]",
+        f"target.centre_of_mass_m={_CENTRE}",
+        "target.mass_sigma_share=0.003",
+        "target.inertia_sigma_share=0.003",
+        "target.centre_of_mass_sigma_m=0.001",
+    ]
+
+
 def wrong_knowledge(seed: int, share: float = 0.3, errors: bool = True) -> list[str]:
     """Return scenario overrides of ``detumble``: the controllers' stated mass and inertia are wrong by ``share``, the stated
     inertia is that of a ball, and its centre of mass the middle of the body; thrusts and pulses have errors with ``errors``."""
     rng = np.random.default_rng([seed, 0xBAD])
     mass, inertia = (1.0 + share * rng.choice([-1.0, 1.0]) for _ in range(2))
-    true = (
-        "mass_kg=150.0,inertia_kg_m2=[16.73,20.29,22.98,-2.41,1.95,-1.41],centre_of_mass_m=[0.06,-0.05,0.04]"
-    )
+    true = f"mass_kg={_MASS},inertia_kg_m2=[{_MOMENTS},{_PRODUCTS}],centre_of_mass_m={_CENTRE}"
     moment = 20.0 * inertia
     out = [
         f"truth.values=[{{target=true,{true}}}]",
-        f"target.mass_kg={150.0 * mass}",
+        f"target.mass_kg={float(_MASS) * mass}",
         f"target.inertia_kg_m2=[{moment},{moment},{moment}]",
         "target.inertia_products_kg_m2=[0.0,0.0,0.0]",
         "target.centre_of_mass_m=[0.0,0.0,0.0]",

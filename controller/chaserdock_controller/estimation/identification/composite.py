@@ -244,7 +244,7 @@ class CompositeIdentification:
         step_s: float,
     ) -> Array:
         x = self._estimate
-        inertia, mass = x.body.inertia_kg_m2, x.body.mass_kg
+        inertia = x.body.inertia_kg_m2
         f = np.eye(len(self.covariance))
         free = inverse @ (rotations.skew(inertia @ omega) - rotations.skew(omega) @ inertia)
         by_inertia = np.stack(
@@ -258,16 +258,31 @@ class CompositeIdentification:
         f[RATE, INERTIA] = step_s * (np.eye(3) + step_s / 2.0 * free) @ by_inertia
         if not stated.any():
             return f
+        pushes, turns = self._by_pulses(rotation, inverse, stated, impulses)
+        f[VELOCITY] += pushes
+        f[RATE] += turns
+        # Half of a change of velocity and rate acts during the step.
+        f[POSITION] += step_s / 2.0 * pushes
+        f[ATTITUDE] += step_s / 2.0 * turns
+        return f
+
+    def _by_pulses(
+        self, rotation: Array, inverse: Array, stated: Array, impulses: Array
+    ) -> tuple[Array, Array]:
+        """Return the matrices (3, size) of the changes of velocity (WRF) and rate (TRF) by pulses over the error state."""
+        x, size = self._estimate, len(self.covariance)
+        mass = x.body.mass_kg
+        pushes, turns = np.zeros((3, size)), np.zeros((3, size))
         wrenches = self._wrenches()
         total = wrenches @ impulses
-        kick, turn = rotation @ total[:3] / mass, inverse @ total[3:]
-        f[VELOCITY, ATTITUDE] = -rotation @ rotations.skew(total[:3]) / mass
-        f[VELOCITY, MASS] = -kick[:, None]
-        f[RATE, CENTRE] = inverse @ rotations.skew(total[:3])
-        f[RATE, INERTIA] += np.stack([-inverse @ (e @ turn) for e in _BASIS], axis=1)
+        turn = inverse @ total[3:]
+        pushes[:, ATTITUDE] = -rotation @ rotations.skew(total[:3]) / mass
+        pushes[:, MASS] = -rotation @ total[:3, None] / mass
+        turns[:, CENTRE] = inverse @ rotations.skew(total[:3])
+        turns[:, INERTIA] = np.stack([-inverse @ (e @ turn) for e in _BASIS], axis=1)
         of_usable = wrenches[:, self._usable] * stated[self._usable]
-        f[VELOCITY, self._scales] = rotation @ of_usable[:3] / mass
-        f[RATE, self._scales] = inverse @ of_usable[3:]
+        pushes[:, self._scales] = rotation @ of_usable[:3] / mass
+        turns[:, self._scales] = inverse @ of_usable[3:]
         for row in range(len(self.chasers)):
             of_chaser = slice(self._n * row, self._n * (row + 1))
             if not stated[of_chaser].any():
@@ -278,14 +293,10 @@ class CompositeIdentification:
             place, attitude = self._mount(row).start, self._mount(row).start + 3
             arm = rotations.skew(x.mounts_m[row] - x.body.centre_trf_m)
             by_turn = -turned @ rotations.skew(own[:3])
-            f[VELOCITY, attitude : attitude + 3] = rotation @ by_turn / mass
-            f[RATE, place : place + 3] = -inverse @ rotations.skew(force)
-            f[RATE, attitude : attitude + 3] = inverse @ (arm @ by_turn - turned @ rotations.skew(own[3:]))
-        # Half of the change of the rate acts during the step.
-        for columns in (CENTRE, self._scales):
-            f[ATTITUDE, columns] += step_s / 2.0 * f[RATE, columns]
-            f[POSITION, columns] += step_s / 2.0 * f[VELOCITY, columns]
-        return f
+            pushes[:, attitude : attitude + 3] = rotation @ by_turn / mass
+            turns[:, place : place + 3] = -inverse @ rotations.skew(force)
+            turns[:, attitude : attitude + 3] = inverse @ (arm @ by_turn - turned @ rotations.skew(own[3:]))
+        return pushes, turns
 
     # -- update ----------------------------------------------------------------------------------------------
 

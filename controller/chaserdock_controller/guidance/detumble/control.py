@@ -328,6 +328,13 @@ class DetumbleControl:
 
     # -- models ----------------------------------------------------------------------------------------------
 
+    def problem(
+        self, state: StackState, chasers: Set[int], isolated: Mapping[int, tuple[int, ...]]
+    ) -> StackProblem:
+        """Return what a plan for these chasers has to solve."""
+        active = {i: state.chasers[i] for i in sorted(chasers)}
+        return self._problem(state, self._thrusters_of(state, active, isolated))
+
     def _problem(self, state: StackState, thrusters: _Thrusters) -> StackProblem:
         momentum = [
             rotations.rotate(state.q_wxyz, p) for p in (state.motion.linear_N_s, state.motion.angular_N_m_s)

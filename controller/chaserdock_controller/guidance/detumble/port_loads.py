@@ -6,6 +6,7 @@ Scaling the thrusts does not lower the peaks, because every pulse is fully on; o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -21,6 +22,18 @@ _MARGIN = 0.9
 """Share of the limits that is used: model errors and the joint's vibrations have the rest."""
 
 
+def _directions(count: int) -> Array:
+    """Return unit vectors (count, 3) that cover the sphere evenly (Fibonacci's spiral)."""
+    k = np.arange(count) + 0.5
+    height, turn = 1.0 - 2.0 * k / count, math.pi * (1.0 + math.sqrt(5.0)) * k
+    radius = np.sqrt(1.0 - height**2)
+    return np.stack([radius * np.cos(turn), radius * np.sin(turn), height], axis=1)
+
+
+_DIRECTIONS = _directions(200)
+"""Directions in which loads are bounded. A load between them is at most 2 % larger."""
+
+
 @dataclass(frozen=True, eq=False)
 class LoadModel:
     """Loads at P ports: ``constant`` (P, 6) plus ``by_thrust`` (P, 6, n) times the thrusts; force and torque about the tip, TRF axes.
@@ -29,14 +42,6 @@ class LoadModel:
     constant: Array
     by_thrust: Array
     limits: Array
-
-    def within(self, thrusts_N: Array) -> bool:
-        """Return whether no port exceeds its limits under thrusts (n,) of open valves."""
-        loads = self.constant + self.by_thrust @ thrusts_N
-        magnitudes = np.stack(
-            [np.linalg.norm(loads[:, :3], axis=1), np.linalg.norm(loads[:, 3:], axis=1)], axis=1
-        )
-        return bool((magnitudes <= _MARGIN * self.limits).all())
 
 
 def load_model(
@@ -80,14 +85,19 @@ def load_model(
 
 
 def fire_in_turn(model: LoadModel, wanted: Array, full_N: Array) -> Array:
-    """Return which thrusters (n,) of those ``wanted`` (n,) may fire together, the most wanted first, as a mask."""
-    chosen, thrusts = np.zeros(len(wanted), dtype=bool), np.zeros(len(wanted))
+    """Return which thrusters (n,) of those ``wanted`` (n,) may fire together, the most wanted first, as a mask.
+
+    Nor does any part of them exceed a limit: their pulses differ in width, and the rest of a load that others have borne remains.
+    """
+    chosen = np.zeros(len(wanted), dtype=bool)
+    ports = len(model.constant)
+    # The largest component of the loads along each direction, over all parts of the chosen thrusters.
+    along = model.constant.reshape(ports, 2, 3) @ _DIRECTIONS.T
+    more = np.einsum("pckn,dk->pcdn", model.by_thrust.reshape(ports, 2, 3, -1), _DIRECTIONS)
     for k in np.argsort(-wanted, kind="stable"):
         if wanted[k] <= 0.0:
             break
-        thrusts[k] = full_N[k]
-        if model.within(thrusts):
-            chosen[k] = True
-        else:
-            thrusts[k] = 0.0
+        added = along + np.maximum(0.0, full_N[k] * more[..., k])
+        if (added.max(axis=2) <= _MARGIN * model.limits).all():
+            chosen[k], along = True, added
     return chosen

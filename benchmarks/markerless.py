@@ -19,8 +19,9 @@ front of the target are random. Parts:
   gate;
 - ``acquisition``, ``earth`` and ``pair``: without a prior at 1 to 3 m, in front of space, of the Earth, and in front of space by one
   of two cameras that see the target at right angles;
-- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated from 36 views from all around at 1 to 1.6 m
-  by the controller's filter; twelve views of each of ``views / 12`` drawn meshes;
+- ``inspect``: as ``knowledge`` at 1 m, after the geometry has been estimated by the controller's filter from 36 views from all around
+  at 1 to 1.6 m, by two cameras on opposite sides whose distance odometry of grade `lab` measures; twelve views of each of
+  ``views / 12`` drawn meshes;
 - ``sequence`` and ``closing``: a tumbling target, followed at 15 Hz from its acquisition on, at 3 m and from 1.4 to 0.55 m.
 
 Gross: an error above 2 degrees or 2 % of range that passes the gate. Times are CPU times of this process. ``--results FILE`` appends
@@ -48,14 +49,17 @@ from chaserdock_agents.chaser.perception.model.alignment import Alignment, Pyram
 from chaserdock_agents.chaser.perception.model.mesh import TrackerMesh
 from chaserdock_agents.chaser.perception.model.perception import ModelPerception
 from chaserdock_agents.chaser.perception.refine import PoseInCamera
-from chaserdock_controller.estimation.target_shape import ShapeFilter
+from chaserdock_agents.chaser.sighting import geometry_message
+from chaserdock_controller.estimation.target_shape import ShapeFilter, seen_place
 from chaserdock_models import rotations
 from chaserdock_models.arrays import Array
 from chaserdock_models.camera import Camera
-from chaserdock_models.geometry_errors import geometry_parameters
 from chaserdock_models.meshes import with_geometry_errors
 from chaserdock_models.satellites import satellite
+from chaserdock_protocol.codec import vector
+from chaserdock_protocol.messages import PoseSolution
 from chaserdock_protocol.scenario.camera import Effects
+from chaserdock_protocol.scenario.navigation import NavigationSection
 from chaserdock_world.rendering.background import SPACE_LEVEL, Earth, Light
 from chaserdock_world.rendering.effects import CameraEffects
 from chaserdock_world.rendering.mesh_renderer import MeshRenderer
@@ -72,6 +76,7 @@ PANEL_SIGMA_RAD, SCALE_SIGMA = np.deg2rad(0.5), 0.003
 PRIOR = (0.01, np.deg2rad(1.5))
 LEAST_GREY = 5.0
 MOST_UNSEEN = 120
+HALF_TURN = np.diag([-1.0, 1.0, -1.0])
 RIGHT_ANGLE = rotations.to_matrix(rotations.exp(np.array([0.0, np.pi / 2.0, 0.0])))
 
 ViewRow = dict[str, float]
@@ -145,23 +150,13 @@ class Cells:
 def inspect(views: int) -> Figures:
     """Estimate the geometry from many views, correct the mesh, and track ``views`` single images at 1 m."""
     rng, scene = np.random.default_rng(21), SatelliteImages()
-    errors, nees, rejected, shape_nees, used = [], [], 0, [], []
-    parameters = geometry_parameters(KNOWN, PANEL_SIGMA_RAD, SCALE_SIGMA)
+    errors, nees, rejected, shape_nees, used, scale_off = [], [], 0, [], [], []
     for number in range(max(views // _VIEWS_AFTER, 1)):
         turns = {joint: rng.normal(0.0, PANEL_SIGMA_RAD, 3) for joint in KNOWN.joints}
         scale = rng.normal(0.0, SCALE_SIGMA)
         mesh = TrackerMesh.of_mesh(with_geometry_errors(KNOWN, scale, turns), PANEL_SIGMA_RAD, SCALE_SIGMA)
         _ = mesh.suns
-        fused = ShapeFilter.prior(len(parameters))
-        for k in range(_VIEWS_BEFORE):
-            pose, light = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
-            image = scene.image(pose, light, 1000 * number + k)
-            found = _track(image, mesh, perturbed(pose, rng, 0.01, np.deg2rad(1.5)))
-            if found is not None and tracking.is_valid(found):
-                direction = -found.pose.rotation.T @ found.pose.position
-                fused = fused.with_view(
-                    direction / np.linalg.norm(direction), found.geometry.matrix, found.geometry.vector
-                )
+        fused = inspected(scene, mesh, rng, 1000 * number)
         # The tracker's mesh is the true one with errors, which it should find with the opposite sign.
         true = -np.append(
             np.concatenate([turns[j] for j in KNOWN.joints]) / PANEL_SIGMA_RAD, scale / SCALE_SIGMA
@@ -171,6 +166,7 @@ def inspect(views: int) -> Figures:
             float(off @ np.linalg.solve(fused.covariance()[: len(true), : len(true)], off)) / len(true)
         )
         used.append(len(fused.cells))
+        scale_off.append(off[-1] * SCALE_SIGMA)
         corrected = mesh.corrected(fused.mean(), fused.covariance())
         for k in range(_VIEWS_AFTER):
             pose, light = random_view(rng, 1.0, CAMERA)
@@ -189,7 +185,42 @@ def inspect(views: int) -> Figures:
         "inspect_meshes": len(used),
         "inspect_views_fused_mean": float(np.mean(used)),
         "inspect_geometry_nees_per_parameter": float(np.mean(shape_nees)),
+        "inspect_scale_rms": float(np.sqrt(np.mean(np.square(scale_off)))),
     }
+
+
+def inspected(scene: SatelliteImages, mesh: TrackerMesh, rng: np.random.Generator, first: int) -> ShapeFilter:
+    """Return the geometry by the views of two cameras on opposite sides of the target, with odometry of grade `lab`."""
+    count, errors = len(mesh.modes_m), NavigationSection(grade="lab").errors()
+    fused, shifts = ShapeFilter.prior(count), rng.normal(0.0, errors.camera_shift_m, (2, 3))
+    sigma_m, common_m = np.sqrt(2.0) * errors.position_noise_m, np.sqrt(2.0) * errors.camera_shift_m
+    for number in range(0, _VIEWS_BEFORE, 2):
+        pose, light = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
+        aside, _ = random_view(rng, rng.uniform(1.0, 1.6), CAMERA)
+        opposite = PoseInCamera(aside.position, HALF_TURN @ pose.rotation)
+        places, lenses = [], []
+        for camera, (seen, turn) in enumerate(((pose, np.eye(3)), (opposite, HALF_TURN))):
+            sun = replace(light, to_sun_w=tuple(turn @ light.to_sun_w))
+            image = scene.image(seen, sun, first + number + camera)
+            lens = seen.rotation.T @ (shifts[camera] - seen.position)
+            lenses.append(lens + rng.normal(0.0, errors.position_noise_m, 3))
+            found = _track(image, mesh, perturbed(seen, rng, *PRIOR))
+            if found is None or not tracking.is_valid(found):
+                continue
+            direction = -found.pose.rotation.T @ found.pose.position
+            direction /= np.linalg.norm(direction)
+            fused = fused.with_view(direction, found.geometry.matrix, found.geometry.vector)
+            solution = PoseSolution(
+                position_m=vector(found.pose.position),
+                q_wxyz=vector(rotations.from_matrix(found.pose.rotation)),
+                covariance=vector(found.covariance),
+                reprojection_rms_px=found.rms_px,
+            )
+            places.append(seen_place(solution, geometry_message(found.geometry), count))
+        if len(places) == 2 and places[0] is not None and places[1] is not None:
+            length_m = float(np.linalg.norm(lenses[0] - lenses[1]))
+            fused = fused.with_baseline(places[0], places[1], length_m, float(sigma_m), float(common_m))
+    return fused
 
 
 def tracked_view(

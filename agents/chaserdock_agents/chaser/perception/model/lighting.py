@@ -39,8 +39,10 @@ _LIKELY = 0.08
 _EVEN_RESIDUAL, _CLEARLY = 0.15, 0.95
 """Mean squared residual, in standard deviations, below which light from everywhere explains the points: of 40 sunlit views the least
 was 0.45, of views without sun on what is visible the most 0.17. Ratio of residuals below which a sun explains a view better."""
-_ALL_AROUND, _COMPARED_FINELY = spread_directions(60), 3
-"""Directions (n, 3) in IRF of which synthetic views are compared coarsely, and number of those that are compared finely."""
+_COMPARED_SUNS = np.array([d for d in spread_directions(60) if d[2] > -0.1 or d[2] < -0.9])
+"""Directions (n, 3) in IRF, behind the target or of a lamp beside the lens, of which synthetic views are compared."""
+_COMPARED_FINELY = 3
+"""Number of these that are compared at a finer level."""
 
 
 @dataclass(frozen=True)
@@ -99,13 +101,16 @@ def light_by_view(
     if coarse is None or fine is None:
         return even
     if previous is not None and previous.to_sun_irf is not None:
-        starts = previous.to_sun_irf[None]
+        fine, nearest, found = (
+            coarse,
+            previous.to_sun_irf,
+            [(*coarse.rate(previous.to_sun_irf), previous.to_sun_irf)],
+        )
     else:
-        rated = [coarse.rate(to_sun)[0] for to_sun in _ALL_AROUND]
-        best = np.argsort(rated)[:_COMPARED_FINELY]
-        starts = np.concatenate([_ALL_AROUND[best], *(_around(_ALL_AROUND[k], 0.25)[1:] for k in best[:1])])
-    found = [(*fine.rate(to_sun), to_sun) for to_sun in starts]
-    nearest = min(found, key=lambda f: f[0])[3]
+        rated = [coarse.rate(to_sun)[0] for to_sun in _COMPARED_SUNS]
+        best = _COMPARED_SUNS[np.argsort(rated)[:_COMPARED_FINELY]]
+        found = [(*fine.rate(to_sun), to_sun) for to_sun in (*best, *_around(best[0], 0.25)[1::2])]
+        nearest = min(found, key=lambda f: f[0])[3]
     found += [(*fine.rate(to_sun), to_sun) for to_sun in _around(nearest, 0.12)[1::2]]
     residual, ambient, direct, to_sun = min(found, key=lambda f: f[0])
     if residual > _CLEARLY * fine.residual:
